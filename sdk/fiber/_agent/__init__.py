@@ -1,0 +1,1 @@
+"""What runs beside the children of one host: agent, zygote, and the child's own first steps."""

@@ -1,0 +1,198 @@
+"""A child's first steps: from a forked zygote or a fresh interpreter to the user's Process object."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import multiprocessing.spawn
+import os
+import pickle
+import signal
+import sys
+import traceback
+from collections.abc import Iterator
+from multiprocessing import process as mp_process
+from multiprocessing import util
+from typing import TYPE_CHECKING, Any
+
+from fiber._agent.board import Board
+from fiber._transport.unix import UnixChannel
+
+if TYPE_CHECKING:
+    from fiber._agent.zygote import Start
+
+_PR_SET_PDEATHSIG = 1
+_libc = ctypes.CDLL(None, use_errno=True)
+
+_descriptors: list[int] = []
+_task_channel: UnixChannel | None = None
+_progress: memoryview | None = None
+host = ""
+"""The host that this process belongs to; empty in a program that Fiber did not start."""
+
+
+def task_channel() -> UnixChannel:
+    """In a pool worker: the channel that brings tasks and takes results."""
+    if _task_channel is None:
+        raise RuntimeError("this process is not a pool worker")
+    return _task_channel
+
+
+def progress() -> memoryview:
+    """In a pool worker: two words of shared memory, sequence number and index of the running task.
+
+    Set the sequence number last, to zero before another batch's index is written: whoever reads them
+    after a crash must never see one batch's number with another's index.
+    """
+    if _progress is None:
+        raise RuntimeError("this process is not a pool worker")
+    return _progress
+
+
+def take_descriptor(index: int) -> int:
+    """A descriptor that came with the start message, for whoever unpickles a handle to it."""
+    fd = _descriptors[index]
+    if fd < 0:
+        raise RuntimeError(f"descriptor {index} of the start message was taken twice")
+    _descriptors[index] = -1
+    return fd
+
+
+def die_with(parent: int) -> None:
+    """Have the kernel kill this process when its zygote dies."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def run(start: Start, fds: list[int], board: Board, agent: int) -> int:
+    """Run what was asked for and return the exit code."""
+    if start.method == "spawn":
+        _exec(start, fds, board, agent)
+    return _run(start, fds, board, agent)
+
+
+def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
+    global _task_channel, _progress, _descriptors  # noqa: PLW0603 - one child, one life
+    _adopt_stdio(fds)
+    rest = fds[2:]
+    if start.slot is not None:
+        _task_channel = UnixChannel.from_fd(rest.pop(0))
+        _progress = board.slot(start.slot)
+    _descriptors = rest
+    try:
+        process = _load(start)
+    except BaseException:
+        traceback.print_exc()
+        _report_birth_failure()
+        util._flush_std_streams()
+        return 1
+    return process._bootstrap(parent_sentinel=agent)
+
+
+def _load(start: Start) -> Any:
+    data: dict[str, Any] = pickle.loads(start.preparation)
+    prepare_paths(data)
+    _prepare_environment(data)
+    with _inheriting():
+        prepare_main(data)
+        process = pickle.loads(start.payload)
+    for fd in _descriptors:
+        if fd >= 0:  # sent along, but nothing unpickled took it
+            os.close(fd)
+    _descriptors.clear()
+    return process
+
+
+@contextlib.contextmanager
+def _inheriting() -> Iterator[None]:
+    """While a child unpickles its Process, starting another is the mistake of an unguarded main."""
+    mp_process.current_process()._inheriting = True  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        del mp_process.current_process()._inheriting  # type: ignore[attr-defined]
+
+
+def prepare_paths(data: dict[str, Any]) -> None:
+    """Make modules importable as in the parent."""
+    sys.path[:] = data["sys_path"]
+    sys.argv[:] = data["sys_argv"]
+    # A directory that is gone or forbidden is the parent's own situation too.
+    with contextlib.suppress(OSError):
+        os.chdir(data["dir"])
+
+
+def prepare_main(data: dict[str, Any]) -> None:
+    """Import the parent's main module as ``__mp_main__``, as multiprocessing's spawn does."""
+    wanted = {key: data[key] for key in ("init_main_from_name", "init_main_from_path") if key in data}
+    multiprocessing.spawn.prepare(wanted)
+
+
+def _prepare_environment(data: dict[str, Any]) -> None:
+    global host  # noqa: PLW0603 - one child, one life
+    host = data["host"]
+    environ = data.get("environ")
+    if environ is not None and environ != os.environb:
+        os.environb.clear()
+        os.environb.update(environ)
+    multiprocessing.spawn.prepare({key: data[key] for key in _SPAWN_KEYS if key in data})
+    for function, arguments in data["calls"]:
+        function(*arguments)
+    numpy_random = sys.modules.get("numpy.random")
+    if numpy_random is not None:
+        # Forked copies of one generator would explore the same noise.
+        numpy_random.seed()
+
+
+_SPAWN_KEYS = ("name", "authkey", "log_to_stderr", "log_level", "orig_dir")
+
+
+def _adopt_stdio(fds: list[int]) -> None:
+    for target, fd in enumerate(fds[:2], start=1):
+        os.dup2(fd, target)
+        os.close(fd)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # closed, or replaced by something of the user's
+            stream.reconfigure(line_buffering=stream.isatty() or stream is sys.stderr)
+
+
+def _report_birth_failure() -> None:
+    if _task_channel is not None:
+        with contextlib.suppress(OSError):
+            _task_channel.send(pickle.dumps(("birth", traceback.format_exc())))
+
+
+def _exec(start: Start, fds: list[int], board: Board, agent: int) -> None:
+    """Replace this forked process by a fresh interpreter that goes on in ``spawned``."""
+    again = os.memfd_create("fiber-start")
+    plan = (tuple(start._replace(method="fork")), fds, board.fd, agent)
+    with os.fdopen(os.dup(again), "wb") as file:
+        pickle.dump(plan, file)
+    for fd in (*fds, board.fd, agent, again):
+        os.set_inheritable(fd, True)
+    executable = os.fsdecode(start.executable or sys.executable)
+    os.execv(executable, interpreter_arguments(executable, f"from fiber._agent.child import spawned; spawned({again})"))
+
+
+def interpreter_arguments(executable: str, statement: str) -> list[str]:
+    """The command line of a fresh interpreter with our flags that can import this package."""
+    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    code = f"import sys; sys.path.insert(0, {root!r}); {statement}"
+    return [executable, *util._args_from_interpreter_flags(), "-c", code]
+
+
+def spawned(plan_fd: int) -> None:
+    """Entry point of a child in an interpreter of its own."""
+    from fiber._agent.zygote import Start
+
+    with os.fdopen(plan_fd, "rb") as file:
+        file.seek(0)
+        fields, fds, board, agent = pickle.load(file)
+    for fd in (*fds, board, agent):
+        os.set_inheritable(fd, False)
+    code = 1
+    try:
+        code = _run(Start(*fields), fds, Board(board), agent)
+    finally:
+        os._exit(code)

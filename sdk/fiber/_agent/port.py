@@ -1,0 +1,94 @@
+"""The seam between whoever wants children and whoever runs them.
+
+The master asks through ``AgentPort`` and ``ChildPort`` and hears through ``ChildObserver``.  The agent
+in this process (``agent.py``) and the agent behind a link (``fiber._backends``) both are one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+from fiber._wire.packet import BytesLike, Message
+
+
+class ExitReport(NamedTuple):
+    """How a child ended."""
+
+    exitcode: int
+    """As multiprocessing has it: the status, or minus the signal."""
+    reason: str
+    """The same for a person: "killed by SIGKILL", "exit status 3", "agent lost: …"."""
+    unread: tuple[int, ...] = ()
+    """Sequence numbers of packets that were delivered and that the child never read."""
+    running: tuple[int, int] | None = None
+    """Sequence number and index of the task that it was running."""
+    log: tuple[str, ...] = ()
+    """The last lines that it wrote, where its output is captured."""
+    host: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ChildSpec:
+    """What to start.  Whoever gets it owns ``fds``."""
+
+    name: str
+    method: str
+    """``fork`` from the zygote or ``spawn`` a new interpreter."""
+    preparation: bytes
+    """Pickled dict: what a child sets up before it unpickles anything of the user's."""
+    payload: bytes
+    """The pickled Process object."""
+    fds: tuple[int, ...] = ()
+    """Descriptors that the payload refers to by index; only for an agent on the same host."""
+    tasks: bool = False
+    """Whether it is a pool worker, with a channel for tasks."""
+    executable: str | None = None
+    stdio: tuple[int, int] | None = field(default=None)
+    """Descriptors for its stdout and stderr; None: those of the agent's process."""
+
+
+class ChildObserver(Protocol):
+    """Hears what becomes of one child.  Called on the loop's thread; must not block."""
+
+    def started(self, pid: int) -> None:
+        """It exists."""
+
+    def said(self, message: Message) -> None:
+        """It sent a packet on its task channel."""
+
+    def taken_back(self, seqs: list[int]) -> None:
+        """These packets it will never see: the answer to ``take_back``."""
+
+    def exited(self, report: ExitReport) -> None:
+        """It is gone, or never came to be.  Exactly once, and last."""
+
+
+class ChildPort(Protocol):
+    """What the master holds of one child.  Any thread; nothing blocks."""
+
+    name: str
+    host: str
+    pid: int | None
+
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a packet to its task channel, ``seq`` (eight bytes) in front."""
+
+    def take_back(self) -> None:
+        """Recall the packets that it has not read; the observer hears which."""
+
+    def signal(self, signum: int) -> None:
+        """Send it a signal; nothing if it is gone."""
+
+
+class AgentPort(Protocol):
+    """One agent: starts children on one host."""
+
+    host: str
+
+    def start(self, spec: ChildSpec, observer: ChildObserver) -> ChildPort:
+        """Start a child; what goes wrong is told to the observer."""
+
+    def close(self) -> None:
+        """Kill every child and end."""

@@ -1,0 +1,226 @@
+"""The process that all children of an agent are forked from.
+
+It never opens a socket of nng, starts no thread and runs no task, so that forking it is safe; it
+imports once what its children need, so that forking is cheap.  As their parent it reaps them and
+sends them signals (a pid that only we can reap cannot be someone else's).  It ends, and they with it,
+when its agent's process does.
+
+Packets from the agent: ``(START, child, start, descriptor count)``, ``(SIGNAL, child, signum)``,
+``(DESCRIPTORS,)`` (more descriptors for the START that follows), ``(QUIT,)``.
+Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
+``(UNFIT, child, reason)``: this zygote's imports made forking unsafe, start that child elsewhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import os
+import pickle
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+import warnings
+from typing import Any, NamedTuple, NoReturn
+
+from fiber._agent import child as child_module
+from fiber._agent.board import Board
+from fiber._wire import packet
+
+START, SIGNAL, DESCRIPTORS, QUIT = range(4)
+STARTED, FAILED, EXITED, UNFIT = range(4)
+
+_HELD = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+
+GRACE = 0.75
+"""Seconds that children have, after the agent's process died, to notice it and end by themselves."""
+
+
+class Start(NamedTuple):
+    """What a zygote is told of one child; the descriptors come beside it."""
+
+    method: str
+    preparation: bytes
+    payload: bytes
+    slot: int | None
+    """Its place on the progress board; a worker's first descriptor is its task channel."""
+    executable: str | None
+
+
+class Zygote:
+    """One loop over three descriptors: the agent's requests, deaths of children, death of the agent."""
+
+    def __init__(self, control: socket.socket, board: Board, agent: int, *, preload: bool) -> None:
+        self._control = control
+        self._board = board
+        self._agent = agent
+        self._preload = preload
+        self._pids: dict[int, int] = {}  # child -> pid
+        self._children: dict[int, int] = {}  # pid -> child
+        self._descriptors: list[int] = []
+        self._deaths, self._deaths_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        self._poller = select.poll()
+        for fd in (control.fileno(), self._deaths, agent):
+            self._poller.register(fd, select.POLLIN)
+
+    def run(self) -> None:
+        """Serve until told to quit or the agent's process is gone; then kill what is left."""
+        self._listen_to_signals()
+        grace = 0.0
+        while True:
+            ready = {fd for fd, _ in self._poller.poll()}
+            if self._deaths in ready:
+                self._reap()
+            if self._agent in ready:
+                grace = GRACE
+                break
+            if self._control.fileno() in ready and not self._serve():
+                break
+        self._end(grace)
+
+    def _listen_to_signals(self) -> None:
+        # Ctrl-C in a terminal is the master's alone.  SIGTERM to us would orphan the children.
+        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(signum, signal.SIG_IGN)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.set_wakeup_fd(self._deaths_in, warn_on_full_buffer=False)
+
+    def _serve(self) -> bool:
+        try:
+            message = packet.receive(self._control, descriptors=True)
+        except (EOFError, ConnectionError):
+            return False
+        fds, message.fds = message.fds, []
+        request: tuple[Any, ...] = packet.loads(message)
+        if request[0] == DESCRIPTORS:
+            self._descriptors += fds
+        elif request[0] == START:
+            fds, self._descriptors = [*self._descriptors, *fds], []
+            self._start(request[1], Start(*request[2]), fds)
+        elif request[0] == SIGNAL:
+            self._signal(request[1], request[2])
+        return bool(request[0] != QUIT)
+
+    def _start(self, child: int, start: Start, fds: list[int]) -> None:
+        if self._preload and start.method == "fork":
+            self._preload = False
+            reason = _preload(start.preparation)
+            self._listen_to_signals()  # an import may have set its own
+            if reason:
+                self._say(UNFIT, child, reason)
+                _close_all(fds)
+                return
+        # Until the child has undone it, it ignores what we ignore: a signal sent to it right after
+        # its birth has to wait, not to be lost.
+        signal.pthread_sigmask(signal.SIG_BLOCK, _HELD)
+        try:
+            pid = os.fork()
+            if pid == 0:
+                self._become(start, fds)
+        except OSError as error:
+            self._say(FAILED, child, f"the system refused a new process: {error.strerror}")
+            return
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _HELD)
+            _close_all(fds)
+        self._pids[child] = pid
+        self._children[pid] = child
+        self._say(STARTED, child, pid)
+
+    def _become(self, start: Start, fds: list[int]) -> NoReturn:
+        """In the forked process: drop what is the zygote's and run the child."""
+        code = 1
+        try:
+            signal.set_wakeup_fd(-1)
+            for signum in (signal.SIGCHLD, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(signum, signal.SIG_DFL)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _HELD)
+            self._control.close()
+            os.close(self._deaths)
+            os.close(self._deaths_in)
+            child_module.die_with(os.getppid())
+            code = child_module.run(start, fds, self._board, self._agent)
+        finally:
+            os._exit(code)
+
+    def _signal(self, child: int, signum: int) -> None:
+        pid = self._pids.get(child)
+        if pid is not None:
+            os.kill(pid, signum)
+
+    def _reap(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._deaths, 4096)
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if not pid:
+                return
+            child = self._children.pop(pid, None)
+            if child is not None:
+                del self._pids[child]
+                self._say(EXITED, child, os.waitstatus_to_exitcode(status))
+
+    def _say(self, *answer: Any) -> None:
+        # An agent that is gone shows on its own descriptor.
+        with contextlib.suppress(OSError):
+            packet.send(self._control, pickle.dumps(answer))
+
+    def _end(self, grace: float) -> None:
+        deadline = time.monotonic() + grace
+        while self._pids and (left := deadline - time.monotonic()) > 0:
+            waiter = select.poll()
+            waiter.register(self._deaths, select.POLLIN)
+            waiter.poll(left * 1000)
+            self._reap()
+        for pid in self._children:
+            os.kill(pid, signal.SIGKILL)
+        while self._children:
+            pid, status = os.waitpid(-1, 0)
+            child = self._children.pop(pid, None)
+            if child is not None:
+                self._say(EXITED, child, os.waitstatus_to_exitcode(status))
+
+
+def _preload(preparation: bytes) -> str | None:
+    """Import the program's main module and what it names; say why forking is unsafe after it."""
+    data: dict[str, Any] = pickle.loads(preparation)
+    child_module.prepare_paths(data)
+    for name in data.get("preload", ()):
+        # Whatever an import raises, a child that needs it will meet, and report, itself.
+        with contextlib.suppress(BaseException):
+            importlib.import_module(name)
+    with contextlib.suppress(BaseException):
+        child_module.prepare_main(data)
+    if threading.active_count() > 1:
+        names = ", ".join(t.name for t in threading.enumerate() if t is not threading.main_thread())
+        return f"importing the main module started threads ({names})"
+    gc.collect()
+    gc.freeze()
+    return None
+
+
+def _close_all(fds: list[int]) -> None:
+    for fd in fds:
+        os.close(fd)
+
+
+def main(control: int, board: int, agent_pid: int, preload: bool) -> None:
+    """Entry point of the zygote's process."""
+    # Native threads of libraries such as OpenBLAS, which handle forks, are what this warns of.
+    warnings.filterwarnings("ignore", message=".*multi-threaded.*fork", category=DeprecationWarning)
+    try:
+        agent = os.pidfd_open(agent_pid)
+    except ProcessLookupError:
+        sys.exit(0)
+    if os.getppid() != agent_pid:  # it died before we could watch it, and its pid may be another's
+        sys.exit(0)
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control)
+    Zygote(sock, Board(board), agent, preload=preload).run()

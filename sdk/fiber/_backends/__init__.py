@@ -1,0 +1,1 @@
+"""Where agents come from: this process, subprocesses on loopback, later pods."""

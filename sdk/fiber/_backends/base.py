@@ -1,0 +1,21 @@
+"""What a backend is: it turns "I want a child" into an agent that can run it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from fiber._agent.port import AgentPort
+
+
+class Backend(Protocol):
+    """Owns the agents of one program."""
+
+    name: str
+    same_host: bool
+    """Whether its agents run on the program's own host, so that descriptors can be handed over."""
+
+    def place(self) -> AgentPort:
+        """The agent for the next child; waits until there is one, at most the start timeout."""
+
+    def close(self) -> None:
+        """End every agent and its children.  Not on the loop's thread."""

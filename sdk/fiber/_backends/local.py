@@ -1,0 +1,24 @@
+"""The default backend: one agent, in this very process."""
+
+from __future__ import annotations
+
+from fiber._agent.agent import Agent
+from fiber._transport.loop import Loop
+
+
+class LocalBackend:
+    """Children are subprocesses of this program."""
+
+    name = "local"
+    same_host = True
+
+    def __init__(self, loop: Loop, host: str) -> None:
+        self._agent = Agent(loop, host)
+
+    def place(self) -> Agent:
+        """The one agent."""
+        return self._agent
+
+    def close(self) -> None:
+        """Kill the children that are left."""
+        self._agent.close()

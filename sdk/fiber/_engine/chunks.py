@@ -1,0 +1,76 @@
+"""How much work one message carries, and how many messages one worker is given ahead.
+
+Pure: numbers in, numbers out.  A message should carry about a millisecond of work, so that its cost
+disappears beside it; tasks of a second travel one by one, tasks of a microsecond by the thousand.
+"""
+
+from __future__ import annotations
+
+TARGET = 1e-3
+"""Seconds of work that one message should carry."""
+
+GROWTH = 4
+"""A message carries at most this many times the tasks of the largest one that was measured."""
+
+RESUMED = 4
+"""What a function that ran before is trusted with at first, counted as a measured message."""
+
+LIMIT = 1 << 14
+"""Tasks in one message, however short they are."""
+
+SLOW = 50e-3
+"""Tasks of this many seconds are not queued behind another one: the gap between two no longer shows."""
+
+STRIDE_SECONDS = 50e-6
+STRIDE_LIMIT = 64
+
+
+class Pace:
+    """Running estimate of the seconds that one task of a function takes."""
+
+    __slots__ = ("largest", "seconds")
+
+    def __init__(self, earlier: Pace | None = None) -> None:
+        """Start from nothing, or from what ``earlier`` knew of the same function, trusted a little."""
+        self.seconds = earlier.seconds if earlier else None
+        self.largest = min(earlier.largest, RESUMED) if earlier else 0
+
+    def observe(self, tasks: int, seconds: float) -> None:
+        """Take in that ``tasks`` of them took ``seconds`` together."""
+        if not tasks:
+            return
+        # One very long task must not make the next thousand travel alone for long.
+        each = min(seconds / tasks, 4 * SLOW)
+        self.seconds = each if self.seconds is None else (self.seconds + each) / 2
+        self.largest = max(self.largest, tasks)
+
+    def batch_size(self, waiting: int, workers: int, unit: int = 1) -> int:
+        """Tasks to send next: whole units of ``unit``, at least one, at most what is ``waiting``.
+
+        Never more than half of a worker's fair share of what is left, so that all finish together.
+        """
+        if self.seconds is None:
+            wanted = 1
+        else:
+            wanted = min(int(TARGET / max(self.seconds, 1e-9)), GROWTH * self.largest, LIMIT)
+        units = min(wanted, waiting // (2 * workers)) // unit
+        return min(max(units, 1) * unit, waiting)
+
+    def depth(self) -> int:
+        """Messages in flight for each worker: one that runs and, unless tasks are slow, one queued."""
+        return 1 if self.seconds is not None and self.seconds >= SLOW else 2
+
+    def stride(self) -> int:
+        """Tasks that a worker runs for each note of where it is.
+
+        The notes tell which task killed it.  Of several very short ones between two notes all are
+        suspects, and running them again one by one costs nothing.
+        """
+        if self.seconds is None:
+            return 1
+        return min(max(int(STRIDE_SECONDS / max(self.seconds, 1e-9)), 1), STRIDE_LIMIT)
+
+
+def default_chunksize(tasks: int, workers: int) -> int:
+    """The chunk that multiprocessing takes when the user gives none: four for each worker."""
+    return -(-tasks // (4 * workers)) or 1

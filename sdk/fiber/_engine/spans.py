@@ -1,0 +1,99 @@
+"""Tasks that wait: slices of a job, kept whole so that a million tasks cost as much as one."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+COMPACT = 1024
+"""Given-out items at the front of a growing list that are kept before it is trimmed."""
+
+
+class Span:
+    """Tasks ``start``, ``start + 1``, ... with their ``items``.  ``alone``: one a message; ``pin``: one worker's."""
+
+    __slots__ = ("alone", "items", "pin", "start")
+
+    def __init__(self, start: int, items: Sequence[Any], alone: bool = False, pin: bool = False) -> None:
+        self.start = start
+        self.items = items
+        self.alone = alone
+        self.pin = pin
+
+    def singly(self) -> list[Span]:
+        """Each task as a span that travels alone."""
+        return [Span(self.start + at, self.items[at : at + 1], True, self.pin) for at in range(len(self.items))]
+
+
+class _Stock:
+    """A span being given out from its front, and growing at its end while tasks come in."""
+
+    __slots__ = ("alone", "items", "position", "start")
+
+    def __init__(self, span: Span) -> None:
+        self.start = span.start
+        self.items = span.items
+        self.alone = span.alone
+        self.position = 0
+
+    def __len__(self) -> int:
+        return len(self.items) - self.position
+
+    def cut(self, size: int) -> Span:
+        position = self.position
+        span = Span(self.start + position, self.items[position : position + size], self.alone)
+        self.position = position + size
+        return span
+
+    def grow(self, span: Span) -> bool:
+        """Take in what comes next, if it fits on without a copy of what is there."""
+        if (
+            not isinstance(self.items, list)
+            or self.alone != span.alone
+            or self.start + len(self.items) != span.start
+        ):
+            return False
+        if self.position > COMPACT and 2 * self.position > len(self.items):
+            del self.items[: self.position]
+            self.start += self.position
+            self.position = 0
+        self.items.extend(span.items)
+        return True
+
+
+class Waiting:
+    """The waiting tasks of one job, in the order in which they will be given out."""
+
+    __slots__ = ("_count", "_stocks")
+
+    def __init__(self) -> None:
+        self._stocks: deque[_Stock] = deque()
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def first_alone(self) -> bool:
+        """The next task travels alone."""
+        return self._stocks[0].alone
+
+    def append(self, span: Span) -> None:
+        """More tasks, behind all others."""
+        self._count += len(span.items)
+        if not self._stocks or not self._stocks[-1].grow(span):
+            self._stocks.append(_Stock(span))
+
+    def appendleft(self, span: Span) -> None:
+        """Tasks that come back, ahead of all others."""
+        self._count += len(span.items)
+        self._stocks.appendleft(_Stock(span))
+
+    def take(self, size: int) -> Span:
+        """The next tasks: at most ``size``, contiguous, one if it travels alone."""
+        stock = self._stocks[0]
+        span = stock.cut(1 if stock.alone else min(size, len(stock)))
+        if not len(stock):
+            self._stocks.popleft()
+        self._count -= len(span.items)
+        return span

@@ -1,0 +1,100 @@
+"""What multiprocessing's Process asks of whatever runs it: the ``Popen`` protocol."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from multiprocessing.process import BaseProcess
+
+from fiber._agent.port import ChildPort, ExitReport
+from fiber._runtime.state import runtime
+from fiber._wire.packet import Message
+from fiber.errors import StartError
+
+
+class Popen:
+    """A started process, observed.  Attributes and methods as multiprocessing's Process expects them."""
+
+    def __init__(self, process: BaseProcess, method: str) -> None:
+        self._name = process.name
+        self.returncode: int | None = None
+        self.report: ExitReport | None = None
+        self.pid: int | None = None
+        self.sentinel = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._born = threading.Event()
+        self._exited = threading.Event()
+        self._closed = False
+        try:
+            self._port: ChildPort = runtime().start(process, self, method=method)
+            self._wait_for_birth()
+        except BaseException:
+            self.close()
+            raise
+
+    def _wait_for_birth(self) -> None:
+        timeout = runtime().config.start_timeout
+        if not self._born.wait(timeout):
+            self.kill()
+            raise StartError(
+                self._name,
+                f"its agent on host {self._port.host!r} did not start it within {timeout:g} s "
+                "(start_timeout)",
+            )
+        if self.pid is None and self.report is not None:
+            raise StartError(self._name, self.report.reason)
+
+    # What the agent says, on the loop's thread
+
+    def started(self, pid: int) -> None:
+        """It has a pid."""
+        self.pid = pid
+        self._born.set()
+
+    def said(self, message: Message) -> None:
+        """Only pool workers talk."""
+        message.release()
+
+    def taken_back(self, seqs: list[int]) -> None:
+        """Only pool workers are given work."""
+
+    def exited(self, report: ExitReport) -> None:
+        """It is gone."""
+        self.report = report
+        self.returncode = report.exitcode
+        self._exited.set()
+        self._born.set()
+        if not self._closed:
+            os.eventfd_write(self.sentinel, 1)
+
+    # What Process asks
+
+    def poll(self) -> int | None:
+        """The exit code, None while it runs."""
+        return self.wait(0)
+
+    def wait(self, timeout: float | None = None) -> int | None:
+        """Wait for the exit code."""
+        self._exited.wait(timeout)
+        return self.returncode
+
+    def terminate(self) -> None:
+        """SIGTERM."""
+        self._signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """SIGKILL."""
+        self._signal(signal.SIGKILL)
+
+    def _signal(self, signum: int) -> None:
+        if self.returncode is None:
+            self._port.signal(signum)
+
+    def close(self) -> None:
+        """Give the sentinel's descriptor back."""
+        if not self._closed:
+            self._closed = True
+            os.close(self.sentinel)
+
+    def __del__(self) -> None:
+        self.close()

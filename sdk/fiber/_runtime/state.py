@@ -1,0 +1,136 @@
+"""The one process-wide state: the loop, the backend, the hub.
+
+Made by the first process, pool or shared handle; ended at interpreter exit.  A process forked by
+someone else (``os.fork``, multiprocessing) starts without one and makes its own when it needs it.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+import threading
+from dataclasses import replace
+from multiprocessing import process as mp_process
+from multiprocessing import spawn, util
+from typing import TYPE_CHECKING, Any
+
+from fiber import config, context, reduction
+from fiber._agent import child
+from fiber._agent.port import AgentPort, ChildObserver, ChildPort, ChildSpec
+from fiber._transport.loop import Loop
+
+if TYPE_CHECKING:
+    from fiber._backends.base import Backend
+
+_EXIT_PRIORITY = -100  # after multiprocessing has ended daemons and joined the other children
+
+
+class Runtime:
+    """What a program needs to run processes: one loop thread and one backend."""
+
+    def __init__(self) -> None:
+        self.config = config.current()
+        self.loop = Loop()
+        self.host = child.host or "local"
+        self.backend: Backend = _make_backend(self)
+        self.loop.start_thread("fiber-io")
+
+    def start(
+        self,
+        process: mp_process.BaseProcess,
+        observer: ChildObserver,
+        *,
+        tasks: bool = False,
+        method: str = "fork",
+    ) -> ChildPort:
+        """Start ``process`` as a child of some agent; ``tasks`` makes it a pool worker.
+
+        Returns at once; the observer hears what becomes of it.  An error in pickling is raised here.
+        """
+        agent = self.backend.place()
+        same_host = self.backend.same_host
+        payload, fds = reduction.dump_process(process, same_host=same_host)
+        spec = ChildSpec(
+            name=process.name,
+            method=method,
+            preparation=self._preparation(process, agent, same_host),
+            payload=payload,
+            fds=tuple(fds),
+            tasks=tasks,
+            executable=spawn.get_executable() if same_host else None,
+        )
+        return agent.start(spec, observer)
+
+    def _preparation(self, process: Any, agent: AgentPort, same_host: bool) -> bytes:
+        data = spawn.get_preparation_data(process.name)
+        data["authkey"] = bytes(data["authkey"])
+        data["host"] = agent.host
+        # What such a process starts itself runs on its own host.
+        data["calls"] = [
+            (config.install, (replace(self.config, backend="local"),)),
+            (context.inherit, (context.default.get_start_method(allow_none=True), context.preload)),
+        ]
+        del data["start_method"]
+        if same_host:
+            data["environ"] = dict(os.environb)
+            data["preload"] = [*context.preload, *_modules_of(process)]
+        else:
+            data.pop("init_main_from_name", None)
+            data.pop("init_main_from_path", None)
+        return pickle.dumps(data)
+
+    def close(self) -> None:
+        """End every child, agent and thread.  Not on the loop's thread."""
+        self.backend.close()
+        self.loop.stop()
+
+
+def _make_backend(runtime: Runtime) -> Backend:
+    if runtime.config.backend == "loopback":
+        from fiber._backends.loopback import LoopbackBackend
+
+        return LoopbackBackend(runtime.loop, runtime.config)
+    from fiber._backends.local import LocalBackend
+
+    return LocalBackend(runtime.loop, runtime.host)
+
+
+def _modules_of(process: Any) -> list[str]:
+    """Modules that the zygote may import once for all: where the target and the class live."""
+    names = {type(process).__module__, getattr(getattr(process, "_target", None), "__module__", None)}
+    return sorted(name for name in names if name in sys.modules and name != "__main__")
+
+
+_lock = threading.Lock()
+_runtime: Runtime | None = None
+
+
+def runtime() -> Runtime:
+    """The runtime of this process; made at the first call."""
+    global _runtime  # noqa: PLW0603 - the one process-wide state
+    if _runtime is None:
+        with _lock:
+            if _runtime is None:
+                _runtime = Runtime()
+                util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
+    return _runtime
+
+
+def shutdown() -> None:
+    """End the runtime and all that it started; the next use makes a new one."""
+    global _runtime  # noqa: PLW0603 - the one process-wide state
+    with _lock:
+        ending, _runtime = _runtime, None
+    if ending is not None:
+        ending.close()
+
+
+def _forget() -> None:
+    """In a process forked by someone else: the loop's thread did not come along."""
+    global _runtime, _lock  # noqa: PLW0603 - the one process-wide state
+    _runtime, _lock = None, threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget)
+config.guard(lambda: _runtime is not None)

@@ -1,0 +1,56 @@
+"""The two primitives under every connection, queue, event and semaphore.
+
+Both have two implementations: kernel objects for holders on the host where the object lives
+(``unix.py``) and a request to that host's hub for all others (``fiber._hub.remote``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from fiber._wire.packet import BytesLike, Message
+
+
+class Channel(Protocol):
+    """One end of a message pipe.  Messages arrive whole; holders may share an end without a lock."""
+
+    def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message; BrokenPipeError when nobody can ever read it."""
+
+    def recv(self) -> Message:
+        """The next message; EOFError when nobody can ever send one."""
+
+    def try_recv(self) -> Message | None:
+        """The next message if one is there."""
+
+    def poll(self, timeout: float | None) -> bool:
+        """Whether ``recv`` would return or raise at once; None waits for ever."""
+
+    def fileno(self) -> int:
+        """A descriptor that is readable whenever ``recv`` would not block."""
+
+    def close(self) -> None:
+        """Let go of this end; the other end sees EOF when its last holder has."""
+
+
+class Counter(Protocol):
+    """A count of things that never falls below zero, to be waited for."""
+
+    def add(self, n: int = 1) -> None:
+        """Raise the count and wake who waits."""
+
+    def take(self, timeout: float | None) -> bool:
+        """Lower the count by one, waiting until it is above zero; False when ``timeout`` is over."""
+
+    def clear(self) -> int:
+        """Set the count to zero and say what it was."""
+
+    def value(self) -> int:
+        """The count now."""
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until the count is above zero, without lowering it."""
+
+    def close(self) -> None:
+        """Let go of it."""

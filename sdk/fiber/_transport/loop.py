@@ -1,0 +1,184 @@
+"""One thread that waits for descriptors and timers and calls back.
+
+In a program it is the daemon thread ``fiber-io``; in an agent it is the main thread.  Callbacks run
+one at a time, must not block, and an exception in one is reported and does not stop the others.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import os
+import select
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+Callback = Callable[[], None]
+
+
+class Timer:
+    """A call that is due; ``cancel`` forgets it."""
+
+    __slots__ = ("callback", "due")
+
+    def __init__(self, due: float, callback: Callback) -> None:
+        self.due = due
+        self.callback: Callback | None = callback
+
+    def cancel(self) -> None:
+        """Never call it."""
+        self.callback = None
+
+
+class Loop:
+    """An epoll loop.  ``register`` and ``unregister`` may be called from any thread."""
+
+    def __init__(self) -> None:
+        self._epoll = select.epoll()
+        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._epoll.register(self._wake, select.EPOLLIN)
+        self._wake_lock = threading.Lock()
+        self._readers: dict[int, Callback] = {self._wake: self._woken}
+        self._writers: dict[int, Callback] = {}
+        self._ready: deque[Callback] = deque()
+        self._timers: list[tuple[float, int, Timer]] = []
+        self._sequence = itertools.count()
+        self._thread: threading.Thread | None = None
+        self._ident: int | None = None
+        self._running = False
+        self._closed = False
+
+    def start_thread(self, name: str) -> None:
+        """Run on a daemon thread of this process."""
+        self._thread = threading.Thread(target=self.run, name=name, daemon=True)
+        self._thread.start()
+
+    def on_thread(self) -> bool:
+        """Whether the caller is the loop's own thread."""
+        return threading.get_ident() == self._ident
+
+    @staticmethod
+    def now() -> float:
+        """The loop's clock: monotonic seconds."""
+        return time.monotonic()
+
+    def call_soon(self, callback: Callable[..., None], *args: Any) -> None:
+        """Call it on the loop's thread, after what was asked before."""
+        self._ready.append(_bound(callback, args))
+        if threading.get_ident() != self._ident:
+            with self._wake_lock:
+                if not self._closed:
+                    os.eventfd_write(self._wake, 1)
+
+    def call_later(self, seconds: float, callback: Callable[..., None], *args: Any) -> Timer:
+        """Call it once, ``seconds`` from now, on the loop's thread."""
+        timer = Timer(self.now() + seconds, _bound(callback, args))
+        if self.on_thread():
+            self._add_timer(timer)
+        else:
+            self.call_soon(self._add_timer, timer)
+        return timer
+
+    def register(self, fd: int, callback: Callback) -> None:
+        """Call back whenever ``fd`` is readable or at its end, until unregistered."""
+        self._readers[fd] = callback
+        self._epoll.register(fd, select.EPOLLIN)
+
+    def unregister(self, fd: int) -> None:
+        """Forget ``fd``; do it before the descriptor is closed."""
+        self._writers.pop(fd, None)
+        if self._readers.pop(fd, None) is not None and not self._closed:
+            self._epoll.unregister(fd)
+
+    def want_write(self, fd: int, callback: Callback | None) -> None:
+        """Also call back when the registered ``fd`` is writable; None ends it."""
+        if callback is None:
+            self._writers.pop(fd, None)
+        else:
+            self._writers[fd] = callback
+        if fd in self._readers:
+            self._epoll.modify(fd, select.EPOLLIN | (select.EPOLLOUT if callback else 0))
+
+    def run(self) -> None:
+        """Call back until stopped."""
+        self._ident = threading.get_ident()
+        self._running = True
+        while self._running:
+            try:
+                events = self._epoll.poll(self._timeout())
+            except InterruptedError:
+                continue
+            self._dispatch(events)
+            self._run_ready()
+            self._run_timers()
+        self._close()
+
+    def stop(self) -> None:
+        """End the loop after what it is doing; from another thread, wait until it has ended."""
+        if self._closed:
+            return
+        self.call_soon(self._stop)
+        if self._thread is not None and not self.on_thread():
+            self._thread.join()
+
+    def _stop(self) -> None:
+        self._running = False
+
+    def _timeout(self) -> float | None:
+        if self._ready:
+            return 0
+        while self._timers and self._timers[0][2].callback is None:
+            heapq.heappop(self._timers)
+        return max(0.0, self._timers[0][0] - self.now()) if self._timers else None
+
+    def _dispatch(self, events: list[tuple[int, int]]) -> None:
+        for fd, event in events:
+            if event & ~select.EPOLLOUT:
+                reader = self._readers.get(fd)
+                if reader is not None:
+                    _call(reader)
+            if event & select.EPOLLOUT:
+                writer = self._writers.get(fd)
+                if writer is not None:
+                    _call(writer)
+
+    def _run_ready(self) -> None:
+        for _ in range(len(self._ready)):
+            _call(self._ready.popleft())
+
+    def _run_timers(self) -> None:
+        now = self.now()
+        while self._timers and self._timers[0][0] <= now:
+            timer = heapq.heappop(self._timers)[2]
+            if timer.callback is not None:
+                _call(timer.callback)
+
+    def _add_timer(self, timer: Timer) -> None:
+        heapq.heappush(self._timers, (timer.due, next(self._sequence), timer))
+
+    def _woken(self) -> None:
+        os.eventfd_read(self._wake)
+
+    def _close(self) -> None:
+        with self._wake_lock:  # a late ``call_soon`` must not write into a descriptor used anew
+            self._closed = True
+            self._epoll.close()
+            os.close(self._wake)
+        self._readers.clear()
+        self._writers.clear()
+
+
+def _bound(callback: Callable[..., None], args: tuple[Any, ...]) -> Callback:
+    return (lambda: callback(*args)) if args else callback
+
+
+def _call(callback: Callback) -> None:
+    try:
+        callback()
+    except Exception:
+        # One broken callback must not stop the others, nor go unseen.
+        sys.excepthook(*sys.exc_info())

@@ -1,0 +1,162 @@
+"""Channels and counters among processes of one host: sockets and eventfds, shared by descriptor."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+import socket
+import time
+from collections.abc import Iterator, Sequence
+
+from fiber._wire import packet
+from fiber._wire.packet import BytesLike, Message
+from fiber.errors import TooManyOpenFiles
+
+PATIENCE = 20
+"""Looks at an empty socket before sleeping: about as long as the wake-up that they may save."""
+
+
+@contextlib.contextmanager
+def naming_the_limit(doing: str) -> Iterator[None]:
+    """Turn "no more descriptors" into the error that says the limit and what to set."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            raise TooManyOpenFiles(doing) from error
+        raise
+
+
+class UnixChannel:
+    """A ``SOCK_SEQPACKET`` socket whose messages are packets."""
+
+    __slots__ = ("_sock",)
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+
+    @classmethod
+    def pair(cls) -> tuple[UnixChannel, UnixChannel]:
+        """Two connected ends."""
+        with naming_the_limit("opening a pipe"):
+            one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        return cls(one), cls(other)
+
+    @classmethod
+    def from_fd(cls, fd: int) -> UnixChannel:
+        """Take over a descriptor."""
+        return cls(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd))
+
+    @property
+    def sock(self) -> socket.socket:
+        """The socket itself, for event loops."""
+        return self._sock
+
+    def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message, waiting for room."""
+        packet.send(self._sock, payload, buffers)
+
+    def recv(self) -> Message:
+        """The next message, EOFError at the end."""
+        return packet.receive(self._sock, patience=PATIENCE)
+
+    def try_recv(self) -> Message | None:
+        """The next message if one is there."""
+        return self.recv() if self.poll(0) else None
+
+    def poll(self, timeout: float | None) -> bool:
+        """Whether ``recv`` would return or raise at once."""
+        return wait_readable(self._sock.fileno(), timeout)
+
+    def fileno(self) -> int:
+        """The socket's descriptor."""
+        return self._sock.fileno()
+
+    def duplicate(self) -> int:
+        """A new descriptor of this end, for another holder."""
+        return os.dup(self._sock.fileno())
+
+    def close(self) -> None:
+        """Close this holder's descriptor."""
+        self._sock.close()
+
+
+class UnixCounter:
+    """An eventfd in semaphore mode."""
+
+    __slots__ = ("_fd",)
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+
+    @classmethod
+    def create(cls, value: int = 0) -> UnixCounter:
+        """A counter that starts at ``value``."""
+        with naming_the_limit("making a counter"):
+            fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
+        counter = cls(fd)
+        if value:
+            counter.add(value)
+        return counter
+
+    def add(self, n: int = 1) -> None:
+        """Raise the count."""
+        os.eventfd_write(self._fd, n)
+
+    def take(self, timeout: float | None) -> bool:
+        """Lower the count by one once it is above zero; False when ``timeout`` is over."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            try:
+                os.eventfd_read(self._fd)
+                return True
+            except BlockingIOError:
+                left = None if deadline is None else deadline - time.monotonic()
+                if left is not None and left <= 0:
+                    return False
+                wait_readable(self._fd, left)
+
+    def clear(self) -> int:
+        """Set the count to zero and say what it was."""
+        taken = 0
+        while self.take(0):
+            taken += 1
+        return taken
+
+    def value(self) -> int:
+        """The count now, as the kernel shows it."""
+        with open(f"/proc/self/fdinfo/{self._fd}", "rb") as info:
+            for line in info:
+                if line.startswith(b"eventfd-count:"):
+                    return int(line.split()[1], 16)
+        raise OSError(f"descriptor {self._fd} is not an event counter")
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until the count is above zero, without lowering it."""
+        return wait_readable(self._fd, timeout)
+
+    def fileno(self) -> int:
+        """The eventfd: readable while the count is above zero."""
+        return self._fd
+
+    def duplicate(self) -> int:
+        """A new descriptor of it, for another holder."""
+        return os.dup(self._fd)
+
+    def close(self) -> None:
+        """Close this holder's descriptor."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
+def wait_readable(fd: int, timeout: float | None) -> bool:
+    """Wait until ``fd`` is readable (or at its end); False when ``timeout`` seconds are over."""
+    if fd < 0:
+        raise OSError("handle is closed")
+    poller = select.poll()
+    poller.register(fd, select.POLLIN)
+    milliseconds = None if timeout is None else max(0.0, timeout) * 1000
+    return bool(poller.poll(milliseconds))

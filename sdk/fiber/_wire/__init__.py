@@ -1,0 +1,1 @@
+"""What travels: packets on one host, messages between hosts.  Knows nothing of who sends them."""

@@ -1,0 +1,97 @@
+"""Memory for large packets, used again once its reader is done.
+
+A fresh memfd costs a page fault for every 4 KiB written, several times the copy itself.  So a sender
+keeps a few memfds; their first byte says whether a reader still needs what is in them.  The reader
+copies the content out and clears the byte; a reader that dies leaves it set, and the block is
+forgotten when its turn comes.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import threading
+from collections.abc import Iterable
+
+RETAINED_LIMIT = 1 << 25
+"""Bytes of memory kept for later messages, per process.  Larger messages get memory of their own."""
+
+DATA_OFFSET = 64
+"""Where the content starts; before it lies the flag."""
+
+_BUSY, _FREE = 1, 0
+_CLEARED = bytes([_FREE])
+_GRAIN = 1 << 16
+
+
+class Block:
+    """One memfd and the mapped page that holds its flag."""
+
+    __slots__ = ("capacity", "fd", "flag")
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.fd = os.memfd_create("fiber-message", os.MFD_CLOEXEC)
+        try:
+            os.ftruncate(self.fd, mmap.PAGESIZE)
+            self.flag = mmap.mmap(self.fd, mmap.PAGESIZE)
+        except BaseException:
+            os.close(self.fd)
+            raise
+        self.flag[0] = _BUSY
+
+    def close(self) -> None:
+        """Let go of it; a reader that has the descriptor keeps the content."""
+        self.flag.close()
+        os.close(self.fd)
+
+
+class Arena:
+    """The blocks of this process.  Thread-safe; a forked child starts with none."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._blocks: list[Block] = []
+        os.register_at_fork(after_in_child=self._forget)
+
+    def _forget(self) -> None:
+        # Parent and child would both believe that a free block is theirs alone.
+        self._lock = threading.Lock()
+        blocks, self._blocks = self._blocks, []
+        for block in blocks:
+            block.close()
+
+    def claim(self, size: int) -> Block:
+        """A block with room for ``size`` bytes, marked busy.  Give it back with ``settle``."""
+        capacity = -(-size // _GRAIN) * _GRAIN
+        with self._lock:
+            for index, block in enumerate(self._blocks):
+                if block.flag[0] == _FREE and size <= block.capacity <= 4 * capacity:
+                    block.flag[0] = _BUSY
+                    return self._blocks.pop(index)
+        return Block(capacity)
+
+    def settle(self, block: Block, *, sent: bool) -> None:
+        """The message went out (``sent``) or did not; keep the block or let it go."""
+        if not sent:
+            block.flag[0] = _FREE
+        if block.capacity > RETAINED_LIMIT:
+            block.close()
+            return
+        with self._lock:
+            self._blocks.append(block)
+            while sum(kept.capacity for kept in self._blocks) > RETAINED_LIMIT:
+                self._blocks.pop(0).close()
+
+
+def fill(block: Block, parts: Iterable[memoryview], offsets: Iterable[int]) -> None:
+    """Write each part at its offset."""
+    for view, offset in zip(parts, offsets, strict=True):
+        done = 0
+        while done < view.nbytes:  # one write moves at most 2 GiB
+            done += os.pwrite(block.fd, view[done:], offset + done)
+
+
+def release(fd: int) -> None:
+    """Tell the sender that the content of its block was copied out."""
+    os.pwrite(fd, _CLEARED, 0)

@@ -1,0 +1,452 @@
+"""The frames between the master and an agent.
+
+Nothing here is unpickled: a frame is a few numbers and then opaque bytes, which only the process
+that they are meant for opens.  What it carries for the user stays out of its repr, and so of logs.
+
+Layout (little endian): version:u8, kind:u8, then each kind's own numbers and the rest.  Packets are
+count:u32, buffer length:u64 * count, payload and buffers.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+from fiber.errors import FiberError
+
+PROTOCOL = 1
+"""Version of everything that master and agent say to each other; both must have the same."""
+
+BytesLike: TypeAlias = bytes | bytearray | memoryview
+
+
+class ProtocolError(FiberError):
+    """The other side of a link sent what it never should have."""
+
+
+class Start(NamedTuple):
+    """Master to agent: start a child as ``spec`` says."""
+
+    child: int
+    spec: BytesLike
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBER.pack(PROTOCOL, _START, self.child) + self.spec
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+class Started(NamedTuple):
+    """Agent to master: the child exists."""
+
+    child: int
+    pid: int
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBERS.pack(PROTOCOL, _STARTED, self.child, self.pid)
+
+
+class Signal(NamedTuple):
+    """Master to agent: send the child a signal."""
+
+    child: int
+    signum: int
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBERS.pack(PROTOCOL, _SIGNAL, self.child, self.signum)
+
+
+class Deliver(NamedTuple):
+    """Master to agent: a packet for the child's task channel."""
+
+    child: int
+    seq: int
+    payload: BytesLike
+    buffers: Sequence[BytesLike] = ()
+
+    def encode(self) -> bytes:
+        """The frame."""
+        head = _DELIVERY.pack(PROTOCOL, _DELIVER, self.child, self.seq)
+        return _packet(head, self.payload, self.buffers)
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+class Said(NamedTuple):
+    """Agent to master: a packet from the child's task channel."""
+
+    child: int
+    payload: BytesLike
+    buffers: Sequence[BytesLike] = ()
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _packet(_NUMBER.pack(PROTOCOL, _SAID, self.child), self.payload, self.buffers)
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+class TakeBack(NamedTuple):
+    """Master to agent: recall the packets that the child has not read."""
+
+    child: int
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBER.pack(PROTOCOL, _TAKE_BACK, self.child)
+
+
+class TakenBack(NamedTuple):
+    """Agent to master: these packets the child will never see."""
+
+    child: int
+    seqs: tuple[int, ...]
+
+    def encode(self) -> bytes:
+        """The frame."""
+        head = _NUMBER.pack(PROTOCOL, _TAKEN_BACK, self.child)
+        return head + struct.pack(f"<{len(self.seqs)}Q", *self.seqs)
+
+
+class Exited(NamedTuple):
+    """Agent to master: the child is gone.  The fields after ``child`` are an ExitReport's."""
+
+    child: int
+    exitcode: int
+    reason: str
+    unread: tuple[int, ...] = ()
+    running: tuple[int, int] | None = None
+    log: tuple[str, ...] = ()
+    host: str = ""
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBER.pack(PROTOCOL, _EXITED, self.child) + _json(self[1:])
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+class Output(NamedTuple):
+    """Agent to master: text that the child wrote to stdout or stderr."""
+
+    child: int
+    text: str
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBER.pack(PROTOCOL, _OUTPUT, self.child) + _utf8(self.text)
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+class Log(NamedTuple):
+    """Agent to master: a log record of the child, or of the agent itself (child 0)."""
+
+    child: int
+    logger: str
+    level: int
+    process: str
+    text: str
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBER.pack(PROTOCOL, _LOG, self.child) + _json(self[1:])
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+class TunnelOpen(NamedTuple):
+    """Either way: connect a new tunnel to the hub at ``target``."""
+
+    tunnel: int
+    target: str
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBER.pack(PROTOCOL, _TUNNEL_OPEN, self.tunnel) + _utf8(self.target)
+
+
+class TunnelData(NamedTuple):
+    """Either way: a packet in a tunnel."""
+
+    tunnel: int
+    payload: BytesLike
+    buffers: Sequence[BytesLike] = ()
+
+    def encode(self) -> bytes:
+        """The frame."""
+        head = _NUMBER.pack(PROTOCOL, _TUNNEL_DATA, self.tunnel)
+        return _packet(head, self.payload, self.buffers)
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+class TunnelClose(NamedTuple):
+    """Either way: a tunnel ended, or could not be opened; ``reason`` is empty at an orderly end."""
+
+    tunnel: int
+    reason: str = ""
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBER.pack(PROTOCOL, _TUNNEL_CLOSE, self.tunnel) + _utf8(self.reason)
+
+
+class Shutdown(NamedTuple):
+    """Master to agent: end every child, within ``grace`` seconds by force, and then yourself."""
+
+    grace: float
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _GRACE.pack(PROTOCOL, _SHUTDOWN, self.grace)
+
+
+class Problem(NamedTuple):
+    """Agent to master: something is wrong that a person should know."""
+
+    text: str
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _HEAD.pack(PROTOCOL, _PROBLEM) + _utf8(self.text)
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+Message: TypeAlias = (
+    Start
+    | Started
+    | Signal
+    | Deliver
+    | Said
+    | TakeBack
+    | TakenBack
+    | Exited
+    | Output
+    | Log
+    | TunnelOpen
+    | TunnelData
+    | TunnelClose
+    | Shutdown
+    | Problem
+)
+
+
+def decode(frame: bytes | bytearray) -> Message:
+    """Read a frame; ProtocolError says what is wrong with one that cannot be read.
+
+    Payloads and buffers are views of ``frame``: not copied, and writable if it is a bytearray.
+    """
+    if len(frame) < _HEAD.size:
+        raise ProtocolError(f"a frame of {len(frame)} bytes is too short to have a kind")
+    version, kind = _HEAD.unpack_from(frame)
+    if version != PROTOCOL:
+        raise ProtocolError(
+            f"a frame is of protocol version {version}; this process has {PROTOCOL}"
+        )
+    reader = _READERS.get(kind)
+    if reader is None:
+        raise ProtocolError(f"a frame is of unknown kind {kind}")
+    try:
+        return reader(memoryview(frame))
+    except (struct.error, UnicodeDecodeError, ValueError, TypeError) as error:
+        # Each of them is what its reader raises for bytes that its writer cannot have written.
+        name = reader.__name__.removeprefix("_read_")
+        raise ProtocolError(
+            f"a frame of kind {name} and {len(frame)} bytes is malformed ({error})"
+        ) from error
+
+
+_START, _STARTED, _SIGNAL, _DELIVER, _SAID, _TAKE_BACK, _TAKEN_BACK, _EXITED = range(1, 9)
+_OUTPUT, _LOG, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN, _PROBLEM = range(9, 16)
+
+_HEAD = struct.Struct("<BB")
+_NUMBER = struct.Struct("<BBQ")
+_NUMBERS = struct.Struct("<BBQq")
+_DELIVERY = struct.Struct("<BBQQ")
+_GRACE = struct.Struct("<BBd")
+_COUNT = struct.Struct("<I")
+_NO_BUFFERS = _COUNT.pack(0)
+
+
+def _packet(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> bytes:
+    if not buffers:
+        return b"".join((head, _NO_BUFFERS, payload))
+    sizes = [memoryview(buffer).nbytes for buffer in buffers]
+    table = struct.pack(f"<I{len(sizes)}Q", len(sizes), *sizes)
+    return b"".join((head, table, payload, *buffers))
+
+
+def _read_packet(view: memoryview, at: int) -> tuple[memoryview, list[memoryview]]:
+    (count,) = _COUNT.unpack_from(view, at)
+    at += _COUNT.size
+    if not count:
+        return view[at:], []
+    if count > len(view) // 8:
+        raise ValueError(f"it announces {count} buffers")
+    sizes = struct.unpack_from(f"<{count}Q", view, at)
+    at += 8 * count
+    start = len(view) - sum(sizes)
+    if start < at:
+        raise ValueError(f"it announces buffers of {sum(sizes)} bytes")
+    payload, buffers = view[at:start], []
+    for size in sizes:
+        buffers.append(view[start : start + size])
+        start += size
+    return payload, buffers
+
+
+def _utf8(text: str) -> bytes:
+    return text.encode("utf-8", "surrogatepass")  # file names and output may hold lone surrogates
+
+
+def _text(view: memoryview) -> str:
+    return str(view, "utf-8", "surrogatepass")
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value).encode()
+
+
+def _read_start(view: memoryview) -> Start:
+    return Start(_NUMBER.unpack_from(view)[2], view[_NUMBER.size :])
+
+
+def _read_started(view: memoryview) -> Started:
+    _, _, child, pid = _NUMBERS.unpack(view)
+    return Started(child, pid)
+
+
+def _read_signal(view: memoryview) -> Signal:
+    _, _, child, signum = _NUMBERS.unpack(view)
+    return Signal(child, signum)
+
+
+def _read_deliver(view: memoryview) -> Deliver:
+    _, _, child, seq = _DELIVERY.unpack_from(view)
+    return Deliver(child, seq, *_read_packet(view, _DELIVERY.size))
+
+
+def _read_said(view: memoryview) -> Said:
+    return Said(_NUMBER.unpack_from(view)[2], *_read_packet(view, _NUMBER.size))
+
+
+def _read_take_back(view: memoryview) -> TakeBack:
+    return TakeBack(_NUMBER.unpack(view)[2])
+
+
+def _read_taken_back(view: memoryview) -> TakenBack:
+    child = _NUMBER.unpack_from(view)[2]
+    count, odd = divmod(len(view) - _NUMBER.size, 8)
+    if odd:
+        raise ValueError("its list of sequence numbers is cut short")
+    return TakenBack(child, struct.unpack_from(f"<{count}Q", view, _NUMBER.size))
+
+
+def _read_exited(view: memoryview) -> Exited:
+    child = _NUMBER.unpack_from(view)[2]
+    exitcode, reason, unread, running, log, host = json.loads(_text(view[_NUMBER.size :]))
+    if running is not None:
+        seq, index = running
+        running = (_integer(seq), _integer(index))
+    return Exited(
+        child,
+        _integer(exitcode),
+        _string(reason),
+        tuple(map(_integer, unread)),
+        running,
+        tuple(map(_string, log)),
+        _string(host),
+    )
+
+
+def _read_output(view: memoryview) -> Output:
+    return Output(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
+
+
+def _read_log(view: memoryview) -> Log:
+    child = _NUMBER.unpack_from(view)[2]
+    logger, level, process, text = json.loads(_text(view[_NUMBER.size :]))
+    return Log(child, _string(logger), _integer(level), _string(process), _string(text))
+
+
+def _read_tunnel_open(view: memoryview) -> TunnelOpen:
+    return TunnelOpen(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
+
+
+def _read_tunnel_data(view: memoryview) -> TunnelData:
+    return TunnelData(_NUMBER.unpack_from(view)[2], *_read_packet(view, _NUMBER.size))
+
+
+def _read_tunnel_close(view: memoryview) -> TunnelClose:
+    return TunnelClose(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
+
+
+def _read_shutdown(view: memoryview) -> Shutdown:
+    return Shutdown(_GRACE.unpack(view)[2])
+
+
+def _read_problem(view: memoryview) -> Problem:
+    return Problem(_text(view[_HEAD.size :]))
+
+
+def _integer(value: Any) -> int:
+    if type(value) is not int:
+        raise ValueError("it has something else where a number belongs")
+    return value
+
+
+def _string(value: Any) -> str:
+    if type(value) is not str:
+        raise ValueError("it has something else where a text belongs")
+    return value
+
+
+_READERS: dict[int, Callable[[memoryview], Message]] = {
+    _START: _read_start,
+    _STARTED: _read_started,
+    _SIGNAL: _read_signal,
+    _DELIVER: _read_deliver,
+    _SAID: _read_said,
+    _TAKE_BACK: _read_take_back,
+    _TAKEN_BACK: _read_taken_back,
+    _EXITED: _read_exited,
+    _OUTPUT: _read_output,
+    _LOG: _read_log,
+    _TUNNEL_OPEN: _read_tunnel_open,
+    _TUNNEL_DATA: _read_tunnel_data,
+    _TUNNEL_CLOSE: _read_tunnel_close,
+    _SHUTDOWN: _read_shutdown,
+    _PROBLEM: _read_problem,
+}
+
+
+def _redacted(message: tuple[Any, ...]) -> str:
+    """The repr of a message whose contents are the user's: sizes instead of values."""
+    values = zip(message._fields, message, strict=True)  # type: ignore[attr-defined]  # a NamedTuple
+    inner = ", ".join(f"{name}={_shown(value)}" for name, value in values)
+    return f"{type(message).__name__}({inner})"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bytes | bytearray | memoryview):
+        return f"<{memoryview(value).nbytes} bytes>"
+    if isinstance(value, str):
+        return f"<{len(value)} characters>"
+    if isinstance(value, list | tuple) and not all(isinstance(item, int) for item in value):
+        return f"<{len(value)} items>"
+    return repr(value)

@@ -1,0 +1,299 @@
+"""One message between two processes of one host: one ``SOCK_SEQPACKET`` packet.
+
+A packet arrives whole or not at all, whoever else reads or writes the same socket, so that ends may be
+shared without a lock and a reader that dies takes nothing but its own message with it.  What is small
+travels inside the packet; what is large lies in a memfd whose descriptor travels with it.
+
+Layout (little endian)::
+
+    kind:u8 = PLAIN     payload
+    kind:u8 = PARTS     count:u32, payload length:u64, buffer lengths:u64 * count,
+                        then payload and buffers, here or (IN_MEMFD) in the first descriptor
+
+Buffers are pickle protocol 5's out-of-band buffers (PEP 574).
+"""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import pickle
+import socket
+import struct
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, release
+from fiber.errors import TooManyOpenFiles
+
+BytesLike: TypeAlias = bytes | bytearray | memoryview
+
+INLINE_LIMIT = 1 << 16
+"""Bytes of payload and buffers up to which a packet carries them itself."""
+
+OUT_OF_BAND_MIN = 1 << 12
+"""Smaller buffers cost less inside the pickle than beside it."""
+
+MAX_DESCRIPTORS = 250
+"""The kernel takes 253 descriptors a packet; one is ours."""
+
+PLAIN = b"\x00"
+PARTS = 1
+PARTS_IN_MEMFD = 2
+
+_PARTS = struct.Struct("<BIQ")
+_SIZE = struct.Struct("<Q")
+_FD = struct.Struct("i")
+_ALIGNMENT = 64
+_RECEIVE = INLINE_LIMIT + 16384
+_ANCILLARY = socket.CMSG_SPACE(_FD.size * (MAX_DESCRIPTORS + 1))
+_ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
+
+
+_Received: TypeAlias = tuple[int, list[tuple[int, int, bytes]], int, Any]
+
+
+class _FreeBuffers(threading.local):
+    """Receive buffers of this thread that no message is using."""
+
+    def __init__(self) -> None:
+        self.free: list[bytearray] = []
+
+
+_buffers = _FreeBuffers()
+_arena = Arena()
+
+
+class Message:
+    """A received packet.  ``payload`` of a small one is borrowed: call ``release`` (or ``loads``) soon."""
+
+    __slots__ = ("_lent", "buffers", "fds", "payload")
+
+    def __init__(
+        self,
+        payload: memoryview,
+        buffers: list[memoryview],
+        fds: list[int],
+        lent: bytearray | None = None,
+    ) -> None:
+        self.payload = payload
+        self.buffers = buffers
+        self.fds = fds
+        self._lent = lent
+
+    def release(self) -> None:
+        """Give the borrowed memory back to this thread; the payload must not be used after it."""
+        if self._lent is not None:
+            _buffers.free.append(self._lent)
+            self._lent = None
+
+    def tobytes(self) -> bytes:
+        """Copy the payload out and release the message."""
+        data = self.payload.tobytes()
+        self.release()
+        return data
+
+    def close_descriptors(self) -> None:
+        """Close descriptors that came with the packet and that nobody took."""
+        for fd in self.fds:
+            os.close(fd)
+        self.fds = []
+
+
+def dumps(
+    obj: Any, dump: Callable[..., bytes] = pickle.dumps
+) -> tuple[bytes, list[memoryview]]:
+    """Pickle ``obj``; large contiguous buffers in it (NumPy arrays) are returned beside the pickle."""
+    buffers: list[memoryview] = []
+
+    def keep_in_band(buffer: pickle.PickleBuffer) -> bool:
+        raw = buffer.raw()
+        if raw.nbytes < OUT_OF_BAND_MIN:
+            return True
+        buffers.append(raw)
+        return False
+
+    return dump(obj, protocol=5, buffer_callback=keep_in_band), buffers
+
+
+def loads(message: Message) -> Any:
+    """Unpickle a message and release it."""
+    try:
+        return pickle.loads(message.payload, buffers=message.buffers)
+    finally:
+        message.release()
+
+
+def send(
+    sock: socket.socket, payload: BytesLike, buffers: Sequence[memoryview] = (), fds: Sequence[int] = ()
+) -> None:
+    """Send one packet.
+
+    On a non-blocking socket BlockingIOError means that nothing was sent.  BrokenPipeError: no one can
+    ever read it.  ``fds`` (at most MAX_DESCRIPTORS) are duplicated into whoever receives the packet.
+    """
+    size = len(payload) if isinstance(payload, bytes) else memoryview(payload).nbytes
+    try:
+        if not buffers and not fds and size <= INLINE_LIMIT:
+            if size < 2048 and isinstance(payload, bytes):
+                sock.send(PLAIN + payload)
+            else:
+                sock.sendmsg((PLAIN, payload))
+        else:
+            _send_parts(sock, payload, size, buffers, fds)
+    except ConnectionResetError as error:
+        raise BrokenPipeError(errno.EPIPE, "the other end is closed") from error
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE, errno.ETOOMANYREFS):
+            raise TooManyOpenFiles("sending a message") from error
+        raise
+
+
+def _send_parts(
+    sock: socket.socket, payload: BytesLike, size: int, buffers: Sequence[memoryview], fds: Sequence[int]
+) -> None:
+    if len(buffers) > 1024:
+        raise ValueError(f"a message has {len(buffers)} out-of-band buffers; at most 1024 are sent")
+    sizes = [view.nbytes for view in buffers]
+    table = b"".join(map(_SIZE.pack, sizes))
+    if size + sum(sizes) <= INLINE_LIMIT:
+        head = _PARTS.pack(PARTS, len(sizes), size) + table
+        _sendmsg(sock, [head, payload, *buffers], fds)
+        return
+    offsets, total = _offsets([size, *sizes])
+    head = _PARTS.pack(PARTS_IN_MEMFD, len(sizes), size) + table
+    block = _arena.claim(total)
+    sent = False
+    try:
+        fill(block, [memoryview(payload).cast("B"), *buffers], offsets)
+        _sendmsg(sock, [head], [block.fd, *fds])
+        sent = True
+    finally:
+        _arena.settle(block, sent=sent)
+
+
+def _sendmsg(sock: socket.socket, parts: Sequence[BytesLike], fds: Sequence[int]) -> None:
+    if not fds:
+        sock.sendmsg(parts)
+        return
+    rights = struct.pack(f"{len(fds)}i", *fds)
+    sock.sendmsg(parts, [(socket.SOL_SOCKET, socket.SCM_RIGHTS, rights)])
+
+
+def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
+    """Where each part lies in a block, aligned for vector loads, and where the last one ends."""
+    offsets, end = [], DATA_OFFSET
+    for size in sizes:
+        start = -(-end // _ALIGNMENT) * _ALIGNMENT
+        offsets.append(start)
+        end = start + size
+    return offsets, end
+
+
+def receive(
+    sock: socket.socket, *, descriptors: bool = False, patience: int = 0, wait: bool = True
+) -> Message:
+    """Receive one packet; EOFError when no one can ever send again.
+
+    Without ``wait``, or on a non-blocking socket, BlockingIOError says that there is none.
+
+    ``descriptors`` makes room for those that the sender attached; without it only the memfd of a large
+    message is taken.  ``patience`` is how often to look and yield the processor before sleeping: an
+    answer that is microseconds away comes several times sooner than through a wake-up.
+    """
+    space = _ANCILLARY if descriptors else _ANCILLARY_ONE
+    free = _buffers.free
+    buffer = free.pop() if free else bytearray(_RECEIVE)
+    try:
+        received = _look(sock, buffer, space, patience) if patience else None
+        size, ancillary, flags, _ = received or _recvmsg(
+            sock, buffer, space, 0 if wait else socket.MSG_DONTWAIT
+        )
+    except BaseException:
+        free.append(buffer)
+        raise
+    view = memoryview(buffer)
+    if size and not buffer[0]:
+        return Message(view[1:size], [], [], buffer)
+    return _receive_parts(view, buffer, size, ancillary, flags)
+
+
+def _look(sock: socket.socket, buffer: bytearray, space: int, patience: int) -> _Received | None:
+    for _ in range(patience):
+        try:
+            return _recvmsg(sock, buffer, space, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            os.sched_yield()
+    return None
+
+
+def _recvmsg(sock: socket.socket, buffer: bytearray, space: int, flags: int) -> _Received:
+    try:
+        return sock.recvmsg_into((buffer,), space, flags)
+    except ConnectionResetError:
+        # The peer closed with packets of ours unread.  The kernel says so once, ahead of what the
+        # peer sent before; the next call delivers that, or the end.
+        return sock.recvmsg_into((buffer,), space, flags)
+
+
+def _receive_parts(
+    view: memoryview, buffer: bytearray, size: int, ancillary: list[tuple[int, int, bytes]], flags: int
+) -> Message:
+    fds = [fd for level, kind, data in ancillary if kind == socket.SCM_RIGHTS and level == socket.SOL_SOCKET
+           for (fd,) in _FD.iter_unpack(data[: len(data) // _FD.size * _FD.size])]
+    lent = Message(view[:0], [], fds, buffer)
+    try:
+        if not size:
+            raise EOFError("the other end is closed")
+        if flags & socket.MSG_CTRUNC:
+            # Descriptors were attached and this process had no room for them.
+            raise TooManyOpenFiles("receiving a descriptor")
+        kind, count, length = _PARTS.unpack_from(view)
+        offset = _PARTS.size + _SIZE.size * count
+        sizes = [length, *(n for (n,) in _SIZE.iter_unpack(view[_PARTS.size : offset]))]
+        if kind == PARTS:
+            return _inline_parts(view[offset:size], sizes, lent)
+        return _memory_parts(sizes, lent)
+    except BaseException:
+        lent.close_descriptors()
+        lent.release()
+        raise
+
+
+def _inline_parts(body: memoryview, sizes: list[int], lent: Message) -> Message:
+    payload, offset = body[: sizes[0]], sizes[0]
+    for length in sizes[1:]:
+        lent.buffers.append(memoryview(bytearray(body[offset : offset + length])))
+        offset += length
+    lent.payload = payload
+    return lent
+
+
+def _memory_parts(sizes: list[int], lent: Message) -> Message:
+    """Take the parts out of the sender's block: by a copy that frees it, or for good if it is large."""
+    memory = lent.fds.pop(0)
+    try:
+        offsets, total = _offsets(sizes)
+        if total > RETAINED_LIMIT:
+            mapped = memoryview(mmap.mmap(memory, total))
+            views = [mapped[at : at + size] for at, size in zip(offsets, sizes, strict=True)]
+        else:
+            views = [_copy_out(memory, at, size) for at, size in zip(offsets, sizes, strict=True)]
+            release(memory)
+    finally:
+        os.close(memory)
+    lent.release()
+    return Message(views[0], views[1:], lent.fds)
+
+
+def _copy_out(memory: int, offset: int, size: int) -> memoryview:
+    content = memoryview(bytearray(size))
+    done = 0
+    while done < size:
+        read = os.preadv(memory, [content[done:]], offset + done)
+        if not read:
+            raise EOFError(f"a large message ends after {done} of {size} bytes")
+        done += read
+    return content

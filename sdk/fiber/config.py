@@ -1,0 +1,354 @@
+"""One frozen configuration per program.
+
+From the weakest source to the strongest: defaults, `[tool.fiber]` in the nearest
+pyproject.toml upward from the working directory, environment variables (`FIBER_BACKEND` for
+`backend`, and so on), `fiber.init()`. All four know the same keys, those of `Config`. A key
+that does not exist and a value that does not fit are a ConfigError wherever they come from.
+
+Variables whose names begin with `FIBER_AGENT_` or `FIBER_CHILD_` are not configuration:
+Fiber passes them to the processes that it starts.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import re
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
+
+from fiber.errors import ConfigError
+
+__all__ = ["Config", "current", "guard", "init", "install", "load"]
+
+
+class _Rule(NamedTuple):
+    """What a key accepts; `check` gives the value to keep or raises ValueError."""
+
+    expects: str
+    check: Callable[[object], object]
+    from_text: Callable[[str], object] = str
+
+
+def _choice(*choices: str) -> _Rule:
+    def check(value: object) -> str:
+        for choice in choices:
+            if isinstance(value, str) and value.lower() == choice.lower():
+                return choice
+        raise ValueError
+
+    return _Rule(f"one of {', '.join(map(repr, choices))}", check)
+
+
+def _whole(low: int, high: int | None = None) -> _Rule:
+    def check(value: object) -> int:
+        if not isinstance(value, int) or isinstance(value, bool) or value < low:
+            raise ValueError
+        if high is not None and value > high:
+            raise ValueError
+        return value
+
+    reach = f"of at least {low}" if high is None else f"from {low} to {high}"
+    return _Rule(f"a whole number {reach}", check, from_text=int)
+
+
+def _seconds() -> _Rule:
+    def check(value: object) -> float:
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise ValueError
+        if not math.isfinite(value) or value <= 0:
+            raise ValueError
+        return float(value)
+
+    return _Rule("a number of seconds above 0", check, from_text=float)
+
+
+def _host() -> _Rule:
+    def check(value: object) -> str:
+        if not isinstance(value, str) or not value.strip():
+            raise ValueError
+        return value.strip()
+
+    return _Rule("a host name or address", check)
+
+
+def _directory() -> _Rule:
+    def check(value: object) -> str:
+        if not isinstance(value, str | os.PathLike):
+            raise ValueError
+        path = os.fsdecode(value)
+        if not os.path.isabs(path) or not os.path.isdir(path):
+            raise ValueError
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise ValueError
+        return path
+
+    return _Rule("the absolute path of a directory that exists and can be written to", check)
+
+
+def _key(default: Any, rule: _Rule, *, fixed: bool = False) -> Any:
+    """A key of Config; `fixed`: read once, when the runtime starts."""
+    return field(default=default, metadata={"rule": rule, "fixed": fixed})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Config:
+    """What can be configured; each key's type and default is in the signature.
+
+    Keys marked * are read when the first process, pool, pipe or queue is made, and cannot
+    change after that; the others hold for what is made next.
+
+    backend*: where processes run. "local" starts them on this machine as children of the
+        program. "loopback" does the same through agents, separate processes that reach the
+        program over encrypted nng links, as they would on other machines.
+    agents*: how many agents the loopback backend starts.
+    processes_per_agent*: how many processes one agent runs at most, a further one being a
+        StartError when all agents are full; 0 means no limit.
+    listen_host*: the address at which the program listens for agents.
+    listen_port*: the port for it; 0 takes one that is free.
+    start_timeout: seconds that a process or an agent may take to start.
+    heartbeat_interval*: seconds between two signs of life of an agent.
+    suspect_after*: seconds of silence after which an agent gets no new work.
+    lost_after*: seconds of silence after which an agent counts as lost, and its tasks run
+        elsewhere.
+    retries: how many times a task runs again after its worker died.
+    log_level: the least severe records of Fiber's logger that are shown.
+    runtime_directory*: where Fiber makes its private directory for sockets and credentials;
+        None means `tempfile.gettempdir()`. Socket paths are short: so should this be.
+    """
+
+    backend: str = _key("local", _choice("local", "loopback"), fixed=True)
+    agents: int = _key(2, _whole(1), fixed=True)
+    processes_per_agent: int = _key(0, _whole(0), fixed=True)
+    listen_host: str = _key("127.0.0.1", _host(), fixed=True)
+    listen_port: int = _key(0, _whole(0, 65535), fixed=True)
+    start_timeout: float = _key(60.0, _seconds())
+    heartbeat_interval: float = _key(1.0, _seconds(), fixed=True)
+    suspect_after: float = _key(5.0, _seconds(), fixed=True)
+    lost_after: float = _key(15.0, _seconds(), fixed=True)
+    retries: int = _key(3, _whole(0))
+    log_level: str = _key("WARNING", _choice("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"))
+    runtime_directory: str | None = _key(None, _directory(), fixed=True)
+
+
+_KEYS = {entry.name: entry for entry in fields(Config)}
+
+
+# ---- the configuration in force -------------------------------------------------------------
+
+
+def _not_in_use() -> bool:
+    return False
+
+
+_lock = threading.Lock()
+_current: Config | None = None
+_in_use: Callable[[], bool] = _not_in_use
+
+
+def current() -> Config:
+    """The configuration in force; read from its sources at the first call."""
+    global _current
+    if _current is None:
+        with _lock:
+            if _current is None:
+                _current = load()
+    return _current
+
+
+def init(**settings: object) -> Config:
+    """Set keys of `Config` for this program, and return the configuration that results.
+
+    Each call starts anew from the other sources: keys of an earlier call are forgotten.
+    Comes before the first process, pool, pipe or queue: a later call may not change a key
+    that the running program was built on.
+    """
+    global _current
+    with _lock:
+        config = load(settings)
+        if _current is not None and _in_use():
+            _refuse_late_change(_current, config)
+        _current = config
+    return config
+
+
+def install(config: Config) -> None:
+    """Put a configuration in force as it is: how a child gets its parent's."""
+    global _current
+    with _lock:
+        _current = config
+
+
+def guard(in_use: Callable[[], bool]) -> None:
+    """Let the runtime say whether it has been built on `current()`, which `init()` respects.
+
+    `in_use` is called with the module's lock held and must not take one itself.
+    """
+    global _in_use
+    _in_use = in_use
+
+
+def _refuse_late_change(running: Config, wanted: Config) -> None:
+    for name, entry in _KEYS.items():
+        old, new = getattr(running, name), getattr(wanted, name)
+        if entry.metadata["fixed"] and old != new:
+            raise ConfigError(
+                f"fiber.init() comes too late for {name}={new!r}: Fiber has been running with "
+                f"{name}={old!r} since the first process, pool, pipe or queue was made. "
+                f"Call fiber.init() before that, or set {_variable(name)} or {name} in "
+                "[tool.fiber] of pyproject.toml."
+            )
+
+
+def _unlock_in_forked_child() -> None:
+    # Another thread may have held it at the fork; that thread does not exist here.
+    global _lock
+    _lock = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_unlock_in_forked_child)
+
+
+# ---- reading the sources --------------------------------------------------------------------
+
+
+class _Setting(NamedTuple):
+    key: str
+    value: object
+    source: str
+    spelling: Callable[[str], str] = str  # how a key is written in this kind of source
+    is_text: bool = False
+
+
+def load(
+    settings: Mapping[str, object] | None = None,
+    *,
+    environ: Mapping[str, str] | None = None,
+    directory: str | None = None,
+) -> Config:
+    """Read all sources, `settings` being what `init()` was given.
+
+    The environment and the directory to start from are the process's own unless given.
+    """
+    environ = os.environ if environ is None else environ
+    values: dict[str, Any] = {}
+    sources: dict[str, str] = {}
+    for setting in (
+        *_from_pyproject(directory),
+        *_from_environment(environ),
+        *_from_init(settings or {}),
+    ):
+        values[setting.key] = _checked(setting)
+        sources[setting.key] = setting.source
+    config = Config(**values)
+    _check_patience(config, sources)
+    return config
+
+
+def _checked(setting: _Setting) -> object:
+    if setting.key not in _KEYS:
+        raise ConfigError(_unknown(setting))
+    rule: _Rule = _KEYS[setting.key].metadata["rule"]
+    try:
+        value = rule.from_text(str(setting.value)) if setting.is_text else setting.value
+        return rule.check(value)
+    except ValueError:
+        raise ConfigError(
+            f"bad value {setting.value!r} for {setting.key!r} in {setting.source}: "
+            f"expected {rule.expects}"
+        ) from None
+
+
+def _unknown(setting: _Setting) -> str:
+    import difflib  # only needed once things have gone wrong
+
+    valid = [setting.spelling(key) for key in _KEYS]
+    written = setting.spelling(setting.key)
+    close = difflib.get_close_matches(written, valid, n=1)
+    hint = f" Did you mean {close[0]!r}?" if close else ""
+    return f"unknown key {written!r} in {setting.source}.{hint} Valid are: {', '.join(valid)}."
+
+
+def _check_patience(config: Config, sources: Mapping[str, str]) -> None:
+    order = ("heartbeat_interval", "suspect_after", "lost_after")
+    for shorter, longer in itertools.pairwise(order):
+        low, high = getattr(config, shorter), getattr(config, longer)
+        if low >= high:
+            raise ConfigError(
+                f"{longer} must be longer than {shorter}, but {longer} is {high:g} s "
+                f"({sources.get(longer, 'default')}) and {shorter} is {low:g} s "
+                f"({sources.get(shorter, 'default')})"
+            )
+
+
+def _from_init(settings: Mapping[str, object]) -> Iterator[_Setting]:
+    for key, value in settings.items():
+        yield _Setting(key, value, "fiber.init()")
+
+
+_PREFIX = "FIBER_"
+_INTERNAL = ("FIBER_AGENT_", "FIBER_CHILD_")
+
+
+def _variable(key: str) -> str:
+    return _PREFIX + key.upper()
+
+
+def _from_environment(environ: Mapping[str, str]) -> Iterator[_Setting]:
+    for name, value in environ.items():
+        if not name.startswith(_PREFIX) or name.startswith(_INTERNAL):
+            continue
+        if _is_service_link(name, environ):
+            continue
+        key = name.removeprefix(_PREFIX).lower()
+        yield _Setting(key, value, f"environment variable {name}", _variable, is_text=True)
+
+
+_SERVICE_LINK = re.compile(r"(FIBER\w*?)_(SERVICE_HOST|SERVICE_PORT\w*|PORT(_\d+_[A-Z]+\w*)?)")
+
+
+def _is_service_link(name: str, environ: Mapping[str, str]) -> bool:
+    # Kubernetes tells every pod of a namespace about a Service fiber-x by variables
+    # FIBER_X_SERVICE_HOST, FIBER_X_PORT and so on, which nobody wrote.
+    link = _SERVICE_LINK.fullmatch(name)
+    return link is not None and f"{link[1]}_SERVICE_HOST" in environ
+
+
+def _from_pyproject(directory: str | None) -> Iterator[_Setting]:
+    path = _nearest_pyproject(directory)
+    if path is None:
+        return
+    source = f"[tool.fiber] of {path}"
+    table = _read_toml(path).get("tool", {}).get("fiber", {})
+    if not isinstance(table, dict):
+        raise ConfigError(f"bad value {table!r} for tool.fiber in {path}: expected a table")
+    for key, value in table.items():
+        yield _Setting(key, value, source)
+
+
+def _nearest_pyproject(directory: str | None) -> str | None:
+    try:
+        here = os.path.abspath(directory or os.getcwd())
+    except FileNotFoundError:  # the working directory was deleted
+        return None
+    while True:
+        path = os.path.join(here, "pyproject.toml")
+        if os.path.isfile(path):
+            return path
+        parent = os.path.dirname(here)
+        if parent == here:
+            return None
+        here = parent
+
+
+def _read_toml(path: str) -> dict[str, Any]:
+    import tomllib  # most programs have no pyproject.toml around them
+
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot read {path} for [tool.fiber]: {error}") from error

@@ -1,0 +1,189 @@
+"""``Connection``, ``Pipe`` and ``wait``: multiprocessing's, over message channels.
+
+A message arrives whole.  Large contiguous buffers (NumPy arrays) are not copied into the pickle.
+"""
+
+from __future__ import annotations
+
+import pickle
+from multiprocessing.connection import Client, Listener, answer_challenge, deliver_challenge, wait
+from typing import TYPE_CHECKING, Any
+
+from fiber import reduction
+from fiber._hub import handles
+from fiber._transport.base import Channel
+from fiber._transport.unix import UnixChannel
+from fiber._wire import packet
+from fiber._wire.packet import BytesLike, Message
+from fiber.errors import BufferTooShort, ConnectionClosed
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+__all__ = [
+    "Client",
+    "Connection",
+    "Listener",
+    "Pipe",
+    "answer_challenge",
+    "deliver_challenge",
+    "wait",
+]
+
+
+class Connection:
+    """One end of a pipe.  EOFError when the last holder of the other end has closed it or died."""
+
+    def __init__(self, channel: Channel, readable: bool = True, writable: bool = True) -> None:
+        self._channel: Channel | None = channel
+        self._readable = readable
+        self._writable = writable
+
+    # Sending
+
+    def send(self, obj: Any) -> None:
+        """Send a picklable object."""
+        channel = self._channel
+        if channel is None or not self._writable:
+            raise self._misuse("read-only")
+        payload, buffers = reduction.encode(obj)
+        channel.send(payload, buffers)
+
+    def send_bytes(self, buf: BytesLike, offset: int = 0, size: int | None = None) -> None:
+        """Send bytes as one message."""
+        channel = self._channel
+        if channel is None or not self._writable:
+            raise self._misuse("read-only")
+        view = memoryview(buf)
+        if view.itemsize > 1 or view.ndim != 1:
+            view = view.cast("B")
+        _check_window(len(view), offset, size)
+        channel.send(view[offset:] if size is None else view[offset : offset + size])
+
+    # Receiving
+
+    def recv(self) -> Any:
+        """The next object."""
+        return packet.loads(self._receive())
+
+    def recv_bytes(self, maxlength: int | None = None) -> bytes:
+        """The next message as bytes; OSError, and the connection closed, if it is longer."""
+        if maxlength is not None and maxlength < 0:
+            raise ValueError("negative maxlength")
+        data = _as_bytes(self._receive())
+        if maxlength is not None and len(data) > maxlength:
+            self.close()
+            raise OSError("bad message length")
+        return data
+
+    def recv_bytes_into(self, buf: Any, offset: int = 0) -> int:
+        """Put the next message into ``buf`` and return its length; BufferTooShort holds what did not fit."""
+        view = memoryview(buf)
+        room = view.itemsize * len(view)
+        if offset < 0:
+            raise ValueError("negative offset")
+        if offset > room:
+            raise ValueError("offset too large")
+        data = _as_bytes(self._receive())
+        if len(data) > room - offset:
+            raise BufferTooShort(data)
+        view.cast("B")[offset : offset + len(data)] = data
+        return len(data)
+
+    def poll(self, timeout: float | None = 0.0) -> bool:
+        """Whether there is something to receive (or the end), waiting up to ``timeout`` seconds."""
+        channel = self._channel
+        if channel is None or not self._readable:
+            raise self._misuse("write-only")
+        return channel.poll(timeout)
+
+    def _receive(self) -> Message:
+        channel = self._channel
+        if channel is None or not self._readable:
+            raise self._misuse("write-only")
+        try:
+            return channel.recv()
+        except EOFError as error:
+            raise ConnectionClosed from error
+
+    # The end itself
+
+    def fileno(self) -> int:
+        """A descriptor that is readable when there is something to receive."""
+        if self._channel is None:
+            raise self._misuse()
+        return self._channel.fileno()
+
+    def close(self) -> None:
+        """Let go of this end."""
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            channel.close()
+
+    @property
+    def closed(self) -> bool:
+        """Whether this end was closed."""
+        return self._channel is None
+
+    @property
+    def readable(self) -> bool:
+        """Whether it can receive."""
+        return self._readable
+
+    @property
+    def writable(self) -> bool:
+        """Whether it can send."""
+        return self._writable
+
+    def __enter__(self) -> Connection:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        if getattr(self, "_channel", None) is not None:
+            self.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._channel is None:
+            raise self._misuse()
+        return _rebuild, (handles.lend(self._channel), self._readable, self._writable)
+
+    def _misuse(self, wrong_way: str = "") -> OSError:
+        if self._channel is None:
+            return OSError("handle is closed")
+        return OSError(f"connection is {wrong_way}")
+
+
+def _rebuild(handle: handles.Handle, readable: bool, writable: bool) -> Connection:
+    return Connection(handles.channel(handle), readable, writable)
+
+
+def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:  # noqa: N802 - multiprocessing's name
+    """Two connected ends; without ``duplex`` the first only receives and the second only sends."""
+    one, other = UnixChannel.pair()
+    if duplex:
+        return Connection(one), Connection(other)
+    return Connection(one, writable=False), Connection(other, readable=False)
+
+
+def _as_bytes(message: Message) -> bytes:
+    if not message.buffers:
+        return message.tobytes()
+    # It was sent by ``send``; whoever asks for bytes expects one pickle.
+    return pickle.dumps(packet.loads(message), protocol=5)
+
+
+def _check_window(length: int, offset: int, size: int | None) -> None:
+    if offset < 0:
+        raise ValueError("offset is negative")
+    if length < offset:
+        raise ValueError("buffer length < offset")
+    if size is not None:
+        if size < 0:
+            raise ValueError("size is negative")
+        if offset + size > length:
+            raise ValueError("buffer length < offset + size")

@@ -1,0 +1,241 @@
+"""Contexts: all of multiprocessing's functions, for one start method.
+
+``fiber`` itself exposes the methods of the default context, as multiprocessing does.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from multiprocessing import process as _mp_process
+from multiprocessing import spawn, util
+from multiprocessing.context import (
+    AuthenticationError,
+    BufferTooShort,
+    ProcessError,
+    TimeoutError,
+)
+from typing import TYPE_CHECKING, Any
+
+from fiber import cpu
+from fiber.process import Process
+
+if TYPE_CHECKING:
+    import logging
+
+    from fiber.connection import Connection
+    from fiber.pool import Pool
+    from fiber.queues import JoinableQueue, Queue, SimpleQueue
+    from fiber.synchronize import BoundedSemaphore, Event, Semaphore
+
+__all__ = ["BaseContext", "DefaultContext", "ForkProcess", "ForkServerProcess", "SpawnProcess"]
+
+START_METHODS = ("forkserver", "spawn", "fork")
+"""``forkserver`` and ``fork`` both fork from Fiber's zygote; the default comes first."""
+
+
+def zygote_method(start_method: str | None) -> str:
+    """What the zygote is asked to do for a start method, None being the default context's."""
+    method = start_method or default.get_start_method()
+    return "spawn" if method == "spawn" else "fork"
+
+
+class ForkProcess(Process):
+    """A process forked from the zygote."""
+
+    _start_method = "fork"
+
+
+class ForkServerProcess(Process):
+    """A process forked from the zygote."""
+
+    _start_method = "forkserver"
+
+
+class SpawnProcess(Process):
+    """A process in a new interpreter."""
+
+    _start_method = "spawn"
+
+
+class BaseContext:
+    """multiprocessing's functions and classes for one start method."""
+
+    ProcessError = ProcessError
+    BufferTooShort = BufferTooShort
+    TimeoutError = TimeoutError
+    AuthenticationError = AuthenticationError
+    Process: type[Process] = Process
+
+    current_process = staticmethod(_mp_process.current_process)
+    parent_process = staticmethod(_mp_process.parent_process)
+    active_children = staticmethod(_mp_process.active_children)
+
+    def __init__(self, method: str | None = None) -> None:
+        self._method = method
+
+    def cpu_count(self) -> int:
+        """Processors that this process may use: its affinity and its cgroup's quota are heeded."""
+        return cpu.cpu_count()
+
+    # Communication
+
+    def Pipe(self, duplex: bool = True) -> tuple[Connection, Connection]:  # noqa: N802
+        """Two connected ends of a pipe."""
+        from fiber.connection import Pipe
+
+        return Pipe(duplex)
+
+    def Queue(self, maxsize: int = 0) -> Queue:  # noqa: N802
+        """A queue for any number of processes."""
+        from fiber.queues import Queue
+
+        return Queue(maxsize)
+
+    def JoinableQueue(self, maxsize: int = 0) -> JoinableQueue:  # noqa: N802
+        """A queue whose items are accounted for by ``task_done`` and ``join``."""
+        from fiber.queues import JoinableQueue
+
+        return JoinableQueue(maxsize)
+
+    def SimpleQueue(self) -> SimpleQueue:  # noqa: N802
+        """A queue without a feeder thread."""
+        from fiber.queues import SimpleQueue
+
+        return SimpleQueue()
+
+    # Synchronization
+
+    def Event(self) -> Event:  # noqa: N802
+        """A flag to wait for."""
+        from fiber.synchronize import Event
+
+        return Event()
+
+    def Semaphore(self, value: int = 1) -> Semaphore:  # noqa: N802
+        """A semaphore."""
+        from fiber.synchronize import Semaphore
+
+        return Semaphore(value)
+
+    def BoundedSemaphore(self, value: int = 1) -> BoundedSemaphore:  # noqa: N802
+        """A semaphore that is never released more often than acquired."""
+        from fiber.synchronize import BoundedSemaphore
+
+        return BoundedSemaphore(value)
+
+    # Work
+
+    def Pool(  # noqa: N802
+        self,
+        processes: int | None = None,
+        initializer: Callable[..., Any] | None = None,
+        initargs: Iterable[Any] = (),
+        maxtasksperchild: int | None = None,
+        **options: Any,
+    ) -> Pool:
+        """A pool of workers; ``options`` are those of ``fiber.pool.Pool``."""
+        from fiber.pool import Pool
+
+        context = self.get_context()
+        return Pool(processes, initializer, initargs, maxtasksperchild, context=context, **options)
+
+    # Settings
+
+    def get_context(self, method: str | None = None) -> BaseContext:
+        """The context of a start method; this one if none is named."""
+        if method is None:
+            return self
+        if method not in _contexts:
+            raise ValueError(f"cannot find context for {method!r}")
+        return _contexts[method]
+
+    def get_start_method(self, allow_none: bool = False) -> str | None:
+        """The name of this context's start method."""
+        return self._method
+
+    def set_start_method(self, method: str | None, force: bool = False) -> None:
+        """Only the default context's can be set."""
+        raise ValueError("cannot set start method of concrete context")
+
+    def get_all_start_methods(self) -> list[str]:
+        """The start methods, the default first."""
+        return list(START_METHODS)
+
+    def set_executable(self, executable: str | bytes | os.PathLike[str]) -> None:
+        """The interpreter for processes started with ``spawn`` on this host."""
+        spawn.set_executable(executable)
+
+    def set_forkserver_preload(self, module_names: list[str]) -> None:
+        """Modules that the zygote imports before it forks; takes effect before the first start."""
+        if not all(isinstance(name, str) for name in module_names):
+            raise TypeError("module_names must be a list of strings")
+        preload[:] = module_names
+
+    def freeze_support(self) -> None:
+        """Nothing: frozen executables exist on Windows only."""
+
+    def allow_connection_pickling(self) -> None:
+        """Nothing: connections always pickle."""
+
+    def get_logger(self) -> logging.Logger:
+        """multiprocessing's logger, which Fiber shares."""
+        return util.get_logger()
+
+    def log_to_stderr(self, level: int | str | None = None) -> logging.Logger:
+        """Show the logger's records on stderr."""
+        return util.log_to_stderr(level)
+
+    @property
+    def reducer(self) -> Any:
+        """How objects become bytes."""
+        from fiber import reduction
+
+        return reduction
+
+
+class _ConcreteContext(BaseContext):
+    def __init__(self, method: str, process: type[Process]) -> None:
+        super().__init__(method)
+        self.Process = process
+
+
+class DefaultContext(BaseContext):
+    """The context behind ``fiber`` itself: its start method can be set, once."""
+
+    def get_context(self, method: str | None = None) -> BaseContext:
+        """The context of a start method; the one in force if none is named."""
+        if method is None:
+            return _contexts[self._method or START_METHODS[0]]
+        return super().get_context(method)
+
+    def get_start_method(self, allow_none: bool = False) -> str | None:
+        """The start method in force; with ``allow_none`` None if nothing was set or used."""
+        if self._method is None and not allow_none:
+            self._method = START_METHODS[0]
+        return self._method
+
+    def set_start_method(self, method: str | None, force: bool = False) -> None:
+        """Set the start method; RuntimeError if it is set already and not ``force``."""
+        if self._method is not None and not force:
+            raise RuntimeError("context has already been set")
+        if method is not None:
+            self.get_context(method)
+        elif not force:
+            raise ValueError("cannot find context for None")
+        self._method = method
+
+
+def inherit(method: str | None, modules: list[str]) -> None:
+    """In a child: what its parent had set."""
+    default._method = method
+    preload[:] = modules
+
+
+preload: list[str] = []
+_contexts: dict[str, BaseContext] = {
+    "fork": _ConcreteContext("fork", ForkProcess),
+    "forkserver": _ConcreteContext("forkserver", ForkServerProcess),
+    "spawn": _ConcreteContext("spawn", SpawnProcess),
+}
+default = DefaultContext()

@@ -1,0 +1,264 @@
+"""The errors that Fiber raises, next to the ones that it shares with multiprocessing.
+
+    Exception
+    ├── ProcessError              multiprocessing's own class, as are the next three
+    │   ├── AuthenticationError   credentials that the other side refuses
+    │   ├── BufferTooShort        Connection.recv_bytes_into() got more than fits
+    │   ├── TimeoutError          a result or a task that took too long
+    │   └── FiberError            everything below is Fiber's
+    │       ├── AdoptionError     a module that fiber.adopt() cannot rebind
+    │       ├── AgentLost         an agent that is out of reach
+    │       ├── ConfigError       a key or value that is wrong (also ValueError)
+    │       ├── ConnectionClosed  the other end of a link is gone (also EOFError)
+    │       ├── StartError        a process that does not start, an initializer that fails
+    │       ├── TooManyOpenFiles  the limit of file descriptors is reached (also OSError)
+    │       ├── UnpicklableError  an object that cannot travel (also PicklingError, TypeError)
+    │       ├── VersionMismatch   two sides that do not speak the same version
+    │       └── WorkerDied        a task whose worker died, every time it was tried
+    └── MaybeEncodingError        multiprocessing.pool's: a result that does not pickle
+
+Each message says what happened, why, and what to do. Errors cross processes: every class
+here pickles with all its attributes, and so do subclasses of FiberError, whatever the
+signature of their `__init__`.
+"""
+
+from __future__ import annotations
+
+import errno
+import pickle
+import signal
+from collections.abc import Sequence
+from multiprocessing import AuthenticationError, BufferTooShort, ProcessError, TimeoutError
+from typing import Any
+
+__all__ = [
+    "AdoptionError",
+    "AgentLost",
+    "AuthenticationError",
+    "BufferTooShort",
+    "ConfigError",
+    "ConnectionClosed",
+    "FiberError",
+    "MaybeEncodingError",
+    "ProcessError",
+    "StartError",
+    "TimeoutError",
+    "TooManyOpenFiles",
+    "UnpicklableError",
+    "VersionMismatch",
+    "WorkerDied",
+]
+
+
+MaybeEncodingError: type[Exception]
+
+
+def __getattr__(name: str) -> Any:
+    # multiprocessing.pool is most of the import time that this module would have.
+    if name == "MaybeEncodingError":
+        from multiprocessing import pool
+
+        return vars(pool)[name]  # typeshed does not list it
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+class FiberError(ProcessError):
+    """Base of the errors that are Fiber's own."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # BaseException would call type(self)(*args), which fails for every __init__ that
+        # wants more than the message, and with it the pool that carries the error.
+        return _rebuild, (type(self), self.args), self.__dict__ or None
+
+
+def _rebuild(kind: type[FiberError], args: tuple[Any, ...]) -> FiberError:
+    error = kind.__new__(kind, *args)
+    # The builtin's initializer after FiberError: OSError fills errno and strerror there.
+    super(FiberError, error).__init__(*args)
+    return error
+
+
+class ConfigError(FiberError, ValueError):
+    """A key that does not exist or a value that does not fit; names it and its source."""
+
+
+class AdoptionError(FiberError):
+    """`fiber.adopt()` cannot serve a module; names what stands in the way, nothing changed."""
+
+
+class AgentLost(FiberError):
+    """The agent of a host is out of reach, and with it the processes that it runs."""
+
+    def __init__(self, agent: str, host: str, reason: str) -> None:
+        super().__init__(
+            f"lost agent {agent!r} on host {host!r}: {reason}. Its processes count as dead. "
+            "Look at the agent's last output and whether the host can be reached."
+        )
+        self.agent = agent
+        self.host = host
+        self.reason = reason
+
+
+class ConnectionClosed(EOFError, FiberError):
+    """The other end of a link was closed, or its last holder died.
+
+    Differs from multiprocessing's EOFError, which it is too, by `peer` and `reason`: who
+    held the other end and how that process ended, where Fiber knows.
+    """
+
+    def __init__(self, peer: str | None = None, reason: str | None = None) -> None:
+        message = "the other end of the connection is closed"
+        if peer or reason:
+            message += f": {peer or 'its process'} is gone"
+        if reason:
+            message += f" ({reason})"
+        super().__init__(message)
+        self.peer = peer
+        self.reason = reason
+
+
+class StartError(FiberError):
+    """A process cannot start, or its initializer fails.
+
+    `cause` is the text of what went wrong in that process, a traceback for instance: the
+    exception itself may be of a class that this process cannot even import.
+    """
+
+    def __init__(self, who: str, reason: str, cause: str = "", attempts: int = 1) -> None:
+        tries = f" after {attempts} attempts" if attempts > 1 else ""
+        message = f"{who} did not start{tries}: {reason}"
+        if cause:
+            message += f"\n{_block('What it said:', cause.splitlines())}"
+        super().__init__(message)
+        self.who = who
+        self.reason = reason
+        self.cause = cause
+        self.attempts = attempts
+
+
+class TooManyOpenFiles(FiberError, OSError):
+    """No file descriptor is left (errno EMFILE); says the limit and how to raise it."""
+
+    def __init__(self, doing: str) -> None:
+        import resource  # only needed once things have gone wrong
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        ceiling = "no hard limit" if hard == resource.RLIM_INFINITY else f"the hard limit is {hard}"
+        super().__init__(
+            errno.EMFILE,
+            f"too many open files while {doing}: this process may hold {soft} ({ceiling}). "
+            "Raise it with `ulimit -n` in the shell that starts the program, LimitNOFILE= in "
+            "its systemd unit, or resource.setrlimit() in the program; or use fewer processes",
+        )
+        self.doing = doing
+        self.limit = soft
+        self.hard_limit = hard
+
+
+class UnpicklableError(FiberError, pickle.PicklingError, TypeError):
+    """An object cannot be sent to another process.
+
+    `what` is its role ("argument 2 of task f"), `path` the way from there to the culprit
+    ("['options'].lock", empty when unknown), `reason` the pickler's own words.
+    """
+
+    def __init__(self, what: str, reason: str, path: str = "") -> None:
+        at = f" (at {path})" if path else ""
+        super().__init__(
+            f"{what} cannot be pickled{at}: {reason}. Objects travel to other processes as "
+            "pickles: pass what it is made from and build it there, or give its class a "
+            "__reduce__ method."
+        )
+        self.what = what
+        self.reason = reason
+        self.path = path
+
+
+class VersionMismatch(FiberError):
+    """The two sides of a link differ in a version that must be equal.
+
+    `what` says which one: "Fiber protocol" or "Python", for instance.
+    """
+
+    def __init__(self, what: str, *, ours: str, theirs: str, peer: str) -> None:
+        super().__init__(
+            f"{what} version mismatch: {peer} has {theirs}, this process has {ours}. "
+            "Install the same fiberpool and Python on both sides; for workers in containers, "
+            "rebuild their image."
+        )
+        self.what = what
+        self.ours = ours
+        self.theirs = theirs
+        self.peer = peer
+
+
+class WorkerDied(FiberError):
+    """The worker died while it ran a task, and no attempt is left.
+
+    The attributes are the last attempt's: `task` and `worker` are names, `exitcode` follows
+    multiprocessing (negative: the signal; None: unknown), `log` holds the last lines that
+    the worker wrote, `attempts` counts how often the task was tried.
+    """
+
+    def __init__(
+        self,
+        *,
+        task: str,
+        worker: str,
+        host: str,
+        pid: int | None,
+        exitcode: int | None,
+        reason: str,
+        log: Sequence[str] = (),
+        attempts: int = 1,
+    ) -> None:
+        self.task = task
+        self.worker = worker
+        self.host = host
+        self.pid = pid
+        self.exitcode = exitcode
+        self.reason = reason
+        self.log = tuple(log)
+        self.attempts = attempts
+        super().__init__(self._message())
+
+    def _message(self) -> str:
+        pid = "" if self.pid is None else f", pid {self.pid}"
+        lines = [
+            f"worker {self.worker!r} died while it ran {self.task}",
+            f"Why: {self.reason} (on host {self.host!r}{pid}).",
+        ]
+        if self.attempts > 1:
+            lines.append(f"The task was tried {self.attempts} times; each time its worker died.")
+        lines.append(f"What to do: {_advice(self.exitcode)}")
+        if self.log:
+            lines.append(_block("Its last output:", self.log))
+        return "\n".join(lines)
+
+
+_CRASHES = frozenset({signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE, signal.SIGABRT})
+
+
+def _advice(exitcode: int | None) -> str:
+    if exitcode is None:
+        return "look at the host and its agent; how the worker itself ended is not known."
+    if exitcode == -signal.SIGKILL:
+        return (
+            "a SIGKILL that nobody sent is mostly the kernel, out of memory (`dmesg` tells). "
+            "Use fewer workers or smaller tasks, or ask for more with @fiber.meta(memory=)."
+        )
+    if -exitcode in _CRASHES:
+        return (
+            "native code crashed: an extension module or a library under it. "
+            "Run with PYTHONFAULTHANDLER=1 to see the Python line that it was called from."
+        )
+    if exitcode < 0:
+        return "find out who sends this signal to the program's processes."
+    return (
+        "the task ended its process itself, by os._exit(), sys.exit() or native code. "
+        "Let it return or raise instead."
+    )
+
+
+def _block(title: str, lines: Sequence[str]) -> str:
+    return "\n".join([title, *(f"  | {line}" for line in lines)])

@@ -1,0 +1,63 @@
+"""``Process``: multiprocessing's, run by Fiber.
+
+The class is multiprocessing's own BaseProcess underneath, so that ``current_process``,
+``active_children``, names, authentication keys and daemon flags are shared with it.
+"""
+
+from __future__ import annotations
+
+import os
+from multiprocessing import process as _mp
+from multiprocessing.process import (
+    BaseProcess,
+    active_children,
+    current_process,
+    parent_process,
+)
+from typing import Any
+
+__all__ = ["BaseProcess", "Process", "active_children", "current_process", "parent_process"]
+
+
+class Process(BaseProcess):
+    """A process that Fiber starts: a subprocess on a laptop, a child in a pod on a cluster.
+
+    As ``multiprocessing.Process``, with one difference: a daemonic process may have children too,
+    which end with it.
+    """
+
+    _start_method: str | None = None
+
+    def _Popen(self) -> Any:  # type: ignore[override]  # noqa: N802 - multiprocessing's name
+        from fiber import context
+        from fiber._runtime.popen import Popen
+
+        return Popen(self, context.zygote_method(self._start_method))
+
+    def start(self) -> None:
+        """Start it; returns when it has a pid."""
+        self._check_closed()  # type: ignore[attr-defined]
+        assert self._popen is None, "cannot start a process twice"  # type: ignore[attr-defined]
+        assert self._parent_pid == os.getpid(), (  # type: ignore[attr-defined]
+            "can only start a process object created by current process"
+        )
+        if getattr(current_process(), "_inheriting", False):
+            raise RuntimeError(UNGUARDED_MAIN)
+        _mp._cleanup()  # type: ignore[attr-defined]
+        self._popen = self._Popen()
+        self._sentinel = self._popen.sentinel
+        # The child has them now; here they would keep the target's arguments alive.
+        del self._target, self._args, self._kwargs  # type: ignore[attr-defined]
+        _mp._children.add(self)  # type: ignore[attr-defined]
+
+
+UNGUARDED_MAIN = """\
+a process was started while its own parent's main module was being imported.
+
+The program starts processes at the top level of its main module, and each of them imports that
+module first. Put what starts processes under
+
+    if __name__ == "__main__":
+        ...
+"""
+

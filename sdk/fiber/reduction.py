@@ -1,0 +1,162 @@
+"""How objects become bytes: plain pickle first, cloudpickle where that fails.
+
+multiprocessing's ``ForkingPickler`` and its registered reducers are used as they are, so that what
+pickles there pickles here.  Lambdas, closures and classes of an interactive session, which do not
+pickle there, travel by value.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import sys
+from collections import ChainMap
+from collections.abc import Callable
+from functools import partial
+from multiprocessing import context as mp_context
+from multiprocessing import reduction as mp_reduction
+from multiprocessing.reduction import ForkingPickler, register
+from typing import Any
+
+from fiber._agent import child
+from fiber._wire import packet
+
+__all__ = ["AbstractReducer", "ForkingPickler", "Spawning", "dump", "dumps", "register"]
+
+AbstractReducer = mp_reduction.AbstractReducer
+
+
+class InheritedDescriptor:
+    """A descriptor that travels with the start message, as the payload names it."""
+
+    def __init__(self, index: int) -> None:
+        self._index = index
+
+    def detach(self) -> int:
+        """In the child: the descriptor itself, once."""
+        return child.take_descriptor(self._index)
+
+
+class Spawning:
+    """What multiprocessing calls the spawning popen: collects descriptors while a Process is pickled."""
+
+    DupFd = InheritedDescriptor
+
+    def __init__(self) -> None:
+        self.fds: list[int] = []
+
+    def duplicate_for_child(self, fd: int) -> int:
+        """Send ``fd`` along; the index under which the child finds it."""
+        self.fds.append(os.dup(fd))
+        return len(self.fds) - 1
+
+    def reset(self) -> None:
+        """Forget what was collected."""
+        for fd in self.fds:
+            os.close(fd)
+        self.fds.clear()
+
+
+def spawning() -> Any:
+    """The Spawning in progress on this thread, None outside of a start on this host."""
+    return mp_context.get_spawning_popen()
+
+
+def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
+    """Pickle a Process that is being started; on the same host its descriptors go along.
+
+    The caller owns the returned descriptors.
+    """
+    attempt = Spawning()
+    mp_context.set_spawning_popen(attempt if same_host else RemoteSpawning())
+    try:
+        payload = dumps(process, by_value=not same_host, before_retry=attempt.reset)
+    except BaseException:
+        attempt.reset()
+        raise
+    finally:
+        mp_context.set_spawning_popen(None)
+    return payload, attempt.fds
+
+
+class RemoteSpawning:
+    """Marks a start on another host: multiprocessing's checks pass, but no descriptor can go along."""
+
+    def duplicate_for_child(self, fd: int) -> int:
+        """Refuse."""
+        raise RuntimeError(
+            f"descriptor {fd} cannot go to a process on another host: "
+            "use Fiber's Pipe and Queue there instead of multiprocessing's or a socket"
+        )
+
+    DupFd = duplicate_for_child
+
+
+def dumps(
+    obj: Any,
+    protocol: int | None = None,
+    *,
+    by_value: bool = False,
+    buffer_callback: Callable[[pickle.PickleBuffer], Any] | None = None,
+    before_retry: Callable[[], None] = lambda: None,
+) -> bytes:
+    """Pickle ``obj``, by reference where possible.
+
+    ``by_value``: the reader cannot import our ``__main__``, so what lives there goes by value.
+    """
+    by_value = by_value or main_is_interactive()
+    try:
+        data = _dump(_Forking, obj, protocol, buffer_callback)
+        if not (by_value and b"__main__" in data):
+            return data
+    except Exception:  # noqa: S110 - whether or not cloudpickle can do it, its error says as much
+        pass
+    before_retry()
+    return _dump(_by_value_pickler(), obj, protocol, buffer_callback)
+
+
+def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
+    """Pickle ``obj`` for a packet: the pickle, and large buffers beside it."""
+    try:
+        encoded = packet.dumps(obj)
+        if not (b"__main__" in encoded[0] and main_is_interactive()):
+            return encoded
+    except Exception:  # noqa: S110 - as above
+        pass
+    return packet.dumps(obj, partial(_dump, _by_value_pickler()))
+
+
+def dump(obj: Any, file: Any, protocol: int | None = None) -> None:
+    """Write the pickle of ``obj`` to ``file``."""
+    file.write(dumps(obj, protocol))
+
+
+def main_is_interactive() -> bool:
+    """Whether a child has no file or module name from which it could import our ``__main__``."""
+    main = sys.modules.get("__main__")
+    return getattr(main, "__file__", None) is None and getattr(main, "__spec__", None) is None
+
+
+class _Forking(ForkingPickler):
+    """ForkingPickler that accepts ``buffer_callback``."""
+
+    def __init__(self, file: Any, protocol: int | None, **options: Any) -> None:
+        pickle.Pickler.__init__(self, file, protocol, **options)
+        self.dispatch_table = self._copyreg_dispatch.new_child(self._extra_reducers)  # type: ignore[attr-defined]
+
+
+def _by_value_pickler() -> Any:
+    import cloudpickle
+
+    class ByValue(cloudpickle.Pickler):  # type: ignore[misc]
+        dispatch_table = ChainMap(ForkingPickler._extra_reducers, cloudpickle.Pickler.dispatch_table)  # type: ignore[attr-defined]
+
+    return ByValue
+
+
+def _dump(pickler: Any, obj: Any, protocol: int | None = None, buffer_callback: Any = None) -> bytes:
+    buffer = io.BytesIO()
+    options = {"buffer_callback": buffer_callback} if buffer_callback else {}
+    pickler(buffer, protocol or pickle.DEFAULT_PROTOCOL, **options).dump(obj)
+    return buffer.getvalue()

@@ -1,0 +1,43 @@
+"""multiprocessing's utilities: finalizers, logging, exit functions.  Shared, not copied."""
+
+from multiprocessing.util import (
+    DEBUG,
+    INFO,
+    NOTSET,
+    SUBDEBUG,
+    SUBWARNING,
+    Finalize,
+    ForkAwareLocal,
+    ForkAwareThreadLock,
+    close_all_fds_except,
+    debug,
+    get_logger,
+    get_temp_dir,
+    info,
+    is_exiting,
+    log_to_stderr,
+    register_after_fork,
+    sub_debug,
+    sub_warning,
+)
+
+__all__ = [
+    "DEBUG",
+    "INFO",
+    "NOTSET",
+    "SUBDEBUG",
+    "SUBWARNING",
+    "Finalize",
+    "ForkAwareLocal",
+    "ForkAwareThreadLock",
+    "close_all_fds_except",
+    "debug",
+    "get_logger",
+    "get_temp_dir",
+    "info",
+    "is_exiting",
+    "log_to_stderr",
+    "register_after_fork",
+    "sub_debug",
+    "sub_warning",
+]
