@@ -27,7 +27,7 @@ from fiber._agent.child import interpreter_arguments
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
-from fiber._transport.unix import naming_the_limit
+from fiber._transport.unix import socketpair
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike
 
@@ -149,8 +149,7 @@ class LocalChild:
             self._open_channel(agent)
 
     def _open_channel(self, agent: Agent) -> None:
-        with naming_the_limit("starting a pool worker"):
-            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours, theirs = socketpair("starting a pool worker")
         ours.setblocking(False)
         self.slot = agent._board.claim()
         # We keep the child's end too: what it has not read when it dies, or when another worker is
@@ -237,8 +236,7 @@ class _ZygoteLink:
     def __init__(self, agent: Agent, loop: Loop, board: int, *, preload: bool) -> None:
         self._agent = agent
         self._loop = loop
-        with naming_the_limit("starting the zygote"):
-            self._sock, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._sock, theirs = socketpair("starting the zygote")
         try:
             self._process = _launch(theirs.fileno(), board, preload=preload)
         finally:

@@ -1,7 +1,8 @@
 """How much work one message carries, and how many messages one worker is given ahead.
 
-Pure: numbers in, numbers out.  A message should carry about a millisecond of work, so that its cost
-disappears beside it; tasks of a second travel one by one, tasks of a microsecond by the thousand.
+Pure: numbers in, numbers out.  A message should carry about a millisecond of work, so that its
+cost disappears beside it: tasks of a second travel one by one, tasks of a microsecond by the
+thousand.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ LIMIT = 1 << 14
 """Tasks in one message, however short they are."""
 
 SLOW = 50e-3
-"""Tasks of this many seconds are not queued behind another one: the gap between two no longer shows."""
+"""Tasks of this many seconds do not queue behind another: the gap between two cannot be seen."""
 
 STRIDE_SECONDS = 50e-6
 STRIDE_LIMIT = 64
@@ -31,9 +32,9 @@ class Pace:
     __slots__ = ("largest", "seconds")
 
     def __init__(self, earlier: Pace | None = None) -> None:
-        """Start from nothing, or from what ``earlier`` knew of the same function, trusted a little."""
-        self.seconds = earlier.seconds if earlier else None
-        self.largest = min(earlier.largest, RESUMED) if earlier else 0
+        """Start from nothing, or from what was known of the same function, trusted a little."""
+        self.seconds: float | None = earlier.seconds if earlier else None
+        self.largest: int = min(earlier.largest, RESUMED) if earlier else 0
 
     def observe(self, tasks: int, seconds: float) -> None:
         """Take in that ``tasks`` of them took ``seconds`` together."""
@@ -47,7 +48,7 @@ class Pace:
     def batch_size(self, waiting: int, workers: int, unit: int = 1) -> int:
         """Tasks to send next: whole units of ``unit``, at least one, at most what is ``waiting``.
 
-        Never more than half of a worker's fair share of what is left, so that all finish together.
+        Never more than half of a worker's fair share of what waits, so that all end together.
         """
         if self.seconds is None:
             wanted = 1
@@ -57,14 +58,14 @@ class Pace:
         return min(max(units, 1) * unit, waiting)
 
     def depth(self) -> int:
-        """Messages in flight for each worker: one that runs and, unless tasks are slow, one queued."""
+        """Messages in flight for each worker: the one that runs and, if tasks are fast, another."""
         return 1 if self.seconds is not None and self.seconds >= SLOW else 2
 
     def stride(self) -> int:
         """Tasks that a worker runs for each note of where it is.
 
-        The notes tell which task killed it.  Of several very short ones between two notes all are
-        suspects, and running them again one by one costs nothing.
+        The notes tell which task killed it.  Of several very short ones between two notes all
+        are suspects, and running them again one by one costs nothing.
         """
         if self.seconds is None:
             return 1

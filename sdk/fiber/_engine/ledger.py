@@ -2,20 +2,20 @@
 
 ::
 
-    feed ──► waiting ──assign──► sent to a worker ──receive──► done
-                ▲                       │
-                └── take_back, split, ──┘
-                    lose, retry
+    feed ──► waiting ──assign──► in a batch ──receive──► done
+                ▲                     │
+                └─ put_back, split, ──┘
+                   lose, retry
 
-* A **task** is one call, known by its job and its index in it.  At every moment it waits, is in exactly
-  one batch, or is done; it becomes done once.
-* A **batch** is a contiguous slice of one job's tasks, sent to one worker in one message and known by
-  its sequence number.  What it brings back counts only while the ledger knows the number, so late,
-  duplicate and foreign results fall off.
-* A worker has at most one batch that it runs and one that it has not read yet.
+* A **task** is one call, known by its job and its index in it.  At every moment it waits, is in
+  exactly one batch, or is done.
+* A **batch** is a contiguous slice of one job's tasks, sent to one worker in one message and known
+  by its sequence number.  Results count only while the ledger knows the number and only from
+  where the last ones ended, so late, duplicate and foreign ones fall off.
+* A **worker** has at most one batch that it runs and one that it has not read yet.
 
-No clock, no I/O: ``now`` is an argument; the caller sends what ``assign`` returns, kills, starts and
-delivers.  Not thread-safe: one lock around it.
+No clock and no I/O: ``now`` is an argument, the caller sends what ``assign`` returns.  Not
+thread-safe: one lock around it.
 """
 
 from __future__ import annotations
@@ -23,132 +23,55 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from fiber._engine.chunks import Pace
+from fiber._engine.roster import PATIENCE, Roster
 from fiber._engine.spans import Span, Waiting
+from fiber._engine.tasks import Batch, Job, Loss, Receipt, Worker
 
-PATIENCE = 2e-3
-"""Seconds that a worker's current batch may take before idle workers ask for the one behind it."""
-
-
-class Job:
-    """The tasks of one call.  Made by ``Ledger.open``."""
-
-    __slots__ = (
-        "alone", "attempts", "closed", "done", "fed", "listed", "owner", "pace", "retries", "unit", "waiting"
-    )
-
-    def __init__(self, owner: Any, pace: Pace, retries: int, unit: int, alone: bool) -> None:
-        self.owner = owner
-        self.pace = pace
-        self.retries = retries
-        self.unit = unit
-        self.alone = alone or retries == 0
-        self.waiting = Waiting()
-        self.attempts: dict[int, int] = {}
-        self.fed = 0
-        self.done = 0
-        self.closed = False
-        self.listed = False
-
-    @property
-    def finished(self) -> bool:
-        """No task will come any more and all that came are done."""
-        return self.closed and self.done == self.fed
-
-
-class Batch:
-    """A slice of a job's tasks in one message.  ``job`` is None once nobody wants its results."""
-
-    __slots__ = ("alone", "items", "job", "pin", "received", "seq", "start", "stride", "worker")
-
-    def __init__(self, seq: int, job: Job, worker: Worker, span: Span, stride: int) -> None:
-        self.seq = seq
-        self.job: Job | None = job
-        self.worker = worker
-        self.start = span.start
-        self.items: Sequence[Any] = span.items
-        self.alone = span.alone
-        self.pin = span.pin
-        self.stride = stride
-        self.received = 0
-
-    @property
-    def units(self) -> int:
-        """What this batch counts for maxtasksperchild."""
-        return -(-len(self.items) // self.job.unit) if self.job else 0
-
-    def rest(self) -> Span:
-        """The tasks without a result."""
-        return Span(self.start + self.received, self.items[self.received :], self.alone, self.pin)
-
-
-class Worker:
-    """What one worker holds.  ``left``: units that it may still be given (maxtasksperchild)."""
-
-    __slots__ = ("key", "leaving", "left", "pinned", "queue", "recalled", "since")
-
-    def __init__(self, key: Any, left: int | None) -> None:
-        self.key = key
-        self.left = left
-        self.queue: deque[Batch] = deque()
-        self.pinned: deque[tuple[Job, Span]] = deque()
-        self.since = 0.0
-        self.recalled = False
-        self.leaving = False
-
-    @property
-    def spent(self) -> bool:
-        """It did all that it may do, and can go."""
-        return self.left == 0 and not self.queue
-
-
-class Loss(NamedTuple):
-    """A task that was running in too many workers when they died."""
-
-    job: Job
-    index: int
-    attempts: int
-
-
-class Receipt(NamedTuple):
-    """Results that count: ``count`` tasks of ``job`` from ``start`` on, whose ``items`` they answer."""
-
-    job: Job
-    start: int
-    items: Sequence[Any]
+__all__ = ["PATIENCE", "Batch", "Job", "Ledger", "Loss", "Receipt", "Span", "Worker"]
 
 
 class Ledger:
-    """The ledger of one pool."""
+    """The ledger of one pool.
+
+    ``starting``, kept by the caller, is the number of workers that will be added soon.
+    """
 
     def __init__(self) -> None:
         self.jobs: set[Job] = set()
         self.workers: set[Worker] = set()
         self.batches: dict[int, Batch] = {}
-        self.starting = 0  # workers that will be added soon; kept by the caller
+        self.starting = 0
         self._seq = itertools.count(1)
         self._turns: deque[Job] = deque()
-        # Insertion-ordered sets of the workers that may be given something, by what they hold.
-        self._idle: dict[Worker, None] = {}
-        self._single: dict[Worker, None] = {}
-        self._deep: dict[Worker, None] = {}
+        self._roster = Roster()
         self._pins: dict[Worker, None] = {}
 
-    # -- jobs ---------------------------------------------------------------------------------------
+    # Jobs
 
     def open(
-        self, owner: Any = None, *, pace: Pace | None = None, retries: int = 3, unit: int = 1, alone: bool = False
+        self,
+        owner: Any = None,
+        *,
+        pace: Pace | None = None,
+        retries: int = 3,
+        unit: int = 1,
+        alone: bool = False,
     ) -> Job:
-        """A new job.  ``unit``: its tasks are given out in contiguous chunks of at least this many.
-        ``alone``: each task travels alone, to an idle worker, with nothing queued behind it."""
+        """A new job; a task of it runs again at most ``retries`` times.
+
+        ``unit``: its tasks are given out in contiguous chunks of at least this many.  ``alone``:
+        each travels alone, to an idle worker, with nothing queued behind it.  Without retries
+        they always do: a crash must not leave in doubt whether another task ran.
+        """
         job = Job(owner, pace or Pace(), retries, unit, alone)
         self.jobs.add(job)
         return job
 
     def feed(self, job: Job, items: Sequence[Any]) -> None:
-        """More tasks for ``job``; ``items`` is sliced as it is sent, and must not change.
+        """More tasks for ``job``; ``items`` is sliced as it is sent and must not change.
 
         A list is taken over: the ledger may append to it.
         """
@@ -177,7 +100,7 @@ class Ledger:
     def cancel(self, job: Job) -> list[Worker]:
         """Forget a job: nothing of it is sent or counted any more.
 
-        Returns the workers that hold unread batches of it, worth a ``take_back``.
+        Returns the workers that hold unread batches of it, worth a recall.
         """
         job.waiting = Waiting()
         self.jobs.discard(job)
@@ -193,14 +116,14 @@ class Ledger:
                 del self._pins[worker]
         return holders
 
-    # -- workers ------------------------------------------------------------------------------------
+    # Workers
 
     def add(self, key: Any, now: float, left: int | None = None) -> Worker:
-        """A worker that is ready for work."""
+        """A worker that is ready for work, ``left`` units of it (None: any number)."""
         worker = Worker(key, left)
         worker.since = now
         self.workers.add(worker)
-        self._shelve(worker)
+        self._roster.sort(worker)
         return worker
 
     def leave(self, worker: Worker) -> bool:
@@ -208,26 +131,26 @@ class Ledger:
         if worker.queue or worker.pinned:
             return False
         worker.leaving = True
-        self._shelve(worker)
+        self._roster.sort(worker)
         return True
 
-    @property
     def idle(self) -> list[Worker]:
         """Workers with nothing to do, the one that has been so for longest first."""
-        return list(self._idle)
+        return list(self._roster.idle)
 
     def demand(self) -> int:
-        """Tasks that wait or run, capped at what is worth asking: the number of workers that could be used."""
-        return sum(len(job.waiting) for job in self._turns) + sum(
-            len(batch.items) - batch.received for batch in self.batches.values()
-        )
+        """Tasks that wait or run: as many workers could be used."""
+        waiting = sum(len(job.waiting) for job in self._turns)
+        running = sum(len(batch.items) - batch.received for batch in self.batches.values())
+        pinned = sum(len(worker.pinned) for worker in self._pins)
+        return waiting + running + pinned
 
-    # -- giving -------------------------------------------------------------------------------------
+    # Giving
 
     def assign(self, now: float) -> Batch | None:
-        """The next batch to send, or None when no worker may be given anything.
+        """The next batch to send, or None when nobody may be given anything.
 
-        Idle workers come first, the last used before others; jobs take turns.
+        Idle workers come first; jobs take turns.
         """
         if self._pins and (batch := self._assign_pinned(now)):
             return batch
@@ -238,13 +161,14 @@ class Ledger:
                 self._turns.popleft()
                 continue
             self._turns.rotate(-1)
-            if (worker := self._worker_for(job)) is not None:
+            worker = self._worker_for(job)
+            if worker is not None:
                 return self._cut(job, worker, now)
         return None
 
     def _assign_pinned(self, now: float) -> Batch | None:
         for worker in self._pins:
-            if worker in self._idle:
+            if worker in self._roster.idle:
                 job, span = worker.pinned.popleft()
                 if not worker.pinned:
                     del self._pins[worker]
@@ -252,38 +176,48 @@ class Ledger:
         return None
 
     def _worker_for(self, job: Job) -> Worker | None:
-        if self._idle:
-            return next(reversed(self._idle))
-        if job.waiting.first_alone() or len(job.waiting) <= self.starting or job.pace.depth() < 2:
+        idle = self._roster.last_idle()
+        if idle is not None:
+            return idle
+        # What a worker that is about to start can run should not queue behind something else.
+        if len(job.waiting) <= self.starting or job.pace.depth() < 2 or job.waiting.first_alone():
             return None
-        return next(iter(self._single), None)
+        return self._roster.first_single()
 
     def _cut(self, job: Job, worker: Worker, now: float) -> Batch:
-        size = job.pace.batch_size(len(job.waiting), len(self.workers) + self.starting or 1, job.unit)
+        workers = len(self.workers) + self.starting
+        size = job.pace.batch_size(len(job.waiting), workers, job.unit)
         if worker.left is not None:
             size = min(size, worker.left * job.unit)
         return self._send(job, worker, job.waiting.take(size), now)
 
     def _send(self, job: Job, worker: Worker, span: Span, now: float) -> Batch:
-        batch = Batch(next(self._seq), job, worker, span, job.pace.stride())
+        batch = Batch(next(self._seq), job, worker, span)
         self.batches[batch.seq] = batch
         if not worker.queue:
             worker.since = now
         worker.queue.append(batch)
         if worker.left is not None:
             worker.left -= min(batch.units, worker.left)
-        self._shelve(worker)
+        self._roster.sort(worker)
         return batch
 
-    # -- taking -------------------------------------------------------------------------------------
+    # Taking
 
     def receive(
-        self, seq: int, offset: int, count: int, now: float, *, seconds: float = 0.0, kept: int | None = None
+        self,
+        seq: int,
+        offset: int,
+        count: int,
+        now: float,
+        *,
+        seconds: float = 0.0,
+        kept: int | None = None,
     ) -> Receipt | None:
-        """``count`` results of batch ``seq``, its tasks from ``offset`` on; None if they do not count.
+        """``count`` results of batch ``seq``, its tasks from ``offset`` on; None: they don't count.
 
-        ``seconds`` is what they took.  ``kept``: the worker keeps only that many tasks of the batch and
-        gives the rest back.
+        ``seconds`` is what they took.  ``kept``: the worker keeps only that many tasks of the
+        batch, with or without a result, and gives the rest back.
         """
         batch = self.batches.get(seq)
         if batch is None or offset != batch.received or offset + count > len(batch.items):
@@ -291,12 +225,12 @@ class Ledger:
         receipt = None
         job = batch.job
         if job is not None:
-            receipt = Receipt(job, batch.start + offset, batch.items[offset : offset + count])
+            receipt = Receipt(job, batch.start + offset, count, batch)
             job.done += count
             job.pace.observe(count, seconds)
         batch.received += count
         if kept is not None:
-            self._cut_short(batch, kept)
+            self._cut_short(batch, max(kept, batch.received))
         if batch.received == len(batch.items):
             self._close_batch(batch, now)
         if job is not None:
@@ -304,26 +238,27 @@ class Ledger:
         return receipt
 
     def _cut_short(self, batch: Batch, kept: int) -> None:
-        kept = max(kept, batch.received)
-        rest = batch.items[kept:]
-        if not len(rest):
+        at, stop = batch.start + kept, batch.stop
+        if at >= stop:
             return
         units = batch.units
-        batch.items = batch.items[:kept]
-        if batch.job is not None:
-            self._return(batch.job, Span(batch.start + kept, rest))
+        rest = batch.span.part(at, stop)
+        batch.span = batch.span.part(batch.start, at)
         if batch.worker.left is not None:
             batch.worker.left += units - batch.units
+        if batch.job is not None:
+            self._return(batch.job, rest)
 
     def _close_batch(self, batch: Batch, now: float) -> None:
         del self.batches[batch.seq]
         worker = batch.worker
+        if worker.queue[0] is batch:
+            worker.since = now
         worker.queue.remove(batch)
-        worker.since = now
-        self._shelve(worker)
+        self._roster.sort(worker)
 
     def retry(self, receipt: Receipt, index: int) -> bool:
-        """Run a task again whose result was received but is not good enough.  False: it had its tries."""
+        """Run a task again whose result is not good enough.  False: it had its tries."""
         job = receipt.job
         if job not in self.jobs and not job.finished:
             return False  # cancelled
@@ -331,11 +266,15 @@ class Ledger:
             return False
         job.done -= 1
         self.jobs.add(job)
-        self._return(job, Span(index, [receipt.items[index - receipt.start]], alone=True))
+        span = receipt.batch.span.part(index, index + 1, alone=True)
+        if span.pin:
+            self.pin_again(job, receipt.batch.worker, span)
+        else:
+            self._return(job, span)
         return True
 
     def put_back(self, worker: Worker, seqs: Iterable[int], now: float) -> None:
-        """The answer to a recall: these batches were never read by ``worker``."""
+        """The answer to a recall: ``worker`` never read these batches."""
         worker.recalled = False
         for batch in sorted(self._held(worker, seqs), key=_by_seq, reverse=True):
             self._withdraw(batch, now)
@@ -343,9 +282,9 @@ class Ledger:
                 self._return(batch.job, batch.rest())
 
     def split(self, seq: int, now: float) -> Receipt | None:
-        """The worker could not read the message: send its tasks again, one by one, to find the culprit.
+        """The worker cannot read the message: send its tasks again, one by one.
 
-        A batch of one is the culprit: then it counts as done, and the receipt says whose it is.
+        A batch of one is the culprit: then its task is done, and the receipt says whose it is.
         """
         batch = self.batches.get(seq)
         if batch is None:
@@ -359,90 +298,92 @@ class Ledger:
         return None
 
     def expire(self, seq: int) -> Receipt | None:
-        """The task of batch ``seq`` (sent alone) ran out of time: done, while its worker still runs it."""
+        """The task of batch ``seq``, sent alone, ran out of time: it is done.
+
+        Its worker, which still runs it, is given nothing more.
+        """
         batch = self.batches.get(seq)
         if batch is None or batch.job is None:
             return None
         job, batch.job = batch.job, None
+        batch.worker.leaving = True
         job.done += 1
         self._finish(job)
-        return Receipt(job, batch.start, batch.items)
+        return Receipt(job, batch.start, 1, batch)
 
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for the batch that they have not read, since others have nothing to do."""
-        if not self._idle or any(job.waiting for job in self._turns):
+        if not self._roster.idle or any(job.waiting for job in self._turns):
             return []
-        victims = []
-        for worker in itertools.islice(self._deep, len(self._idle)):
-            if now - worker.since >= PATIENCE and not worker.recalled:
-                worker.recalled = True
-                victims.append(worker)
-        return victims
+        return self._roster.recall(now)
 
     def next_recall(self) -> float | None:
         """When ``recall`` could next return something, if nothing else happens."""
-        if not self._idle or not self._deep:
-            return None
-        return min((w.since + PATIENCE for w in itertools.islice(self._deep, len(self._idle)) if not w.recalled),
-                   default=None)
+        return self._roster.next_recall()
 
-    # -- losing -------------------------------------------------------------------------------------
+    # Losing
 
     def lose(
         self, worker: Worker, unread: Iterable[int], running: tuple[int, int] | None
     ) -> tuple[list[Loss], list[tuple[Job, Span]]]:
-        """``worker`` is gone.  Its tasks wait again; those it was running are charged an attempt.
+        """``worker`` is gone; its tasks wait again.  Those it was running are charged an attempt.
 
-        ``unread``: batches that it never read.  ``running``: batch and offset of the task it was in.
-        Returns the tasks that had their tries, which are done by that, and the pinned ones, which need
-        another worker (``pin_again``).
+        ``unread``: batches that it never read.  ``running``: batch and offset of the task it was
+        in.  Returns the tasks that had their tries, which are done by that, and the pinned ones,
+        which need another worker (``pin_again``).
         """
         self.workers.discard(worker)
-        worker.leaving = True
-        untouched = {id(batch) for batch in self._held(worker, unread)}
+        self._pins.pop(worker, None)
+        untouched = {batch.seq for batch in self._held(worker, unread)}
         losses: list[Loss] = []
         homeless = list(worker.pinned)
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):
             del self.batches[batch.seq]
-            job = batch.job
-            if job is None:
-                continue
-            suspects = range(0) if id(batch) in untouched else _suspects(batch, running)
-            for span in reversed(_around(batch.rest(), suspects)):
-                if span.start in suspects and not self._charge(job, span.start):
-                    losses.append(Loss(job, span.start, job.attempts.pop(span.start)))
-                    job.done += 1
-                elif span.pin:
-                    homeless.append((job, span))
-                else:
-                    self._return(job, span)
-            self._finish(job)
+            if batch.job is not None:
+                suspects = range(0) if batch.seq in untouched else batch.suspects(running)
+                self._lose_batch(batch.job, batch.rest(), suspects, losses, homeless)
+        worker.leaving = True
         worker.queue.clear()
         worker.pinned.clear()
-        self._pins.pop(worker, None)
-        self._shelve(worker)
+        self._roster.sort(worker)
         losses.reverse()
         return losses, homeless
 
-    # -- inside -------------------------------------------------------------------------------------
+    def _lose_batch(
+        self,
+        job: Job,
+        rest: Span,
+        suspects: range,
+        losses: list[Loss],
+        homeless: list[tuple[Job, Span]],
+    ) -> None:
+        for span in reversed(_around(rest, suspects)):
+            if span.start in suspects and not self._charge(job, span.start):
+                losses.append(Loss(job, span.start, job.attempts.pop(span.start), span.items[0]))
+                job.done += 1
+            elif span.pin:
+                homeless.append((job, span))
+            else:
+                self._return(job, span)
+        self._finish(job)
+
+    # Inside
 
     def _held(self, worker: Worker, seqs: Iterable[int]) -> list[Batch]:
         found = (self.batches.get(seq) for seq in seqs)
         return [batch for batch in found if batch is not None and batch.worker is worker]
 
     def _withdraw(self, batch: Batch, now: float) -> None:
-        worker = batch.worker
-        if worker.left is not None:
-            worker.left += batch.units
-        self._close_batch(batch, now if worker.queue[0] is batch else worker.since)
+        if batch.worker.left is not None:
+            batch.worker.left += batch.units
+        self._close_batch(batch, now)
 
     def _charge(self, job: Job, index: int) -> bool:
-        """Count one more lost run; False if that was the last one allowed."""
+        """Count one more run that came to nothing; False if that was the last one allowed."""
         job.attempts[index] = attempts = job.attempts.get(index, 0) + 1
         return attempts <= job.retries
 
     def _return(self, job: Job, span: Span) -> None:
-        span.alone = span.alone or job.alone
         job.waiting.appendleft(span)
         self._list(job)
 
@@ -456,43 +397,19 @@ class Ledger:
             self.jobs.discard(job)
         return job.finished
 
-    def _shelve(self, worker: Worker) -> None:
-        """Put the worker where ``assign`` looks for one that holds as much as it does."""
-        self._idle.pop(worker, None)
-        self._single.pop(worker, None)
-        queue = worker.queue
-        if len(queue) < 2:
-            self._deep.pop(worker, None)
-        elif worker not in self._deep:
-            self._deep[worker] = None
-        if worker.leaving or worker.left == 0:
-            return
-        if not queue:
-            self._idle[worker] = None
-        elif len(queue) == 1 and not queue[0].alone and not worker.pinned:
-            self._single[worker] = None
-
 
 def _by_seq(batch: Batch) -> int:
     return batch.seq
 
 
-def _suspects(batch: Batch, running: tuple[int, int] | None) -> range:
-    """Indexes of the tasks one of which was running: all that have no result, if nothing is known."""
-    first, end = batch.start + batch.received, batch.start + len(batch.items)
-    if running is None or running[0] != batch.seq:
-        return range(first, end)
-    at = batch.start + running[1]
-    return range(max(first, at), min(end, at + batch.stride))
-
-
 def _around(span: Span, suspects: range) -> list[Span]:
     """``span`` in pieces: what lies before the suspects, each of them alone, what lies behind."""
     if not suspects:
-        return [span]
-    first, last = suspects.start - span.start, suspects.stop - span.start
-    pieces = [Span(span.start, span.items[:first], span.alone, span.pin)] if first else []
-    pieces += Span(suspects.start, span.items[first:last], span.alone, span.pin).singly()
-    if last < len(span.items):
-        pieces.append(Span(suspects.stop, span.items[last:], span.alone, span.pin))
+        return [span] if len(span.items) else []
+    pieces = []
+    if span.start < suspects.start:
+        pieces.append(span.part(span.start, suspects.start))
+    pieces += span.part(suspects.start, suspects.stop).singly()
+    if suspects.stop < span.start + len(span.items):
+        pieces.append(span.part(suspects.stop, span.start + len(span.items)))
     return pieces

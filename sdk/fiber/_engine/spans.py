@@ -11,19 +11,30 @@ COMPACT = 1024
 
 
 class Span:
-    """Tasks ``start``, ``start + 1``, ... with their ``items``.  ``alone``: one a message; ``pin``: one worker's."""
+    """Tasks ``start``, ``start + 1``, ... with their ``items``.
+
+    ``alone``: they travel one a message; ``pin``: only one certain worker may run them.
+    """
 
     __slots__ = ("alone", "items", "pin", "start")
 
-    def __init__(self, start: int, items: Sequence[Any], alone: bool = False, pin: bool = False) -> None:
+    def __init__(
+        self, start: int, items: Sequence[Any], alone: bool = False, pin: bool = False
+    ) -> None:
         self.start = start
         self.items = items
         self.alone = alone
         self.pin = pin
 
+    def part(self, first: int, stop: int, *, alone: bool = False) -> Span:
+        """The tasks from ``first`` to before ``stop``, as indexes of the job."""
+        items = self.items[first - self.start : stop - self.start]
+        return Span(first, items, alone or self.alone, self.pin)
+
     def singly(self) -> list[Span]:
         """Each task as a span that travels alone."""
-        return [Span(self.start + at, self.items[at : at + 1], True, self.pin) for at in range(len(self.items))]
+        first = self.start
+        return [self.part(at, at + 1, alone=True) for at in range(first, first + len(self.items))]
 
 
 class _Stock:

@@ -29,6 +29,20 @@ def naming_the_limit(doing: str) -> Iterator[None]:
         raise
 
 
+def socketpair(doing: str) -> tuple[socket.socket, socket.socket]:
+    """Two connected packet sockets that block, whatever the program's default timeout is."""
+    with naming_the_limit(doing):
+        pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    for sock in pair:
+        _block(sock)
+    return pair
+
+
+def _block(sock: socket.socket) -> None:
+    if sock.gettimeout() is not None:  # socket.setdefaulttimeout() is for the user's own
+        sock.settimeout(None)
+
+
 class UnixChannel:
     """A ``SOCK_SEQPACKET`` socket whose messages are packets."""
 
@@ -40,14 +54,15 @@ class UnixChannel:
     @classmethod
     def pair(cls) -> tuple[UnixChannel, UnixChannel]:
         """Two connected ends."""
-        with naming_the_limit("opening a pipe"):
-            one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        one, other = socketpair("opening a pipe")
         return cls(one), cls(other)
 
     @classmethod
     def from_fd(cls, fd: int) -> UnixChannel:
         """Take over a descriptor."""
-        return cls(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd))
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd)
+        _block(sock)
+        return cls(sock)
 
     @property
     def sock(self) -> socket.socket:
@@ -55,8 +70,11 @@ class UnixChannel:
         return self._sock
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message, waiting for room."""
-        packet.send(self._sock, payload, buffers)
+        """Send one message, waiting for room; a bulky one until it is read."""
+        if packet.send(self._sock, payload, buffers, ballast=True):
+            poller = select.poll()
+            poller.register(self._sock, select.POLLOUT)
+            poller.poll()
 
     def recv(self) -> Message:
         """The next message, EOFError at the end."""

@@ -33,6 +33,12 @@ BytesLike: TypeAlias = bytes | bytearray | memoryview
 INLINE_LIMIT = 1 << 16
 """Bytes of payload and buffers up to which a packet carries them itself."""
 
+BULK = 1 << 18
+"""Bytes above which a blocking sender waits until its message is read, as it would on a pipe."""
+
+BALLAST = bytes(1 << 16)
+"""More than a quarter of a socket's buffer (net.core.wmem_default), where it stops being writable."""
+
 OUT_OF_BAND_MIN = 1 << 12
 """Smaller buffers cost less inside the pickle than beside it."""
 
@@ -47,7 +53,7 @@ _PARTS = struct.Struct("<BIQ")
 _SIZE = struct.Struct("<Q")
 _FD = struct.Struct("i")
 _ALIGNMENT = 64
-_RECEIVE = INLINE_LIMIT + 16384
+_RECEIVE = INLINE_LIMIT + len(BALLAST) + 16384
 _ANCILLARY = socket.CMSG_SPACE(_FD.size * (MAX_DESCRIPTORS + 1))
 _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
@@ -127,12 +133,20 @@ def loads(message: Message) -> Any:
 
 
 def send(
-    sock: socket.socket, payload: BytesLike, buffers: Sequence[memoryview] = (), fds: Sequence[int] = ()
-) -> None:
+    sock: socket.socket,
+    payload: BytesLike,
+    buffers: Sequence[memoryview] = (),
+    fds: Sequence[int] = (),
+    *,
+    ballast: bool = False,
+) -> bool:
     """Send one packet.
 
     On a non-blocking socket BlockingIOError means that nothing was sent.  BrokenPipeError: no one can
     ever read it.  ``fds`` (at most MAX_DESCRIPTORS) are duplicated into whoever receives the packet.
+
+    With ``ballast`` a message above BULK weighs enough in the socket's buffer that the socket is not
+    writable until the message is read; True says that it was such a message.
     """
     size = len(payload) if isinstance(payload, bytes) else memoryview(payload).nbytes
     try:
@@ -142,17 +156,26 @@ def send(
             else:
                 sock.sendmsg((PLAIN, payload))
         else:
-            _send_parts(sock, payload, size, buffers, fds)
+            total = size + sum(view.nbytes for view in buffers)
+            weight = BALLAST if ballast and total > BULK else b""
+            _send_parts(sock, payload, size, buffers, fds, weight)
+            return bool(weight)
     except ConnectionResetError as error:
         raise BrokenPipeError(errno.EPIPE, "the other end is closed") from error
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE, errno.ETOOMANYREFS):
             raise TooManyOpenFiles("sending a message") from error
         raise
+    return False
 
 
 def _send_parts(
-    sock: socket.socket, payload: BytesLike, size: int, buffers: Sequence[memoryview], fds: Sequence[int]
+    sock: socket.socket,
+    payload: BytesLike,
+    size: int,
+    buffers: Sequence[memoryview],
+    fds: Sequence[int],
+    ballast: bytes,
 ) -> None:
     if len(buffers) > 1024:
         raise ValueError(f"a message has {len(buffers)} out-of-band buffers; at most 1024 are sent")
@@ -168,7 +191,7 @@ def _send_parts(
     sent = False
     try:
         fill(block, [memoryview(payload).cast("B"), *buffers], offsets)
-        _sendmsg(sock, [head], [block.fd, *fds])
+        _sendmsg(sock, [head, ballast], [block.fd, *fds])
         sent = True
     finally:
         _arena.settle(block, sent=sent)

@@ -1,0 +1,57 @@
+"""Who may be given work: the ready workers, sorted by how much each holds."""
+
+from __future__ import annotations
+
+import itertools
+
+from fiber._engine.tasks import Worker
+
+PATIENCE = 2e-3
+"""Seconds that a worker's current batch may take before idle ones ask for what lies behind it."""
+
+
+class Roster:
+    """The ready workers.  Dicts serve as sets that remember the order of insertion."""
+
+    def __init__(self) -> None:
+        self.idle: dict[Worker, None] = {}
+        self.single: dict[Worker, None] = {}
+        self.deep: dict[Worker, None] = {}
+
+    def sort(self, worker: Worker) -> None:
+        """Put ``worker`` where one that holds as much as it does belongs."""
+        self.idle.pop(worker, None)
+        self.single.pop(worker, None)
+        queue = worker.queue
+        if len(queue) < 2:
+            self.deep.pop(worker, None)
+        elif worker not in self.deep:
+            self.deep[worker] = None
+        if worker.leaving or worker.left == 0:
+            return
+        if not queue:
+            self.idle[worker] = None
+        elif len(queue) == 1 and not queue[0].span.alone and not worker.pinned:
+            self.single[worker] = None
+
+    def last_idle(self) -> Worker | None:
+        """The worker that became idle last: its memory is warm, and the others may leave."""
+        return next(reversed(self.idle), None)
+
+    def first_single(self) -> Worker | None:
+        """The worker that will need something to do first."""
+        return next(iter(self.single), None)
+
+    def recall(self, now: float) -> list[Worker]:
+        """Workers to ask for what they have not read, one for each idle one; marks them."""
+        victims = []
+        for worker in itertools.islice(self.deep, len(self.idle)):
+            if now - worker.since >= PATIENCE and not worker.recalled:
+                worker.recalled = True
+                victims.append(worker)
+        return victims
+
+    def next_recall(self) -> float | None:
+        """When ``recall`` could next return something, if nothing else happens."""
+        candidates = itertools.islice(self.deep, len(self.idle))
+        return min((w.since + PATIENCE for w in candidates if not w.recalled), default=None)

@@ -1,0 +1,138 @@
+"""The ledger's entries: jobs, batches and workers.  Only the ledger changes them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from fiber._engine.chunks import Pace
+from fiber._engine.spans import Span, Waiting
+
+
+class Job:
+    """The tasks of one call."""
+
+    __slots__ = (
+        "alone",
+        "attempts",
+        "closed",
+        "done",
+        "fed",
+        "listed",
+        "owner",
+        "pace",
+        "retries",
+        "unit",
+        "waiting",
+    )
+
+    def __init__(self, owner: Any, pace: Pace, retries: int, unit: int, alone: bool) -> None:
+        self.owner = owner
+        self.pace = pace
+        self.retries = retries
+        self.unit = unit
+        self.alone = alone or retries == 0
+        self.waiting = Waiting()
+        self.attempts: dict[int, int] = {}
+        self.fed = 0
+        self.done = 0
+        self.closed = False
+        self.listed = False  # whether it is in the ledger's round of turns
+
+    @property
+    def finished(self) -> bool:
+        """No task will come any more, and all that came are done."""
+        return self.closed and self.done == self.fed
+
+
+class Batch:
+    """A slice of a job's tasks in one message.
+
+    ``job`` is None once nobody wants its results; ``received`` counts those that came, ``stride``
+    is the number of tasks between two notes of the worker's progress.
+    """
+
+    __slots__ = ("job", "received", "seq", "span", "stride", "worker")
+
+    def __init__(self, seq: int, job: Job, worker: Worker, span: Span) -> None:
+        self.seq = seq
+        self.job: Job | None = job
+        self.worker = worker
+        self.span = span
+        self.stride = job.pace.stride()
+        self.received = 0
+
+    @property
+    def items(self) -> Sequence[Any]:
+        """What its tasks are made from."""
+        return self.span.items
+
+    @property
+    def start(self) -> int:
+        """The index of its first task in the job."""
+        return self.span.start
+
+    @property
+    def stop(self) -> int:
+        """The index behind its last task."""
+        return self.span.start + len(self.span.items)
+
+    @property
+    def units(self) -> int:
+        """What this batch counts for maxtasksperchild."""
+        return -(-len(self.items) // self.job.unit) if self.job else 0
+
+    def rest(self) -> Span:
+        """The tasks without a result."""
+        return self.span.part(self.start + self.received, self.stop)
+
+    def suspects(self, running: tuple[int, int] | None) -> range:
+        """Tasks one of which was running: all without a result, if nothing else is known."""
+        first, stop = self.start + self.received, self.stop
+        if running is None or running[0] != self.seq:
+            return range(first, stop)
+        at = self.start + running[1]
+        return range(max(first, at), max(first, min(stop, at + self.stride)))
+
+
+class Worker:
+    """What one worker holds.  ``left``: units that it may still be given (maxtasksperchild)."""
+
+    __slots__ = ("key", "leaving", "left", "pinned", "queue", "recalled", "since")
+
+    def __init__(self, key: Any, left: int | None) -> None:
+        self.key = key
+        self.left = left
+        self.queue: deque[Batch] = deque()
+        self.pinned: deque[tuple[Job, Span]] = deque()
+        self.since = 0.0  # when it began what it does now
+        self.recalled = False
+        self.leaving = False
+
+    @property
+    def spent(self) -> bool:
+        """It did all that it may do, and can go."""
+        return self.left == 0 and not self.queue
+
+
+class Receipt(NamedTuple):
+    """``size`` results that count: tasks of ``job`` from index ``start`` on."""
+
+    job: Job
+    start: int
+    size: int
+    batch: Batch
+
+    def item(self, index: int) -> Any:
+        """What the task ``index`` was made from."""
+        return self.batch.items[index - self.batch.start]
+
+
+class Loss(NamedTuple):
+    """A task that was running in too many workers when they died."""
+
+    job: Job
+    task: int
+    attempts: int
+    item: Any

@@ -1,0 +1,165 @@
+"""Who is there: the first words on a connection, before it belongs to a link.
+
+    agent                                master
+      │  Hello: identity, session,         │
+      │         how much has arrived       │
+      ├───────────────────────────────────►│  versions fit, session new or known?
+      │◄───────────────────────────────────┤
+         Welcome: identity, how much has arrived, heartbeat      or      Refusal: identity, reason
+
+The same exchange resumes a session on a new connection.  The layout is one byte for the kind and
+JSON.  The fields of an identity stay what they are in every version, so that two sides that do not
+understand each other can still say why.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from typing import Any, NamedTuple, TypeAlias
+
+from fiber._wire.messages import PROTOCOL, ProtocolError
+from fiber.errors import VersionMismatch
+
+_HELLO, _WELCOME, _REFUSAL = 0x10, 0x11, 0x12
+
+
+@dataclasses.dataclass(frozen=True)
+class Identity:
+    """Who one side is.  ``facts`` are what it tells about its host."""
+
+    name: str
+    protocol: int
+    python: str
+    fiber: str
+    facts: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of_this_process(cls, name: str, **facts: str) -> Identity:
+        """This interpreter and this Fiber, called ``name``."""
+        return cls(name, PROTOCOL, platform.python_version(), _fiber_version(), facts)
+
+
+class Hello(NamedTuple):
+    """An agent's first words."""
+
+    identity: Identity
+    session: str
+    """Names the session; random, so that a master that restarted takes it for no other."""
+    arrived: int
+    """The master's datagrams that the agent has."""
+    welcomed: bool
+    """Whether a master accepted this session before: then only that master can go on with it."""
+
+    def encode(self) -> bytes:
+        """The datagram."""
+        return _encode(_HELLO, self)
+
+
+class Welcome(NamedTuple):
+    """The master goes on with the agent's session."""
+
+    identity: Identity
+    arrived: int
+    """The agent's datagrams that the master has."""
+    heartbeat: float
+    """How often the agent shall be heard, in seconds."""
+
+    def encode(self) -> bytes:
+        """The datagram."""
+        return _encode(_WELCOME, self)
+
+
+class Refusal(NamedTuple):
+    """The master wants nothing to do with it."""
+
+    identity: Identity
+    reason: str
+
+    def encode(self) -> bytes:
+        """The datagram."""
+        return _encode(_REFUSAL, self)
+
+
+Greeting: TypeAlias = Hello | Welcome | Refusal
+
+
+def decode(datagram: bytes) -> Greeting:
+    """Read a greeting; ProtocolError if it is none."""
+    reader = _READERS.get(datagram[0]) if datagram else None
+    if reader is None:
+        raise ProtocolError(f"its first {len(datagram)} bytes are no greeting")
+    try:
+        fields = json.loads(datagram[1:])
+        return reader(_identity(fields["identity"]), fields)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        # Whatever JSON holds instead of what belongs there.
+        raise ProtocolError(
+            f"its greeting is malformed ({type(error).__name__}: {error})"
+        ) from None
+
+
+def mismatch(ours: Identity, theirs: Identity) -> VersionMismatch | None:
+    """Why these two cannot work together: pickles and messages cross, so both must be equal."""
+    if ours.protocol != theirs.protocol:
+        return VersionMismatch(
+            "Fiber protocol",
+            ours=f"{ours.protocol} (fiberpool {ours.fiber})",
+            theirs=f"{theirs.protocol} (fiberpool {theirs.fiber})",
+            peer=theirs.name,
+        )
+    if _minor(ours.python) != _minor(theirs.python):
+        return VersionMismatch("Python", ours=ours.python, theirs=theirs.python, peer=theirs.name)
+    return None
+
+
+def _minor(version: str) -> list[str]:
+    return version.split(".")[:2]
+
+
+def _fiber_version() -> str:
+    try:
+        return metadata.version("fiberpool")
+    except metadata.PackageNotFoundError:
+        # Run from a source tree that was never installed.
+        return "unknown"
+
+
+def _encode(kind: int, greeting: Greeting) -> bytes:
+    fields = {**greeting._asdict(), "identity": dataclasses.asdict(greeting.identity)}
+    return bytes([kind]) + json.dumps(fields).encode()
+
+
+def _identity(fields: Mapping[str, Any]) -> Identity:
+    facts = {str(key): str(value) for key, value in fields["facts"].items()}
+    return Identity(
+        str(fields["name"]),
+        int(fields["protocol"]),
+        str(fields["python"]),
+        str(fields["fiber"]),
+        facts,
+    )
+
+
+def _read_hello(identity: Identity, fields: Mapping[str, Any]) -> Hello:
+    if identity.protocol != PROTOCOL:  # another version may put other things here
+        return Hello(identity, "", 0, False)
+    return Hello(identity, str(fields["session"]), int(fields["arrived"]), bool(fields["welcomed"]))
+
+
+def _read_welcome(identity: Identity, fields: Mapping[str, Any]) -> Welcome:
+    return Welcome(identity, int(fields["arrived"]), float(fields["heartbeat"]))
+
+
+def _read_refusal(identity: Identity, fields: Mapping[str, Any]) -> Refusal:
+    return Refusal(identity, str(fields["reason"]))
+
+
+_READERS: dict[int, Callable[[Identity, Mapping[str, Any]], Greeting]] = {
+    _HELLO: _read_hello,
+    _WELCOME: _read_welcome,
+    _REFUSAL: _read_refusal,
+}

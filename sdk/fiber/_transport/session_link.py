@@ -1,0 +1,274 @@
+"""The one implementation of a link: a session, the loop that drives it, the wire of the moment.
+
+Who touches what: ``send``, ``close`` and ``attach`` come from any thread and only leave a note for
+the loop; everything else happens on the loop's thread.  The transport under it (``nng``, ``memory``)
+calls ``connected``, ``disconnected``, ``datagram`` and ``refused``, and is told by ``on_end`` when to
+forget the link.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections import deque
+from collections.abc import Callable
+
+from fiber._transport.handshake import Identity
+from fiber._transport.link import LinkObserver, Patience, Scheduler, Timer, Wire
+from fiber._transport.session import Frame, Session, Statistics
+from fiber._wire.messages import ProtocolError
+
+_BYE, _BYE_HEARD = b"\x20", b"\x21"
+
+_LAST_WORD = 0.2
+"""Seconds for a farewell, or the answer to it, to leave before this side hangs up."""
+
+
+class _State(enum.Enum):
+    OPEN = enum.auto()
+    CLOSING = enum.auto()
+    """Closed by us: what is queued still leaves."""
+    LEAVING = enum.auto()
+    """We said good-bye and wait for the answer."""
+    ENDED = enum.auto()
+
+
+class SessionLink:
+    """A link over one wire after the other; a ``Link``."""
+
+    def __init__(
+        self,
+        loop: Scheduler,
+        peer: Identity,
+        patience: Patience,
+        on_end: Callable[[SessionLink], None],
+    ) -> None:
+        self.peer = peer
+        self._loop = loop
+        self._patience = patience
+        self._on_end = on_end
+        self._session = Session(loop.now(), heartbeat=patience.heartbeat)
+        self._state = _State.OPEN
+        self._wire: Wire | None = None
+        self._suspect = False
+        self._observer: LinkObserver | None = None
+        self._inbox: deque[Frame] = deque()
+        self._lost: str | None = None
+        self._outbox: deque[Frame] = deque()
+        self._flush_due = False
+        self._timer: Timer | None = None
+        self._timer_due = 0.0
+        self._farewell = b""
+        self._then: list[Callable[[], None]] = []
+
+    @property
+    def arrived(self) -> int:
+        """How much of the peer's has arrived, for the handshake."""
+        return self._session.arrived
+
+    def attach(self, observer: LinkObserver) -> None:
+        """Whom to tell.  What arrived before waits for it."""
+        self._observer = observer
+        self._loop.call_soon(self._hand_over)
+
+    def send(self, frame: Frame) -> None:
+        """Send a frame as soon as there is room; dropped if the link has ended."""
+        self._outbox.append(frame)
+        self._flush_soon()
+
+    def close(
+        self,
+        reason: str = "",
+        *,
+        linger: float = 1.0,
+        then: Callable[[], None] | None = None,
+    ) -> None:
+        """End the link after what was sent, within ``linger`` seconds, and then call ``then``."""
+        self._observer = None
+        self._loop.call_soon(self._close, reason, linger, then)
+
+    def statistics(self) -> Statistics:
+        """What it holds now and has done so far."""
+        return self._session.statistics()
+
+    def connected(self, wire: Wire, arrived: int) -> None:
+        """Go on over ``wire``, whose other end has ``arrived`` of our datagrams."""
+        if self._state is _State.ENDED:
+            wire.close()
+            return
+        if self._wire is not None:
+            self._unplug().close()
+        try:
+            self._session.connected(arrived, self._loop.now())
+        except ProtocolError as error:
+            # A peer that forgot what it had acknowledged is not the one that this session was with.
+            wire.close()
+            self._lose(str(error))
+            return
+        self._wire = wire
+        self._heard()
+        self._flush()
+
+    def disconnected(self, wire: Wire) -> None:
+        """``wire`` broke; one that was replaced before does not matter."""
+        if wire is not self._wire:
+            return
+        self._unplug()
+        if self._state is _State.LEAVING:
+            self._end()
+
+    def datagram(self, wire: Wire, datagram: bytes) -> None:
+        """Take what came over ``wire``; nothing that a replaced wire still brings."""
+        if wire is not self._wire or self._state is _State.ENDED:
+            return
+        if datagram[:1] == _BYE:
+            wire.put(_BYE_HEARD)
+            self._lose(str(datagram[1:], "utf-8", "replace") or "it closed the link", hang_up=False)
+        elif datagram == _BYE_HEARD:
+            if self._state is _State.LEAVING:
+                self._end()
+        else:
+            self._take(datagram)
+
+    def refused(self, reason: str) -> None:
+        """The peer does not go on with it."""
+        self._lose(reason)
+
+    def _take(self, datagram: bytes) -> None:
+        try:
+            frames = self._session.received(datagram, self._loop.now())
+        except ProtocolError as error:
+            # Past this point nothing that it says can be relied upon.
+            self._lose(f"it broke the protocol: {error}")
+            return
+        if self._state is _State.OPEN:
+            self._inbox += frames
+        self._heard()
+        self._hand_over()
+        self._flush_soon()
+
+    def _heard(self) -> None:
+        if self._suspect:
+            self._suspect = False
+            if observer := self._observer:
+                observer.on_trusted()
+
+    def _hand_over(self) -> None:
+        """Tell the observer what waits for it.  If it fails, the rest waits for the next turn."""
+        try:
+            while self._inbox and (observer := self._observer):
+                observer.on_frame(self._inbox.popleft())
+        finally:
+            if self._inbox and self._observer:
+                self._loop.call_soon(self._hand_over)
+        if self._lost is not None and (observer := self._observer):
+            self._observer = None
+            observer.on_lost(self._lost)
+
+    def _flush_soon(self) -> None:
+        if not self._flush_due:
+            self._flush_due = True
+            self._loop.call_soon(self._flush)
+
+    def _flush(self) -> None:
+        # The flag first: a frame that is appended while this runs is either taken or flushed again.
+        self._flush_due = False
+        if self._state is _State.ENDED:
+            self._outbox.clear()
+            return
+        while self._outbox:
+            self._session.send(self._outbox.popleft())
+        self._speak()
+
+    def _speak(self) -> None:
+        now = self._loop.now()
+        if self._wire is not None:
+            for datagram in self._session.outgoing(now):
+                self._wire.put(datagram)
+            if self._state is _State.CLOSING and self._session.idle:
+                self._state = _State.LEAVING
+                self._wire.put(self._farewell)
+        self._wind(now)
+
+    def _wind(self, now: float) -> None:
+        """Set the timer; one that is due too early only looks again."""
+        due = self._session.next_timer()
+        if self._timer is not None:
+            if self._timer_due <= due:
+                return
+            self._timer.cancel()
+        self._timer_due = due
+        self._timer = self._loop.call_later(max(0.0, due - now), self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        silent = self._session.tick(self._loop.now())
+        if silent >= self._patience.lost_after:
+            broken = "" if self._wire else "the connection broke, and "
+            self._lose(f"{broken}nothing was heard for {silent:.0f} s")
+            return
+        if silent >= self._patience.suspect_after and not self._suspect:
+            self._suspect = True
+            if self._wire is not None:
+                self._wire.doubt()
+            if observer := self._observer:
+                observer.on_suspect()
+        self._speak()
+
+    def _unplug(self) -> Wire:
+        wire, self._wire = self._wire, None
+        assert wire is not None
+        self._session.disconnected()
+        return wire
+
+    def _close(self, reason: str, linger: float, then: Callable[[], None] | None) -> None:
+        if then is not None:
+            self._then.append(then)
+        self._inbox.clear()
+        if self._state is _State.ENDED:
+            self._finished()
+        elif self._state is _State.OPEN:
+            self._state = _State.CLOSING
+            self._farewell = _BYE + reason.encode("utf-8", "replace")
+            self._loop.call_later(linger, self._give_up)
+            self._flush()
+
+    def _give_up(self) -> None:
+        """The linger is over."""
+        if self._state is _State.ENDED:
+            return
+        if self._state is _State.CLOSING and self._wire is not None:
+            self._wire.put(self._farewell)
+            self._state = _State.LEAVING
+            self._loop.call_later(_LAST_WORD, self._give_up)
+        else:
+            self._end()
+
+    def _lose(self, reason: str, *, hang_up: bool = True) -> None:
+        if self._state is _State.ENDED:
+            return
+        if self._state is _State.OPEN:
+            self._lost = reason
+        if hang_up:
+            self._end()
+        else:
+            self._stop()
+            self._loop.call_later(_LAST_WORD, self._end)
+        self._hand_over()
+
+    def _stop(self) -> None:
+        self._state = _State.ENDED
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _end(self) -> None:
+        self._stop()
+        if self._wire is not None:
+            self._unplug().close()
+        self._on_end(self)
+        self._finished()
+
+    def _finished(self) -> None:
+        finished, self._then = self._then, []
+        for then in finished:
+            then()

@@ -1,0 +1,1 @@
+"""Managers: not in this release."""
