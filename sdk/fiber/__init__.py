@@ -12,53 +12,93 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from multiprocessing.process import active_children, current_process, parent_process
-
-    from fiber.adoption import adopt
-    from fiber.config import Config, init
-    from fiber.context import (
-        AuthenticationError,
-        BufferTooShort,
-        ProcessError,
-        TimeoutError,
-    )
-    from fiber.errors import FiberError, StartError, WorkerDied
-    from fiber.process import Process
-    from fiber.resources import meta
+    from fiber.adoption import adopt as adopt
+    from fiber.config import Config as Config
+    from fiber.config import init as init
+    from fiber.errors import AuthenticationError as AuthenticationError
+    from fiber.errors import BufferTooShort as BufferTooShort
+    from fiber.errors import ConfigError as ConfigError
+    from fiber.errors import FiberError as FiberError
+    from fiber.errors import ProcessError as ProcessError
+    from fiber.errors import StartError as StartError
+    from fiber.errors import TimeoutError as TimeoutError
+    from fiber.errors import WorkerDied as WorkerDied
+    from fiber.process import Process as Process
+    from fiber.process import active_children as active_children
+    from fiber.process import current_process as current_process
+    from fiber.process import parent_process as parent_process
+    from fiber.resources import meta as meta
 
 _SUBMODULES = frozenset(
-    "connection context errors managers pool process queues reduction results sharedctypes synchronize "
-    "util".split()
+    {
+        "connection",
+        "context",
+        "errors",
+        "managers",
+        "pool",
+        "process",
+        "queues",
+        "reduction",
+        "results",
+        "sharedctypes",
+        "synchronize",
+        "util",
+    }
 )
 
-_FROM_DEFAULT_CONTEXT = frozenset(
-    "AuthenticationError BoundedSemaphore BufferTooShort Event JoinableQueue Pipe Pool ProcessError Queue "
-    "Semaphore SimpleQueue TimeoutError active_children allow_connection_pickling cpu_count "
-    "current_process freeze_support get_all_start_methods get_context get_logger get_start_method "
-    "log_to_stderr parent_process reducer set_executable set_forkserver_preload set_start_method".split()
+_METHODS_OF_THE_DEFAULT_CONTEXT = frozenset(
+    {
+        "BoundedSemaphore",
+        "Event",
+        "JoinableQueue",
+        "Pipe",
+        "Pool",
+        "Queue",
+        "Semaphore",
+        "SimpleQueue",
+        "allow_connection_pickling",
+        "cpu_count",
+        "freeze_support",
+        "get_all_start_methods",
+        "get_context",
+        "get_logger",
+        "get_start_method",
+        "log_to_stderr",
+        "reducer",
+        "set_executable",
+        "set_forkserver_preload",
+        "set_start_method",
+    }
 )
 
-_FROM = {
-    "Process": "process",
+_HOMES = {
+    "AuthenticationError": "errors",
+    "BufferTooShort": "errors",
     "Config": "config",
-    "init": "config",
-    "adopt": "adoption",
-    "meta": "resources",
     "ConfigError": "errors",
     "FiberError": "errors",
+    "Process": "process",
+    "ProcessError": "errors",
     "StartError": "errors",
+    "TimeoutError": "errors",
     "WorkerDied": "errors",
+    "active_children": "process",
+    "adopt": "adoption",
+    "current_process": "process",
+    "init": "config",
+    "meta": "resources",
+    "parent_process": "process",
 }
 
-__all__ = sorted([*_FROM_DEFAULT_CONTEXT, *_FROM])  # noqa: PLE0605
+__all__ = sorted([*_METHODS_OF_THE_DEFAULT_CONTEXT, *_HOMES])  # noqa: PLE0605 - computed once
 
 
 def __getattr__(name: str) -> Any:
     """Names are looked up when first used, so that importing Fiber costs nothing."""
-    if name in _FROM_DEFAULT_CONTEXT:
+    if name in _METHODS_OF_THE_DEFAULT_CONTEXT:
         value = getattr(importlib.import_module("fiber.context").default, name)
-    elif name in _FROM:
-        value = getattr(importlib.import_module(f"fiber.{_FROM[name]}"), name)
+    elif name in _HOMES:
+        value = getattr(importlib.import_module(f"fiber.{_HOMES[name]}"), name)
     elif name in _SUBMODULES:
         return importlib.import_module(f"fiber.{name}")
     else:

@@ -77,7 +77,9 @@ class Connection:
         return data
 
     def recv_bytes_into(self, buf: Any, offset: int = 0) -> int:
-        """Put the next message into ``buf`` and return its length; BufferTooShort holds what did not fit."""
+        """Put the next message into ``buf`` and return its length; BufferTooShort holds what did
+        not fit.
+        """
         view = memoryview(buf)
         room = view.itemsize * len(view)
         if offset < 0:
@@ -139,7 +141,10 @@ class Connection:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -162,7 +167,7 @@ def _rebuild(handle: handles.Handle, readable: bool, writable: bool) -> Connecti
     return Connection(handles.channel(handle), readable, writable)
 
 
-def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:  # noqa: N802 - multiprocessing's name
+def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
     """Two connected ends; without ``duplex`` the first only receives and the second only sends."""
     one, other = UnixChannel.pair()
     if duplex:

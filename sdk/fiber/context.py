@@ -80,25 +80,25 @@ class BaseContext:
 
     # Communication
 
-    def Pipe(self, duplex: bool = True) -> tuple[Connection, Connection]:  # noqa: N802
+    def Pipe(self, duplex: bool = True) -> tuple[Connection, Connection]:
         """Two connected ends of a pipe."""
         from fiber.connection import Pipe
 
         return Pipe(duplex)
 
-    def Queue(self, maxsize: int = 0) -> Queue:  # noqa: N802
+    def Queue(self, maxsize: int = 0) -> Queue:
         """A queue for any number of processes."""
         from fiber.queues import Queue
 
         return Queue(maxsize)
 
-    def JoinableQueue(self, maxsize: int = 0) -> JoinableQueue:  # noqa: N802
+    def JoinableQueue(self, maxsize: int = 0) -> JoinableQueue:
         """A queue whose items are accounted for by ``task_done`` and ``join``."""
         from fiber.queues import JoinableQueue
 
         return JoinableQueue(maxsize)
 
-    def SimpleQueue(self) -> SimpleQueue:  # noqa: N802
+    def SimpleQueue(self) -> SimpleQueue:
         """A queue without a feeder thread."""
         from fiber.queues import SimpleQueue
 
@@ -106,19 +106,19 @@ class BaseContext:
 
     # Synchronization
 
-    def Event(self) -> Event:  # noqa: N802
+    def Event(self) -> Event:
         """A flag to wait for."""
         from fiber.synchronize import Event
 
         return Event()
 
-    def Semaphore(self, value: int = 1) -> Semaphore:  # noqa: N802
+    def Semaphore(self, value: int = 1) -> Semaphore:
         """A semaphore."""
         from fiber.synchronize import Semaphore
 
         return Semaphore(value)
 
-    def BoundedSemaphore(self, value: int = 1) -> BoundedSemaphore:  # noqa: N802
+    def BoundedSemaphore(self, value: int = 1) -> BoundedSemaphore:
         """A semaphore that is never released more often than acquired."""
         from fiber.synchronize import BoundedSemaphore
 
@@ -126,7 +126,7 @@ class BaseContext:
 
     # Work
 
-    def Pool(  # noqa: N802
+    def Pool(
         self,
         processes: int | None = None,
         initializer: Callable[..., Any] | None = None,
@@ -164,7 +164,7 @@ class BaseContext:
 
     def set_executable(self, executable: str | bytes | os.PathLike[str]) -> None:
         """The interpreter for processes started with ``spawn`` on this host."""
-        spawn.set_executable(executable)
+        spawn.set_executable(os.fsdecode(executable))
 
     def set_forkserver_preload(self, module_names: list[str]) -> None:
         """Modules that the zygote imports before it forks; takes effect before the first start."""

@@ -28,7 +28,7 @@ class Process(BaseProcess):
 
     _start_method: str | None = None
 
-    def _Popen(self) -> Any:  # type: ignore[override]  # noqa: N802 - multiprocessing's name
+    def _Popen(self) -> Any:
         from fiber import context
         from fiber._runtime.popen import Popen
 
@@ -37,14 +37,14 @@ class Process(BaseProcess):
     def start(self) -> None:
         """Start it; returns when it has a pid."""
         self._check_closed()  # type: ignore[attr-defined]
-        assert self._popen is None, "cannot start a process twice"  # type: ignore[attr-defined]
+        assert self.pid is None, "cannot start a process twice"
         assert self._parent_pid == os.getpid(), (  # type: ignore[attr-defined]
             "can only start a process object created by current process"
         )
         if getattr(current_process(), "_inheriting", False):
             raise RuntimeError(UNGUARDED_MAIN)
         _mp._cleanup()  # type: ignore[attr-defined]
-        self._popen = self._Popen()
+        self._popen: Any = self._Popen()
         self._sentinel = self._popen.sentinel
         # The child has them now; here they would keep the target's arguments alive.
         del self._target, self._args, self._kwargs  # type: ignore[attr-defined]
@@ -60,4 +60,3 @@ module first. Put what starts processes under
     if __name__ == "__main__":
         ...
 """
-

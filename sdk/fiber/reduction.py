@@ -17,7 +17,7 @@ from functools import partial
 from multiprocessing import context as mp_context
 from multiprocessing import reduction as mp_reduction
 from multiprocessing.reduction import ForkingPickler, register
-from typing import Any
+from typing import Any, ClassVar, cast
 
 from fiber._agent import child
 from fiber._wire import packet
@@ -39,7 +39,9 @@ class InheritedDescriptor:
 
 
 class Spawning:
-    """What multiprocessing calls the spawning popen: collects descriptors while a Process is pickled."""
+    """What multiprocessing calls the spawning popen: collects descriptors while a Process is
+    pickled.
+    """
 
     DupFd = InheritedDescriptor
 
@@ -69,7 +71,7 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
     The caller owns the returned descriptors.
     """
     attempt = Spawning()
-    mp_context.set_spawning_popen(attempt if same_host else RemoteSpawning())
+    mp_context.set_spawning_popen(cast("Any", attempt if same_host else RemoteSpawning()))
     try:
         payload = dumps(process, by_value=not same_host, before_retry=attempt.reset)
     except BaseException:
@@ -81,7 +83,9 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
 
 
 class RemoteSpawning:
-    """Marks a start on another host: multiprocessing's checks pass, but no descriptor can go along."""
+    """Marks a start on another host: multiprocessing's checks pass, but no descriptor can go
+    along.
+    """
 
     def duplicate_for_child(self, fd: int) -> int:
         """Refuse."""
@@ -110,7 +114,7 @@ def dumps(
         data = _dump(_Forking, obj, protocol, buffer_callback)
         if not (by_value and b"__main__" in data):
             return data
-    except Exception:  # noqa: S110 - whether or not cloudpickle can do it, its error says as much
+    except Exception:
         pass
     before_retry()
     return _dump(_by_value_pickler(), obj, protocol, buffer_callback)
@@ -122,7 +126,7 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
         encoded = packet.dumps(obj)
         if not (b"__main__" in encoded[0] and main_is_interactive()):
             return encoded
-    except Exception:  # noqa: S110 - as above
+    except Exception:
         pass
     return packet.dumps(obj, partial(_dump, _by_value_pickler()))
 
@@ -150,12 +154,16 @@ def _by_value_pickler() -> Any:
     import cloudpickle
 
     class ByValue(cloudpickle.Pickler):  # type: ignore[misc]
-        dispatch_table = ChainMap(ForkingPickler._extra_reducers, cloudpickle.Pickler.dispatch_table)  # type: ignore[attr-defined]
+        dispatch_table: ClassVar[Any] = ChainMap(
+            cast("Any", ForkingPickler)._extra_reducers, cloudpickle.Pickler.dispatch_table
+        )
 
     return ByValue
 
 
-def _dump(pickler: Any, obj: Any, protocol: int | None = None, buffer_callback: Any = None) -> bytes:
+def _dump(
+    pickler: Any, obj: Any, protocol: int | None = None, buffer_callback: Any = None
+) -> bytes:
     buffer = io.BytesIO()
     options = {"buffer_callback": buffer_callback} if buffer_callback else {}
     pickler(buffer, protocol or pickle.DEFAULT_PROTOCOL, **options).dump(obj)

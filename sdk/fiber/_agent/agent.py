@@ -4,7 +4,8 @@ In a program with the local backend it lives in the program itself, on its loop;
 process of its own (``python -m fiber.agent``) whose ``ChildObserver`` is the link to the master.
 
 Who touches what: ``start``, ``deliver``, ``take_back`` and ``signal`` come from any thread and only
-append to outboxes or tables under ``_lock``; everything that arrives is handled on the loop's thread.
+append to outboxes or tables under ``_lock``; everything that arrives is handled on the loop's
+thread.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Agent:
                 child.zygote.request(child)
             except BaseException:
                 del self._children[child.id]
-                self._loop.call_soon(child.hang_up)
+                self._loop.call_soon(child.abandon)
                 raise
         return child
 
@@ -175,7 +176,7 @@ class LocalChild:
         """Send a packet to the worker."""
         outbox = self._outbox
         if outbox is not None:
-            outbox.send(_SEQ.pack(seq) + payload, buffers)
+            outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
 
     def take_back(self) -> None:
         """Recall unread packets; answered on the loop."""
@@ -185,6 +186,10 @@ class LocalChild:
         """Signal the child through its zygote."""
         if self.zygote is not None:
             self.zygote.send(zygote.SIGNAL, self.id, signum)
+
+    def abandon(self) -> None:
+        """It never came to be."""
+        self.hang_up()
 
     def hang_up(self) -> tuple[int, ...]:
         """It is gone: hear its last words, recall what it never read.  On the loop."""
@@ -218,7 +223,8 @@ class LocalChild:
         return True
 
     def _recall(self) -> list[int]:
-        assert self._theirs is not None and self._outbox is not None
+        assert self._theirs is not None
+        assert self._outbox is not None
         seqs = []
         try:
             while True:
@@ -252,8 +258,15 @@ class _ZygoteLink:
         while len(fds) > packet.MAX_DESCRIPTORS:
             some, fds = fds[: packet.MAX_DESCRIPTORS], fds[packet.MAX_DESCRIPTORS :]
             self._outbox.send(pickle.dumps((zygote.DESCRIPTORS,)), fds=some)
-        start = (spec.method, spec.preparation, spec.payload, child.slot, spec.executable)
-        self._outbox.send(pickle.dumps((zygote.START, child.id, start), protocol=5), fds=fds)
+        start = zygote.Start(
+            spec.method,
+            spec.preparation,
+            spec.payload,
+            child.slot,
+            spec.executable,
+            captured=spec.stdio is not None,
+        )
+        self._outbox.send(pickle.dumps((zygote.START, child.id, tuple(start)), protocol=5), fds=fds)
 
     def send(self, *request: Any) -> None:
         """Ask for something else."""
@@ -293,8 +306,7 @@ class _ZygoteLink:
 
 def _launch(control: int, board: int, *, preload: bool) -> subprocess.Popen[bytes]:
     statement = (
-        "from fiber._agent.zygote import main; "
-        f"main({control}, {board}, {os.getpid()}, {preload})"
+        f"from fiber._agent.zygote import main; main({control}, {board}, {os.getpid()}, {preload})"
     )
     return subprocess.Popen(
         interpreter_arguments(sys.executable, statement),

@@ -1,19 +1,21 @@
-"""A child's first steps: from a forked zygote or a fresh interpreter to the user's Process object."""
+"""A child's first steps: from forked zygote or a fresh interpreter to the user's Process object."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import io
 import multiprocessing.spawn
 import os
 import pickle
 import signal
+import subprocess
 import sys
 import traceback
 from collections.abc import Iterator
 from multiprocessing import process as mp_process
 from multiprocessing import util
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from fiber._agent.board import Board
 from fiber._transport.unix import UnixChannel
@@ -41,8 +43,8 @@ def task_channel() -> UnixChannel:
 def progress() -> memoryview:
     """In a pool worker: two words of shared memory, sequence number and index of the running task.
 
-    Set the sequence number last, to zero before another batch's index is written: whoever reads them
-    after a crash must never see one batch's number with another's index.
+    Set the sequence number last, to zero before another batch's index is written: whoever reads
+    them after a crash must never see one batch's number with another's index.
     """
     if _progress is None:
         raise RuntimeError("this process is not a pool worker")
@@ -73,8 +75,8 @@ def run(start: Start, fds: list[int], board: Board, agent: int) -> int:
 
 
 def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
-    global _task_channel, _progress, _descriptors  # noqa: PLW0603 - one child, one life
-    _adopt_stdio(fds)
+    global _task_channel, _progress, _descriptors
+    _adopt_stdio(fds, captured=start.captured)
     rest = fds[2:]
     if start.slot is not None:
         _task_channel = UnixChannel.from_fd(rest.pop(0))
@@ -85,9 +87,9 @@ def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
     except BaseException:
         traceback.print_exc()
         _report_birth_failure()
-        util._flush_std_streams()
+        util._flush_std_streams()  # type: ignore[attr-defined]
         return 1
-    return process._bootstrap(parent_sentinel=agent)
+    return int(process._bootstrap(parent_sentinel=agent))
 
 
 def _load(start: Start) -> Any:
@@ -115,8 +117,12 @@ def _inheriting() -> Iterator[None]:
 
 
 def prepare_paths(data: dict[str, Any]) -> None:
-    """Make modules importable as in the parent."""
-    sys.path[:] = data["sys_path"]
+    """Make modules importable as in the parent, as far as its directories exist here."""
+    if data["same_host"]:
+        sys.path[:] = data["sys_path"]
+    else:
+        known = set(sys.path)
+        sys.path += [p for p in data["sys_path"] if p not in known and os.path.exists(p or ".")]
     sys.argv[:] = data["sys_argv"]
     # A directory that is gone or forbidden is the parent's own situation too.
     with contextlib.suppress(OSError):
@@ -125,18 +131,21 @@ def prepare_paths(data: dict[str, Any]) -> None:
 
 def prepare_main(data: dict[str, Any]) -> None:
     """Import the parent's main module as ``__mp_main__``, as multiprocessing's spawn does."""
-    wanted = {key: data[key] for key in ("init_main_from_name", "init_main_from_path") if key in data}
+    wanted: Any = {
+        key: data[key] for key in ("init_main_from_name", "init_main_from_path") if key in data
+    }
     multiprocessing.spawn.prepare(wanted)
 
 
 def _prepare_environment(data: dict[str, Any]) -> None:
-    global host  # noqa: PLW0603 - one child, one life
+    global host
     host = data["host"]
     environ = data.get("environ")
     if environ is not None and environ != os.environb:
         os.environb.clear()
         os.environb.update(environ)
-    multiprocessing.spawn.prepare({key: data[key] for key in _SPAWN_KEYS if key in data})
+    given: Any = {key: data[key] for key in _SPAWN_KEYS if key in data}
+    multiprocessing.spawn.prepare(given)
     for function, arguments in data["calls"]:
         function(*arguments)
     numpy_random = sys.modules.get("numpy.random")
@@ -148,13 +157,15 @@ def _prepare_environment(data: dict[str, Any]) -> None:
 _SPAWN_KEYS = ("name", "authkey", "log_to_stderr", "log_level", "orig_dir")
 
 
-def _adopt_stdio(fds: list[int]) -> None:
+def _adopt_stdio(fds: list[int], *, captured: bool) -> None:
     for target, fd in enumerate(fds[:2], start=1):
         os.dup2(fd, target)
         os.close(fd)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # closed, or replaced by something of the user's
-            stream.reconfigure(line_buffering=stream.isatty() or stream is sys.stderr)
+            cast("io.TextIOWrapper", stream).reconfigure(
+                line_buffering=captured or stream.isatty() or stream is sys.stderr
+            )
 
 
 def _report_birth_failure() -> None:
@@ -172,14 +183,20 @@ def _exec(start: Start, fds: list[int], board: Board, agent: int) -> None:
     for fd in (*fds, board.fd, agent, again):
         os.set_inheritable(fd, True)
     executable = os.fsdecode(start.executable or sys.executable)
-    os.execv(executable, interpreter_arguments(executable, f"from fiber._agent.child import spawned; spawned({again})"))
+    os.execv(
+        executable,
+        interpreter_arguments(
+            executable, f"from fiber._agent.child import spawned; spawned({again})"
+        ),
+    )
 
 
 def interpreter_arguments(executable: str, statement: str) -> list[str]:
     """The command line of a fresh interpreter with our flags that can import this package."""
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     code = f"import sys; sys.path.insert(0, {root!r}); {statement}"
-    return [executable, *util._args_from_interpreter_flags(), "-c", code]
+    interpreter_flags: list[str] = cast("Any", subprocess)._args_from_interpreter_flags()
+    return [executable, *interpreter_flags, "-c", code]
 
 
 def spawned(plan_fd: int) -> None:

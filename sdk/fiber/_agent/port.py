@@ -1,7 +1,7 @@
 """The seam between whoever wants children and whoever runs them.
 
-The master asks through ``AgentPort`` and ``ChildPort`` and hears through ``ChildObserver``.  The agent
-in this process (``agent.py``) and the agent behind a link (``fiber._backends``) both are one.
+The master asks through ``AgentPort`` and ``ChildPort`` and hears through ``ChildObserver``.  The
+agent in this process (``agent.py``) and the agent behind a link (``fiber._backends``) both are one.
 """
 
 from __future__ import annotations

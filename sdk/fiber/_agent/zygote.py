@@ -2,8 +2,8 @@
 
 It never opens a socket of nng, starts no thread and runs no task, so that forking it is safe; it
 imports once what its children need, so that forking is cheap.  As their parent it reaps them and
-sends them signals (a pid that only we can reap cannot be someone else's).  It ends, and they with it,
-when its agent's process does.
+sends them signals (a pid that only we can reap cannot be someone else's).  It ends, and they with
+it, when its agent's process does.
 
 Packets from the agent: ``(START, child, start, descriptor count)``, ``(SIGNAL, child, signum)``,
 ``(DESCRIPTORS,)`` (more descriptors for the START that follows), ``(QUIT,)``.
@@ -37,7 +37,8 @@ STARTED, FAILED, EXITED, UNFIT = range(4)
 _HELD = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 GRACE = 0.75
-"""Seconds that children have, after the agent's process died, to notice it and end by themselves."""
+"""Seconds that children have, after the agent's process died, to notice it and end by themselves.
+"""
 
 
 class Start(NamedTuple):
@@ -49,10 +50,14 @@ class Start(NamedTuple):
     slot: int | None
     """Its place on the progress board; a worker's first descriptor is its task channel."""
     executable: str | None
+    captured: bool
+    """Whether its output goes to its agent, which wants it line by line."""
 
 
 class Zygote:
-    """One loop over three descriptors: the agent's requests, deaths of children, death of the agent."""
+    """One loop over three descriptors: the agent's requests, deaths of children, death of the
+    agent.
+    """
 
     def __init__(self, control: socket.socket, board: Board, agent: int, *, preload: bool) -> None:
         self._control = control

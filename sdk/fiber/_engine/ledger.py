@@ -59,14 +59,16 @@ class Ledger:
         retries: int = 3,
         unit: int = 1,
         alone: bool = False,
+        exact: bool = False,
     ) -> Job:
         """A new job; a task of it runs again at most ``retries`` times.
 
         ``unit``: its tasks are given out in contiguous chunks of at least this many.  ``alone``:
         each travels alone, to an idle worker, with nothing queued behind it.  Without retries
-        they always do: a crash must not leave in doubt whether another task ran.
+        they always do: a crash must not leave in doubt whether another task ran.  ``exact``: the
+        worker notes each task that it begins, however short they are.
         """
-        job = Job(owner, pace or Pace(), retries, unit, alone)
+        job = Job(owner, pace or Pace(), retries, unit, alone, exact)
         self.jobs.add(job)
         return job
 

@@ -18,6 +18,7 @@ class Job:
         "attempts",
         "closed",
         "done",
+        "exact",
         "fed",
         "listed",
         "owner",
@@ -27,11 +28,14 @@ class Job:
         "waiting",
     )
 
-    def __init__(self, owner: Any, pace: Pace, retries: int, unit: int, alone: bool) -> None:
+    def __init__(
+        self, owner: Any, pace: Pace, retries: int, unit: int, alone: bool, exact: bool
+    ) -> None:
         self.owner = owner
         self.pace = pace
         self.retries = retries
         self.unit = unit
+        self.exact = exact
         self.alone = alone or retries == 0
         self.waiting = Waiting()
         self.attempts: dict[int, int] = {}
@@ -60,7 +64,7 @@ class Batch:
         self.job: Job | None = job
         self.worker = worker
         self.span = span
-        self.stride = job.pace.stride()
+        self.stride = 1 if job.exact else job.pace.stride()
         self.received = 0
 
     @property

@@ -14,7 +14,10 @@ from fiber.errors import StartError
 
 
 class Popen:
-    """A started process, observed.  Attributes and methods as multiprocessing's Process expects them."""
+    """A started process, observed.
+
+    Attributes and methods as multiprocessing's Process expects them.
+    """
 
     def __init__(self, process: BaseProcess, method: str) -> None:
         self._name = process.name

@@ -46,7 +46,8 @@ class Runtime:
     ) -> ChildPort:
         """Start ``process`` as a child of some agent; ``tasks`` makes it a pool worker.
 
-        Returns at once; the observer hears what becomes of it.  An error in pickling is raised here.
+        Returns at once; the observer hears what becomes of it.  An error in pickling is raised
+        here.
         """
         agent = self.backend.place()
         same_host = self.backend.same_host
@@ -72,10 +73,12 @@ class Runtime:
             (context.inherit, (context.default.get_start_method(allow_none=True), context.preload)),
         ]
         del data["start_method"]
+        data["same_host"] = same_host
         if same_host:
             data["environ"] = dict(os.environb)
             data["preload"] = [*context.preload, *_modules_of(process)]
         else:
+            data["preload"] = ["cloudpickle"]
             data.pop("init_main_from_name", None)
             data.pop("init_main_from_path", None)
         return pickle.dumps(data)
@@ -98,7 +101,10 @@ def _make_backend(runtime: Runtime) -> Backend:
 
 def _modules_of(process: Any) -> list[str]:
     """Modules that the zygote may import once for all: where the target and the class live."""
-    names = {type(process).__module__, getattr(getattr(process, "_target", None), "__module__", None)}
+    names = {
+        type(process).__module__,
+        getattr(getattr(process, "_target", None), "__module__", None),
+    }
     return sorted(name for name in names if name in sys.modules and name != "__main__")
 
 
@@ -108,7 +114,7 @@ _runtime: Runtime | None = None
 
 def runtime() -> Runtime:
     """The runtime of this process; made at the first call."""
-    global _runtime  # noqa: PLW0603 - the one process-wide state
+    global _runtime
     if _runtime is None:
         with _lock:
             if _runtime is None:
@@ -119,7 +125,7 @@ def runtime() -> Runtime:
 
 def shutdown() -> None:
     """End the runtime and all that it started; the next use makes a new one."""
-    global _runtime  # noqa: PLW0603 - the one process-wide state
+    global _runtime
     with _lock:
         ending, _runtime = _runtime, None
     if ending is not None:
@@ -128,7 +134,7 @@ def shutdown() -> None:
 
 def _forget() -> None:
     """In a process forked by someone else: the loop's thread did not come along."""
-    global _runtime, _lock  # noqa: PLW0603 - the one process-wide state
+    global _runtime, _lock
     _runtime, _lock = None, threading.Lock()
 
 

@@ -13,7 +13,10 @@ from fiber._wire.packet import BytesLike, Message
 
 
 class Channel(Protocol):
-    """One end of a message pipe.  Messages arrive whole; holders may share an end without a lock."""
+    """One end of a message pipe.
+
+    Messages arrive whole; holders may share an end without a lock.
+    """
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message; BrokenPipeError when nobody can ever read it."""
@@ -41,7 +44,7 @@ class Counter(Protocol):
         """Raise the count and wake who waits."""
 
     def take(self, timeout: float | None) -> bool:
-        """Lower the count by one, waiting until it is above zero; False when ``timeout`` is over."""
+        """Lower the count by one once it is above zero; False when ``timeout`` is over."""
 
     def clear(self) -> int:
         """Set the count to zero and say what it was."""

@@ -1,8 +1,8 @@
 """Who may talk to whom: a certificate authority per run, one certificate for each side.
 
-nng checks the server's name in the certificate, not its address, so one certificate serves a master
-behind any address.  The authority's key is forgotten as soon as both certificates are signed: nobody
-can make a third one.
+nng checks the server's name in the certificate, not its address, so one certificate serves a
+master behind any address.  The authority's key is forgotten once both certificates are signed:
+nobody can make a third one.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ class Credentials:
         except (ValueError, KeyError, TypeError):
             # Whatever else may stand in an environment variable.
             raise ConfigError(
-                f"the credentials in the environment ({len(value)} characters) cannot be read: they "
-                "are cut short or not Fiber's. Hand them over as the master made them."
+                f"the credentials in the environment ({len(value)} characters) cannot be read: "
+                "they are cut short or not Fiber's. Hand them over as the master made them."
             ) from None
 
     def expires(self) -> datetime.datetime:

@@ -2,7 +2,8 @@
 
 A link carries frames both ways, each once and in order, also across a break of the connection under
 it.  It ends when one side closes it or when nothing was heard for too long; then it stays ended.
-``session_link.SessionLink`` is the one implementation; ``nng`` and ``memory`` give it wires.
+``session_link.SessionLink`` is the one implementation; ``listener``, ``dialer`` and ``memory`` make
+them.
 """
 
 from __future__ import annotations
@@ -28,6 +29,12 @@ class Patience(NamedTuple):
     """Two heartbeats did not come."""
     lost_after: float = 15.0
     """The link ends; whatever comes later is dropped."""
+
+
+MASTER_PATIENCE = Patience()
+
+AGENT_PATIENCE = Patience(lost_after=30.0)
+"""Longer: an agent answers at all times, user code in the master may hold the interpreter."""
 
 
 class LinkObserver(Protocol):

@@ -74,6 +74,13 @@ class Loop:
                 if not self._closed:
                     os.eventfd_write(self._wake, 1)
 
+    def interrupt(self, callback: Callable[..., None], *args: Any) -> None:
+        """``call_soon`` for a signal handler, which may run on the loop's own thread while it
+        waits.
+        """
+        self._ready.append(_bound(callback, args))
+        os.eventfd_write(self._wake, 1)
+
     def call_later(self, seconds: float, callback: Callable[..., None], *args: Any) -> Timer:
         """Call it once, ``seconds`` from now, on the loop's thread."""
         timer = Timer(self.now() + seconds, _bound(callback, args))

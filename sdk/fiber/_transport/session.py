@@ -233,7 +233,7 @@ class Session:
 
     def _must_speak(self, now: float) -> bool:
         ack_is_due = self._ack_due is not None and self._ack_due <= now
-        return ack_is_due or now - self._last_sent >= self.heartbeat
+        return ack_is_due or self._last_sent + self.heartbeat <= now
 
     def _again(self, now: float) -> list[bytes]:
         if not self._resend:  # it was the timer

@@ -1,9 +1,9 @@
 """The one implementation of a link: a session, the loop that drives it, the wire of the moment.
 
 Who touches what: ``send``, ``close`` and ``attach`` come from any thread and only leave a note for
-the loop; everything else happens on the loop's thread.  The transport under it (``nng``, ``memory``)
-calls ``connected``, ``disconnected``, ``datagram`` and ``refused``, and is told by ``on_end`` when to
-forget the link.
+the loop; everything else happens on the loop's thread.  The transport under it (``listener``,
+``dialer``, ``memory``) calls ``connected``, ``disconnected``, ``datagram`` and ``refused``, and is
+told by ``on_end`` when to forget the link.
 """
 
 from __future__ import annotations
@@ -21,6 +21,10 @@ _BYE, _BYE_HEARD = b"\x20", b"\x21"
 
 _LAST_WORD = 0.2
 """Seconds for a farewell, or the answer to it, to leave before this side hangs up."""
+
+
+_GRAIN = 0.001
+"""Seconds.  No timer is finer, or rounding could make one fire just too early, for ever."""
 
 
 class _State(enum.Enum):
@@ -197,7 +201,7 @@ class SessionLink:
                 return
             self._timer.cancel()
         self._timer_due = due
-        self._timer = self._loop.call_later(max(0.0, due - now), self._tick)
+        self._timer = self._loop.call_later(max(_GRAIN, due - now), self._tick)
 
     def _tick(self) -> None:
         self._timer = None

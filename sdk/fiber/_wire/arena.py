@@ -1,9 +1,9 @@
 """Memory for large packets, used again once its reader is done.
 
-A fresh memfd costs a page fault for every 4 KiB written, several times the copy itself.  So a sender
-keeps a few memfds; their first byte says whether a reader still needs what is in them.  The reader
-copies the content out and clears the byte; a reader that dies leaves it set, and the block is
-forgotten when its turn comes.
+A fresh memfd costs a page fault for every 4 KiB written, several times the copy itself.  So a
+sender keeps a few memfds; their first byte says whether a reader still needs what is in them.  The
+reader copies the content out and clears the byte; a reader that dies leaves it set, and the block
+is forgotten when its turn comes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ import threading
 from collections.abc import Iterable
 
 RETAINED_LIMIT = 1 << 25
-"""Bytes of memory kept for later messages, per process.  Larger messages get memory of their own."""
+"""Bytes of memory kept for later messages, per process.
+
+ Larger messages get memory of their own.
+"""
 
 DATA_OFFSET = 64
 """Where the content starts; before it lies the flag."""

@@ -1,8 +1,8 @@
 """One message between two processes of one host: one ``SOCK_SEQPACKET`` packet.
 
-A packet arrives whole or not at all, whoever else reads or writes the same socket, so that ends may be
-shared without a lock and a reader that dies takes nothing but its own message with it.  What is small
-travels inside the packet; what is large lies in a memfd whose descriptor travels with it.
+A packet arrives whole or not at all, whoever else reads or writes the same socket, so that ends may
+be shared without a lock and a reader that dies takes nothing but its own message with it.  What is
+small travels inside the packet; what is large lies in a memfd whose descriptor travels with it.
 
 Layout (little endian)::
 
@@ -37,7 +37,8 @@ BULK = 1 << 18
 """Bytes above which a blocking sender waits until its message is read, as it would on a pipe."""
 
 BALLAST = bytes(1 << 16)
-"""More than a quarter of a socket's buffer (net.core.wmem_default), where it stops being writable."""
+"""More than a quarter of a socket's buffer (net.core.wmem_default), where it stops being writable.
+"""
 
 OUT_OF_BAND_MIN = 1 << 12
 """Smaller buffers cost less inside the pickle than beside it."""
@@ -73,7 +74,10 @@ _arena = Arena()
 
 
 class Message:
-    """A received packet.  ``payload`` of a small one is borrowed: call ``release`` (or ``loads``) soon."""
+    """A received packet.
+
+    ``payload`` of a small one is borrowed: call ``release`` (or ``loads``) soon.
+    """
 
     __slots__ = ("_lent", "buffers", "fds", "payload")
 
@@ -108,10 +112,10 @@ class Message:
         self.fds = []
 
 
-def dumps(
-    obj: Any, dump: Callable[..., bytes] = pickle.dumps
-) -> tuple[bytes, list[memoryview]]:
-    """Pickle ``obj``; large contiguous buffers in it (NumPy arrays) are returned beside the pickle."""
+def dumps(obj: Any, dump: Callable[..., bytes] = pickle.dumps) -> tuple[bytes, list[memoryview]]:
+    """Pickle ``obj``; large contiguous buffers in it (NumPy arrays) are returned beside the
+    pickle.
+    """
     buffers: list[memoryview] = []
 
     def keep_in_band(buffer: pickle.PickleBuffer) -> bool:
@@ -142,11 +146,12 @@ def send(
 ) -> bool:
     """Send one packet.
 
-    On a non-blocking socket BlockingIOError means that nothing was sent.  BrokenPipeError: no one can
-    ever read it.  ``fds`` (at most MAX_DESCRIPTORS) are duplicated into whoever receives the packet.
+    On a non-blocking socket BlockingIOError means that nothing was sent.  BrokenPipeError: no one
+    can ever read it.  ``fds`` (at most MAX_DESCRIPTORS) are duplicated into whoever receives the
+    packet.
 
-    With ``ballast`` a message above BULK weighs enough in the socket's buffer that the socket is not
-    writable until the message is read; True says that it was such a message.
+    With ``ballast`` a message above BULK weighs enough in the socket's buffer that the socket is
+    not writable until the message is read; True says that it was such a message.
     """
     size = len(payload) if isinstance(payload, bytes) else memoryview(payload).nbytes
     try:
@@ -222,9 +227,9 @@ def receive(
 
     Without ``wait``, or on a non-blocking socket, BlockingIOError says that there is none.
 
-    ``descriptors`` makes room for those that the sender attached; without it only the memfd of a large
-    message is taken.  ``patience`` is how often to look and yield the processor before sleeping: an
-    answer that is microseconds away comes several times sooner than through a wake-up.
+    ``descriptors`` makes room for those that the sender attached; without it only the memfd of a
+    large message is taken.  ``patience`` is how often to look and yield the processor before
+    sleeping: an answer that is microseconds away comes several times sooner than through a wake-up.
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
@@ -262,10 +267,18 @@ def _recvmsg(sock: socket.socket, buffer: bytearray, space: int, flags: int) -> 
 
 
 def _receive_parts(
-    view: memoryview, buffer: bytearray, size: int, ancillary: list[tuple[int, int, bytes]], flags: int
+    view: memoryview,
+    buffer: bytearray,
+    size: int,
+    ancillary: list[tuple[int, int, bytes]],
+    flags: int,
 ) -> Message:
-    fds = [fd for level, kind, data in ancillary if kind == socket.SCM_RIGHTS and level == socket.SOL_SOCKET
-           for (fd,) in _FD.iter_unpack(data[: len(data) // _FD.size * _FD.size])]
+    fds = [
+        fd
+        for level, kind, data in ancillary
+        if kind == socket.SCM_RIGHTS and level == socket.SOL_SOCKET
+        for (fd,) in _FD.iter_unpack(data[: len(data) // _FD.size * _FD.size])
+    ]
     lent = Message(view[:0], [], fds, buffer)
     try:
         if not size:
@@ -295,7 +308,9 @@ def _inline_parts(body: memoryview, sizes: list[int], lent: Message) -> Message:
 
 
 def _memory_parts(sizes: list[int], lent: Message) -> Message:
-    """Take the parts out of the sender's block: by a copy that frees it, or for good if it is large."""
+    """Take the parts out of the sender's block: by a copy that frees it, or for good if it is
+    large.
+    """
     memory = lent.fds.pop(0)
     try:
         offsets, total = _offsets(sizes)

@@ -1,0 +1,186 @@
+"""What a pool worker answers to one batch: results collected, made safe to send, sent in pieces.
+
+Two threads meet here: the one that runs the tasks appends, the watch (``watch.py``) may send what
+is there.  A value counts as there once it is in ``values``; what belongs to it is stored before.
+"""
+
+from __future__ import annotations
+
+import pickle
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from multiprocessing.reduction import ForkingPickler
+from operator import length_hint
+from typing import Any, Protocol
+
+from fiber._wire import packet, work
+
+
+class Sender(Protocol):
+    """The sending side of a channel."""
+
+    def send(self, payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message, waiting for room."""
+
+
+class Answer:
+    """The results of batch ``seq``: of ``total`` tasks, of which ``rest`` yields those to begin.
+
+    With ``exact``, each value is safe to send as soon as it is in ``values``; without, values come
+    straight from the tasks, and ``settle`` makes them so.
+    """
+
+    __slots__ = (
+        "_buffers",
+        "_channel",
+        "_lock",
+        "_mark",
+        "_odd",
+        "_retryable",
+        "_sent",
+        "_settled",
+        "exact",
+        "rest",
+        "seq",
+        "total",
+        "values",
+    )
+
+    def __init__(
+        self,
+        channel: Sender,
+        seq: int,
+        rest: Iterator[Any],
+        total: int,
+        *,
+        exact: bool,
+        started: float,
+        retryable: tuple[type[BaseException], ...] = (),
+    ) -> None:
+        self.seq = seq
+        self.rest = rest
+        self.total = total
+        self.exact = exact
+        self.values: list[Any] = []
+        self._settled = 0
+        self._sent = 0
+        self._odd: list[tuple[int, int, bytes, int]] = []
+        self._buffers: list[memoryview] = []
+        self._channel = channel
+        self._lock = threading.Lock()
+        self._mark = started
+        self._retryable = retryable
+
+    def add(self, value: Any) -> None:
+        """Take the next task's value as it is now: a later task may change the object."""
+        kind = type(value)
+        if kind in work.PLAIN or (kind is tuple and work.PLAIN.issuperset(map(type, value))):
+            self.values.append(value)
+            return
+        self._pickle(len(self.values), value)
+        self.values.append(None)
+        if self._buffers:
+            # They show the value's own memory, which the next task may write to.
+            self.flush()
+
+    def fail(self, error: BaseException) -> None:
+        """Take the next task's error."""
+        again = bool(self._retryable) and isinstance(error, self._retryable)
+        kind = work.AGAIN if again else work.ERROR
+        self._odd.append((len(self.values), kind, encode_error(error), 0))
+        self.values.append(None)
+
+    def settle(self) -> None:
+        """Make safe to send what came since the last time."""
+        first, values = self._settled, self.values
+        if not work.is_plain(values[first:]):
+            for at in range(first, len(values)):
+                if type(values[at]) not in work.PLAIN:
+                    self._pickle(at, values[at])
+                    values[at] = None
+        self._settled = len(values)
+        if self._buffers:
+            self.flush()
+
+    def _pickle(self, position: int, value: Any) -> None:
+        try:
+            data, buffers = packet.dumps(value)
+            if len(buffers) > work.BUFFERS:
+                data, buffers = pickle.dumps(value, 5), []
+        except Exception as error:
+            # Sockets and the like need multiprocessing's reducers, which only its pickler knows.
+            try:
+                data, buffers = bytes(ForkingPickler.dumps(value)), []
+            except Exception:
+                self._odd.append((position, work.ERROR, encode_error(unsendable(error, value)), 0))
+                return
+        self._buffers += buffers
+        self._odd.append((position, work.VALUE, data, len(buffers)))
+
+    def begun(self) -> int:
+        """How many tasks have begun."""
+        with self._lock:
+            return self.total - length_hint(self.rest)
+
+    def flush(self) -> None:
+        """Send what can be sent."""
+        with self._lock:
+            self._send(None)
+
+    def give_back(self) -> None:
+        """Send what can be sent, and give back every task that has not begun."""
+        with self._lock:
+            # Taking them from the iterator is atomic: either the running thread gets a task or we.
+            left = len(list(self.rest))
+            self.total -= left
+            self._send(self.total if left else None)
+
+    def _send(self, kept: int | None) -> None:
+        first, stop = self._sent, len(self.values) if self.exact else self._settled
+        if first == stop and kept is None:
+            return
+        odd = [(at - first, kind, data, n) for at, kind, data, n in self._odd if at < stop]
+        buffers = self._buffers[: sum(entry[3] for entry in odd)]
+        now = time.perf_counter()
+        data = (self.seq, first, kept, now - self._mark, self.values[first:stop], odd)
+        self._channel.send(pickle.dumps(data, 5), buffers)
+        self._sent, self._mark = stop, now
+        del self._odd[: len(odd)], self._buffers[: len(buffers)]
+
+
+def encode_error(error: BaseException) -> bytes:
+    """Pickle an error, with its traceback as text, so that it surely unpickles."""
+    from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
+
+    wrapped = ExceptionWithTraceback(error, error.__traceback__)
+    try:
+        data = pickle.dumps(wrapped)
+        pickle.loads(data)
+        return data
+    except Exception as reason:
+        # An error that cannot be sent still has to say what happened, and where.
+        substitute = ExceptionWithTraceback(unsendable(reason, error), None)
+        substitute.tb = wrapped.tb
+        return pickle.dumps(substitute)
+
+
+def unsendable(reason: BaseException, value: Any) -> Exception:
+    """multiprocessing's error for a value that does not pickle."""
+    from multiprocessing.pool import MaybeEncodingError  # type: ignore[attr-defined]
+
+    error: Exception = MaybeEncodingError(_Words(reason), _Words(value))
+    return error
+
+
+class _Words:
+    """Stands for a value whose own repr may raise."""
+
+    def __init__(self, value: Any) -> None:
+        self._value = value
+
+    def __repr__(self) -> str:
+        try:
+            return repr(self._value)
+        except Exception:  # whatever it is, an error message must not fail for it
+            return object.__repr__(self._value)

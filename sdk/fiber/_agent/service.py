@@ -1,0 +1,145 @@
+"""The agent's side of its link: does what the master's frames say and tells what becomes of it."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+from collections.abc import Callable
+
+from fiber._agent.agent import Agent
+from fiber._agent.capture import Capture
+from fiber._agent.port import ChildSpec, ExitReport
+from fiber._transport.link import Link
+from fiber._transport.loop import Loop
+from fiber._transport.session import Frame
+from fiber._wire import messages, packet
+
+_BACKLOG = 4 << 20
+"""Bytes waiting on the link above which no more output of children is read."""
+
+
+class AgentService:
+    """Serves one master until the link ends; a ``LinkObserver``.  On the loop's thread."""
+
+    def __init__(self, loop: Loop, link: Link, agent: Agent, on_end: Callable[[str], None]) -> None:
+        self._loop = loop
+        self._link = link
+        self._agent = agent
+        self._on_end = on_end
+        self._children: dict[int, _Observed] = {}
+        self._stopping = False
+
+    def send(self, message: messages.Message) -> None:
+        """Tell the master."""
+        self._link.send(message.encode())
+
+    def busy(self) -> bool:
+        """Whether the link is so far behind that output should wait."""
+        return self._link.statistics().queued_bytes > _BACKLOG
+
+    # What comes over the link
+
+    def on_frame(self, frame: Frame) -> None:
+        """Do what the master says."""
+        message = messages.decode(frame)
+        if isinstance(message, messages.Start):
+            self._start(message)
+        elif isinstance(message, messages.Shutdown):
+            self.stop("the master ended", message.grace)
+        elif isinstance(message, messages.Deliver | messages.Signal | messages.TakeBack):
+            child = self._children.get(message.child)
+            if child is not None:  # otherwise its end and this crossed
+                child.obey(message)
+
+    def on_suspect(self) -> None:
+        """The master is silent; work goes on."""
+
+    def on_trusted(self) -> None:
+        """It is back."""
+
+    def on_lost(self, reason: str) -> None:
+        """The master is gone for good."""
+        self.stop(f"lost the master: {reason}", 0)
+
+    # Children
+
+    def _start(self, message: messages.Start) -> None:
+        name, method, preparation, payload, tasks = pickle.loads(message.spec)
+        child = _Observed(self, self._loop, message.child)
+        self._children[message.child] = child
+        child.start(
+            self._agent,
+            ChildSpec(name, method, preparation, payload, tasks=tasks, stdio=child.capture.stdio),
+        )
+
+    def forget(self, child: int) -> None:
+        """That one is gone."""
+        del self._children[child]
+        if self._stopping and not self._children:
+            self._loop.call_soon(self._on_end, "")
+
+    def stop(self, reason: str, grace: float) -> None:
+        """End the children, by force after ``grace`` seconds, and then the agent."""
+        if self._stopping:
+            return
+        self._stopping = True
+        if not self._children:
+            self._on_end(reason)
+            return
+        self._signal_all(signal.SIGTERM if grace else signal.SIGKILL)
+        self._loop.call_later(grace, self._signal_all, signal.SIGKILL)
+        self._loop.call_later(grace + 5, self._on_end, reason)
+
+    def _signal_all(self, signum: int) -> None:
+        for child in self._children.values():
+            child.obey(messages.Signal(0, signum))
+
+
+class _Observed:
+    """One child, heard for the master; a ``ChildObserver``."""
+
+    def __init__(self, service: AgentService, loop: Loop, number: int) -> None:
+        self._service = service
+        self._number = number
+        self.capture = Capture(loop, self._wrote, service.busy)
+
+    def start(self, agent: Agent, spec: ChildSpec) -> None:
+        """Start it."""
+        try:
+            self._child = agent.start(spec, self)
+        except Exception as error:
+            # Whatever keeps a child from starting here, the one who asked is the master.
+            self.exited(ExitReport(1, f"could not be started: {error}", host=agent.host))
+
+    def obey(self, message: messages.Deliver | messages.Signal | messages.TakeBack) -> None:
+        """What the master wants of it."""
+        if isinstance(message, messages.Deliver):
+            buffers = [memoryview(buffer) for buffer in message.buffers]
+            self._child.deliver(message.seq, message.payload, buffers)
+        elif isinstance(message, messages.Signal):
+            self._child.signal(message.signum)
+        else:
+            self._child.take_back()
+
+    def started(self, pid: int) -> None:
+        """It exists."""
+        self.capture.started()
+        self._service.send(messages.Started(self._number, pid))
+
+    def said(self, message: packet.Message) -> None:
+        """Pass a packet on."""
+        self._service.send(messages.Said(self._number, message.payload, message.buffers))
+        message.release()
+
+    def taken_back(self, seqs: list[int]) -> None:
+        """Pass the answer on."""
+        self._service.send(messages.TakenBack(self._number, tuple(seqs)))
+
+    def exited(self, report: ExitReport) -> None:
+        """Its last lines, then its end."""
+        log = self.capture.finish()
+        self._service.send(messages.Exited(self._number, *report._replace(log=log)))
+        self._service.forget(self._number)
+
+    def _wrote(self, text: str) -> None:
+        self._service.send(messages.Output(self._number, text))

@@ -1,0 +1,66 @@
+"""A pool worker's second thread: no task and no result waits behind a slow task of its own batch.
+
+Short tasks travel many a message, and one of them may turn out long, or wait for something that
+the program does once it has the result of another.  So when a batch has run for a while, what it
+has so far is sent, and what it has not begun is given back for others to run.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+
+from fiber._agent.answer import Answer
+
+PATIENCE = 10e-3
+"""Seconds that a batch may run before it is taken apart; it was meant for one millisecond."""
+
+
+class Watch:
+    """Watches over one batch after the other.  Sleeps while there is none."""
+
+    def __init__(self) -> None:
+        self._watched: Answer | None = None
+        self._asleep = False
+        self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._started = False
+
+    def begin(self, answer: Answer) -> None:
+        """The batch of ``answer`` starts to run."""
+        self._watched = answer
+        if self._asleep:
+            self._asleep = False
+            self._wake.put(None)
+        elif not self._started:
+            self._started = True
+            threading.Thread(target=self._run, name="fiber-watch", daemon=True).start()
+
+    def end(self) -> None:
+        """It has run."""
+        self._watched = None
+
+    def _run(self) -> None:
+        seen = None
+        while True:
+            # Nothing to watch, or nothing more to do for it.  What begins between these lines is
+            # seen by the second; what begins later puts something in.
+            self._asleep = True
+            if self._watched is None or self._watched.seq == seen:
+                self._wake.get()
+            answer = self._outlast()
+            if answer is not None:
+                seen = answer.seq
+                try:
+                    answer.give_back()
+                except OSError:  # the dispatcher is gone, and this process will follow
+                    return
+                del answer  # its results must not live until the next batch
+
+    def _outlast(self) -> Answer | None:
+        """Wait for a batch that runs for too long; None if they end before that."""
+        while (answer := self._watched) is not None:
+            time.sleep(PATIENCE)
+            if self._watched is answer:
+                return answer
+        return None

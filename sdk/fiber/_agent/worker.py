@@ -1,0 +1,217 @@
+"""The loop of a pool worker: read a batch, run its tasks, answer.
+
+A worker reads one message at a time, so that what it has not read can be taken back from the
+kernel.  Before each task (or, for very short ones, each few) it notes in shared memory where it
+is, so that its death names the task.
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+import traceback
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice, starmap
+from typing import Any
+
+from fiber._agent import child
+from fiber._agent.answer import Answer, Sender, encode_error
+from fiber._agent.watch import PATIENCE, Watch
+from fiber._wire import work
+from fiber._wire.packet import Message
+
+FUNCTIONS = 128
+"""Functions that a worker remembers."""
+
+_Function = Callable[..., Any]
+
+
+def run(
+    initializer: Callable[..., object] | None,
+    initargs: Iterable[Any],
+    retryable: tuple[type[BaseException], ...],
+) -> None:
+    """The target of a pool worker's process."""
+    channel = child.task_channel()
+    if initializer is not None:
+        try:
+            initializer(*initargs)
+        except Exception:
+            channel.send(pickle.dumps((work.BIRTH, traceback.format_exc())))
+            raise SystemExit(1) from None
+    channel.send(pickle.dumps((work.READY,)))
+    worker = Worker(channel, child.progress(), retryable)
+    while True:
+        try:
+            message = channel.recv()
+        except (EOFError, OSError):
+            return
+        if not worker.handle(message):
+            return
+
+
+class Worker:
+    """Runs batches.  ``board``: two shared words, sequence number and index of what runs."""
+
+    def __init__(
+        self, channel: Sender, board: memoryview, retryable: tuple[type[BaseException], ...] = ()
+    ) -> None:
+        self._channel = channel
+        self._board = board
+        self._retryable = retryable
+        self._functions: OrderedDict[int, _Function] = OrderedDict()
+        self._watch = Watch()
+
+    def handle(self, message: Message) -> bool:
+        """Run and answer one message; False if it says to stop."""
+        started = time.perf_counter()
+        payload = message.payload
+        (seq,) = work.SEQ.unpack_from(payload)
+        head = work.Head._make(work.HEAD.unpack_from(payload, work.SEQ.size))
+        try:
+            if head.kind != work.STOP:
+                self._answer(seq, head, payload[work.BODY :], message.buffers, started)
+        finally:
+            message.release()
+        return head.kind != work.STOP
+
+    def _answer(
+        self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview], started: float
+    ) -> None:
+        function: _Function | None
+        if head.kind == work.CALLS:
+            items: Any = list(work.unpack_calls(body, head.size))
+            function = _Caller(buffers)
+        else:
+            function = self._function(seq, head, body, buffers)
+            if function is None:
+                return
+            try:
+                items = pickle.loads(body[head.size :], buffers=buffers[head.buffers :])
+            except Exception as error:
+                self._say(work.UNREADABLE, seq, encode_error(error))
+                return
+        answer = Answer(
+            self._channel,
+            seq,
+            iter(items),
+            len(items),
+            exact=head.stride == 1 == head.unit,
+            started=started,
+            retryable=self._retryable,
+        )
+        self._run(answer, function, head, started)
+        answer.flush()
+
+    def _function(
+        self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview]
+    ) -> _Function | None:
+        functions = self._functions
+        if head.size:
+            try:
+                function = pickle.loads(body[: head.size], buffers=buffers[: head.buffers])
+            except Exception as error:
+                self._say(work.BROKEN, seq, encode_error(error))
+                return None
+            functions[head.function] = function
+            if len(functions) > FUNCTIONS:
+                functions.popitem(last=False)
+        elif head.function not in functions:
+            self._say(work.UNKNOWN, seq)
+        return functions.get(head.function)
+
+    def _say(self, *words: Any) -> None:
+        self._channel.send(pickle.dumps(words))
+
+    # Running
+
+    def _run(self, answer: Answer, function: _Function, head: work.Head, started: float) -> None:
+        board = self._board
+        board[0] = 0
+        board[1] = 0
+        board[0] = answer.seq
+        # Chunks that the user asked for stay whole; anything else can be taken apart.
+        if answer.total > 1 and head.unit == 1:
+            self._watch.begin(answer)
+        if not answer.exact:
+            apply = starmap if head.kind == work.STAR else map
+            self._run_in_strides(answer, lambda some: apply(function, some), head, started)
+        elif head.kind == work.STAR:
+            self._run_exactly(answer, lambda arguments: function(*arguments))
+        else:
+            self._run_exactly(answer, function)
+        self._watch.end()
+
+    def _run_exactly(self, answer: Answer, function: _Function) -> None:
+        """One task after the other: its place noted, its result kept as it is right after it."""
+        board, values, plain = self._board, answer.values, work.PLAIN
+        for index, item in enumerate(answer.rest):
+            board[1] = index
+            try:
+                value = function(item)
+            except BaseException as error:
+                self._failed(answer, error)
+                continue
+            if type(value) in plain:
+                values.append(value)
+            else:
+                answer.add(value)
+
+    def _run_in_strides(
+        self,
+        answer: Answer,
+        apply: Callable[[Iterable[Any]], Iterator[Any]],
+        head: work.Head,
+        started: float,
+    ) -> None:
+        """Several tasks at a time, at the speed of ``map``; chunks end where they should."""
+        values, unit = answer.values, head.unit
+        while True:
+            done = self._board[1] = len(values)
+            size = head.stride if unit == 1 else min(head.stride, unit - done % unit)
+            more = self._extend(answer, apply(islice(answer.rest, size)), size)
+            answer.settle()
+            if not more:
+                return
+            if time.perf_counter() - started > PATIENCE and len(values) % unit == 0:
+                answer.give_back()
+
+    def _extend(self, answer: Answer, results: Iterator[Any], size: int) -> bool:
+        """Run the tasks of one stride; False if they were the last ones."""
+        values = answer.values
+        stop = len(values) + size
+        while True:
+            try:
+                values.extend(results)
+            except BaseException as error:
+                self._failed(answer, error)
+                continue
+            if len(values) == stop:
+                return True
+            if answer.begun() == len(values):
+                return False
+            # ``extend`` takes a task's StopIteration for the end of all.
+            answer.fail(StopIteration())
+
+    def _failed(self, answer: Answer, error: BaseException) -> None:
+        if isinstance(error, SystemExit | KeyboardInterrupt):
+            # It ends this process, as in multiprocessing; what was done before it counts.
+            self._watch.end()
+            if not answer.exact:
+                answer.settle()
+            answer.flush()
+            raise error
+        answer.fail(error)
+
+
+class _Caller:
+    """Runs pickled calls, whose buffers lie one after the other in ``buffers``."""
+
+    def __init__(self, buffers: list[memoryview]) -> None:
+        self._buffers = iter(buffers)
+
+    def __call__(self, call: tuple[memoryview, int]) -> Any:
+        data, count = call
+        function, args, kwargs = pickle.loads(data, buffers=list(islice(self._buffers, count)))
+        return function(*args, **kwargs)

@@ -1,0 +1,164 @@
+"""An agent behind a link, as the master sees it: the same ports as the agent in this process."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+import signal
+import threading
+from collections.abc import Callable, Sequence
+
+from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._backends.output import Output
+from fiber._transport.link import Link
+from fiber._transport.session import Frame
+from fiber._wire import messages, packet
+from fiber._wire.packet import BytesLike
+
+_SHUTDOWN_GRACE = 0.5
+
+
+class RemoteAgent:
+    """An ``AgentPort``.
+
+    It takes work before its link is there; what it cannot do it reports as exits.
+    """
+
+    def __init__(self, host: str, output: Output, on_lost: Callable[[RemoteAgent], None]) -> None:
+        self.host = host
+        self._output = output
+        self._on_lost = on_lost
+        self._lock = threading.Lock()
+        self._ids = itertools.count(1)
+        self._children: dict[int, RemoteChild] = {}
+        self._link: Link | None = None
+        self._early: list[Frame] = []
+        self._lost: str | None = None
+
+    @property
+    def children(self) -> int:
+        """How many children it has."""
+        return len(self._children)
+
+    @property
+    def joined(self) -> bool:
+        """Whether it has its link."""
+        return self._link is not None
+
+    def join(self, link: Link) -> None:
+        """Its process dialled in.  On the loop's thread."""
+        with self._lock:
+            self._link = link
+            early, self._early = self._early, []
+            for frame in early:
+                link.send(frame)
+        link.attach(self)
+
+    def start(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
+        """Start a child there."""
+        child = RemoteChild(self, next(self._ids), spec.name, observer)
+        with self._lock:
+            lost = self._lost
+            if lost is None:
+                self._children[child.number] = child
+        if lost is not None:
+            raise RuntimeError(f"agent {self.host} cannot start {spec.name}: {lost}")
+        fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
+        self.send(messages.Start(child.number, pickle.dumps(fields, protocol=5)))
+        return child
+
+    def send(self, message: messages.Message) -> None:
+        """Send a frame, now or when the link is there."""
+        frame = message.encode()
+        with self._lock:
+            if self._link is None:
+                self._early.append(frame)
+                return
+        self._link.send(frame)
+
+    def close(self) -> None:
+        """End it and its children."""
+        self.send(messages.Shutdown(_SHUTDOWN_GRACE))
+
+    def lose(self, reason: str) -> None:
+        """It is gone, and its children with it.  On the loop's thread."""
+        with self._lock:
+            if self._lost is not None:
+                return
+            self._lost = reason
+            children, self._children = self._children, {}
+        for child in children.values():
+            child.observer.exited(
+                ExitReport(-signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host)
+            )
+        self._on_lost(self)
+
+    # What comes over the link, on the loop's thread
+
+    def on_frame(self, frame: Frame) -> None:
+        """What the agent tells of its children."""
+        message = messages.decode(frame)
+        if isinstance(message, messages.Problem):
+            self._output.write(self.host, message.text)
+            return
+        number = getattr(message, "child", None)
+        child = None if number is None else self._children.get(number)
+        if child is None:
+            return
+        if isinstance(message, messages.Exited):
+            with self._lock:
+                self._children.pop(message.child, None)
+        child.heard(message, self._output)
+
+    def on_suspect(self) -> None:
+        """Silent for a while: the backend places nothing on it until it is heard again."""
+        self.suspect = True
+
+    def on_trusted(self) -> None:
+        """Heard again."""
+        self.suspect = False
+
+    suspect = False
+
+    def on_lost(self, reason: str) -> None:
+        """The link is over."""
+        self.lose(reason)
+
+
+class RemoteChild:
+    """A ``ChildPort`` whose child is on another host."""
+
+    def __init__(self, agent: RemoteAgent, number: int, name: str, observer: ChildObserver) -> None:
+        self.number = number
+        self.name = name
+        self.host = agent.host
+        self.pid: int | None = None
+        self.observer = observer
+        self._agent = agent
+
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a packet to its task channel."""
+        self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
+
+    def take_back(self) -> None:
+        """Recall unread packets."""
+        self._agent.send(messages.TakeBack(self.number))
+
+    def signal(self, signum: int) -> None:
+        """Send it a signal."""
+        self._agent.send(messages.Signal(self.number, signum))
+
+    def heard(self, message: messages.Message, output: Output) -> None:
+        """Something about this child."""
+        if isinstance(message, messages.Said):
+            buffers = [memoryview(buffer) for buffer in message.buffers]
+            self.observer.said(packet.Message(memoryview(message.payload), buffers, []))
+        elif isinstance(message, messages.Started):
+            self.pid = message.pid
+            self.observer.started(message.pid)
+        elif isinstance(message, messages.TakenBack):
+            self.observer.taken_back(list(message.seqs))
+        elif isinstance(message, messages.Output):
+            output.write(f"{self.name}@{self.host}", message.text)
+        elif isinstance(message, messages.Exited):
+            self.observer.exited(ExitReport(*message[1:]))

@@ -1,0 +1,114 @@
+"""Channels and counters of this host with many holders, of which some can wait and some cannot."""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any, cast
+
+from fiber._transport.unix import UnixChannel, UnixCounter
+from fiber._wire import packet
+from fiber._wire.packet import BytesLike, Message
+
+_DONTWAIT = int(socket.MSG_DONTWAIT)  # the enum member is slow to combine
+
+
+class Impatient(socket.socket):
+    """A socket whose sends never wait.
+
+    The descriptor's own mode will not do: O_NONBLOCK is shared by all that hold the socket.
+    """
+
+    __slots__ = ()
+
+    def send(self, data: Any, flags: int = 0, /) -> int:
+        """Send or raise BlockingIOError."""
+        return super().send(data, flags | _DONTWAIT)
+
+    def sendmsg(
+        self,
+        buffers: Iterable[Any],
+        ancdata: Iterable[Any] = (),
+        flags: int = 0,
+        address: Any = None,
+        /,
+    ) -> int:
+        """Send or raise BlockingIOError."""
+        return super().sendmsg(buffers, ancdata, flags | _DONTWAIT)
+
+
+class LocalChannel(UnixChannel):
+    """A channel that can also be asked not to wait, whoever else uses the same end."""
+
+    __slots__ = ("_impatient",)
+
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__(sock)
+        self._impatient: Impatient | None = None
+
+    @classmethod
+    def pair(cls) -> tuple[LocalChannel, LocalChannel]:
+        """Two connected ends."""
+        return cast("tuple[LocalChannel, LocalChannel]", super().pair())
+
+    @classmethod
+    def from_fd(cls, fd: int) -> LocalChannel:
+        """Take over a descriptor."""
+        return cast(LocalChannel, super().from_fd(fd))
+
+    def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send one message if there is room for it now."""
+        sock = self._impatient
+        if sock is None:
+            sock = self._impatient = Impatient(fileno=self._sock.fileno())
+        try:
+            packet.send(sock, payload, buffers)
+        except BlockingIOError:
+            return False
+        return True
+
+    def try_recv(self) -> Message | None:
+        """The next message if one is there; EOFError at the end."""
+        try:
+            return packet.receive(self._sock, wait=False)
+        except BlockingIOError:
+            return None
+
+    def close(self) -> None:
+        """Close this holder's descriptor."""
+        impatient, self._impatient = self._impatient, None
+        if impatient is not None:
+            impatient.detach()  # the same descriptor
+        super().close()
+
+    def __del__(self) -> None:
+        self.close()
+
+
+class LocalCounter(UnixCounter):
+    """A counter whose every change can be waited for."""
+
+    __slots__ = ()
+
+    @classmethod
+    def create(cls, value: int = 0) -> LocalCounter:
+        """A counter that starts at ``value``."""
+        return cast(LocalCounter, super().create(value))
+
+    def changed(self, since: int, timeout: float | None) -> bool:
+        """Wait until the count is not ``since``; False when ``timeout`` is over."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        with select.epoll() as poller:
+            # Edge-triggered: each write wakes every waiter once, and none has to consume it.
+            poller.register(self._fd, select.EPOLLIN | select.EPOLLET)
+            while self.value() == since:
+                left = None if deadline is None else deadline - time.monotonic()
+                if left is not None and left <= 0:
+                    return False
+                poller.poll(left)
+        return True
+
+    def __del__(self) -> None:
+        self.close()

@@ -1,0 +1,84 @@
+"""What became of a task, as the dispatcher hands it on.
+
+The loop's thread never runs the user's code, and unpickling may: so what is not plain stays pickled
+until whoever wants it asks, in a thread of theirs.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from typing import Any
+
+from fiber._wire import work
+
+
+class Failure:
+    """The task raised, or could not run."""
+
+    __slots__ = ("error",)
+
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+
+
+class Encoded:
+    """A value or an error, still pickled."""
+
+    __slots__ = ("buffers", "data", "kind")
+
+    def __init__(self, kind: int, data: bytes, buffers: Sequence[memoryview]) -> None:
+        self.kind = kind
+        self.data = data
+        self.buffers = buffers
+
+    @property
+    def failed(self) -> bool:
+        """Whether it is an error."""
+        return self.kind != work.VALUE
+
+    def decode(self) -> Any:
+        """The value, or the Failure."""
+        try:
+            value = pickle.loads(self.data, buffers=self.buffers)
+        except Exception as error:
+            return Failure(_unreadable(error))
+        return Failure(value) if self.failed else value
+
+
+def is_failure(outcome: Any) -> bool:
+    """Whether a task failed; a value that does not unpickle is not known to."""
+    kind = type(outcome)
+    return kind is Failure or (kind is Encoded and outcome.failed)
+
+
+def decode(outcome: Any) -> Any:
+    """A plain value as it is; what is pickled as its value or a Failure."""
+    return outcome.decode() if type(outcome) is Encoded else outcome
+
+
+def outcomes(
+    values: list[Any], odd: list[tuple[int, int, bytes, int]], buffers: list[memoryview]
+) -> list[Any]:
+    """A worker's answer with what is pickled in its place."""
+    used = 0
+    for position, kind, data, count in odd:
+        values[position] = Encoded(kind, data, buffers[used : used + count])
+        used += count
+    return values
+
+
+def _unreadable(reason: Exception) -> Exception:
+    from multiprocessing.pool import MaybeEncodingError  # type: ignore[attr-defined]
+
+    error: Exception = MaybeEncodingError(reason, _UNREADABLE)
+    error.__cause__ = reason
+    return error
+
+
+class _Unreadable:
+    def __repr__(self) -> str:
+        return "a result that was sent but does not unpickle here"
+
+
+_UNREADABLE = _Unreadable()

@@ -1,0 +1,53 @@
+"""A pool's helper thread, for what the loop must not do: run the user's picklers, start processes."""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+
+class Pump:
+    """Does one thing after the other on a thread of its own, which starts when first needed."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._queue: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]] | None]
+        self._queue = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._stopped = False
+
+    def post(self, action: Callable[..., object], *args: Any) -> None:
+        """Have it done, after what was posted before; dropped once stopped."""
+        if self._stopped:
+            return
+        self._queue.put((action, args))
+        if self._thread is None:
+            with self._lock:
+                if self._thread is None:
+                    self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                    self._thread.start()
+
+    def stop(self) -> None:
+        """End once everything posted is done."""
+        self._stopped = True
+        self._queue.put(None)
+
+    def join(self) -> None:
+        """Wait until it has ended; nothing when called by what it is doing."""
+        thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join()
+
+    def _run(self) -> None:
+        while (entry := self._queue.get()) is not None:
+            action, args = entry
+            try:
+                action(*args)
+            except BaseException:
+                # Mostly a callback of the user's: it must be seen, and must not end the others.
+                sys.excepthook(*sys.exc_info())
+            del entry, action, args

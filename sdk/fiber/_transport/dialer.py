@@ -1,0 +1,158 @@
+"""An agent's end of its link to the master."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Callable
+
+from fiber._transport import handshake
+from fiber._transport.credentials import Credentials
+from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
+from fiber._transport.link import AGENT_PATIENCE, Link, LinkError, Patience, Poller
+from fiber._transport.nng import Pipe, Socket, SocketClosed, Unreachable, Untrusted, url_of
+from fiber._transport.session_link import SessionLink
+from fiber._wire.messages import ProtocolError
+from fiber.errors import AuthenticationError, FiberError
+
+_PAUSE_MIN, _PAUSE_MAX = 0.1, 2.0
+"""Seconds between attempts to dial for the first time, growing."""
+
+
+class AgentDialer:
+    """An agent's end: dials the master at ``host:port`` until it answers or ``timeout`` is over.
+
+    Calls back once, on the loop's thread: ``on_link`` with the link, or ``on_failed`` with an
+    AuthenticationError, VersionMismatch or LinkError.  A link that breaks later is dialled again
+    until it is lost.  The default patience is longer than the master's: an agent answers at all
+    times, while user code in the master may hold the interpreter for long.
+    """
+
+    def __init__(
+        self,
+        loop: Poller,
+        address: str,
+        credentials: Credentials,
+        identity: Identity,
+        *,
+        on_link: Callable[[Link], None],
+        on_failed: Callable[[FiberError | AuthenticationError], None],
+        timeout: float = 30.0,
+        patience: Patience = AGENT_PATIENCE,
+    ) -> None:
+        self._loop = loop
+        self._address = address
+        self._credentials = credentials
+        self._identity = identity
+        self._on_link = on_link
+        self._on_failed = on_failed
+        self._timeout = timeout
+        self._patience = patience
+        self._session = secrets.token_hex(16)
+        self._link: SessionLink | None = None
+        self._obstacle = "nothing was tried"
+        self._over = threading.Event()
+        self._url = url_of(address)
+        self._socket = Socket(
+            loop,
+            credentials,
+            dials=True,
+            on_message=self._message,
+            on_gone=Pipe.disconnected,
+            on_pipe=self._introduce,
+        )
+        self._deadline = loop.call_later(timeout, self._too_late)
+        # A dial that does not block never reports a failure, so the first one gets a thread.
+        threading.Thread(target=self._dial, name="fiber-dial", daemon=True).start()
+
+    def close(self) -> None:
+        """Give up dialling, or drop the link without a farewell.  Calls nobody back."""
+        self._loop.call_soon(self._stop)
+
+    def _dial(self) -> None:
+        pause = _PAUSE_MIN
+        while not self._over.is_set():
+            try:
+                self._socket.dial(self._url)
+                self._obstacle = "it took the connection and said nothing"
+                return
+            except Untrusted:
+                self._loop.call_soon(self._distrust)
+                return
+            except SocketClosed:
+                return
+            except Unreachable as error:
+                # Nobody there yet, or no way there yet.
+                self._obstacle = str(error)
+            self._over.wait(pause)
+            pause = min(2 * pause, _PAUSE_MAX)
+
+    def _introduce(self, pipe: Pipe) -> None:
+        link = self._link
+        arrived = link.arrived if link else 0
+        pipe.put(Hello(self._identity, self._session, arrived, welcomed=link is not None).encode())
+
+    def _message(self, pipe: Pipe, datagram: bytes) -> None:
+        if pipe.link is not None:
+            pipe.link.datagram(pipe, datagram)
+            return
+        try:
+            greeting = handshake.decode(datagram)
+        except ProtocolError as error:
+            self._fail(LinkError(f"what answers at {self._address} is no master: {error}"))
+            return
+        mismatch = handshake.mismatch(self._identity, greeting.identity)
+        if mismatch is not None:
+            self._fail(mismatch)
+        elif isinstance(greeting, Welcome):
+            self._welcomed(pipe, greeting)
+        else:
+            reason = greeting.reason if isinstance(greeting, Refusal) else "it is an agent itself"
+            self._fail(LinkError(f"the master at {self._address} refused this agent: {reason}"))
+
+    def _welcomed(self, pipe: Pipe, welcome: Welcome) -> None:
+        link = self._link
+        if link is None:
+            patience = self._patience._replace(heartbeat=welcome.heartbeat)
+            link = SessionLink(
+                self._loop, welcome.identity, patience, on_end=lambda _: self._stop()
+            )
+        pipe.link = link
+        link.connected(pipe, welcome.arrived)
+        if self._link is None:
+            self._deadline.cancel()
+            self._link = link
+            self._on_link(link)
+
+    def _too_late(self) -> None:
+        self._fail(
+            LinkError(
+                f"no master answered at {self._address} within {self._timeout:g} s: "
+                f"{self._obstacle}. See that it runs and that this host can reach that address."
+            )
+        )
+
+    def _distrust(self) -> None:
+        self._fail(
+            AuthenticationError(
+                f"this agent and what answers at {self._address} do not trust each other: the TLS "
+                "handshake failed. The credentials are those of another run, or expired (this "
+                f"agent's are for {self._credentials.server_name} until "
+                f"{self._credentials.expires():%Y-%m-%d %H:%M} UTC), or it is no master. Give the "
+                "agent the credentials that this master made."
+            )
+        )
+
+    def _fail(self, error: FiberError | AuthenticationError) -> None:
+        if self._over.is_set():
+            return
+        if self._link is not None:
+            self._link.refused(str(error))
+        else:
+            self._stop()
+            self._on_failed(error)
+
+    def _stop(self) -> None:
+        self._over.set()
+        self._deadline.cancel()
+        self._socket.close()

@@ -1,0 +1,98 @@
+"""What the dispatcher and a pool worker say to each other.
+
+To a worker (behind the sequence number that its agent put in front)::
+
+    MAP, STAR   head, pickled function (once for each worker), pickled items
+    CALLS       head, (size:u32, buffers:u32) * count, a pickled (function, args, kwargs) each
+    STOP        head
+
+From a worker, pickled tuples of plain values, so that reading one never runs the user's code::
+
+    (seq, offset, kept, seconds, values, odd)   results of batch seq, its tasks from offset on
+    (UNREADABLE, seq, error)                    its message does not unpickle
+    (UNKNOWN, seq)                              its function was forgotten, or never seen
+    (BROKEN, seq, error)                        its function does not unpickle
+    (READY,)  (BIRTH, text)                     initialized; failed before that
+
+``kept`` is how many tasks of the batch the worker keeps, None for all: it gives the others back.
+``values`` holds plain values; what is not plain is None there and stands in ``odd`` as (position
+in values, VALUE | ERROR | AGAIN, pickle, number of buffers), AGAIN being an error after which the
+pool was told to run the task again.  ``error`` is such a pickle.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from typing import Any, NamedTuple
+
+from fiber._wire.packet import BytesLike
+
+MAP, STAR, CALLS, STOP = range(4)
+UNREADABLE, UNKNOWN, BROKEN, READY, BIRTH = "unreadable", "unknown", "broken", "ready", "birth"
+VALUE, ERROR, AGAIN = range(3)
+
+SEQ = struct.Struct("<Q")
+HEAD = struct.Struct("<BHIQII")
+CALL = struct.Struct("<II")
+
+PLAIN = frozenset({int, float, complex, str, bytes, bool, type(None)})
+"""Immutable, and pickled and unpickled without running anyone's code."""
+
+_ROWS = frozenset({tuple, list})
+
+
+class Head(NamedTuple):
+    """Fixed part of a message to a worker."""
+
+    kind: int
+    stride: int
+    unit: int
+    function: int
+    size: int
+    """Bytes of the pickled function, 0 if the worker has it; for CALLS their number."""
+    buffers: int
+    """Buffers of the message that belong to the function."""
+
+
+BODY = SEQ.size + HEAD.size
+"""Where what follows the head begins."""
+
+BUFFERS = 256
+"""An object with more large buffers than this is pickled as a whole."""
+
+STOP_MESSAGE = HEAD.pack(STOP, 1, 1, 0, 0, 0)
+
+
+def pack_calls(calls: Sequence[tuple[bytes, Sequence[memoryview]]]) -> bytes:
+    """A message of calls that are already pickled."""
+    if len(calls) == 1:
+        data, buffers = calls[0]
+        return HEAD.pack(CALLS, 1, 1, 0, 1, 0) + CALL.pack(len(data), len(buffers)) + data
+    table = b"".join([CALL.pack(len(data), len(buffers)) for data, buffers in calls])
+    body = b"".join([data for data, _ in calls])
+    return HEAD.pack(CALLS, 1, 1, 0, len(calls), 0) + table + body
+
+
+def unpack_calls(body: memoryview, count: int) -> Iterable[tuple[memoryview, int]]:
+    """The pickles in a message of calls, each with its number of buffers."""
+    start = CALL.size * count
+    for size, buffers in CALL.iter_unpack(body[:start]):
+        yield body[start : start + size], buffers
+        start += size
+
+
+def pack_batch(head: Head, function: bytes, items: BytesLike) -> bytes:
+    """A message of one function and the items to apply it to."""
+    return b"".join((HEAD.pack(*head), function, items))
+
+
+def is_plain(items: Sequence[Any]) -> bool:
+    """Whether pickling ``items`` runs none of the user's code: plain values, or rows of them."""
+    if type(items) is range:
+        return True
+    kinds = set(map(type, items))
+    if kinds <= PLAIN:
+        return True
+    return kinds <= _ROWS and PLAIN.issuperset(map(type, chain.from_iterable(items)))
