@@ -6,6 +6,7 @@ A message arrives whole.  Large contiguous buffers (NumPy arrays) are not copied
 from __future__ import annotations
 
 import pickle
+import weakref
 from multiprocessing.connection import Client, Listener, answer_challenge, deliver_challenge, wait
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,9 @@ __all__ = [
 ]
 
 
+_LAST_MOMENT = 0.05
+
+
 class Connection:
     """One end of a pipe.  EOFError when the last holder of the other end has closed it or died."""
 
@@ -38,6 +42,8 @@ class Connection:
         self._channel: Channel | None = channel
         self._readable = readable
         self._writable = writable
+        self._given_to: list[weakref.ref[Any]] = []
+        self._other_given_to: list[weakref.ref[Any]] = []
 
     # Sending
 
@@ -105,8 +111,18 @@ class Connection:
             raise self._misuse("write-only")
         try:
             return channel.recv()
-        except EOFError as error:
-            raise ConnectionClosed from error
+        except EOFError:
+            raise self._closed_by() from None
+
+    def _closed_by(self) -> ConnectionClosed:
+        """The end of the connection, with how the process that held the other end ended."""
+        for reference in reversed(self._other_given_to):
+            process = reference()
+            popen = getattr(process, "_popen", None)
+            # The kernel closes what a process held moments before its parent hears of its death.
+            if popen is not None and popen.wait(_LAST_MOMENT) is not None:
+                return ConnectionClosed(process.name, popen.report.reason)
+        return ConnectionClosed()
 
     # The end itself
 
@@ -155,6 +171,9 @@ class Connection:
     def __reduce__(self) -> tuple[Any, ...]:
         if self._channel is None:
             raise self._misuse()
+        spawning = reduction.spawning()
+        if spawning is not None:
+            self._given_to.append(weakref.ref(spawning.process))
         return _rebuild, (handles.lend(self._channel), self._readable, self._writable)
 
     def _misuse(self, wrong_way: str = "") -> OSError:
@@ -170,9 +189,10 @@ def _rebuild(handle: handles.Handle, readable: bool, writable: bool) -> Connecti
 def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
     """Two connected ends; without ``duplex`` the first only receives and the second only sends."""
     one, other = UnixChannel.pair()
-    if duplex:
-        return Connection(one), Connection(other)
-    return Connection(one, writable=False), Connection(other, readable=False)
+    first = Connection(one, writable=duplex)
+    second = Connection(other, readable=duplex)
+    first._other_given_to, second._other_given_to = second._given_to, first._given_to
+    return first, second
 
 
 def _as_bytes(message: Message) -> bytes:

@@ -45,7 +45,8 @@ class Spawning:
 
     DupFd = InheritedDescriptor
 
-    def __init__(self) -> None:
+    def __init__(self, process: Any) -> None:
+        self.process = process
         self.fds: list[int] = []
 
     def duplicate_for_child(self, fd: int) -> int:
@@ -70,8 +71,8 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
 
     The caller owns the returned descriptors.
     """
-    attempt = Spawning()
-    mp_context.set_spawning_popen(cast("Any", attempt if same_host else RemoteSpawning()))
+    attempt = Spawning(process)
+    mp_context.set_spawning_popen(cast("Any", attempt if same_host else RemoteSpawning(process)))
     try:
         payload = dumps(process, by_value=not same_host, before_retry=attempt.reset)
     except BaseException:
@@ -83,9 +84,10 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
 
 
 class RemoteSpawning:
-    """Marks a start on another host: multiprocessing's checks pass, but no descriptor can go
-    along.
-    """
+    """Marks a start on another host: multiprocessing's checks pass, no descriptor can go along."""
+
+    def __init__(self, process: Any) -> None:
+        self.process = process
 
     def duplicate_for_child(self, fd: int) -> int:
         """Refuse."""

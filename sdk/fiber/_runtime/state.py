@@ -100,12 +100,15 @@ def _make_backend(runtime: Runtime) -> Backend:
 
 
 def _modules_of(process: Any) -> list[str]:
-    """Modules that the zygote may import once for all: where the target and the class live."""
-    names = {
-        type(process).__module__,
-        getattr(getattr(process, "_target", None), "__module__", None),
-    }
-    return sorted(name for name in names if name in sys.modules and name != "__main__")
+    """What the zygote may import once for all: where class and target live, and our own modules."""
+    target = getattr(process, "_target", None)
+    names = {type(process).__module__, getattr(target, "__module__", None)}
+    return sorted(names & sys.modules.keys() - {"__main__"}) + [
+        name for name in _OURS if name in sys.modules
+    ]
+
+
+_OURS = ("fiber.connection", "fiber.queues", "fiber.synchronize", "fiber._agent.worker")
 
 
 _lock = threading.Lock()
