@@ -240,6 +240,7 @@ class _Backlog:
         self._items: deque[tuple[bytes, list[memoryview]]] = deque()
         self._changed = threading.Condition(threading.Lock())
         self._thread: threading.Thread | None = None
+        self._idle = True
         self._closing = False
         self._join: util.Finalize | None = None
         self._join_cancelled = False
@@ -247,13 +248,13 @@ class _Backlog:
     def put(self, payload: bytes, buffers: list[memoryview]) -> None:
         """Send a message now if it is its turn and there is room, otherwise later."""
         with self._changed:
-            if not self._items and self._outbox.try_send(payload, buffers):
+            if self._idle and self._outbox.try_send(payload, buffers):
                 return
             # The arrays behind the buffers are their owner's to change once ``put`` has returned.
             self._items.append((payload, [memoryview(bytearray(view)) for view in buffers]))
-            if self._thread is None:
-                self._start()
-            self._changed.notify()
+            if self._idle:
+                self._idle = False
+                self._wake_feeder()
 
     def close(self) -> None:
         """Take no more; let go of the channel once everything is sent."""
@@ -274,34 +275,38 @@ class _Backlog:
         if self._join is not None:
             self._join.cancel()
 
-    def _start(self) -> None:
-        thread = threading.Thread(target=self._feed, name="QueueFeederThread", daemon=True)
-        self._thread = thread
-        thread.start()
+    def _wake_feeder(self) -> None:
+        if self._thread is not None:
+            self._changed.notify()
+            return
+        self._thread = threading.Thread(target=self._feed, name="QueueFeederThread", daemon=True)
+        self._thread.start()
         util.Finalize(self._queue(), self.close, exitpriority=10)
         if not self._join_cancelled:
-            self._join = util.Finalize(thread, _join, [weakref.ref(thread)], exitpriority=-5)
+            thread = weakref.ref(self._thread)
+            self._join = util.Finalize(self._thread, _join, [thread], exitpriority=-5)
 
     def _feed(self) -> None:
-        while (item := self._next()) is not None:
+        while self._has_items():
             try:
-                self._outbox.send(*item)
+                while self._items:
+                    self._outbox.send(*self._items.popleft())
             except BrokenPipeError:
-                with self._changed:
-                    self._items.clear()
-                continue
+                self._items.clear()
             except OSError as error:
                 self._failed(error)
-            with self._changed:
-                # Only now may ``put`` go past the backlog again.
-                self._items.popleft()
         self._writer.close()
 
-    def _next(self) -> tuple[bytes, list[memoryview]] | None:
+    def _has_items(self) -> bool:
+        """Wait for items; False once there will be none."""
         with self._changed:
-            while not self._items and not self._closing:
+            while not self._items:
+                if self._closing:
+                    return False
+                # From here on ``put`` may send by itself again: nothing is left to overtake.
+                self._idle = True
                 self._changed.wait()
-            return self._items[0] if self._items else None
+            return True
 
     def _failed(self, error: OSError) -> None:
         if util.is_exiting():

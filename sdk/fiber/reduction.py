@@ -126,7 +126,7 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     """Pickle ``obj`` for a packet: the pickle, and large buffers beside it."""
     try:
         encoded = packet.dumps(obj)
-        if not (b"__main__" in encoded[0] and main_is_interactive()):
+        if not (main_is_interactive() and b"__main__" in encoded[0]):
             return encoded
     except Exception:
         pass

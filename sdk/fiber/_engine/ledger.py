@@ -48,6 +48,7 @@ class Ledger:
         self._turns: deque[Job] = deque()
         self._roster = Roster()
         self._pins: dict[Worker, None] = {}
+        self._homeless: list[tuple[Job, Span]] = []
 
     # Jobs
 
@@ -83,14 +84,19 @@ class Ledger:
         job.fed += len(items)
         self._list(job)
 
-    def pin(self, job: Job, worker: Worker, item: Any) -> None:
-        """One more task for ``job``, which only ``worker`` may run."""
+    def pin(self, job: Job, worker: Worker | None, item: Any) -> None:
+        """One more task for ``job``, for this worker and no other; None: for one still to come.
+
+        If the worker is lost, one that comes after it takes its place.
+        """
         span = Span(job.fed, [item], alone=True, pin=True)
         job.fed += 1
-        self.pin_again(job, worker, span)
+        if worker is None:
+            self._homeless.append((job, span))
+        else:
+            self._pin(job, worker, span)
 
-    def pin_again(self, job: Job, worker: Worker, span: Span) -> None:
-        """Give a pinned task whose worker was lost to another one."""
+    def _pin(self, job: Job, worker: Worker, span: Span) -> None:
         worker.pinned.append((job, span))
         self._pins[worker] = None
 
@@ -98,6 +104,13 @@ class Ledger:
         """No more tasks will be fed; True if the job is finished by that."""
         job.closed = True
         return self._finish(job)
+
+    def unfinished(self, job: Job) -> list[Any]:
+        """The items of its tasks that are not done."""
+        spans = [batch.rest() for batch in self.batches.values() if batch.job is job]
+        pinned = itertools.chain(self._homeless, *(worker.pinned for worker in self._pins))
+        spans += [span for owner, span in pinned if owner is job]
+        return [*job.waiting.items(), *itertools.chain.from_iterable(s.items for s in spans)]
 
     def cancel(self, job: Job) -> list[Worker]:
         """Forget a job: nothing of it is sent or counted any more.
@@ -116,6 +129,7 @@ class Ledger:
             worker.pinned = deque(pinned for pinned in worker.pinned if pinned[0] is not job)
             if not worker.pinned:
                 del self._pins[worker]
+        self._homeless = [pinned for pinned in self._homeless if pinned[0] is not job]
         return holders
 
     # Workers
@@ -125,8 +139,19 @@ class Ledger:
         worker = Worker(key, left)
         worker.since = now
         self.workers.add(worker)
+        self._adopt(worker)
         self._roster.sort(worker)
         return worker
+
+    def _adopt(self, worker: Worker) -> None:
+        """Give it the pinned tasks of a lost worker: one of each job, as every worker has."""
+        left = []
+        for job, span in self._homeless:
+            if any(job is pinned[0] for pinned in worker.pinned):
+                left.append((job, span))
+            else:
+                self._pin(job, worker, span)
+        self._homeless = left
 
     def leave(self, worker: Worker) -> bool:
         """Give ``worker`` nothing more.  False, and nothing changed, if it is busy."""
@@ -140,12 +165,16 @@ class Ledger:
         """Workers with nothing to do, the one that has been so for longest first."""
         return list(self._roster.idle)
 
+    def hungry(self) -> bool:
+        """Whether somebody could be given something."""
+        return bool(self._roster.idle or self._roster.single)
+
     def demand(self) -> int:
         """Tasks that wait or run: as many workers could be used."""
         waiting = sum(len(job.waiting) for job in self._turns)
         running = sum(len(batch.items) - batch.received for batch in self.batches.values())
         pinned = sum(len(worker.pinned) for worker in self._pins)
-        return waiting + running + pinned
+        return waiting + running + pinned + len(self._homeless)
 
     # Giving
 
@@ -270,7 +299,7 @@ class Ledger:
         self.jobs.add(job)
         span = receipt.batch.span.part(index, index + 1, alone=True)
         if span.pin:
-            self.pin_again(job, receipt.batch.worker, span)
+            self._pin(job, receipt.batch.worker, span)
         else:
             self._return(job, span)
         return True
@@ -327,47 +356,40 @@ class Ledger:
 
     def lose(
         self, worker: Worker, unread: Iterable[int], running: tuple[int, int] | None
-    ) -> tuple[list[Loss], list[tuple[Job, Span]]]:
+    ) -> list[Loss]:
         """``worker`` is gone; its tasks wait again.  Those it was running are charged an attempt.
 
         ``unread``: batches that it never read.  ``running``: batch and offset of the task it was
-        in.  Returns the tasks that had their tries, which are done by that, and the pinned ones,
-        which need another worker (``pin_again``).
+        in.  Returns the tasks that had their tries; they are done by that.
         """
         self.workers.discard(worker)
         self._pins.pop(worker, None)
+        self._homeless += worker.pinned
         untouched = {batch.seq for batch in self._held(worker, unread)}
         losses: list[Loss] = []
-        homeless = list(worker.pinned)
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):
             del self.batches[batch.seq]
             if batch.job is not None:
                 suspects = range(0) if batch.seq in untouched else batch.suspects(running)
-                self._lose_batch(batch.job, batch.rest(), suspects, losses, homeless)
+                losses += self._lose_batch(batch.job, batch.rest(), suspects)
         worker.leaving = True
         worker.queue.clear()
         worker.pinned.clear()
         self._roster.sort(worker)
-        losses.reverse()
-        return losses, homeless
+        return losses[::-1]
 
-    def _lose_batch(
-        self,
-        job: Job,
-        rest: Span,
-        suspects: range,
-        losses: list[Loss],
-        homeless: list[tuple[Job, Span]],
-    ) -> None:
+    def _lose_batch(self, job: Job, rest: Span, suspects: range) -> list[Loss]:
+        losses = []
         for span in reversed(_around(rest, suspects)):
             if span.start in suspects and not self._charge(job, span.start):
                 losses.append(Loss(job, span.start, job.attempts.pop(span.start), span.items[0]))
                 job.done += 1
             elif span.pin:
-                homeless.append((job, span))
+                self._homeless.append((job, span))
             else:
                 self._return(job, span)
         self._finish(job)
+        return losses
 
     # Inside
 

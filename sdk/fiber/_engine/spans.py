@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 COMPACT = 1024
@@ -84,6 +84,11 @@ class Waiting:
 
     def __len__(self) -> int:
         return self._count
+
+    def items(self) -> Iterator[Any]:
+        """What the waiting tasks are made from."""
+        for stock in self._stocks:
+            yield from stock.items[stock.position :]
 
     def first_alone(self) -> bool:
         """The next task travels alone."""

@@ -8,15 +8,28 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
-from fiber._transport.unix import UnixChannel, UnixCounter
+from fiber._transport.unix import UnixChannel, UnixCounter, naming_the_limit
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
 
 _DONTWAIT = int(socket.MSG_DONTWAIT)  # the enum member is slow to combine
 
 
+class QuietSocket(socket.socket):
+    """A socket that closes without a warning when nobody holds it any more.
+
+    Queues and connections may be forgotten, as in multiprocessing, and garbage in cycles ends in
+    any order: the socket perhaps before whoever would close it.
+    """
+
+    __slots__ = ()
+
+    def __del__(self) -> None:
+        self.close()
+
+
 class Impatient(socket.socket):
-    """A socket whose sends never wait.
+    """Another's socket, whose sends never wait.
 
     The descriptor's own mode will not do: O_NONBLOCK is shared by all that hold the socket.
     """
@@ -38,6 +51,9 @@ class Impatient(socket.socket):
         """Send or raise BlockingIOError."""
         return super().sendmsg(buffers, ancdata, flags | _DONTWAIT)
 
+    def __del__(self) -> None:
+        self.detach()
+
 
 class LocalChannel(UnixChannel):
     """A channel that can also be asked not to wait, whoever else uses the same end."""
@@ -51,12 +67,14 @@ class LocalChannel(UnixChannel):
     @classmethod
     def pair(cls) -> tuple[LocalChannel, LocalChannel]:
         """Two connected ends."""
-        return cast("tuple[LocalChannel, LocalChannel]", super().pair())
+        with naming_the_limit("opening a pipe"):
+            one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        return cls.from_fd(one.detach()), cls.from_fd(other.detach())
 
     @classmethod
     def from_fd(cls, fd: int) -> LocalChannel:
         """Take over a descriptor."""
-        return cast(LocalChannel, super().from_fd(fd))
+        return cls(QuietSocket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd))
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""

@@ -1,41 +1,299 @@
-"""The dispatcher: gives the work of one pool to its workers and takes their results.
-
-::
-
-    caller's thread            loop's thread                     worker
-    submit ─┐                                                      │
-            ├─ ledger.assign ── send ────────────────────────────► │ run
-    pump ───┘        ▲                                             │
-                     └── ledger.receive ◄── heard ◄─────────────── │ answer
-                               │
-                               └─► sink.put, sink.end ──► results, iterators, callbacks
-
-Who touches what: ``_ledger``, ``_crew``, ``_unsent`` and the flags are guarded by ``_lock``.  Work is
-assigned under it by whichever thread found that there is some, and sent after it is released.
-``heard``, ``recalled``, ``lost`` and ``_expired`` run on the loop's thread, which must not run any of
-the user's code: a batch that pickles with it goes to the pump, values that unpickle with it stay
-``Encoded``.  A batch that is assigned but not yet sent is in ``_unsent``: nobody can have run it.
-"""
+"""The dispatcher: what is asked of a pool.  ``exchange.py`` sees to it that it is done."""
 
 from __future__ import annotations
 
-import pickle
+import itertools
 import signal
-import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from fiber import reduction
-from fiber._agent.port import ExitReport
 from fiber._engine.chunks import Pace
-from fiber._engine.ledger import Batch, Job, Ledger, Receipt, Span
-from fiber._runtime.outcome import Encoded, Failure, outcomes
-from fiber._runtime.pump import Pump
-from fiber._runtime.requests import Call, Function, Request, Sink, encode, is_plain, name_of
-from fiber._runtime.state import runtime
-from fiber._runtime.workers import Crew, Link, dismiss
-from fiber._transport.loop import Timer
-from fiber._wire import packet, work
-from fiber._wire.packet import Message
-from fiber.errors import TimeoutError, WorkerDied
+from fiber._runtime.exchange import Exchange, Terms
+from fiber._runtime.outcome import Failure
+from fiber._runtime.reader import Reader
+from fiber._runtime.requests import Call, Function, Request, Sink, name_of
+from fiber._runtime.workers import Link
+from fiber._wire import work
+
+__all__ = ["Dispatcher", "Terms"]
+
+FUNCTIONS = 128
+"""Functions that are recognized when they come again."""
+
+FUNCTION_SIZE = 1 << 16
+"""Bytes of a pickled function up to which it is."""
+
+KILL_AFTER = 2.0
+"""Seconds between SIGTERM and SIGKILL for workers that are to end at once."""
+
+
+class Dispatcher(Exchange):
+    """The working half of a pool; ``fiber.pool.Pool`` is its face, and may be forgotten first."""
+
+    def __init__(self, terms: Terms) -> None:
+        super().__init__(terms)
+        self._functions: dict[bytes, Function] = {}
+        self._function_ids = itertools.count(1)
+        self._calls = self._open(work.CALLS, exact=True)
+
+    def start(self) -> None:
+        """Start the first workers; raises what stands in the way of one."""
+        self.crew.hiring = self.crew.minimum
+        try:
+            for _ in range(self.crew.minimum):
+                self.crew.hire()
+        except BaseException:
+            with self._lock:
+                self.crew.hiring = 0
+            self.terminate(RuntimeError("the pool could not be started"))
+            raise
+        with self._lock:
+            self._count()
+
+    # Requests
+
+    def call(
+        self,
+        sink: Sink,
+        function: Callable[..., Any],
+        args: Iterable[Any],
+        kwargs: Mapping[str, Any],
+        timeout: float | None = None,
+    ) -> None:
+        """One call of a function."""
+        call = _make_call(sink, function, args, kwargs)
+        if call is None:
+            return
+        with self._lock:
+            self._check()
+            request = self._calls
+            if timeout is not None:
+                request = self._open(work.CALLS, timeout=timeout)
+            self._ledger.feed(request.job, [call])
+            if request is not self._calls:
+                self._ledger.close(request.job)
+            batches = self._assign()
+            if call.buffers and not any(call in batch.items for batch in batches):
+                call.detach()
+            self._grow()
+        self._send(batches)
+
+    def broadcast(self, sink: Sink, function: Callable[..., Any], args: Sequence[Any]) -> None:
+        """The same call on every worker, present or starting; ``sink`` gets one outcome of each."""
+        call = _make_call(sink, function, args, {})
+        if call is None:
+            return
+        with self._lock:
+            self._check()
+            request = self._open(work.CALLS, sink=sink)
+            for link in self.crew.staying():
+                self._ledger.pin(request.job, link.worker, call)
+            for _ in range(self.crew.hiring):
+                self._ledger.pin(request.job, None, call)
+            self._ledger.close(request.job)
+            batches = self._assign()
+        self._send(batches)
+
+    def function(self, function: Callable[..., Any]) -> Function:
+        """``function``, pickled; one that pickles as an earlier one did is the same."""
+        data, buffers = reduction.encode(function)
+        with self._lock:
+            known = self._functions.get(data)
+            if known is not None:
+                return known
+            made = Function(next(self._function_ids), name_of(function), data, buffers, None)
+            if not buffers and len(data) <= FUNCTION_SIZE:
+                self._functions[data] = made
+                if len(self._functions) > FUNCTIONS:
+                    del self._functions[next(iter(self._functions))]
+        return made
+
+    def map(
+        self,
+        kind: int,
+        function: Function,
+        items: Sequence[Any],
+        sink: Sink,
+        *,
+        unit: int = 1,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> Request:
+        """Apply ``function`` to ``items``, which must not change until they are done."""
+        with self._lock:
+            self._check()
+            request = self._open(
+                kind, function=function, sink=sink, unit=unit, exact=exact, timeout=timeout
+            )
+            self._ledger.feed(request.job, items)
+            finished = self._ledger.close(request.job)
+            batches = self._assign()
+            self._grow()
+        self._send(batches)
+        if finished:
+            sink.end()
+        return request
+
+    def stream(
+        self,
+        kind: int,
+        function: Function,
+        sink: Sink,
+        *,
+        unit: int = 1,
+        exact: bool = False,
+        timeout: float | None = None,
+        limit: int | None = None,
+    ) -> Request:
+        """Apply ``function`` to what ``read`` will read."""
+        with self._lock:
+            self._check()
+            request = self._open(
+                kind, function=function, sink=sink, unit=unit, exact=exact, timeout=timeout
+            )
+            request.reader = Reader(request.job, self._lock, limit)
+            self._readers.append(request.reader)
+        return request
+
+    def read(self, request: Request, iterable: Iterable[Any]) -> None:
+        """Read the tasks of a stream on this thread, as fast as they are worked off.
+
+        Raises what the iterable raises; the stream then still has to be finished or cancelled.
+        """
+        assert request.reader is not None
+        request.reader.read(iterable, self._feed_hungry)
+
+    def finish(self, request: Request, error: BaseException | None = None) -> None:
+        """The stream has no more tasks; ``error``, if any, takes the place of the next one."""
+        ends: list[Sink] = []
+        with self._lock:
+            if request.job not in self._ledger.jobs:
+                return  # aborted or cancelled meanwhile
+            batches = self._assign()  # empties the inbox
+            if error is not None and request.sink is not None:
+                request.sink.put(request.job.fed, [Failure(error)], True)
+            self._ledger.close(request.job)
+            self._check_finished(request.job, ends)
+        self._send(batches)
+        self._end(ends)
+
+    def cancel(self, request: Request) -> None:
+        """Nobody wants the rest of it any more; what runs is left to end."""
+        with self._lock:
+            self._stop_reader(request)
+            for worker in self._ledger.cancel(request.job):
+                worker.key.port.take_back()
+            batches = self._assign()
+        if self._loop.on_thread():
+            self._send_from_loop(batches)
+        else:
+            self._send(batches)
+        self._wind_down()
+
+    def post(self, action: Callable[..., None], *args: Any) -> None:
+        """Have something done on the loop's thread: for finalizers, which may hold any lock."""
+        self._loop.call_soon(action, *args)
+
+    def on_loop(self) -> bool:
+        """Whether this is the loop's thread, which must not wait."""
+        return self._loop.on_thread()
+
+    def _feed_hungry(self) -> None:
+        if self.hungry:
+            with self._lock:
+                batches = self._assign()
+                self._grow()
+            self._send(batches)
+
+    def _open(
+        self,
+        kind: int,
+        *,
+        function: Function | None = None,
+        sink: Sink | None = None,
+        unit: int = 1,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> Request:
+        pace = Pace(function.pace if function is not None else None)
+        job = self._ledger.open(
+            pace=pace,
+            retries=self.terms.retries,
+            unit=unit,
+            alone=timeout is not None,
+            exact=exact,
+        )
+        if function is not None:
+            function.pace = pace
+        request = Request(kind, job, function=function, sink=sink, timeout=timeout)
+        job.owner = request
+        return request
+
+    def _check(self) -> None:
+        """Refuse what cannot be done any more.  Lock held."""
+        if self.crew.error is not None:
+            raise self.crew.error
+        if self._closing:
+            raise ValueError("Pool not running")
+
+    def _grow(self) -> None:
+        """Start more workers if there is more work than those that are there can do.  Lock held."""
+        if len(self.crew.links) + self.crew.hiring < self.crew.maximum:
+            self._replace()
+
+    # The end
+
+    def close(self) -> None:
+        """Take no more requests; the workers leave once those that are there are done."""
+        with self._lock:
+            self._closing = True
+            self._ledger.close(self._calls.job)
+        self._wind_down()
+
+    def terminate(self, error: BaseException) -> None:
+        """End the workers now; ``error`` is what those hear who wait for a result."""
+        with self._lock:
+            self._closing = self._terminated = True
+            self.callbacks.stop()
+            links = list(self.crew.links)
+            self._give_up(error)
+            for link in links:
+                link.terminate()
+        if links:
+            self._loop.call_later(KILL_AFTER, _kill, links)
+        self._wind_down()
+
+    def join(self) -> None:
+        """Wait until all workers and threads are gone; after ``close`` or ``terminate``."""
+        with self._lock:
+            for reader in self._readers:
+                reader.unbind()
+        self.ended.wait()
+        self.pump.join()
+        self.callbacks.join()
+
+    def links(self) -> list[Link]:
+        """The workers that are there."""
+        with self._lock:
+            return list(self.crew.links)
+
+
+def _kill(links: list[Any]) -> None:
+    for link in links:
+        link.signal(signal.SIGKILL)
+
+
+def _make_call(
+    sink: Sink, function: Callable[..., Any], args: Iterable[Any], kwargs: Mapping[str, Any]
+) -> Call | None:
+    """A call, pickled; None if it does not pickle, which the sink is told."""
+    try:
+        data, buffers = reduction.encode((function, args, kwargs))
+        if len(buffers) > work.BUFFERS:
+            data, buffers = reduction.dumps((function, args, kwargs), 5), []
+    except Exception as error:
+        sink.put(0, [Failure(error)], True)
+        sink.end()
+        return None
+    return Call(name_of(function), data, buffers, sink)

@@ -1,4 +1,4 @@
-"""A pool's helper thread, for what the loop must not do: run the user's picklers, start processes."""
+"""A pool's helper thread, for what the loop must not do: run the user's code, start processes."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ class Pump:
         self._thread: threading.Thread | None = None
         self._stopped = False
 
-    def post(self, action: Callable[..., object], *args: Any) -> None:
-        """Have it done, after what was posted before; dropped once stopped."""
-        if self._stopped:
-            return
-        self._queue.put((action, args))
-        if self._thread is None:
-            with self._lock:
-                if self._thread is None:
-                    self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-                    self._thread.start()
+    def post(self, action: Callable[..., object], *args: Any) -> bool:
+        """Have it done, after what was posted before; False: it has been stopped, and drops it."""
+        with self._lock:
+            if self._stopped:
+                return False
+            self._queue.put((action, args))
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._thread.start()
+        return True
 
     def stop(self) -> None:
         """End once everything posted is done."""
-        self._stopped = True
-        self._queue.put(None)
+        with self._lock:
+            self._stopped = True
+            self._queue.put(None)
 
     def join(self) -> None:
         """Wait until it has ended; nothing when called by what it is doing."""

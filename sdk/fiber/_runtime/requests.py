@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import pickle
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from typing import Any, Protocol
 
 from fiber import reduction
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Batch, Job
+from fiber._runtime.reader import Reader
 from fiber._wire import work
 
 
 class Sink(Protocol):
     """Where the outcomes of a request go.  ``put`` and ``abort`` come under the pool's lock."""
 
-    def put(self, start: int, outcomes: list[Any]) -> None:
-        """Outcomes of the tasks from ``start`` on.  Each task's comes once, in any order."""
+    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+        """Outcomes of the tasks from ``start`` on.  Each task's comes once, in any order.
+
+        Unless ``mixed`` they are all plain values.
+        """
 
     def end(self) -> None:
         """All tasks have theirs."""
@@ -47,9 +50,7 @@ class Call:
 
     __slots__ = ("buffers", "data", "name", "sink")
 
-    def __init__(
-        self, name: str, data: bytes, buffers: Sequence[memoryview], sink: Sink
-    ) -> None:
+    def __init__(self, name: str, data: bytes, buffers: Sequence[memoryview], sink: Sink) -> None:
         self.name = name
         self.data = data
         self.buffers = buffers
@@ -62,9 +63,12 @@ class Call:
 
 
 class Request:
-    """A job of the ledger, and all that the ledger need not know of it."""
+    """A job of the ledger, and all that the ledger need not know of it.
 
-    __slots__ = ("function", "inbox", "job", "kind", "room", "sink", "timeout")
+    Without a ``sink`` each of its tasks is a Call with its own.
+    """
+
+    __slots__ = ("function", "job", "kind", "reader", "sink", "timeout")
 
     def __init__(
         self,
@@ -80,10 +84,7 @@ class Request:
         self.function = function
         self.sink = sink
         self.timeout = timeout
-        self.inbox: deque[Any] = deque()
-        """Tasks on their way from a reading thread to the ledger."""
-        self.room: Callable[[], None] | None = None
-        """Called when the reading thread may go on."""
+        self.reader: Reader | None = None
 
     def task_name(self, task: int, item: Any) -> str:
         """How errors call a task."""
@@ -98,7 +99,9 @@ def name_of(function: Any) -> str:
     return getattr(function, "__qualname__", None) or repr(function)
 
 
-def encode(request: Request, batch: Batch, known: dict[int, None]) -> tuple[bytes, Sequence[memoryview]]:
+def encode(
+    request: Request, batch: Batch, known: dict[int, None]
+) -> tuple[bytes, Sequence[memoryview]]:
     """The message for a batch; ``known`` are the functions that its worker was sent."""
     items = batch.items
     if request.kind == work.CALLS:

@@ -8,7 +8,6 @@ nobody can make a third one.
 from __future__ import annotations
 
 import base64
-import contextlib
 import datetime
 import json
 import os
@@ -186,20 +185,21 @@ class _Authority:
         from cryptography.hazmat.primitives import hashes, serialization
 
         signed = builder.sign(self._key, hashes.SHA256())
-        return signed.public_bytes(serialization.Encoding.PEM).decode()
+        return signed.public_bytes(serialization.Encoding.PEM).decode().strip()
 
 
 def _pem(key: ec.EllipticCurvePrivateKey) -> str:
     from cryptography.hazmat.primitives import serialization
 
-    return key.private_bytes(
+    pem = key.private_bytes(
         serialization.Encoding.PEM,
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
-    ).decode()
+    )
+    return pem.decode().strip()
 
 
 def _write_private(path: Path, text: str) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with contextlib.closing(os.fdopen(descriptor, "w")) as file:
-        file.write(text + "\n" if not text.endswith("\n") else text)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(text + "\n")

@@ -61,14 +61,16 @@ class MasterListener:
         linger: float = 1.0,
         then: Callable[[], None] | None = None,
     ) -> None:
-        """Close every link as ``Link.close`` does, then the socket, then call ``then``."""
+        """Close every link as ``Link.close`` does, then the socket, then call ``then``.
+
+        Who dials meanwhile is refused: nng cannot stop listening without breaking its pipes.
+        """
         self._loop.call_soon(self._close, reason, linger, then)
 
     def _close(self, reason: str, linger: float, then: Callable[[], None] | None) -> None:
         first = self._closing is None
         self._closing = [*(self._closing or ()), *([then] if then else ())]
         if first:
-            self._socket.stop_listening()
             for link in list(self._links.values()):
                 link.close(reason, linger=linger, then=self._finish_closing)
         self._finish_closing()

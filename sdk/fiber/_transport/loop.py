@@ -79,7 +79,8 @@ class Loop:
         waits.
         """
         self._ready.append(_bound(callback, args))
-        os.eventfd_write(self._wake, 1)
+        if not self._closed:
+            os.eventfd_write(self._wake, 1)
 
     def call_later(self, seconds: float, callback: Callable[..., None], *args: Any) -> Timer:
         """Call it once, ``seconds`` from now, on the loop's thread."""

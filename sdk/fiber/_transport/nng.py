@@ -7,6 +7,8 @@ What nng does behind one's back, and what follows from it:
 
 * A pipe holds three messages that wait to be sent and drops the rest in silence.  So a session has
   two datagrams under way, and sending takes no longer than passing a message to the pipe.
+* A connection that breaks while no receive waits for it may break unnoticed: only silence tells,
+  and so an agent that hears nothing hangs up and dials anew.
 * Pipes come and go on nng's threads; their callbacks only leave a note for the loop.
 * A socket does not survive a fork: in the child it is made harmless, not closed.
 """
@@ -84,7 +86,6 @@ class Socket:
         self._nng.add_pre_pipe_connect_cb(self._note)
         self._nng.add_post_pipe_connect_cb(lambda pipe: loop.call_soon(self._came, pipe.id))
         self._nng.add_post_pipe_remove_cb(lambda pipe: loop.call_soon(self._went, pipe.id))
-        self._listener: Any = None
         self._fd: int = self._nng.recv_fd
         _live.add(self)
         loop.register(self._fd, self._readable)
@@ -93,7 +94,7 @@ class Socket:
         """Take connections at ``host:port``; the address with the port that it really has."""
         url = url_of(address)
         try:
-            self._listener = self._nng.listen(url)
+            listener = self._nng.listen(url)
         except pynng.AddressInUse as error:
             raise LinkError(
                 f"cannot listen on {address}: another program uses that port. Stop it, or choose "
@@ -106,12 +107,8 @@ class Socket:
                 f"cannot listen on {address}: {str(error).lower()}. Use an address of this host "
                 "and a port that this user may bind."
             ) from error
-        port = str(self._listener.local_address).rpartition(":")[2]
+        port = str(listener.local_address).rpartition(":")[2]
         return f"{address.rpartition(':')[0]}:{port}"
-
-    def stop_listening(self) -> None:
-        """Take no new connections."""
-        self._listener.close()
 
     def dial(self, url: str) -> None:
         """Connect, on a thread that may block.  Once it succeeded, nng dials again by itself.
@@ -138,9 +135,8 @@ class Socket:
     def abandon_after_fork(self) -> None:
         """Let the parent keep what both share; nng aborts a child that touches it."""
         self._closed = True
-        vars(self._nng).pop(
-            "_socket", None
-        )  # pynng's close(), also at garbage collection, asks for it
+        # pynng closes what this attribute holds, when told to and at garbage collection.
+        vars(self._nng).pop("_socket", None)
 
     def _note(self, pipe: Any) -> None:
         self._pipes[pipe.id] = self._kind(pipe)
@@ -207,7 +203,7 @@ class DialledPipe(Pipe):
     """The agent's side of a connection."""
 
     def doubt(self) -> None:
-        """Hang up: nng dials anew, past whatever on the way has forgotten the connection."""
+        """Hang up; nng dials anew."""
         self.close()
 
 
@@ -231,7 +227,7 @@ def _tls(credentials: Credentials, *, dials: bool) -> Any:
     try:
         return config(
             config.MODE_CLIENT if dials else config.MODE_SERVER,
-            # Only the dialer knows the name of the other side; a listener would expect it of agents.
+            # The master's name.  A listener that is given one expects it of its agents.
             server_name=credentials.server_name if dials else None,
             ca_string=credentials.authority,
             own_key_string=credentials.key,
@@ -256,6 +252,7 @@ def _after_fork_in_child() -> None:
 os.register_at_fork(after_in_child=_after_fork_in_child)
 
 # pynng ends nng before multiprocessing's exit functions run, which still need our links; and in a
-# forked child it would close the parent's sockets.  A Finalize runs after them, in this process only.
+# forked child it would close the parent's sockets.  A Finalize runs after them, in this process
+# only.
 atexit.unregister(pynng.nng._pynng_atexit)
 util.Finalize(None, pynng.nng._pynng_atexit, exitpriority=-200)

@@ -11,6 +11,10 @@ from collections.abc import Callable, Sequence
 from fiber._transport.loop import Loop
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike
+from fiber.errors import TooManyOpenFiles
+
+_PAUSE = 0.05
+"""Seconds before a message that lacked a descriptor is tried again."""
 
 _Waiting = tuple[BytesLike, Sequence[memoryview], tuple[int, ...]]
 
@@ -24,6 +28,7 @@ class Outbox:
         self._lock = threading.Lock()
         self._waiting: deque[_Waiting] = deque()
         self._closed = False
+        self._stalled = False
 
     def send(
         self, payload: BytesLike, buffers: Sequence[memoryview] = (), fds: Sequence[int] = ()
@@ -38,6 +43,7 @@ class Outbox:
             if self._closed:
                 _close_all(fds)
                 return
+            packet.check_buffers(buffers)
             self._waiting.append((payload, buffers, tuple(fds)))
             if len(self._waiting) == 1:
                 self._loop.call_soon(self._watch, self._flush)
@@ -77,8 +83,18 @@ class Outbox:
     def _flush(self) -> None:
         with self._lock:
             while self._waiting:
-                if not self._try(*self._waiting[0]):
-                    return
+                try:
+                    if not self._try(*self._waiting[0]):
+                        return
+                except TooManyOpenFiles:
+                    # Its sender cannot be told any more.  Others' ends give descriptors back.
+                    self._watch(None)
+                    self._loop.call_later(_PAUSE, self._watch, self._flush)
+                    if self._stalled:
+                        return
+                    self._stalled = True
+                    raise
+                self._stalled = False
                 self._waiting.popleft()
         self._watch(None)
 

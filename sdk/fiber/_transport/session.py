@@ -46,9 +46,6 @@ RESEND_MIN, RESEND_MAX = 1.0, 10.0
 HEARTBEAT = 3.0
 """Seconds without sending after which a session says that it is alive."""
 
-TICK = 1.0
-"""How often silence is counted.  A longer interval means that this process itself did not run."""
-
 DATA, CONTROL = 1, 2
 
 _ACK_NOW = 1
@@ -99,7 +96,8 @@ class Session:
         window: int = WINDOW,
         budget: int = BUDGET,
     ) -> None:
-        self.heartbeat = heartbeat
+        self._heartbeat = heartbeat
+        self._tick = heartbeat / 3
         self._window = window
         self._budget = budget
         self._connected = False
@@ -205,15 +203,15 @@ class Session:
         To be called at ``next_timer``.  A stopped process must not take its own sleep for its
         peer's.
         """
-        self._silent += min(now - self._ticked, 2 * TICK)
+        self._silent += min(now - self._ticked, 2 * self._tick)
         self._ticked = now
         return self._silent
 
     def next_timer(self) -> float:
         """When ``tick`` and ``outgoing`` want to be called again, if nothing happens before."""
-        due = self._ticked + TICK
+        due = self._ticked + self._tick
         if self._connected:
-            due = min(due, self._last_sent + self.heartbeat)
+            due = min(due, self._last_sent + self._heartbeat)
             if self._ack_due is not None:
                 due = min(due, self._ack_due)
             if self._resend_due is not None:
@@ -233,7 +231,7 @@ class Session:
 
     def _must_speak(self, now: float) -> bool:
         ack_is_due = self._ack_due is not None and self._ack_due <= now
-        return ack_is_due or self._last_sent + self.heartbeat <= now
+        return ack_is_due or self._last_sent + self._heartbeat <= now
 
     def _again(self, now: float) -> list[bytes]:
         if not self._resend:  # it was the timer

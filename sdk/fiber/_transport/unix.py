@@ -14,8 +14,11 @@ from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import TooManyOpenFiles
 
-PATIENCE = 20
+LOOKS = 20
 """Looks at an empty socket before sleeping: about as long as the wake-up that they may save."""
+
+LOOKS_ON_TRIAL = 50
+SLEEPS_BETWEEN_TRIALS = 32
 
 
 @contextlib.contextmanager
@@ -44,12 +47,19 @@ def _block(sock: socket.socket) -> None:
 
 
 class UnixChannel:
-    """A ``SOCK_SEQPACKET`` socket whose messages are packets."""
+    """A ``SOCK_SEQPACKET`` socket whose messages are packets.
 
-    __slots__ = ("_sock",)
+    A receiver looks at the empty socket for some microseconds before it sleeps, which saves a
+    wake-up where answers come at once.  Where they do not, it sleeps at once and tries anew after
+    some messages.
+    """
+
+    __slots__ = ("_looks", "_sleeps", "_sock")
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
+        self._looks = LOOKS
+        self._sleeps = 0
 
     @classmethod
     def pair(cls) -> tuple[UnixChannel, UnixChannel]:
@@ -78,7 +88,17 @@ class UnixChannel:
 
     def recv(self) -> Message:
         """The next message, EOFError at the end."""
-        return packet.receive(self._sock, patience=PATIENCE)
+        sock = self._sock
+        for _ in range(self._looks):
+            try:
+                message = packet.receive(sock, wait=False)
+            except BlockingIOError:
+                continue
+            self._looks = LOOKS
+            return message
+        self._sleeps += 1
+        self._looks = LOOKS_ON_TRIAL if self._sleeps % SLEEPS_BETWEEN_TRIALS == 0 else 0
+        return packet.receive(sock)
 
     def try_recv(self) -> Message | None:
         """The next message if one is there."""

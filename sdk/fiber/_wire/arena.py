@@ -19,6 +19,9 @@ RETAINED_LIMIT = 1 << 25
  Larger messages get memory of their own.
 """
 
+RETAINED_BLOCKS = 32
+"""How many pieces that memory is kept in; each holds two descriptors."""
+
 DATA_OFFSET = 64
 """Where the content starts; before it lies the flag."""
 
@@ -83,8 +86,13 @@ class Arena:
             return
         with self._lock:
             self._blocks.append(block)
-            while sum(kept.capacity for kept in self._blocks) > RETAINED_LIMIT:
+            while self._too_much():
                 self._blocks.pop(0).close()
+
+    def _too_much(self) -> bool:
+        if len(self._blocks) > RETAINED_BLOCKS:
+            return True
+        return sum(block.capacity for block in self._blocks) > RETAINED_LIMIT
 
 
 def fill(block: Block, parts: Iterable[memoryview], offsets: Iterable[int]) -> None:

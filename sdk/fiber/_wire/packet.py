@@ -40,11 +40,14 @@ BALLAST = bytes(1 << 16)
 """More than a quarter of a socket's buffer (net.core.wmem_default), where it stops being writable.
 """
 
-OUT_OF_BAND_MIN = 1 << 12
+OUT_OF_BAND_MIN = 1 << 16
 """Smaller buffers cost less inside the pickle than beside it."""
 
 MAX_DESCRIPTORS = 250
 """The kernel takes 253 descriptors a packet; one is ours."""
+
+MAX_BUFFERS = 1024
+"""Out-of-band buffers of one message."""
 
 PLAIN = b"\x00"
 PARTS = 1
@@ -56,6 +59,7 @@ _FD = struct.Struct("i")
 _ALIGNMENT = 64
 _RECEIVE = INLINE_LIMIT + len(BALLAST) + 16384
 _ANCILLARY = socket.CMSG_SPACE(_FD.size * (MAX_DESCRIPTORS + 1))
+_DONTWAIT = socket.MSG_DONTWAIT
 _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
@@ -174,6 +178,14 @@ def send(
     return False
 
 
+def check_buffers(buffers: Sequence[memoryview]) -> None:
+    """ValueError if a message cannot have so many."""
+    if len(buffers) > MAX_BUFFERS:
+        raise ValueError(
+            f"a message has {len(buffers)} out-of-band buffers; at most {MAX_BUFFERS} are sent"
+        )
+
+
 def _send_parts(
     sock: socket.socket,
     payload: BytesLike,
@@ -182,8 +194,7 @@ def _send_parts(
     fds: Sequence[int],
     ballast: bytes,
 ) -> None:
-    if len(buffers) > 1024:
-        raise ValueError(f"a message has {len(buffers)} out-of-band buffers; at most 1024 are sent")
+    check_buffers(buffers)
     sizes = [view.nbytes for view in buffers]
     table = b"".join(map(_SIZE.pack, sizes))
     if size + sum(sizes) <= INLINE_LIMIT:
@@ -220,25 +231,18 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
     return offsets, end
 
 
-def receive(
-    sock: socket.socket, *, descriptors: bool = False, patience: int = 0, wait: bool = True
-) -> Message:
+def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True) -> Message:
     """Receive one packet; EOFError when no one can ever send again.
 
     Without ``wait``, or on a non-blocking socket, BlockingIOError says that there is none.
-
     ``descriptors`` makes room for those that the sender attached; without it only the memfd of a
-    large message is taken.  ``patience`` is how often to look and yield the processor before
-    sleeping: an answer that is microseconds away comes several times sooner than through a wake-up.
+    large message is taken.
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
     buffer = free.pop() if free else bytearray(_RECEIVE)
     try:
-        received = _look(sock, buffer, space, patience) if patience else None
-        size, ancillary, flags, _ = received or _recvmsg(
-            sock, buffer, space, 0 if wait else socket.MSG_DONTWAIT
-        )
+        size, ancillary, flags, _ = _recvmsg(sock, buffer, space, 0 if wait else _DONTWAIT)
     except BaseException:
         free.append(buffer)
         raise
@@ -246,15 +250,6 @@ def receive(
     if size and not buffer[0]:
         return Message(view[1:size], [], [], buffer)
     return _receive_parts(view, buffer, size, ancillary, flags)
-
-
-def _look(sock: socket.socket, buffer: bytearray, space: int, patience: int) -> _Received | None:
-    for _ in range(patience):
-        try:
-            return _recvmsg(sock, buffer, space, socket.MSG_DONTWAIT)
-        except BlockingIOError:
-            os.sched_yield()
-    return None
 
 
 def _recvmsg(sock: socket.socket, buffer: bytearray, space: int, flags: int) -> _Received:

@@ -1,0 +1,244 @@
+"""Objects of this host as its hub sees them: who waits for what, on the loop's thread.
+
+A hub takes a message out of a channel, or a count out of a counter, only for a request that waits for
+it, and answers at once.  A user who dies takes nothing that it had not asked for.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Protocol, TypeAlias
+
+from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.poller import EDGE, IN, OUT, Poller
+from fiber._hub.protocol import Kind, Status
+from fiber._wire.packet import INLINE_LIMIT, Message
+
+
+class Asker(Protocol):
+    """A request that waits."""
+
+    def answer(
+        self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()
+    ) -> None:
+        """Answer it; once."""
+
+
+class Watcher(Protocol):
+    """Wants to know when a channel becomes readable."""
+
+    def ready(self) -> None:
+        """It is.  Not called again until the watcher asks again."""
+
+
+class HostedChannel:
+    """One end of a channel."""
+
+    kind = Kind.CHANNEL
+
+    def __init__(self, poller: Poller, fd: int) -> None:
+        self._poller = poller
+        self._channel = LocalChannel.from_fd(fd)
+        self._senders: deque[tuple[Asker, Sequence[memoryview]]] = deque()
+        self._receivers: deque[Asker] = deque()
+        self._pollers: deque[Asker] = deque()
+        self._watchers: set[Watcher] = set()
+
+    def fileno(self) -> int:
+        """Its descriptor."""
+        return self._channel.fileno()
+
+    def send(self, asker: Asker, parts: Sequence[memoryview]) -> None:
+        """Send payload and buffers, in the order of asking."""
+        self._senders.append((asker, parts))
+        self._serve_senders()
+        self._watch()
+
+    def receive(self, asker: Asker, *, wait: bool) -> None:
+        """Answer with the next message."""
+        self._receivers.append(asker)
+        self._serve_receivers()
+        if not wait and asker in self._receivers:
+            self._receivers.remove(asker)
+            asker.answer(Status.NO)
+        self._watch()
+
+    def poll(self, asker: Asker) -> None:
+        """Answer when it is readable."""
+        if self.readable():
+            asker.answer(Status.OK)
+        else:
+            self._pollers.append(asker)
+            self._watch()
+
+    def readable(self) -> bool:
+        """Whether there is a message or the end."""
+        return self._channel.poll(0)
+
+    def watch(self, watcher: Watcher) -> None:
+        """Say once when it is readable."""
+        if self.readable():
+            watcher.ready()
+        else:
+            self._watchers.add(watcher)
+            self._watch()
+
+    def withdraw(self, asker: Asker) -> bool:
+        """It waits no more; False if it did not."""
+        for queue in (self._receivers, self._pollers):
+            if asker in queue:
+                queue.remove(asker)
+                self._watch()
+                return True
+        for entry in self._senders:
+            if entry[0] is asker:
+                self._senders.remove(entry)
+                self._watch()
+                return True
+        return False
+
+    def forget(self, watcher: Watcher) -> None:
+        """It wants to know nothing more."""
+        self._watchers.discard(watcher)
+        self._watch()
+
+    def close(self) -> None:
+        """Let go of the end."""
+        self._poller.forget(self._channel.fileno())
+        self._channel.close()
+
+    def _watch(self) -> None:
+        wanted = self._receivers or self._pollers or self._watchers
+        mask = (IN if wanted else 0) | (OUT if self._senders else 0)
+        self._poller.watch(self._channel.fileno(), mask, self._event)
+
+    def _event(self, events: int) -> None:
+        if events & ~IN:
+            self._serve_senders()
+        if events & ~OUT:
+            self._serve_receivers()
+            self._tell()
+        self._watch()
+
+    def _serve_senders(self) -> None:
+        while self._senders:
+            asker, parts = self._senders[0]
+            try:
+                if not self._channel.try_send(parts[0], parts[1:]):
+                    return
+            except BrokenPipeError:
+                status = Status.BROKEN
+            else:
+                status = Status.OK
+            self._senders.popleft()
+            asker.answer(status)
+
+    def _serve_receivers(self) -> None:
+        while self._receivers:
+            try:
+                message = self._channel.try_recv()
+            except EOFError:
+                while self._receivers:
+                    self._receivers.popleft().answer(Status.EOF)
+                return
+            if message is None:
+                return
+            self._hand_over(self._receivers.popleft(), message)
+
+    def _hand_over(self, asker: Asker, message: Message) -> None:
+        payload, buffers = message.payload, message.buffers
+        if len(payload) <= INLINE_LIMIT:
+            # It may be borrowed, and the answer may have to wait.
+            payload = memoryview(message.tobytes())
+        asker.answer(Status.OK, self.readable(), [payload, *buffers])
+
+    def _tell(self) -> None:
+        if (self._pollers or self._watchers) and self.readable():
+            while self._pollers:
+                self._pollers.popleft().answer(Status.OK)
+            watchers, self._watchers = self._watchers, set()
+            for watcher in watchers:
+                watcher.ready()
+
+
+class HostedCounter:
+    """A counter."""
+
+    kind = Kind.COUNTER
+
+    def __init__(self, poller: Poller, fd: int) -> None:
+        self._poller = poller
+        self._counter = LocalCounter(fd)
+        self._takers: deque[Asker] = deque()
+        self._waiters: deque[Asker] = deque()
+        self._changes: dict[Asker, int] = {}
+
+    def fileno(self) -> int:
+        """Its descriptor."""
+        return self._counter.fileno()
+
+    def add(self, n: int) -> None:
+        """Raise the count."""
+        self._counter.add(n)
+
+    def clear(self) -> int:
+        """Zero it."""
+        return self._counter.clear()
+
+    def value(self) -> int:
+        """The count."""
+        return self._counter.value()
+
+    def take(self, asker: Asker) -> None:
+        """Answer when the count was lowered for it."""
+        self._takers.append(asker)
+        self._event(IN)
+
+    def wait(self, asker: Asker) -> None:
+        """Answer when the count is above zero."""
+        self._waiters.append(asker)
+        self._event(IN)
+
+    def changed(self, asker: Asker, since: int) -> None:
+        """Answer when the count is not ``since``."""
+        self._changes[asker] = since
+        self._event(IN)
+
+    def withdraw(self, asker: Asker) -> bool:
+        """It waits no more; False if it did not."""
+        found = self._changes.pop(asker, None) is not None
+        for queue in (self._takers, self._waiters):
+            if asker in queue:
+                queue.remove(asker)
+                found = True
+        self._watch()
+        return found
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._poller.forget(self._counter.fileno())
+        self._counter.close()
+
+    def _watch(self) -> None:
+        mask = IN if self._takers or self._waiters else 0
+        if not mask and self._changes:
+            # A count that stays above zero would be reported for ever.
+            mask = IN | EDGE
+        self._poller.watch(self._counter.fileno(), mask, self._event)
+
+    def _event(self, _events: int) -> None:
+        if self._waiters and self._counter.wait(0):
+            while self._waiters:
+                self._waiters.popleft().answer(Status.OK)
+        if self._changes:
+            value = self._counter.value()
+            for asker in [asker for asker, since in self._changes.items() if since != value]:
+                del self._changes[asker]
+                asker.answer(Status.OK)
+        while self._takers and self._counter.take(0):
+            self._takers.popleft().answer(Status.OK)
+        self._watch()
+
+
+Hosted: TypeAlias = HostedChannel | HostedCounter

@@ -1,0 +1,91 @@
+"""What is said on a stream to a hub.
+
+A message is one packet.  Requests and replies are a few numbers; what a user sends or receives lies
+beside them as the packet's buffers, payload first, and nothing here is ever unpickled.
+
+``HELLO`` comes first and is silent unless refused, as are ``CONNECT`` (go on to another host's hub;
+what follows is for that one, ``HELLO`` first) and ``ATTACH`` (what follows concerns one object).  So a
+client opens a stream and makes its first request without waiting.  At most one request of a stream is
+unanswered; ``CANCEL``, or another request, ends the one that is.
+
+Layout (little endian): request kind:u8, number:u32, and its own fields; reply the same.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+
+VERSION = 1
+KEY_BYTES = 32
+
+
+class Kind(IntEnum):
+    """What an object is."""
+
+    CHANNEL = 1
+    COUNTER = 2
+
+
+class Op(IntEnum):
+    """Requests."""
+
+    HELLO = 1  # version, key
+    CONNECT = 2  # host
+    REGISTER = 3  # kind, reusable; a descriptor beside it -> object, grant
+    FETCH = 4  # object, grant -> a descriptor beside the reply
+    ATTACH = 5  # object, grant
+    GRANT = 6  # object, reusable -> object, grant
+    RELEASE = 7  # grant; silent
+    CANCEL = 8  # the request's number is the one to end; silent unless it is waiting
+    # For an attached channel
+    SEND = 10  # payload and buffers beside it
+    RECV = 11  # -> more; payload and buffers beside it
+    TRY_RECV = 12  # -> the same, or NO
+    POLL = 13
+    WATCH = 14  # silent; the stream then gets READY once the channel is readable
+    CHECK = 15  # on a watching stream: whether it is readable; if so, READY follows
+    # For an attached counter
+    ADD = 20  # how much
+    TAKE = 21
+    CLEAR = 22  # -> count
+    VALUE = 23  # -> count
+    WAIT = 24
+    CHANGED = 25  # since
+
+
+class Status(IntEnum):
+    """Replies."""
+
+    OK = 0
+    NO = 1  # cancelled, or not so
+    EOF = 2
+    BROKEN = 3
+    READY = 4  # of a watching stream; answers nothing
+    GONE = 5  # why the stream ends
+
+
+HEAD = struct.Struct("<BI")
+HELLO = struct.Struct(f"<BIB{KEY_BYTES}s")
+TWO = struct.Struct("<BIQQ")
+ONE = struct.Struct("<BIQ")
+
+
+def hello(key: bytes) -> bytes:
+    """The first message of every stream."""
+    return HELLO.pack(Op.HELLO, 0, VERSION, key)
+
+
+def connect(host: str) -> bytes:
+    """Go on to the hub of ``host``."""
+    return HEAD.pack(Op.CONNECT, 0) + host.encode()
+
+
+def gone(reason: str) -> bytes:
+    """The last message of a stream that a hub ends."""
+    return HEAD.pack(Status.GONE, 0) + reason.encode(errors="replace")
+
+
+def text(payload: memoryview) -> str:
+    """What follows the numbers of CONNECT and GONE."""
+    return str(payload[HEAD.size :], "utf-8", "replace")

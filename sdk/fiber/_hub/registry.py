@@ -1,0 +1,153 @@
+"""Which objects a hub hosts, and what keeps each of them there.
+
+An object stays as long as someone on another host is attached to it or a grant for it is out.  A
+grant is the permission that travels inside a pickled handle.  A plain one is used up by the first who
+takes it; a reusable one lasts until it is released.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import stat
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from fiber._hub.hosted import Hosted
+from fiber._hub.protocol import Kind
+from fiber._transport.unix import naming_the_limit
+
+
+class NoSuchObject(LookupError):
+    """The grant was used up or released, or nobody holds the object any more."""
+
+
+@dataclass(eq=False)
+class Entry:
+    """A hosted object and its holders."""
+
+    number: int
+    hosted: Hosted
+    identity: tuple[int, int]
+    attached: int = 0
+    grants: set[int] = field(default_factory=set)
+
+
+class Registry:
+    """The objects of one hub.  Any thread."""
+
+    def __init__(self, host: Callable[[Kind, int], Hosted], discard: Callable[[Hosted], None]):
+        self._host = host
+        self._discard = discard
+        self._lock = threading.Lock()
+        # Ids are unguessable only in so far as nobody without the hub's key gets to ask for one.
+        self._numbers = itertools.count(1)
+        self._entries: dict[int, Entry] = {}
+        self._by_identity: dict[tuple[int, int], Entry] = {}
+        self._reusable: dict[int, Entry] = {}
+
+    def register(self, kind: Kind, fd: int, *, reusable: bool) -> tuple[int, int]:
+        """Host what ``fd`` refers to, which stays the caller's; its number and a grant."""
+        identity = _identity(kind, fd)
+        with self._lock:
+            entry = self._by_identity.get(identity)
+            if entry is None:
+                with naming_the_limit("sharing a pipe or queue with another process"):
+                    hosted = self._host(kind, os.dup(fd))
+                entry = Entry(next(self._numbers), hosted, identity)
+                self._entries[entry.number] = self._by_identity[identity] = entry
+            return entry.number, self._grant(entry, reusable)
+
+    def grant(self, number: int, *, reusable: bool) -> int:
+        """One more grant for an object."""
+        with self._lock:
+            return self._grant(self._find(number), reusable)
+
+    def fetch(self, number: int, grant: int) -> int:
+        """A descriptor for someone on this host; uses up a plain grant."""
+        with self._lock:
+            entry = self._find(number, grant)
+            with naming_the_limit("receiving a pipe or queue from another process"):
+                fd = os.dup(entry.hosted.fileno())
+            self._use(entry, grant)
+        return fd
+
+    def attach(self, number: int, grant: int) -> Entry:
+        """Someone on another host uses it now; ``detach`` ends that.
+
+        Who is attached already may attach again with grant 0.
+        """
+        with self._lock:
+            entry = self._find(number, grant)
+            entry.attached += 1
+            self._use(entry, grant)
+        return entry
+
+    def detach(self, entry: Entry) -> None:
+        """One user less."""
+        with self._lock:
+            entry.attached -= 1
+            self._drop_if_unused(entry)
+
+    def release(self, grant: int) -> None:
+        """Nobody will use the grant any more."""
+        with self._lock:
+            entry = self._reusable.pop(grant, None)
+            if entry is None:
+                entry = next((e for e in self._entries.values() if grant in e.grants), None)
+            if entry is not None:
+                entry.grants.discard(grant)
+                self._drop_if_unused(entry)
+
+    def close(self) -> None:
+        """Let go of everything."""
+        with self._lock:
+            for entry in self._entries.values():
+                self._discard(entry.hosted)
+            self._entries.clear()
+            self._by_identity.clear()
+            self._reusable.clear()
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def _find(self, number: int, grant: int = 0) -> Entry:
+        entry = self._entries.get(number)
+        if entry is None or (grant and grant not in entry.grants) or not (grant or entry.attached):
+            raise NoSuchObject(
+                "the pipe, queue or event that this handle stands for is not there any more: "
+                "the handle was used once already, or all of its holders have ended"
+            )
+        return entry
+
+    def _grant(self, entry: Entry, reusable: bool) -> int:
+        grant = next(self._numbers)
+        entry.grants.add(grant)
+        if reusable:
+            self._reusable[grant] = entry
+        return grant
+
+    def _use(self, entry: Entry, grant: int) -> None:
+        if grant not in self._reusable:
+            entry.grants.discard(grant)
+            self._drop_if_unused(entry)
+
+    def _drop_if_unused(self, entry: Entry) -> None:
+        if not entry.attached and not entry.grants and entry.number in self._entries:
+            del self._entries[entry.number], self._by_identity[entry.identity]
+            self._discard(entry.hosted)
+
+
+def _identity(kind: Kind, fd: int) -> tuple[int, int]:
+    """What two descriptors of one kernel object have in common, while it exists."""
+    if kind is Kind.CHANNEL:
+        status = os.fstat(fd)
+        if not stat.S_ISSOCK(status.st_mode):
+            raise ValueError(f"descriptor {fd} is not a socket")
+        return kind, status.st_ino
+    with open(f"/proc/self/fdinfo/{fd}", "rb") as info:
+        for line in info:
+            if line.startswith(b"eventfd-id:"):
+                return kind, int(line.split()[1])
+    raise ValueError(f"descriptor {fd} is not an event counter")

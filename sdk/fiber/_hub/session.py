@@ -1,0 +1,279 @@
+"""A hub's side of one stream: who it is, what it is attached to, what it waits for."""
+
+from __future__ import annotations
+
+import hmac
+import struct
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from fiber._hub import protocol
+from fiber._hub.hosted import HostedChannel, HostedCounter
+from fiber._hub.protocol import HEAD, ONE, TWO, Kind, Op, Status
+from fiber._hub.registry import Entry, NoSuchObject, Registry
+from fiber._hub.streams import Deaf, Stream
+from fiber._wire.packet import Message
+
+
+class Home(Protocol):
+    """What a session needs of its hub."""
+
+    key: bytes
+    registry: Registry
+
+    def connect(self, host: str, stream: Stream) -> None:
+        """Go on with ``stream`` at the hub of ``host``."""
+
+    def ended(self, session: Session) -> None:
+        """The session is over."""
+
+
+class Refused(Exception):
+    """The stream has to end; says why."""
+
+
+class Request:
+    """One request; answered once."""
+
+    __slots__ = ("_number", "_session")
+
+    def __init__(self, session: Session, number: int) -> None:
+        self._session = session
+        self._number = number
+
+    def answer(
+        self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()
+    ) -> None:
+        """Send the reply."""
+        if self._session.waiting is self:
+            self._session.waiting = None
+        self._session.stream.send(ONE.pack(status, self._number, value), buffers)
+
+    @property
+    def number(self) -> int:
+        """What the requester calls it."""
+        return self._number
+
+
+class Session:
+    """Serves one stream; its ``Handler``."""
+
+    def __init__(self, home: Home, stream: Stream) -> None:
+        self.stream = stream
+        self.waiting: Request | None = None
+        self._home = home
+        self._admitted = False
+        self._entry: Entry | None = None
+        self._own_grants: set[int] = set()
+        stream.handler = self
+
+    def on_message(self, message: Message) -> None:
+        """Do what it says."""
+        try:
+            operation = Op(message.payload[0])
+            if not self._admitted:
+                self._admit(operation, message.payload)
+            else:
+                _OPERATIONS[operation](self, message)
+        except Refused as refusal:
+            self._end(str(refusal))
+        except NoSuchObject as error:
+            self._end(str(error))
+        except (struct.error, ValueError, IndexError, KeyError, OSError) as error:
+            # A request that ours never send, or a system that has no descriptor left.
+            self._end(f"the hub could not do what was asked: {error}")
+
+    def on_room(self) -> None:
+        """Replies fit again; there is at most one at a time."""
+
+    def on_closed(self, reason: str) -> None:
+        """Whoever used it has ended."""
+        self._leave()
+
+    def close(self, reason: str) -> None:
+        """End it from this side."""
+        self._end(reason)
+
+    def _end(self, reason: str) -> None:
+        self._leave()
+        self.stream.finish(reason)
+
+    def _leave(self) -> None:
+        self._cancel()
+        entry, self._entry = self._entry, None
+        if entry is not None:
+            if isinstance(entry.hosted, HostedChannel):
+                entry.hosted.forget(self)
+            self._home.registry.detach(entry)
+        for grant in self._own_grants:
+            self._home.registry.release(grant)
+        self._own_grants.clear()
+        self._home.ended(self)
+
+    def _cancel(self) -> Request | None:
+        """Withdraw the request that waits."""
+        request, self.waiting = self.waiting, None
+        if request is not None and self._entry is not None:
+            self._entry.hosted.withdraw(request)
+        return request
+
+    def _request(self, message: Message) -> Request:
+        """A request to be answered later; ends the one before."""
+        self._cancel()
+        self.waiting = Request(self, HEAD.unpack_from(message.payload)[1])
+        return self.waiting
+
+    # Getting in
+
+    def _admit(self, operation: Op, payload: memoryview) -> None:
+        if operation is not Op.HELLO:
+            raise Refused("a stream to a hub begins with a greeting")
+        _, _, version, key = protocol.HELLO.unpack(payload)
+        if version != protocol.VERSION:
+            raise Refused(
+                f"this hub speaks version {protocol.VERSION} of its protocol, the other side "
+                f"{version}: install the same fiberpool on both sides"
+            )
+        if not hmac.compare_digest(key, self._home.key):
+            raise Refused("the key is not this hub's: the handle belongs to another program")
+        self._admitted = True
+
+    def hello(self, message: Message) -> None:
+        """Again, after CONNECT to this very host."""
+        self._admit(Op.HELLO, message.payload)
+
+    def connect(self, message: Message) -> None:
+        """Go on at another host's hub."""
+        host = protocol.text(message.payload)
+        self.stream.handler = Deaf()
+        self._leave()
+        self._home.connect(host, self.stream)
+
+    # Objects
+
+    def register(self, message: Message) -> None:
+        """Host a descriptor."""
+        _, number, kind, reusable = TWO.unpack(message.payload)
+        (fd,) = message.fds
+        entry, grant = self._home.registry.register(Kind(kind), fd, reusable=bool(reusable))
+        self._granted(number, entry, grant, reusable)
+
+    def grant(self, message: Message) -> None:
+        """Give a grant for an object that the sender uses."""
+        _, number, entry, reusable = TWO.unpack(message.payload)
+        grant = self._home.registry.grant(entry, reusable=bool(reusable))
+        self._granted(number, entry, grant, reusable)
+
+    def _granted(self, number: int, entry: int, grant: int, reusable: int) -> None:
+        if reusable:
+            self._own_grants.add(grant)
+        self.stream.send(TWO.pack(Status.OK, number, entry, grant))
+
+    def release(self, message: Message) -> None:
+        """Take a grant back."""
+        self._home.registry.release(ONE.unpack(message.payload)[2])
+
+    def fetch(self, message: Message) -> None:
+        """Hand over a descriptor."""
+        _, number, entry, grant = TWO.unpack(message.payload)
+        if not self.stream.passes_descriptors:
+            raise Refused("a descriptor cannot be handed to another host")
+        fd = self._home.registry.fetch(entry, grant)
+        self.stream.send(HEAD.pack(Status.OK, number), (), [fd])
+
+    def attach(self, message: Message) -> None:
+        """Begin to use an object."""
+        if self._entry is not None:
+            raise Refused("a stream is for one object")
+        _, _, entry, grant = TWO.unpack(message.payload)
+        self._entry = self._home.registry.attach(entry, grant)
+
+    def cancel(self, message: Message) -> None:
+        """End the request that waits, with the answer NO."""
+        number = HEAD.unpack_from(message.payload)[1]
+        if self.waiting is not None and self.waiting.number == number:
+            request = self._cancel()
+            assert request is not None
+            request.answer(Status.NO)
+
+    # A channel
+
+    def _channel(self) -> HostedChannel:
+        if self._entry is None or not isinstance(self._entry.hosted, HostedChannel):
+            raise Refused("the stream is not attached to a channel")
+        return self._entry.hosted
+
+    def send(self, message: Message) -> None:
+        """Send a message."""
+        if not message.buffers:
+            raise Refused("there is no message to send")
+        self._channel().send(self._request(message), message.buffers)
+
+    def recv(self, message: Message) -> None:
+        """Receive a message."""
+        self._channel().receive(self._request(message), wait=True)
+
+    def try_recv(self, message: Message) -> None:
+        """Receive a message if one is there."""
+        self._channel().receive(self._request(message), wait=False)
+
+    def poll(self, message: Message) -> None:
+        """Wait for a message."""
+        self._channel().poll(self._request(message))
+
+    def watch(self, message: Message) -> None:
+        """Say once when there is a message."""
+        self._channel().watch(self)
+
+    def check(self, message: Message) -> None:
+        """Say whether there is a message; if so, the stream itself becomes readable, if not, later."""
+        channel, number = self._channel(), HEAD.unpack_from(message.payload)[1]
+        channel.forget(self)
+        readable = channel.readable()
+        self.stream.send(ONE.pack(Status.OK if readable else Status.NO, number, 0))
+        channel.watch(self)
+
+    def ready(self) -> None:
+        """The channel that this stream watches is readable."""
+        self.stream.send(HEAD.pack(Status.READY, 0))
+
+    # A counter
+
+    def _counter(self) -> HostedCounter:
+        if self._entry is None or not isinstance(self._entry.hosted, HostedCounter):
+            raise Refused("the stream is not attached to a counter")
+        return self._entry.hosted
+
+    def add(self, message: Message) -> None:
+        """Raise it."""
+        counter, n = self._counter(), ONE.unpack(message.payload)[2]
+        try:
+            counter.add(n)
+        except BlockingIOError:
+            raise Refused("the count is as high as it can be") from None
+        self._request(message).answer(Status.OK)
+
+    def take(self, message: Message) -> None:
+        """Lower it."""
+        self._counter().take(self._request(message))
+
+    def clear(self, message: Message) -> None:
+        """Zero it."""
+        self._request(message).answer(Status.OK, self._counter().clear())
+
+    def value(self, message: Message) -> None:
+        """Tell it."""
+        self._request(message).answer(Status.OK, self._counter().value())
+
+    def wait(self, message: Message) -> None:
+        """Wait until it is above zero."""
+        self._counter().wait(self._request(message))
+
+    def changed(self, message: Message) -> None:
+        """Wait until it is another."""
+        self._counter().changed(self._request(message), ONE.unpack(message.payload)[2])
+
+
+_OPERATIONS: dict[Op, Callable[[Session, Message], None]] = {
+    operation: getattr(Session, operation.name.lower()) for operation in Op
+}

@@ -1,0 +1,547 @@
+"""``Pool``: multiprocessing's, that cannot hang.
+
+Signatures, results and errors are multiprocessing's.  What is more is spelled by keywords, so that
+code which ignores it also runs there.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from multiprocessing import util
+from multiprocessing.pool import (  # type: ignore[attr-defined]
+    CLOSE,
+    INIT,
+    RUN,
+    TERMINATE,
+    MaybeEncodingError,
+    RemoteTraceback,
+    ThreadPool,
+)
+from typing import Any
+
+from fiber import config, cpu
+from fiber import context as fiber_context
+from fiber._engine.chunks import default_chunksize
+from fiber._runtime.dispatcher import Dispatcher, Terms
+from fiber._runtime.outcome import Failure
+from fiber._runtime.requests import Request
+from fiber._wire import work
+from fiber.errors import FiberError
+from fiber.results import (
+    ApplyResult,
+    AsyncResult,
+    IMapIterator,
+    IMapUnorderedIterator,
+    MapResult,
+)
+
+__all__ = [
+    "ApplyResult",
+    "AsyncResult",
+    "IMapIterator",
+    "IMapUnorderedIterator",
+    "MapResult",
+    "MaybeEncodingError",
+    "Pool",
+    "RemoteTraceback",
+    "ThreadPool",
+]
+
+IDLE_TIMEOUT = 60.0
+"""Seconds after which a worker above ``min_workers`` that has nothing to do leaves."""
+
+_SLICEABLE = (tuple, range, str, bytes)
+
+_Function = Callable[..., Any]
+_Callback = Callable[[Any], object]
+
+
+class Pool:
+    """A pool of worker processes.
+
+    ``processes`` is fixed; ``min_workers`` and ``max_workers`` in its place make the pool follow
+    the work.  Beyond multiprocessing:
+
+    * A task whose worker dies runs again elsewhere, at most ``retries`` times (None: as
+      configured), then it raises ``WorkerDied``; other tasks never notice.
+    * A task that raises one of ``retry_exceptions`` (with ``error_handling=True`` any Exception)
+      runs again, too, before the exception counts.
+    * A task that runs for longer than ``task_timeout`` seconds, or the ``timeout=`` of its call,
+      raises TimeoutError, and its worker is killed and replaced.
+    """
+
+    def __init__(
+        self,
+        processes: int | None = None,
+        initializer: Callable[..., object] | None = None,
+        initargs: Iterable[Any] = (),
+        maxtasksperchild: int | None = None,
+        context: Any = None,
+        *,
+        min_workers: int | None = None,
+        max_workers: int | None = None,
+        retries: int | None = None,
+        retry_exceptions: type[BaseException] | Sequence[type[BaseException]] = (),
+        error_handling: bool = False,
+        task_timeout: float | None = None,
+        idle_timeout: float = IDLE_TIMEOUT,
+    ) -> None:
+        self._state = INIT  # __del__ looks at it
+        minimum, maximum = _sizes(processes, min_workers, max_workers)
+        if maxtasksperchild is not None and (
+            not _is_int(maxtasksperchild) or maxtasksperchild <= 0
+        ):
+            raise ValueError("maxtasksperchild must be a positive int or None")
+        if initializer is not None and not callable(initializer):
+            raise TypeError("initializer must be a callable")
+        self._ctx = context or fiber_context.default.get_context()
+        self._processes = maximum
+        self._maxtasksperchild = maxtasksperchild
+        self._task_timeout = _positive("task_timeout", task_timeout)
+        self._owner = os.getpid()
+        self._dispatcher = Dispatcher(
+            Terms(
+                context=self._ctx,
+                initializer=initializer,
+                initargs=tuple(initargs),
+                minimum=minimum,
+                maximum=maximum,
+                maxtasks=maxtasksperchild,
+                retries=_retries(retries),
+                retryable=(Exception,) if error_handling else _classes(retry_exceptions),
+                idle_timeout=_positive("idle_timeout", idle_timeout) or IDLE_TIMEOUT,
+            )
+        )
+        self._dispatcher.start()
+        self._terminate = util.Finalize(self, _abandon, args=(self._dispatcher,), exitpriority=15)
+        self._state = RUN
+
+    # Calls
+
+    def apply(
+        self,
+        func: _Function,
+        args: Iterable[Any] = (),
+        kwds: Mapping[str, Any] = {},
+        *,
+        timeout: float | None = None,
+    ) -> Any:
+        """Call ``func(*args, **kwds)`` in a worker and return its result."""
+        return self.apply_async(func, args, kwds, timeout=timeout).get()
+
+    def apply_async(
+        self,
+        func: _Function,
+        args: Iterable[Any] = (),
+        kwds: Mapping[str, Any] = {},
+        callback: _Callback | None = None,
+        error_callback: _Callback | None = None,
+        *,
+        timeout: float | None = None,
+    ) -> AsyncResult:
+        """As ``apply``, but return at once with a result to wait for."""
+        self._check_running()
+        result = AsyncResult(self, callback, error_callback)
+        self._dispatcher.call(result, func, args, kwds, self._limit(timeout))
+        return result
+
+    def broadcast(self, func: _Function, *args: Any) -> list[Any]:
+        """Call ``func(*args)`` once in every worker, and return the results of all."""
+        self._check_running()
+        result = MapResult(self)
+        self._dispatcher.broadcast(result, func, args)
+        values: list[Any] = result.get()
+        return values
+
+    # Maps
+
+    def map(
+        self,
+        func: _Function,
+        iterable: Iterable[Any],
+        chunksize: int | None = None,
+        *,
+        timeout: float | None = None,
+    ) -> list[Any]:
+        """``[func(x) for x in iterable]``, the calls spread over the workers.
+
+        ``chunksize`` consecutive items go to one worker together; left out, it adapts to how long
+        they take.  An iterator is read as fast as it is worked off.
+        """
+        return self._map(work.MAP, func, iterable, chunksize, timeout)
+
+    def starmap(
+        self,
+        func: _Function,
+        iterable: Iterable[Iterable[Any]],
+        chunksize: int | None = None,
+        *,
+        timeout: float | None = None,
+    ) -> list[Any]:
+        """``[func(*x) for x in iterable]``, otherwise as ``map``."""
+        return self._map(work.STAR, func, iterable, chunksize, timeout)
+
+    def map_async(
+        self,
+        func: _Function,
+        iterable: Iterable[Any],
+        chunksize: int | None = None,
+        callback: _Callback | None = None,
+        error_callback: _Callback | None = None,
+        *,
+        timeout: float | None = None,
+    ) -> MapResult:
+        """As ``map``, but return at once with a result to wait for.  ``iterable`` is read first."""
+        result = MapResult(self, callback, error_callback)
+        self._map_async(work.MAP, func, iterable, chunksize, timeout, result)
+        return result
+
+    def starmap_async(
+        self,
+        func: _Function,
+        iterable: Iterable[Iterable[Any]],
+        chunksize: int | None = None,
+        callback: _Callback | None = None,
+        error_callback: _Callback | None = None,
+        *,
+        timeout: float | None = None,
+    ) -> MapResult:
+        """As ``starmap``, but return at once with a result to wait for."""
+        result = MapResult(self, callback, error_callback)
+        self._map_async(work.STAR, func, iterable, chunksize, timeout, result)
+        return result
+
+    def imap(
+        self,
+        func: _Function,
+        iterable: Iterable[Any],
+        chunksize: int = 1,
+        *,
+        timeout: float | None = None,
+        buffersize: int | None = None,
+    ) -> IMapIterator:
+        """An iterator over ``func(x) for x in iterable``, in order.
+
+        ``iterable`` is read in another thread, little faster than it is worked off; with
+        ``buffersize`` also at most so many items ahead of what the iterator has given out.
+        """
+        return self._imap(IMapIterator(self), func, iterable, chunksize, timeout, buffersize)
+
+    def imap_unordered(
+        self,
+        func: _Function,
+        iterable: Iterable[Any],
+        chunksize: int = 1,
+        *,
+        timeout: float | None = None,
+        buffersize: int | None = None,
+    ) -> IMapIterator:
+        """As ``imap``, in the order in which the results come."""
+        iterator = IMapUnorderedIterator(self)
+        return self._imap(iterator, func, iterable, chunksize, timeout, buffersize)
+
+    # How they are done
+
+    def _map(
+        self,
+        kind: int,
+        func: _Function,
+        iterable: Iterable[Any],
+        chunksize: int | None,
+        timeout: float | None,
+    ) -> list[Any]:
+        result = MapResult(self)
+        if isinstance(iterable, (*_SLICEABLE, list)) or self._maxtasksperchild is not None:
+            request = self._map_async(kind, func, iterable, chunksize, timeout, result)
+        else:
+            request = self._map_stream(kind, func, iterable, chunksize, timeout, result)
+        try:
+            result.wait()
+        except BaseException:  # Ctrl-C: whoever waits for it no longer does
+            if request is not None:
+                self._dispatcher.cancel(request)
+            raise
+        values: list[Any] = result.get()
+        return values
+
+    def _map_async(
+        self,
+        kind: int,
+        func: _Function,
+        iterable: Iterable[Any],
+        chunksize: int | None,
+        timeout: float | None,
+        result: MapResult,
+    ) -> Request | None:
+        self._check_running()
+        _check_chunksize(chunksize)
+        try:
+            items = iterable if isinstance(iterable, _SLICEABLE) else tuple(iterable)
+        except Exception as error:
+            if not hasattr(iterable, "__len__"):
+                raise
+            # multiprocessing reads what has a length in the background.
+            _fail(result, error)
+            return None
+        try:
+            function = self._dispatcher.function(func)
+        except Exception as error:
+            _fail(result, error)
+            return None
+        if chunksize is None and self._maxtasksperchild is not None:
+            chunksize = default_chunksize(len(items), self._processes)
+        return self._dispatcher.map(
+            kind,
+            function,
+            items,
+            result,
+            unit=chunksize or 1,
+            exact=chunksize == 1,
+            timeout=self._limit(timeout),
+        )
+
+    def _map_stream(
+        self,
+        kind: int,
+        func: _Function,
+        iterable: Iterable[Any],
+        chunksize: int | None,
+        timeout: float | None,
+        result: MapResult,
+    ) -> Request | None:
+        """A map that reads its input on this thread."""
+        self._check_running()
+        _check_chunksize(chunksize)
+        try:
+            function = self._dispatcher.function(func)
+        except Exception as error:
+            _fail(result, error)
+            return None
+        request = self._dispatcher.stream(
+            kind,
+            function,
+            result,
+            unit=chunksize or 1,
+            exact=chunksize == 1,
+            timeout=self._limit(timeout),
+        )
+        try:
+            self._dispatcher.read(request, iterable)
+        except BaseException:
+            self._dispatcher.cancel(request)
+            raise
+        self._dispatcher.finish(request)
+        return request
+
+    def _imap(
+        self,
+        iterator: IMapIterator,
+        func: _Function,
+        iterable: Iterable[Any],
+        chunksize: int,
+        timeout: float | None,
+        buffersize: int | None,
+    ) -> IMapIterator:
+        self._check_running()
+        _check_chunksize(chunksize)
+        if buffersize is not None and buffersize < 1:
+            raise ValueError(f"buffersize must be 1+, not {buffersize!r}")
+        buffer = iterator._buffer
+        dispatcher = self._dispatcher
+        try:
+            function = dispatcher.function(func)
+        except Exception as error:
+            _fail(buffer, error)
+            return iterator
+        options: dict[str, Any] = {
+            "unit": chunksize,
+            "exact": chunksize == 1,
+            "timeout": self._limit(timeout),
+        }
+        if buffersize is None and isinstance(iterable, (*_SLICEABLE, list)):
+            items = tuple(iterable) if isinstance(iterable, list) else iterable
+            dispatcher.map(work.MAP, function, items, buffer, **options)
+            return iterator
+        request = dispatcher.stream(work.MAP, function, buffer, limit=buffersize, **options)
+        if buffersize is not None:
+            buffer.reader = request.reader
+            iterator._cancel = partial(dispatcher.post, dispatcher.cancel, request)
+        threading.Thread(
+            target=_feed,
+            args=(dispatcher, request, iterable),
+            name="fiber-pool-feeder",
+            daemon=True,
+        ).start()
+        return iterator
+
+    def _limit(self, timeout: float | None) -> float | None:
+        return self._task_timeout if timeout is None else _positive("timeout", timeout)
+
+    def _call_back(self, action: Callable[[], None]) -> bool:
+        """Have a callback run; False if the pool was terminated and none runs any more."""
+        return self._dispatcher.callbacks.post(action)
+
+    # The pool itself
+
+    @property
+    def _pool(self) -> list[Any]:
+        """The processes of its workers."""
+        return [link.process for link in self._dispatcher.links()]
+
+    def _repopulate_pool(self) -> None:
+        """Nothing: workers are replaced as they go."""
+
+    def _check_running(self) -> None:
+        self._check_owner()
+        if self._state != RUN:
+            raise ValueError("Pool not running")
+
+    def _check_owner(self) -> None:
+        if os.getpid() != self._owner:
+            raise RuntimeError(
+                f"this pool belongs to process {self._owner}: a copy of it that came here by a "
+                "fork has no workers; make a pool in this process"
+            )
+
+    def close(self) -> None:
+        """Take no more work.  The workers go once all that was asked for is done."""
+        self._check_owner()
+        util.debug("closing pool")
+        if self._state == RUN:
+            self._state = CLOSE
+            self._dispatcher.close()
+
+    def terminate(self) -> None:
+        """End the workers at once.  Whoever waits for a result gets an error."""
+        self._check_owner()
+        util.debug("terminating pool")
+        self._state = TERMINATE
+        self._terminate.cancel()
+        _end(self._dispatcher)
+
+    def join(self) -> None:
+        """Wait until all workers are gone; after ``close`` or ``terminate``.
+
+        Results that nobody has taken from ``imap(buffersize=)`` no longer hold up what is left.
+        """
+        self._check_owner()
+        util.debug("joining pool")
+        if self._state == RUN:
+            raise ValueError("Pool is still running")
+        if self._state not in (CLOSE, TERMINATE):
+            raise ValueError("In unknown state")
+        self._dispatcher.join()
+        self._terminate.cancel()
+
+    def __enter__(self) -> Pool:
+        self._check_running()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.terminate()
+
+    def __reduce__(self) -> str:
+        raise NotImplementedError("pool objects cannot be passed between processes or pickled")
+
+    def __repr__(self) -> str:
+        cls = type(self)
+        size = len(self._pool) if self._state != INIT else 0
+        return f"<{cls.__module__}.{cls.__qualname__} state={self._state} pool_size={size}>"
+
+    def __del__(self, _warn: Any = warnings.warn, RUN: str = RUN) -> None:
+        if self._state == RUN and self._owner == os.getpid():
+            _warn(f"unclosed running multiprocessing pool {self!r}", ResourceWarning, source=self)
+
+
+def _feed(dispatcher: Dispatcher, request: Request, iterable: Iterable[Any]) -> None:
+    """What a feeder thread does: read the input of an imap."""
+    error = None
+    try:
+        dispatcher.read(request, iterable)
+    except BaseException as raised:
+        error = raised
+    dispatcher.finish(request, error)
+
+
+def _fail(sink: Any, error: BaseException) -> None:
+    """Nothing can be sent, because of ``error``."""
+    sink.put(0, [Failure(error)], True)
+    sink.end()
+
+
+def _end(dispatcher: Dispatcher) -> None:
+    dispatcher.terminate(
+        FiberError(
+            "the pool was terminated before this result was there: close() and join() it "
+            "to wait for what was asked"
+        )
+    )
+    if not dispatcher.on_loop():
+        dispatcher.ended.wait()
+
+
+def _abandon(dispatcher: Dispatcher) -> None:
+    """The program ends, or has forgotten the pool."""
+    if util.is_exiting():
+        _end(dispatcher)
+    else:
+        # The garbage collector runs anywhere, even where a lock is held that this needs.
+        dispatcher.post(_end, dispatcher)
+
+
+def _sizes(processes: int | None, low: int | None, high: int | None) -> tuple[int, int]:
+    """Smallest and largest number of workers."""
+    if low is None and high is None:
+        count = cpu.cpu_count() if processes is None else processes
+        if count < 1:
+            raise ValueError("Number of processes must be at least 1")
+        return count, count
+    if processes is not None:
+        raise ValueError(
+            "processes= is a fixed number of workers: give it, or min_workers= and max_workers="
+        )
+    low = 1 if low is None else low
+    high = max(low, cpu.cpu_count()) if high is None else high
+    if not 0 <= low <= high or high < 1:
+        raise ValueError(
+            f"min_workers={low} and max_workers={high}: expected 0 <= min_workers <= max_workers, "
+            "and max_workers >= 1"
+        )
+    return low, high
+
+
+def _is_int(value: object) -> bool:
+    return isinstance(value, int)
+
+
+def _retries(retries: int | None) -> int:
+    if retries is None:
+        return config.current().retries
+    if not _is_int(retries) or retries < 0:
+        raise ValueError(f"retries must be a whole number of at least 0, not {retries!r}")
+    return retries
+
+
+def _positive(name: str, seconds: float | None) -> float | None:
+    if seconds is not None and not seconds > 0:
+        raise ValueError(f"{name} must be a number of seconds above 0, not {seconds!r}")
+    return seconds
+
+
+def _classes(
+    wanted: type[BaseException] | Sequence[type[BaseException]],
+) -> tuple[type[BaseException], ...]:
+    classes = (wanted,) if isinstance(wanted, type) else tuple(wanted)
+    for cls in classes:
+        if not issubclass(cls, BaseException):
+            raise TypeError(f"retry_exceptions must be exception classes, not {cls!r}")
+    return classes
+
+
+def _check_chunksize(chunksize: int | None) -> None:
+    if chunksize is not None and chunksize < 1:
+        raise ValueError(f"Chunksize must be 1+, not {chunksize!r}")

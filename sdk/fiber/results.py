@@ -1,0 +1,269 @@
+"""What a pool's calls return: results to wait for, and iterators over results.
+
+As in ``multiprocessing.pool``, with what that leaves open promised: a result of a pool that is
+terminated or cannot go on raises an error instead of waiting for ever.
+"""
+
+from __future__ import annotations
+
+import threading
+import types
+from collections import deque
+from collections.abc import Callable, Iterator
+from multiprocessing import TimeoutError
+from typing import TYPE_CHECKING, Any
+
+from fiber._runtime.outcome import Encoded, Failure, decode, is_failure
+
+if TYPE_CHECKING:
+    from fiber._runtime.reader import Reader
+    from fiber.pool import Pool
+
+__all__ = ["ApplyResult", "AsyncResult", "IMapIterator", "IMapUnorderedIterator", "MapResult"]
+
+_Callback = Callable[[Any], object]
+
+
+class ApplyResult:
+    """The result of one call, as ``apply_async`` returns it."""
+
+    def __init__(
+        self,
+        pool: Pool,
+        callback: _Callback | None = None,
+        error_callback: _Callback | None = None,
+    ) -> None:
+        # Keeps the pool while there is something to wait for, as in multiprocessing.
+        self._pool: Pool | None = pool
+        self._callback = callback
+        self._error_callback = error_callback
+        self._outcome: Any = None
+        self._mixed = False
+        self._done = False
+        # Held until the result is there; whoever waits takes it and hands it on.
+        self._lock = threading.Lock()
+        self._lock.acquire()
+
+    def ready(self) -> bool:
+        """Whether the call has completed."""
+        return self._done
+
+    def successful(self) -> bool:
+        """Whether it completed without raising; ValueError if it has not completed."""
+        if not self._done:
+            raise ValueError(f"{self!r} not ready")
+        return type(self._settled()) is not Failure
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Wait until the result is there or ``timeout`` seconds are over."""
+        if not self._done and self._lock.acquire(True, -1 if timeout is None else max(0, timeout)):
+            self._lock.release()
+
+    def get(self, timeout: float | None = None) -> Any:
+        """The result, or the exception that the call raised; TimeoutError if there is neither."""
+        self.wait(timeout)
+        if not self._done:
+            raise TimeoutError
+        outcome = self._settled()
+        if type(outcome) is Failure:
+            raise outcome.error
+        return outcome
+
+    # What the dispatcher says
+
+    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+        """Take the outcome."""
+        self._outcome = outcomes[0]
+        self._mixed = mixed
+
+    def end(self) -> None:
+        """All outcomes are there: call back, then let those go on who wait."""
+        wanted = self._callback is not None or self._error_callback is not None
+        pool = self._pool
+        if not wanted or pool is None or not pool._call_back(self._run_callback):
+            self._complete()
+
+    def abort(self, error: BaseException) -> None:
+        """There will be no outcome."""
+        self._outcome = Failure(error)
+        self._mixed = False
+        self._complete()
+
+    def _run_callback(self) -> None:
+        try:
+            self._settle()
+            failed = type(self._outcome) is Failure
+            callback = self._error_callback if failed else self._callback
+            if callback is not None:
+                callback(self._outcome.error if failed else self._outcome)
+        finally:
+            self._complete()
+
+    def _complete(self) -> None:
+        self._pool = None
+        self._done = True
+        self._lock.release()
+
+    def _settled(self) -> Any:
+        if self._mixed:
+            with self._lock:
+                self._settle()
+        return self._outcome
+
+    def _settle(self) -> None:
+        """Unpickle what still is; on one thread."""
+        if self._mixed:
+            self._outcome = decode(self._outcome)
+            self._mixed = False
+
+    __class_getitem__: Any = classmethod(types.GenericAlias)
+
+
+AsyncResult = ApplyResult
+
+
+class MapResult(ApplyResult):
+    """The results of a map, as ``map_async`` returns it.
+
+    If tasks raised, it raises what the first of them, in time, did; once all are done.
+    """
+
+    def __init__(
+        self,
+        pool: Pool,
+        callback: _Callback | None = None,
+        error_callback: _Callback | None = None,
+    ) -> None:
+        super().__init__(pool, callback, error_callback)
+        self._outcome = []
+        self._first: Any = None
+
+    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+        """Take outcomes."""
+        values = self._outcome
+        if start > len(values):
+            values.extend([None] * (start - len(values)))
+        values[start : start + len(outcomes)] = outcomes
+        if mixed:
+            self._mixed = True
+            if self._first is None:
+                self._first = next(filter(is_failure, outcomes), None)
+
+    def _settle(self) -> None:
+        if not self._mixed:
+            return
+        if self._first is not None:
+            self._outcome = decode(self._first)
+        else:
+            values = self._outcome
+            for at, value in enumerate(values):
+                if type(value) is Encoded:
+                    values[at] = value.decode()
+                    if type(values[at]) is Failure:
+                        self._outcome = values[at]
+                        break
+        self._mixed = False
+
+
+class _Buffer:
+    """Results on their way to an iterator: what the dispatcher fills and the iterator empties."""
+
+    def __init__(self, pool: Pool) -> None:
+        self.items: deque[Any] = deque()
+        self.finished = False
+        self.reader: Reader | None = None
+        self.pool: Pool | None = pool
+        self._arrived = threading.Condition(threading.Lock())
+        self._waiting = 0
+
+    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+        """Take outcomes."""
+        self.items.extend(outcomes)
+        self._wake()
+
+    def end(self) -> None:
+        """All outcomes are there."""
+        self.finished = True
+        self.pool = None
+        self._wake()
+
+    def abort(self, error: BaseException) -> None:
+        """There will be no more outcomes."""
+        self.items.append(Failure(error))
+        self.end()
+
+    def _wake(self) -> None:
+        # Who waits says so first and looks at the items then.
+        if self._waiting:
+            with self._arrived:
+                self._arrived.notify_all()
+
+    def wait(self, timeout: float | None) -> Any:
+        """The next outcome; StopIteration at the end, TimeoutError if it takes too long."""
+        with self._arrived:
+            self._waiting += 1
+            try:
+                self._arrived.wait_for(lambda: self.items or self.finished, timeout)
+                if self.items:
+                    return self.items.popleft()
+            finally:
+                self._waiting -= 1
+        if self.finished:
+            raise StopIteration
+        raise TimeoutError
+
+
+class _OrderedBuffer(_Buffer):
+    def __init__(self, pool: Pool) -> None:
+        super().__init__(pool)
+        self._next = 0
+        self._early: dict[int, list[Any]] = {}
+
+    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+        """Take outcomes; pass on what is next in order."""
+        self._early[start] = outcomes
+        while (ready := self._early.pop(self._next, None)) is not None:
+            self.items.extend(ready)
+            self._next += len(ready)
+        self._wake()
+
+
+class IMapIterator:
+    """Iterator over the results of ``imap``, in order."""
+
+    _buffer_type: type[_Buffer] = _OrderedBuffer
+
+    def __init__(self, pool: Pool) -> None:
+        self._buffer = self._buffer_type(pool)
+        self._cancel: Callable[[], None] | None = None
+
+    def __iter__(self) -> Iterator[Any]:
+        return self
+
+    def next(self, timeout: float | None = None) -> Any:
+        """The next result; TimeoutError if it takes longer than ``timeout`` seconds."""
+        buffer = self._buffer
+        try:
+            outcome = buffer.items.popleft()
+        except IndexError:
+            outcome = buffer.wait(timeout)
+        if buffer.reader is not None:
+            buffer.reader.consume(1)
+        if type(outcome) is Encoded:
+            outcome = outcome.decode()
+        if type(outcome) is Failure:
+            raise outcome.error
+        return outcome
+
+    __next__ = next
+
+    def __del__(self) -> None:
+        # Nobody can make room any more for what was not read yet.
+        if self._cancel is not None and not self._buffer.finished:
+            self._cancel()
+
+
+class IMapUnorderedIterator(IMapIterator):
+    """Iterator over the results of ``imap_unordered``, as they come."""
+
+    _buffer_type = _Buffer
