@@ -74,7 +74,7 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
     attempt = Spawning(process)
     mp_context.set_spawning_popen(cast("Any", attempt if same_host else RemoteSpawning(process)))
     try:
-        payload = dumps(process, by_value=not same_host, before_retry=attempt.reset)
+        payload = dumps(process, before_retry=attempt.reset)
     except BaseException:
         attempt.reset()
         raise
@@ -103,18 +103,16 @@ def dumps(
     obj: Any,
     protocol: int | None = None,
     *,
-    by_value: bool = False,
     buffer_callback: Callable[[pickle.PickleBuffer], Any] | None = None,
     before_retry: Callable[[], None] = lambda: None,
 ) -> bytes:
     """Pickle ``obj``, by reference where possible.
 
-    ``by_value``: the reader cannot import our ``__main__``, so what lives there goes by value.
+    What lives in a ``__main__`` that the reader cannot import goes by value.
     """
-    by_value = by_value or main_is_interactive()
     try:
         data = _dump(_Forking, obj, protocol, buffer_callback)
-        if not (by_value and b"__main__" in data):
+        if not (main_is_out_of_reach() and b"__main__" in data):
             return data
     except Exception:
         pass
@@ -126,7 +124,7 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     """Pickle ``obj`` for a packet: the pickle, and large buffers beside it."""
     try:
         encoded = packet.dumps(obj)
-        if not (main_is_interactive() and b"__main__" in encoded[0]):
+        if not (main_is_out_of_reach() and b"__main__" in encoded[0]):
             return encoded
     except Exception:
         pass
@@ -138,10 +136,21 @@ def dump(obj: Any, file: Any, protocol: int | None = None) -> None:
     file.write(dumps(obj, protocol))
 
 
-def main_is_interactive() -> bool:
-    """Whether a child has no file or module name from which it could import our ``__main__``."""
+def main_is_out_of_reach() -> bool:
+    """Whether those who read our pickles cannot import our ``__main__`` from a file or by name."""
+    if _readers_are_remote:
+        return True
     main = sys.modules.get("__main__")
     return getattr(main, "__file__", None) is None and getattr(main, "__spec__", None) is None
+
+
+def readers_are_remote(remote: bool) -> None:
+    """Our processes run on other hosts (or no longer do): what is in ``__main__`` goes by value."""
+    global _readers_are_remote
+    _readers_are_remote = remote
+
+
+_readers_are_remote = False
 
 
 class _Forking(ForkingPickler):

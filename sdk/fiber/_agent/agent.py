@@ -10,6 +10,7 @@ thread.
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
 import pickle
@@ -28,7 +29,7 @@ from fiber._agent.child import interpreter_arguments
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
-from fiber._transport.unix import socketpair
+from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike
 
@@ -53,6 +54,7 @@ class Agent:
         """Start a child; it has its pid when ``observer.started`` is called."""
         with self._lock:
             if self._closed:
+                _close_all(spec.fds)
                 raise RuntimeError("this process is ending: no process can be started any more")
             child = LocalChild(self, next(self._ids), spec, observer)
             self._children[child.id] = child
@@ -61,7 +63,7 @@ class Agent:
                 child.zygote.request(child)
             except BaseException:
                 del self._children[child.id]
-                self._loop.call_soon(child.abandon)
+                self._loop.call_soon(self._bury, child)
                 raise
         return child
 
@@ -105,27 +107,39 @@ class Agent:
         for child in [c for c in self._children.values() if c.zygote is link]:
             self._gone(child, -signal.SIGKILL, "killed by SIGKILL, together with its zygote")
 
-    def _start_elsewhere(self, unlucky: LocalChild) -> None:
-        """The zygote must not be forked: use one that imports nothing for it and all after it."""
-        with self._lock:
-            old = unlucky.zygote
-            fresh = self._zygote(preload=False)
-            for child in self._children.values():
-                if child.zygote is old and child.pid is None:
-                    child.zygote = fresh
-                    fresh.request(child)
-        assert old is not None
-        old.retire()
+    def _start_elsewhere(self, child: LocalChild) -> None:
+        """Its zygote must not be forked: one that imports nothing serves it and all after it.
+
+        What the old one runs already lives on there.
+        """
+        try:
+            with self._lock:
+                if self._closed:
+                    return  # and the end of its zygote is its own
+                old = child.zygote
+                child.zygote = self._zygote(preload=self._zygotes[-1] is not old)
+                child.zygote.request(child)
+                deserted = all(other.zygote is not old for other in self._children.values())
+        except Exception as error:
+            self._gone(child, 1, f"could not be started: {error}")
+            return
+        if deserted and old is not None:
+            old.send(zygote.QUIT)
 
     def _gone(self, child: LocalChild, exitcode: int, reason: str) -> None:
         with self._lock:
             del self._children[child.id]
-        unread = child.hang_up()
-        running = None
-        if child.slot is not None:
-            running = self._board.running(child.slot)
-            self._board.release(child.slot)
+        unread, running = self._bury(child)
         child.observer.exited(ExitReport(exitcode, reason, unread, running, host=self.host))
+
+    def _bury(self, child: LocalChild) -> tuple[tuple[int, ...], tuple[int, int] | None]:
+        """Give back what it had; what it never read and what it was running."""
+        unread = child.hang_up()
+        if child.slot is None:
+            return unread, None
+        running = self._board.running(child.slot)
+        self._board.release(child.slot)
+        return unread, running
 
 
 class LocalChild:
@@ -146,8 +160,12 @@ class LocalChild:
         self._theirs: socket.socket | None = None
         self._outbox: Outbox | None = None
         self._lock = threading.Lock()
-        if spec.tasks:
-            self._open_channel(agent)
+        try:
+            if spec.tasks:
+                self._open_channel(agent)
+        except BaseException:
+            self.release_descriptors()
+            raise
 
     def _open_channel(self, agent: Agent) -> None:
         ours, theirs = socketpair("starting a pool worker")
@@ -161,11 +179,16 @@ class LocalChild:
 
     def descriptors(self) -> list[int]:
         """New descriptors for the child: stdout, stderr, task channel, and those of its handles."""
-        out, err = self.spec.stdio or (1, 2)
-        fds = [_dup_or_null(out), _dup_or_null(err)]
-        if self._theirs is not None:
-            fds.append(os.dup(self._theirs.fileno()))
-        return fds + [os.dup(fd) for fd in self._fds]
+        ours = [] if self._theirs is None else [self._theirs.fileno()]
+        fds: list[int] = []
+        try:
+            with naming_the_limit("starting a process"):
+                fds += map(_dup_or_null, self.spec.stdio or (1, 2))
+                fds += map(os.dup, [*ours, *self._fds])
+        except BaseException:
+            _close_all(fds)
+            raise
+        return fds
 
     def release_descriptors(self) -> None:
         """It has its own now: the other end must see EOF when the child lets go."""
@@ -187,9 +210,7 @@ class LocalChild:
         if self.zygote is not None:
             self.zygote.send(zygote.SIGNAL, self.id, signum)
 
-    def abandon(self) -> None:
-        """It never came to be."""
-        self.hang_up()
+
 
     def hang_up(self) -> tuple[int, ...]:
         """It is gone: hear its last words, recall what it never read.  On the loop."""
@@ -242,9 +263,14 @@ class _ZygoteLink:
     def __init__(self, agent: Agent, loop: Loop, board: int, *, preload: bool) -> None:
         self._agent = agent
         self._loop = loop
+        self._gone = threading.Event()
         self._sock, theirs = socketpair("starting the zygote")
         try:
-            self._process = _launch(theirs.fileno(), board, preload=preload)
+            with naming_the_limit("starting the zygote"):
+                self._process = _launch(theirs.fileno(), board, preload=preload)
+        except BaseException:
+            self._sock.close()
+            raise
         finally:
             theirs.close()
         self._sock.setblocking(False)
@@ -272,14 +298,6 @@ class _ZygoteLink:
         """Ask for something else."""
         self._outbox.send(pickle.dumps(request))
 
-    def retire(self) -> None:
-        """End it once it has nothing to do for us; on the loop's thread."""
-        self.send(zygote.QUIT)
-        self._loop.unregister(self._sock.fileno())
-        self._outbox.close()
-        self._sock.close()
-        self._process.wait(_QUIT_TIMEOUT)
-
     def quit(self) -> None:
         """End it and its children, and wait for that; on any thread but the loop's."""
         self.send(zygote.QUIT)
@@ -288,6 +306,9 @@ class _ZygoteLink:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        if self._loop.running:
+            # Its last words tell of its children.
+            self._gone.wait(_QUIT_TIMEOUT)
 
     def _receive(self) -> None:
         try:
@@ -300,6 +321,7 @@ class _ZygoteLink:
             self._sock.close()
             self._process.wait()
             self._agent.zygote_gone(self)
+            self._gone.set()
             return
         self._agent.heard(self, answer)
 
@@ -312,8 +334,10 @@ def _launch(control: int, board: int, *, preload: bool) -> subprocess.Popen[byte
         interpreter_arguments(sys.executable, statement),
         pass_fds=(control, board),
         stdin=subprocess.DEVNULL,
-        # Its own session: Ctrl-C in the terminal is for the program alone.
-        start_new_session=True,
+        # Ctrl-C in the terminal is for the program's own group.  A session of its own would make
+        # the kernel's scheduler share the processors between program and children by half
+        # (sched_autogroup), however many children there are.
+        process_group=0,
     )
 
 
@@ -330,7 +354,10 @@ def describe(exitcode: int) -> str:
 def _dup_or_null(fd: int) -> int:
     try:
         return os.dup(fd)
-    except OSError:  # the program closed its stdout or stderr
+    except OSError as error:
+        if error.errno != errno.EBADF:
+            raise
+        # The program closed its stdout or stderr.
         return os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
 
 

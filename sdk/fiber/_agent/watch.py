@@ -14,7 +14,10 @@ import time
 from fiber._agent.answer import Answer
 
 PATIENCE = 10e-3
-"""Seconds that a batch may run before it is taken apart; it was meant for one millisecond."""
+"""Seconds that a batch may run before it is taken apart, if its results are wanted one by one."""
+
+LONG_PATIENCE = 40e-3
+"""The same for other batches.  Both are some times what a message was meant to carry."""
 
 
 class Watch:
@@ -60,7 +63,7 @@ class Watch:
     def _outlast(self) -> Answer | None:
         """Wait for a batch that runs for too long; None if they end before that."""
         while (answer := self._watched) is not None:
-            time.sleep(PATIENCE)
+            time.sleep(PATIENCE if answer.exact else LONG_PATIENCE)
             if self._watched is answer:
                 return answer
         return None

@@ -17,7 +17,7 @@ from typing import Any
 
 from fiber._agent import child
 from fiber._agent.answer import Answer, Sender, encode_error
-from fiber._agent.watch import PATIENCE, Watch
+from fiber._agent.watch import LONG_PATIENCE, Watch
 from fiber._wire import work
 from fiber._wire.packet import Message
 
@@ -97,7 +97,7 @@ class Worker:
             seq,
             iter(items),
             len(items),
-            exact=head.stride == 1 == head.unit,
+            exact=not head.stride,
             started=started,
             retryable=self._retryable,
         )
@@ -174,7 +174,7 @@ class Worker:
             answer.settle()
             if not more:
                 return
-            if time.perf_counter() - started > PATIENCE and len(values) % unit == 0:
+            if time.perf_counter() - started > LONG_PATIENCE and len(values) % unit == 0:
                 answer.give_back()
 
     def _extend(self, answer: Answer, results: Iterator[Any], size: int) -> bool:

@@ -64,6 +64,7 @@ class Zygote:
         self._board = board
         self._agent = agent
         self._preload = preload
+        self._unfit: str | None = None
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
         self._descriptors: list[int] = []
@@ -111,14 +112,10 @@ class Zygote:
         return bool(request[0] != QUIT)
 
     def _start(self, child: int, start: Start, fds: list[int]) -> None:
-        if self._preload and start.method == "fork":
-            self._preload = False
-            reason = _preload(start.preparation)
-            self._listen_to_signals()  # an import may have set its own
-            if reason:
-                self._say(UNFIT, child, reason)
-                _close_all(fds)
-                return
+        if start.method == "fork" and not self._fit(start):
+            self._say(UNFIT, child, self._unfit)
+            _close_all(fds)
+            return
         # Until the child has undone it, it ignores what we ignore: a signal sent to it right after
         # its birth has to wait, not to be lost.
         signal.pthread_sigmask(signal.SIG_BLOCK, _HELD)
@@ -135,6 +132,14 @@ class Zygote:
         self._pids[child] = pid
         self._children[pid] = child
         self._say(STARTED, child, pid)
+
+    def _fit(self, start: Start) -> bool:
+        """Whether this process may be forked, after it has imported what it shall."""
+        if self._preload:
+            self._preload = False
+            self._unfit = _preload(start.preparation)
+            self._listen_to_signals()  # an import may have set its own
+        return self._unfit is None
 
     def _become(self, start: Start, fds: list[int]) -> NoReturn:
         """In the forked process: drop what is the zygote's and run the child."""

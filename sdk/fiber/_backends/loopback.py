@@ -162,7 +162,7 @@ class _Slot:
             interpreter_arguments(sys.executable, statement),
             env=self._backend.environment(name),
             stdin=subprocess.DEVNULL,
-            start_new_session=True,
+            process_group=0,
         )
         self._watched = os.pidfd_open(self._process.pid)
         self._backend.loop.register(self._watched, self._ended)

@@ -1,19 +1,26 @@
 """How much work one message carries, and how many messages one worker is given ahead.
 
-Pure: numbers in, numbers out.  A message should carry about a millisecond of work, so that its
-cost disappears beside it: tasks of a second travel one by one, tasks of a microsecond by the
-thousand.
+Pure: numbers in, numbers out.  A message should carry some milliseconds of work, so that its cost
+disappears beside it: tasks of a second travel one by one, tasks of a microsecond by the thousand.
+That a message may turn out to carry far more is the worker's business: it gives back what it has
+not begun (``_agent/watch.py``).
 """
 
 from __future__ import annotations
 
-TARGET = 1e-3
+TARGET = 16e-3
 """Seconds of work that one message should carry."""
 
-GROWTH = 4
+PROMPT = 4e-3
+"""The same for tasks whose results are wanted one by one, as they are ready."""
+
+FLOOR = 250e-6
+"""Seconds of work that one message carries even where less would spread it more evenly."""
+
+GROWTH = 8
 """A message carries at most this many times the tasks of the largest one that was measured."""
 
-RESUMED = 4
+RESUMED = 64
 """What a function that ran before is trusted with at first, counted as a measured message."""
 
 LIMIT = 1 << 14
@@ -22,8 +29,8 @@ LIMIT = 1 << 14
 SLOW = 50e-3
 """Tasks of this many seconds do not queue behind another: the gap between two cannot be seen."""
 
-STRIDE_SECONDS = 50e-6
-STRIDE_LIMIT = 64
+STRIDE_SECONDS = 200e-6
+STRIDE_LIMIT = 1024
 
 
 class Pace:
@@ -45,17 +52,21 @@ class Pace:
         self.seconds = each if self.seconds is None else (self.seconds + each) / 2
         self.largest = max(self.largest, tasks)
 
-    def batch_size(self, waiting: int, workers: int, unit: int = 1) -> int:
+    def batch_size(self, waiting: int, workers: int, unit: int = 1, target: float = TARGET) -> int:
         """Tasks to send next: whole units of ``unit``, at least one, at most what is ``waiting``.
 
-        Never more than half of a worker's fair share of what waits, so that all end together.
+        About ``target`` seconds of work, but no more than half of a worker's fair share of what
+        waits, so that all end together.
         """
-        if self.seconds is None:
-            wanted = 1
-        else:
-            wanted = min(int(TARGET / max(self.seconds, 1e-9)), GROWTH * self.largest, LIMIT)
-        units = min(wanted, waiting // (2 * workers)) // unit
-        return min(max(units, 1) * unit, waiting)
+        seconds = self.seconds
+        size = 1
+        if seconds is not None and seconds <= target:
+            seconds = seconds or 1e-9
+            wanted = min(int(target / seconds), GROWTH * self.largest, LIMIT)
+            share = waiting // (2 * workers)
+            size = wanted if wanted <= share else min(wanted, max(share, int(FLOOR / seconds)))
+        units = size // unit or 1
+        return min(units * unit, waiting)
 
     def depth(self) -> int:
         """Messages in flight for each worker: the one that runs and, if tasks are fast, another."""

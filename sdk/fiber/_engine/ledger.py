@@ -25,7 +25,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from fiber._engine.chunks import Pace
+from fiber._engine.chunks import PROMPT, TARGET, Pace
 from fiber._engine.roster import PATIENCE, Roster
 from fiber._engine.spans import Span, Waiting
 from fiber._engine.tasks import Batch, Job, Loss, Receipt, Worker
@@ -66,8 +66,8 @@ class Ledger:
 
         ``unit``: its tasks are given out in contiguous chunks of at least this many.  ``alone``:
         each travels alone, to an idle worker, with nothing queued behind it.  Without retries
-        they always do: a crash must not leave in doubt whether another task ran.  ``exact``: the
-        worker notes each task that it begins, however short they are.
+        they always do: a crash must not leave in doubt whether another task ran.  ``exact``: results
+        are wanted one by one, and the worker notes each task that it begins, however short.
         """
         job = Job(owner, pace or Pace(), retries, unit, alone, exact)
         self.jobs.add(job)
@@ -183,6 +183,8 @@ class Ledger:
 
         Idle workers come first; jobs take turns.
         """
+        if not self.hungry():
+            return None
         if self._pins and (batch := self._assign_pinned(now)):
             return batch
         for _ in range(len(self._turns)):
@@ -210,14 +212,17 @@ class Ledger:
         idle = self._roster.last_idle()
         if idle is not None:
             return idle
+        if job.pace.depth() < 2 or job.waiting.first_alone():
+            return None
         # What a worker that is about to start can run should not queue behind something else.
-        if len(job.waiting) <= self.starting or job.pace.depth() < 2 or job.waiting.first_alone():
+        if self.starting and len(job.waiting) <= self.starting:
             return None
         return self._roster.first_single()
 
     def _cut(self, job: Job, worker: Worker, now: float) -> Batch:
         workers = len(self.workers) + self.starting
-        size = job.pace.batch_size(len(job.waiting), workers, job.unit)
+        target = PROMPT if job.exact else TARGET
+        size = job.pace.batch_size(len(job.waiting), workers, job.unit, target)
         if worker.left is not None:
             size = min(size, worker.left * job.unit)
         return self._send(job, worker, job.waiting.take(size), now)
@@ -253,28 +258,27 @@ class Ledger:
         batch = self.batches.get(seq)
         if batch is None or offset != batch.received or offset + count > len(batch.items):
             return None
-        receipt = None
         job = batch.job
+        batch.received = received = offset + count
         if job is not None:
-            receipt = Receipt(job, batch.start + offset, count, batch)
             job.done += count
             job.pace.observe(count, seconds)
-        batch.received += count
         if kept is not None:
-            self._cut_short(batch, max(kept, batch.received))
-        if batch.received == len(batch.items):
+            self._cut_short(batch, max(kept, received))
+        if received == len(batch.items):
             self._close_batch(batch, now)
-        if job is not None:
-            self._finish(job)
-        return receipt
+        if job is None:
+            return None
+        self._finish(job)
+        return Receipt(job, batch.start + offset, count, batch)
 
     def _cut_short(self, batch: Batch, kept: int) -> None:
         at, stop = batch.start + kept, batch.stop
         if at >= stop:
             return
         units = batch.units
-        rest = batch.span.part(at, stop)
-        batch.span = batch.span.part(batch.start, at)
+        rest = batch.part(at, stop)
+        batch.items = batch.items[:kept]
         if batch.worker.left is not None:
             batch.worker.left += units - batch.units
         if batch.job is not None:
@@ -285,7 +289,9 @@ class Ledger:
         worker = batch.worker
         if worker.queue[0] is batch:
             worker.since = now
-        worker.queue.remove(batch)
+            worker.queue.popleft()
+        else:
+            worker.queue.remove(batch)
         self._roster.sort(worker)
 
     def retry(self, receipt: Receipt, index: int) -> bool:
@@ -297,7 +303,7 @@ class Ledger:
             return False
         job.done -= 1
         self.jobs.add(job)
-        span = receipt.batch.span.part(index, index + 1, alone=True)
+        span = Span(index, [receipt.item(index)], True, receipt.batch.pin)
         if span.pin:
             self._pin(job, receipt.batch.worker, span)
         else:
@@ -344,9 +350,10 @@ class Ledger:
 
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for the batch that they have not read, since others have nothing to do."""
-        if not self._roster.idle or any(job.waiting for job in self._turns):
+        roster = self._roster
+        if not roster.idle or not roster.deep or any(job.waiting for job in self._turns):
             return []
-        return self._roster.recall(now)
+        return roster.recall(now)
 
     def next_recall(self) -> float | None:
         """When ``recall`` could next return something, if nothing else happens."""

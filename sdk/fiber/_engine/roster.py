@@ -31,7 +31,7 @@ class Roster:
             return
         if not queue:
             self.idle[worker] = None
-        elif len(queue) == 1 and not queue[0].span.alone and not worker.pinned:
+        elif len(queue) == 1 and not queue[0].alone and not worker.pinned:
             self.single[worker] = None
 
     def last_idle(self) -> Worker | None:
@@ -53,5 +53,7 @@ class Roster:
 
     def next_recall(self) -> float | None:
         """When ``recall`` could next return something, if nothing else happens."""
+        if not self.idle or not self.deep:
+            return None
         candidates = itertools.islice(self.deep, len(self.idle))
         return min((w.since + PATIENCE for w in candidates if not w.recalled), default=None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from fiber._engine.chunks import Pace
@@ -57,30 +56,23 @@ class Batch:
     is the number of tasks between two notes of the worker's progress.
     """
 
-    __slots__ = ("job", "received", "seq", "span", "stride", "worker")
+    __slots__ = ("alone", "items", "job", "pin", "received", "seq", "start", "stride", "worker")
 
     def __init__(self, seq: int, job: Job, worker: Worker, span: Span) -> None:
         self.seq = seq
         self.job: Job | None = job
         self.worker = worker
-        self.span = span
+        self.start = span.start
+        self.items = span.items
+        self.alone = span.alone
+        self.pin = span.pin
         self.stride = 1 if job.exact else job.pace.stride()
         self.received = 0
 
     @property
-    def items(self) -> Sequence[Any]:
-        """What its tasks are made from."""
-        return self.span.items
-
-    @property
-    def start(self) -> int:
-        """The index of its first task in the job."""
-        return self.span.start
-
-    @property
     def stop(self) -> int:
         """The index behind its last task."""
-        return self.span.start + len(self.span.items)
+        return self.start + len(self.items)
 
     @property
     def units(self) -> int:
@@ -89,7 +81,11 @@ class Batch:
 
     def rest(self) -> Span:
         """The tasks without a result."""
-        return self.span.part(self.start + self.received, self.stop)
+        return self.part(self.start + self.received, self.stop)
+
+    def part(self, first: int, stop: int) -> Span:
+        """The tasks from index ``first`` to before ``stop``."""
+        return Span(self.start, self.items, self.alone, self.pin).part(first, stop)
 
     def suspects(self, running: tuple[int, int] | None) -> range:
         """Tasks one of which was running: all without a result, if nothing else is known."""

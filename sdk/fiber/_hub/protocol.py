@@ -6,7 +6,7 @@ beside them as the packet's buffers, payload first, and nothing here is ever unp
 ``HELLO`` comes first and is silent unless refused, as are ``CONNECT`` (go on to another host's hub;
 what follows is for that one, ``HELLO`` first) and ``ATTACH`` (what follows concerns one object).  So a
 client opens a stream and makes its first request without waiting.  At most one request of a stream is
-unanswered; ``CANCEL``, or another request, ends the one that is.
+unanswered; another one withdraws it.
 
 Layout (little endian): request kind:u8, number:u32, and its own fields; reply the same.
 """
@@ -37,7 +37,8 @@ class Op(IntEnum):
     ATTACH = 5  # object, grant
     GRANT = 6  # object, reusable -> object, grant
     RELEASE = 7  # grant; silent
-    CANCEL = 8  # the request's number is the one to end; silent unless it is waiting
+    CANCEL = 8  # answers the request of this number NO, if it is still waiting; otherwise silent
+    SYNC = 9  # withdraws what is waiting -> nothing
     # For an attached channel
     SEND = 10  # payload and buffers beside it
     RECV = 11  # -> more; payload and buffers beside it

@@ -196,6 +196,10 @@ class Session:
             assert request is not None
             request.answer(Status.NO)
 
+    def sync(self, message: Message) -> None:
+        """Answer, so that the requester knows that nothing else is to come."""
+        self._request(message).answer(Status.OK)
+
     # A channel
 
     def _channel(self) -> HostedChannel:

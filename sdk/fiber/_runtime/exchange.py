@@ -111,19 +111,22 @@ class Exchange:
         """Send batches, on a thread that may run the user's code."""
         todo = deque(batches)
         while todo:
-            todo.extend(self._send_one(todo.popleft()))
+            todo.extend(self._send_one(todo.popleft(), plain=False))
 
     def _send_from_loop(self, batches: Iterable[Batch]) -> None:
         """Send batches from the loop's thread, or have the pump send those that it must not."""
         for batch in batches:
             job = batch.job
             if job is None or job.owner.kind == work.CALLS or is_plain(batch.items):
-                self._send_from_loop(self._send_one(batch))
+                self._send_from_loop(self._send_one(batch, plain=True))
             else:
                 self.pump.post(self._send, (batch,))
 
-    def _send_one(self, batch: Batch) -> list[Batch]:
-        """Send one batch; returns what can be sent since it could not."""
+    def _send_one(self, batch: Batch, *, plain: bool) -> list[Batch]:
+        """Send one batch; returns what can be sent since it could not.
+
+        ``plain``: its items are known to pickle without the user's code.
+        """
         job = batch.job
         if job is None:
             return self._withdraw(batch)
@@ -131,7 +134,7 @@ class Exchange:
         link: Link = batch.worker.key
         assert link.port is not None
         try:
-            message, buffers = encode(request, batch, link.known)
+            message, buffers = encode(request, batch, link.known, plain)
             link.port.deliver(batch.seq, message, buffers)
         except Exception as error:
             # Whatever the user's pickler raises, or the system for want of memory or descriptors,

@@ -100,21 +100,26 @@ def name_of(function: Any) -> str:
 
 
 def encode(
-    request: Request, batch: Batch, known: dict[int, None]
+    request: Request, batch: Batch, known: dict[int, None], plain: bool
 ) -> tuple[bytes, Sequence[memoryview]]:
-    """The message for a batch; ``known`` are the functions that its worker was sent."""
+    """The message for a batch; ``known`` are the functions that its worker was sent.
+
+    ``plain``: the items are known to pickle without the user's code.
+    """
     items = batch.items
     if request.kind == work.CALLS:
+        if len(items) == 1:
+            return work.pack_calls([(items[0].data, items[0].buffers)]), items[0].buffers
         calls: list[Call] = list(items)
         buffers = list(chain.from_iterable(call.buffers for call in calls))
         return work.pack_calls([(call.data, call.buffers) for call in calls]), buffers
     function = request.function
     assert function is not None
-    data, buffers = encode_items(items)
+    data, buffers = (pickle.dumps(items, 5), []) if plain else _encode_items(items)
     carry = function.id not in known
     head = work.Head(
         request.kind,
-        batch.stride,
+        0 if request.job.exact else batch.stride,
         request.job.unit,
         function.id,
         len(function.data) if carry else 0,
@@ -127,10 +132,7 @@ def encode(
     return message, buffers
 
 
-def encode_items(items: Any) -> tuple[bytes, list[memoryview]]:
-    """Pickle the items of a batch."""
-    if is_plain(items):
-        return pickle.dumps(items, 5), []
+def _encode_items(items: Any) -> tuple[bytes, list[memoryview]]:
     data, buffers = reduction.encode(items)
     if len(buffers) > work.BUFFERS:
         return reduction.dumps(items, 5), []

@@ -34,6 +34,7 @@ class Runtime:
         self.loop = Loop()
         self.host = child.host or "local"
         self.backend: Backend = _make_backend(self)
+        reduction.readers_are_remote(not self.backend.same_host)
         self.loop.start_thread("fiber-io")
 
     def start(

@@ -61,6 +61,11 @@ class Loop:
         """Whether the caller is the loop's own thread."""
         return threading.get_ident() == self._ident
 
+    @property
+    def running(self) -> bool:
+        """Whether it still calls back."""
+        return self._running
+
     @staticmethod
     def now() -> float:
         """The loop's clock: monotonic seconds."""

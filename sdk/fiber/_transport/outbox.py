@@ -38,12 +38,16 @@ class Outbox:
         Takes over ``fds``.
         """
         with self._lock:
-            if not self._waiting and self._try(payload, buffers, fds):
-                return
+            try:
+                packet.check_buffers(buffers)
+                if not self._waiting and self._try(payload, buffers, fds):
+                    return
+            except BaseException:
+                _close_all(fds)
+                raise
             if self._closed:
                 _close_all(fds)
                 return
-            packet.check_buffers(buffers)
             self._waiting.append((payload, buffers, tuple(fds)))
             if len(self._waiting) == 1:
                 self._loop.call_soon(self._watch, self._flush)

@@ -89,12 +89,13 @@ class UnixChannel:
     def recv(self) -> Message:
         """The next message, EOFError at the end."""
         sock = self._sock
-        for _ in range(self._looks):
+        for look in range(self._looks):
             try:
                 message = packet.receive(sock, wait=False)
             except BlockingIOError:
                 continue
-            self._looks = LOOKS
+            if look:  # it came while we looked; one that was there before proves nothing
+                self._looks = LOOKS
             return message
         self._sleeps += 1
         self._looks = LOOKS_ON_TRIAL if self._sleeps % SLEEPS_BETWEEN_TRIALS == 0 else 0

@@ -48,7 +48,10 @@ class Head(NamedTuple):
 
     kind: int
     stride: int
+    """Tasks from one note of the worker's progress to the next; 0: each result is pickled, or
+    plain, as soon as it is there."""
     unit: int
+    """Tasks that stay together."""
     function: int
     size: int
     """Bytes of the pickled function, 0 if the worker has it; for CALLS their number."""
@@ -62,17 +65,17 @@ BODY = SEQ.size + HEAD.size
 BUFFERS = 256
 """An object with more large buffers than this is pickled as a whole."""
 
-STOP_MESSAGE = HEAD.pack(STOP, 1, 1, 0, 0, 0)
+STOP_MESSAGE = HEAD.pack(STOP, 0, 1, 0, 0, 0)
 
 
 def pack_calls(calls: Sequence[tuple[bytes, Sequence[memoryview]]]) -> bytes:
     """A message of calls that are already pickled."""
     if len(calls) == 1:
         data, buffers = calls[0]
-        return HEAD.pack(CALLS, 1, 1, 0, 1, 0) + CALL.pack(len(data), len(buffers)) + data
+        return HEAD.pack(CALLS, 0, 1, 0, 1, 0) + CALL.pack(len(data), len(buffers)) + data
     table = b"".join([CALL.pack(len(data), len(buffers)) for data, buffers in calls])
     body = b"".join([data for data, _ in calls])
-    return HEAD.pack(CALLS, 1, 1, 0, len(calls), 0) + table + body
+    return HEAD.pack(CALLS, 0, 1, 0, len(calls), 0) + table + body
 
 
 def unpack_calls(body: memoryview, count: int) -> Iterable[tuple[memoryview, int]]:
