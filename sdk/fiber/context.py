@@ -18,6 +18,7 @@ from multiprocessing.context import (
 from typing import TYPE_CHECKING, Any
 
 from fiber import cpu
+from fiber._runtime import methods
 from fiber.process import Process
 
 if TYPE_CHECKING:
@@ -29,16 +30,6 @@ if TYPE_CHECKING:
     from fiber.synchronize import BoundedSemaphore, Event, Semaphore
 
 __all__ = ["BaseContext", "DefaultContext", "ForkProcess", "ForkServerProcess", "SpawnProcess"]
-
-START_METHODS = ("forkserver", "spawn", "fork")
-"""``forkserver`` and ``fork`` both fork from Fiber's zygote; the default comes first."""
-
-
-def zygote_method(start_method: str | None) -> str:
-    """What the zygote is asked to do for a start method, None being the default context's."""
-    method = start_method or default.get_start_method()
-    return "spawn" if method == "spawn" else "fork"
-
 
 class ForkProcess(Process):
     """A process forked from the zygote."""
@@ -160,7 +151,7 @@ class BaseContext:
 
     def get_all_start_methods(self) -> list[str]:
         """The start methods, the default first."""
-        return list(START_METHODS)
+        return list(methods.START_METHODS)
 
     def set_executable(self, executable: str | bytes | os.PathLike[str]) -> None:
         """The interpreter for processes started with ``spawn`` on this host."""
@@ -170,7 +161,7 @@ class BaseContext:
         """Modules that the zygote imports before it forks; takes effect before the first start."""
         if not all(isinstance(name, str) for name in module_names):
             raise TypeError("module_names must be a list of strings")
-        preload[:] = module_names
+        methods.preload[:] = module_names
 
     def freeze_support(self) -> None:
         """Nothing: frozen executables exist on Windows only."""
@@ -205,34 +196,23 @@ class DefaultContext(BaseContext):
 
     def get_context(self, method: str | None = None) -> BaseContext:
         """The context of a start method; the one in force if none is named."""
-        if method is None:
-            return _contexts[self._method or START_METHODS[0]]
-        return super().get_context(method)
+        return super().get_context(method or methods.chosen or methods.START_METHODS[0])
 
     def get_start_method(self, allow_none: bool = False) -> str | None:
         """The start method in force; with ``allow_none`` None if nothing was set or used."""
-        if self._method is None and not allow_none:
-            self._method = START_METHODS[0]
-        return self._method
+        return methods.chosen if allow_none else methods.settle()
 
     def set_start_method(self, method: str | None, force: bool = False) -> None:
         """Set the start method; RuntimeError if it is set already and not ``force``."""
-        if self._method is not None and not force:
+        if methods.chosen is not None and not force:
             raise RuntimeError("context has already been set")
         if method is not None:
             self.get_context(method)
         elif not force:
             raise ValueError("cannot find context for None")
-        self._method = method
+        methods.choose(method)
 
 
-def inherit(method: str | None, modules: list[str]) -> None:
-    """In a child: what its parent had set."""
-    default._method = method
-    preload[:] = modules
-
-
-preload: list[str] = []
 _contexts: dict[str, BaseContext] = {
     "fork": _ConcreteContext("fork", ForkProcess),
     "forkserver": _ConcreteContext("forkserver", ForkServerProcess),

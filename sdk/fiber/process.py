@@ -29,10 +29,10 @@ class Process(BaseProcess):
     _start_method: str | None = None
 
     def _Popen(self) -> Any:
-        from fiber import context
+        from fiber._runtime.methods import zygote_method
         from fiber._runtime.popen import Popen
 
-        return Popen(self, context.zygote_method(self._start_method))
+        return Popen(self, zygote_method(self._start_method))
 
     def start(self) -> None:
         """Start it; returns when it has a pid."""

@@ -14,6 +14,7 @@ import errno
 import itertools
 import os
 import pickle
+import resource
 import signal
 import socket
 import struct
@@ -210,8 +211,6 @@ class LocalChild:
         if self.zygote is not None:
             self.zygote.send(zygote.SIGNAL, self.id, signum)
 
-
-
     def hang_up(self) -> tuple[int, ...]:
         """It is gone: hear its last words, recall what it never read.  On the loop."""
         self.release_descriptors()
@@ -291,6 +290,7 @@ class _ZygoteLink:
             child.slot,
             spec.executable,
             captured=spec.stdio is not None,
+            open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
         )
         self._outbox.send(pickle.dumps((zygote.START, child.id, tuple(start)), protocol=5), fds=fds)
 

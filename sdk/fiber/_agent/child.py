@@ -96,7 +96,7 @@ def _load(start: Start) -> Any:
     data: dict[str, Any] = pickle.loads(start.preparation)
     prepare_paths(data)
     _prepare_environment(data)
-    with _inheriting():
+    with inheriting():
         prepare_main(data)
         process = pickle.loads(start.payload)
     for fd in _descriptors:
@@ -107,8 +107,8 @@ def _load(start: Start) -> Any:
 
 
 @contextlib.contextmanager
-def _inheriting() -> Iterator[None]:
-    """While a child unpickles its Process, starting another is the mistake of an unguarded main."""
+def inheriting() -> Iterator[None]:
+    """While main is imported or a Process unpickled, starting one is an unguarded main's mistake."""
     mp_process.current_process()._inheriting = True  # type: ignore[attr-defined]
     try:
         yield
@@ -183,12 +183,11 @@ def _exec(start: Start, fds: list[int], board: Board, agent: int) -> None:
     for fd in (*fds, board.fd, agent, again):
         os.set_inheritable(fd, True)
     executable = os.fsdecode(start.executable or sys.executable)
-    os.execv(
-        executable,
-        interpreter_arguments(
-            executable, f"from fiber._agent.child import spawned; spawned({again})"
-        ),
-    )
+    statement = f"from fiber._agent.child import spawned; spawned({again})"
+    try:
+        os.execv(executable, interpreter_arguments(executable, statement))
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, executable) from None
 
 
 def interpreter_arguments(executable: str, statement: str) -> list[str]:

@@ -18,12 +18,14 @@ import gc
 import importlib
 import os
 import pickle
+import resource
 import select
 import signal
 import socket
 import sys
 import threading
 import time
+import traceback
 import warnings
 from typing import Any, NamedTuple, NoReturn
 
@@ -52,6 +54,8 @@ class Start(NamedTuple):
     executable: str | None
     captured: bool
     """Whether its output goes to its agent, which wants it line by line."""
+    open_files: tuple[int, int]
+    """Its limits of descriptors, soft and hard: those of its agent's process."""
 
 
 class Zygote:
@@ -65,6 +69,7 @@ class Zygote:
         self._agent = agent
         self._preload = preload
         self._unfit: str | None = None
+        self._pid = os.getpid()
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
         self._descriptors: list[int] = []
@@ -153,8 +158,12 @@ class Zygote:
             self._control.close()
             os.close(self._deaths)
             os.close(self._deaths_in)
-            child_module.die_with(os.getppid())
+            child_module.die_with(self._pid)
+            resource.setrlimit(resource.RLIMIT_NOFILE, start.open_files)
             code = child_module.run(start, fds, self._board, self._agent)
+        except BaseException:
+            # The user's own errors do not come here: these are of the system, or Fiber's.
+            traceback.print_exc()
         finally:
             os._exit(code)
 
@@ -207,7 +216,7 @@ def _preload(preparation: bytes) -> str | None:
         # Whatever an import raises, a child that needs it will meet, and report, itself.
         with contextlib.suppress(BaseException):
             importlib.import_module(name)
-    with contextlib.suppress(BaseException):
+    with contextlib.suppress(BaseException), child_module.inheriting():
         child_module.prepare_main(data)
     if threading.active_count() > 1:
         names = ", ".join(t.name for t in threading.enumerate() if t is not threading.main_thread())
@@ -233,4 +242,7 @@ def main(control: int, board: int, agent_pid: int, preload: bool) -> None:
     if os.getppid() != agent_pid:  # it died before we could watch it, and its pid may be another's
         sys.exit(0)
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control)
+    # A program that raised its limit after it started us may send more than ours.
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     Zygote(sock, Board(board), agent, preload=preload).run()

@@ -66,8 +66,8 @@ class Ledger:
 
         ``unit``: its tasks are given out in contiguous chunks of at least this many.  ``alone``:
         each travels alone, to an idle worker, with nothing queued behind it.  Without retries
-        they always do: a crash must not leave in doubt whether another task ran.  ``exact``: results
-        are wanted one by one, and the worker notes each task that it begins, however short.
+        they always do: a crash must not leave in doubt whether another task ran.  ``exact``:
+        results are wanted one by one, and the worker notes each task that it begins.
         """
         job = Job(owner, pace or Pace(), retries, unit, alone, exact)
         self.jobs.add(job)
@@ -313,7 +313,9 @@ class Ledger:
     def put_back(self, worker: Worker, seqs: Iterable[int], now: float) -> None:
         """The answer to a recall: ``worker`` never read these batches."""
         worker.recalled = False
-        for batch in sorted(self._held(worker, seqs), key=_by_seq, reverse=True):
+        held = (self.batches.get(seq) for seq in seqs)
+        mine = [batch for batch in held if batch is not None and batch.worker is worker]
+        for batch in sorted(mine, key=_by_seq, reverse=True):
             self._withdraw(batch, now)
             if batch.job is not None:
                 self._return(batch.job, batch.rest())
@@ -364,20 +366,21 @@ class Ledger:
     def lose(
         self, worker: Worker, unread: Iterable[int], running: tuple[int, int] | None
     ) -> list[Loss]:
-        """``worker`` is gone; its tasks wait again.  Those it was running are charged an attempt.
+        """``worker`` is gone; its tasks wait again, and what it was running is charged an attempt.
 
         ``unread``: batches that it never read.  ``running``: batch and offset of the task it was
-        in.  Returns the tasks that had their tries; they are done by that.
+        in; if that says nothing, it was in the first batch that it may have read.  Returns the
+        tasks that had their tries; they are done by that.
         """
         self.workers.discard(worker)
         self._pins.pop(worker, None)
         self._homeless += worker.pinned
-        untouched = {batch.seq for batch in self._held(worker, unread)}
+        guilty = _in_progress(worker, set(unread), running)
         losses: list[Loss] = []
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):
             del self.batches[batch.seq]
             if batch.job is not None:
-                suspects = range(0) if batch.seq in untouched else batch.suspects(running)
+                suspects = batch.suspects(running) if batch is guilty else range(0)
                 losses += self._lose_batch(batch.job, batch.rest(), suspects)
         worker.leaving = True
         worker.queue.clear()
@@ -399,10 +402,6 @@ class Ledger:
         return losses
 
     # Inside
-
-    def _held(self, worker: Worker, seqs: Iterable[int]) -> list[Batch]:
-        found = (self.batches.get(seq) for seq in seqs)
-        return [batch for batch in found if batch is not None and batch.worker is worker]
 
     def _withdraw(self, batch: Batch, now: float) -> None:
         if batch.worker.left is not None:
@@ -431,6 +430,13 @@ class Ledger:
 
 def _by_seq(batch: Batch) -> int:
     return batch.seq
+
+
+def _in_progress(worker: Worker, unread: set[int], running: tuple[int, int] | None) -> Batch | None:
+    """The batch that a worker was in when it died: it reads one at a time."""
+    read = [batch for batch in worker.queue if batch.seq not in unread]
+    named = [batch for batch in read if running is not None and batch.seq == running[0]]
+    return next(iter(named or read), None)
 
 
 def _around(span: Span, suspects: range) -> list[Span]:

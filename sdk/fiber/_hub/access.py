@@ -1,11 +1,12 @@
 """Where this process finds its host's hub.
 
-The hub's own process has it at hand; the processes that its agent starts are told its address and key
-when they are born.
+The hub's own process has it at hand; the processes that its agent starts are told its address and
+key when they are born.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -69,6 +70,12 @@ def current() -> Access:
     return _access
 
 
+def host() -> str:
+    """The name of this host."""
+    hub = own_hub()
+    return hub.host if hub is not None else current().host
+
+
 def told() -> Access | None:
     """What this process was told when it was born."""
     return _access
@@ -84,3 +91,4 @@ def forget() -> None:
 _access: Access | None = None
 _hub: Hub | None = None
 _starter: Callable[[], object] | None = None
+os.register_at_fork(after_in_child=forget)

@@ -26,7 +26,8 @@ class Reply:
     __slots__ = ("fds", "number", "parts", "status", "values")
 
     def __init__(self, message: Message) -> None:
-        _, self.number, *self.values = _FORMS[len(message.payload)].unpack(message.payload)
+        fields: tuple[int, ...] = _FORMS[len(message.payload)].unpack(message.payload)
+        self.number, self.values = fields[1], fields[2:]
         self.status = Status(message.payload[0])
         self.parts = message.buffers
         self.fds, message.fds = message.fds, []
@@ -151,15 +152,13 @@ class Line:
 
 def _dial(home: Access) -> tuple[socket.socket, Sequence[bytes]]:
     """A socket towards ``home``, and what to say before greeting it."""
+    if home.host == access.host():
+        return _connect(home), []
     hub = access.own_hub()
     if hub is not None:
-        if hub.host != home.host:
-            return hub.dial(), [protocol.hello(hub.key), protocol.connect(home.host)]
-        return (hub.dial() if hub.key == home.key else _connect(home)), []
+        return hub.dial(), [protocol.hello(hub.key), protocol.connect(home.host)]
     own = access.current()
-    if own.host != home.host:
-        return _connect(own), [protocol.hello(own.key), protocol.connect(home.host)]
-    return _connect(home), []
+    return _connect(own), [protocol.hello(own.key), protocol.connect(home.host)]
 
 
 def _connect(to: Access) -> socket.socket:

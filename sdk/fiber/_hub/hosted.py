@@ -1,7 +1,7 @@
 """Objects of this host as its hub sees them: who waits for what, on the loop's thread.
 
-A hub takes a message out of a channel, or a count out of a counter, only for a request that waits for
-it, and answers at once.  A user who dies takes nothing that it had not asked for.
+A hub takes a message out of a channel, or lowers a counter, only for a request that waits for that,
+and answers at once.  A user who dies takes nothing that it had not asked for.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ from fiber._wire.packet import INLINE_LIMIT, Message
 class Asker(Protocol):
     """A request that waits."""
 
-    def answer(
-        self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()
-    ) -> None:
+    def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
         """Answer it; once."""
 
 

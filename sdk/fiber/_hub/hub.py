@@ -1,8 +1,8 @@
 """The hub: keeps what processes of this host share with others, one per host and program.
 
-It lives in the agent of its host, on its loop.  A process of the same host asks it for descriptors and
-needs it no more; one on another host reaches it through a tunnel and uses its objects by request
-(``fiber._hub.remote``).  Who wants anything has to know the hub's key.
+It lives in the agent of its host, on its loop.  A process of the same host asks it for descriptors
+and needs it no more; one on another host reaches it through a tunnel and uses its objects by
+request (``fiber._hub.remote``).  Who wants anything has to know the hub's key.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Hub:
     def link(self, host: str | None, send: Send, *, dialer: bool) -> Tunnels:
         """The hub of ``host`` can be reached by tunnels whose frames go out by ``send``.
 
-        None stands for every host that has no link of its own: an agent's link to the master is that.
+        None stands for every host that has no link of its own, as an agent's link to the master.
         """
         return self._switch.link(host, send, dialer=dialer)
 
@@ -94,7 +94,7 @@ class Hub:
         self._sessions.discard(session)
 
     def close(self) -> None:
-        """End every stream, let go of every object, leave no file.  On the loop, or after its end."""
+        """End all streams, let go of all objects, leave no file.  On the loop, or after its end."""
         for session in list(self._sessions):
             session.close("the program that keeps it has ended")
         for stream in list(self._streams):
@@ -142,9 +142,7 @@ class Hub:
             self._loop.unregister(self._door.fileno())
             self._loop.call_later(_RETRY, self._listen_again)
             return
-        _, uid, _ = _PEER.unpack(
-            sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
-        )
+        _, uid, _ = _PEER.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
         if uid in (os.geteuid(), 0):
             self._admit(sock)
         else:

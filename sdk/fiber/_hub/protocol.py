@@ -3,10 +3,10 @@
 A message is one packet.  Requests and replies are a few numbers; what a user sends or receives lies
 beside them as the packet's buffers, payload first, and nothing here is ever unpickled.
 
-``HELLO`` comes first and is silent unless refused, as are ``CONNECT`` (go on to another host's hub;
-what follows is for that one, ``HELLO`` first) and ``ATTACH`` (what follows concerns one object).  So a
-client opens a stream and makes its first request without waiting.  At most one request of a stream is
-unanswered; another one withdraws it.
+``HELLO`` comes first and is silent unless refused, as are ``CONNECT`` (go on to another host's
+hub; what follows is for that one, ``HELLO`` first) and ``ATTACH`` (what follows concerns one
+object).  So a client opens a stream and makes its first request without waiting.  At most one
+request of a stream is unanswered; another one withdraws it.
 
 Layout (little endian): request kind:u8, number:u32, and its own fields; reply the same.
 """
@@ -44,8 +44,8 @@ class Op(IntEnum):
     RECV = 11  # -> more; payload and buffers beside it
     TRY_RECV = 12  # -> the same, or NO
     POLL = 13
-    WATCH = 14  # silent; the stream then gets READY once the channel is readable
-    CHECK = 15  # on a watching stream: whether it is readable; if so, READY follows
+    WATCH = 14  # silent; the stream gets READY once the channel is readable
+    CHECK = 15  # whether it is readable now; then as WATCH
     # For an attached counter
     ADD = 20  # how much
     TAKE = 21

@@ -1,8 +1,8 @@
 """Which objects a hub hosts, and what keeps each of them there.
 
 An object stays as long as someone on another host is attached to it or a grant for it is out.  A
-grant is the permission that travels inside a pickled handle.  A plain one is used up by the first who
-takes it; a reusable one lasts until it is released.
+grant is the permission that travels inside a pickled handle.  A plain one is used up by whoever
+takes it first; a reusable one lasts until it is released.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Channels and counters of another host: every operation is a request to the hub there.
 
-An operation takes a stream for itself, so that threads which wait do not wait for each other.  There
-are as many streams as threads that ever used the object at once.
+An operation has a stream for itself, so that threads which wait do not wait for each other.  There
+are as many streams as threads ever used the object at once.
 """
 
 from __future__ import annotations
@@ -9,17 +9,19 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from fiber._hub.access import Access
 from fiber._hub.client import Line, Reply
-from fiber._hub.protocol import HEAD, ONE, TWO, Op, Status
+from fiber._hub.protocol import ONE, TWO, Op, Status
+from fiber._transport.unix import wait_readable
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import ConnectionClosed
 
 
 class RemoteObject:
-    """An object that lives elsewhere; attached to it as long as it is open."""
+    """An object that lives elsewhere, and stays there as long as this is open."""
 
     def __init__(self, home: Access, number: int, grant: int) -> None:
         self.home = home
@@ -27,29 +29,21 @@ class RemoteObject:
         self._lock = threading.Lock()
         self._pid = os.getpid()
         self._closed = False
-        # This stream is opened now, so that the grant is used and the object stays; what goes wrong
-        # shows at the first request, because whoever unpickles a handle may not be able to wait.
+        # Opened at once, so that the grant is used up, but without waiting: whoever unpickles this
+        # may be the very thread that carries the answer.  An error shows at the first request.
         self._idle = [self._open(grant)]
 
-    def ask(
-        self,
-        operation: Op,
-        *values: int,
-        form: struct.Struct = HEAD,
-        timeout: float | None = None,
-        buffers: Sequence[memoryview] = (),
-    ) -> Reply:
-        """Make a request to the object's hub."""
+    @contextmanager
+    def line(self) -> Iterator[Line]:
+        """A stream to the object's hub that nobody else uses."""
         line = self._take_line()
         try:
-            return line.ask(operation, *values, form=form, timeout=timeout, buffers=buffers)
+            late = line.settle()
+            if late is not None:
+                self._settled(*late)
+            yield line
         finally:
             self._give_back(line)
-
-    def fork_line(self) -> Line:
-        """A stream of its own, attached to the object."""
-        self._check()
-        return self._open(0)
 
     def close(self) -> None:
         """Let go of the object."""
@@ -60,32 +54,21 @@ class RemoteObject:
             line.close()
 
     def __del__(self) -> None:
-        if hasattr(self, "_idle"):
+        if hasattr(self, "_idle"):  # otherwise its first stream could not be opened
             self.close()
 
-    def settled(self, operation: Op, reply: Reply) -> None:
-        """A request that was given up (Ctrl-C) had been granted."""
-
-    def _open(self, grant: int) -> Line:
+    def _open(self, grant: int = 0) -> Line:
         return Line(self.home, [TWO.pack(Op.ATTACH, 0, self.number, grant)])
 
-    def _check(self) -> None:
-        if self._closed:
-            raise OSError("handle is closed")
-
     def _take_line(self) -> Line:
-        self._check()
         with self._lock:
+            if self._closed:
+                raise OSError("handle is closed")
             if self._pid != os.getpid():
-                # Forked by someone else: the streams are our parent's, who keeps the object there.
-                self._pid, self._idle = os.getpid(), []
-            line = self._idle.pop() if self._idle else None
-        if line is None:
-            return self._open(0)
-        late = line.settle()
-        if late is not None:
-            self.settled(*late)
-        return line
+                self._forked()
+            if self._idle:
+                return self._idle.pop()
+        return self._open()
 
     def _give_back(self, line: Line) -> None:
         with self._lock:
@@ -94,57 +77,141 @@ class RemoteObject:
                 return
         line.close()
 
+    def _forked(self) -> None:
+        """Someone else forked us: the streams are our parent's, which keeps the object there."""
+        self._pid = os.getpid()
+        self._idle = []
+
+    def _settled(self, operation: Op, reply: Reply) -> None:
+        """A request that was given up (Ctrl-C) had been granted by then."""
+
 
 class RemoteChannel(RemoteObject):
     """One end of a message pipe on another host; a ``SharedChannel``."""
 
     def __init__(self, home: Access, number: int, grant: int) -> None:
-        super().__init__(home, number, grant)
         self._late: deque[Reply] = deque()
         self._watch: Line | None = None
         self._watch_lock = threading.Lock()
+        super().__init__(home, number, grant)
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message; returns when it can be received."""
-        parts = [memoryview(payload), *buffers]
         try:
-            reply = self.ask(Op.SEND, buffers=parts)
+            with self.line() as line:
+                reply = line.ask(Op.SEND, buffers=[memoryview(payload), *buffers])
         except ConnectionClosed as error:
             raise BrokenPipeError(str(error)) from error
         if reply.status is Status.BROKEN:
             raise BrokenPipeError("the other end is closed")
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
-        """Never: it would take a round trip to find out."""
+        """Never: to find out takes as long as to send."""
         return False
 
     def recv(self) -> Message:
         """The next message; EOFError at the end."""
-        return self._message(Op.RECV) or self.recv()
+        message = self._receive(Op.RECV)
+        assert message is not None
+        return message
 
     def try_recv(self) -> Message | None:
-        """The next message if one is there."""
-        return self._message(Op.TRY_RECV)
+        """The next message if one is there; EOFError at the end."""
+        return self._receive(Op.TRY_RECV)
+
+    def _receive(self, operation: Op) -> Message | None:
+        with self.line() as line:
+            reply = self._late.popleft() if self._late else line.ask(operation)
+        if reply.status is Status.EOF:
+            raise EOFError("the other end is closed")
+        if reply.status is Status.NO:
+            return None
+        (more,) = reply.values
+        if not more:
+            self._watch_again()
+        return Message(reply.parts[0], reply.parts[1:], [])
 
     def poll(self, timeout: float | None) -> bool:
         """Whether ``recv`` would return or raise at once."""
-        return bool(self._late) or self.ask(Op.POLL, timeout=timeout).status is Status.OK
+        with self.line() as line:
+            return bool(self._late) or line.ask(Op.POLL, timeout=timeout).status is Status.OK
 
     def fileno(self) -> int:
-        """A descriptor that is readable exactly if there is something to receive now.
+        """A descriptor that is readable if, at this moment, there is something to receive.
 
-        Who keeps it instead of asking again finds it readable too early at times, if others receive
-        from the same end.
+        It becomes so when there is.  It may stay so for too long if another holder receives it:
+        ask again for the truth.
         """
         with self._watch_lock:
+            if self._closed:
+                raise OSError("handle is closed")
             if self._watch is None:
-                self._watch = self.fork_line()
-            number = self._check_watch(self._watch)
-            del number
+                self._watch = self._open()
+            if self._watch.ask(Op.CHECK).status is Status.OK:
+                wait_readable(self._watch.fileno(), None)
             return self._watch.fileno()
 
     def close(self) -> None:
         """Let go of this end."""
         super().close()
-        if getattr(self, "_watch", None) is not None:
-            self._watch.close()
+        with self._watch_lock:
+            if self._watch is not None:
+                self._watch.close()
+                self._watch = None
+
+    def _watch_again(self) -> None:
+        """The descriptor says that there is something, and there is not."""
+        with self._watch_lock:
+            if self._watch is not None:
+                while wait_readable(self._watch.fileno(), 0):
+                    self._watch.receive()
+                self._watch.say(Op.WATCH)
+
+    def _forked(self) -> None:
+        super()._forked()
+        self._watch = None
+
+    def _settled(self, operation: Op, reply: Reply) -> None:
+        if reply.parts:
+            self._late.append(reply)
+
+
+class RemoteCounter(RemoteObject):
+    """A counting event on another host; a ``SharedCounter``."""
+
+    def add(self, n: int = 1) -> None:
+        """Raise the count; returns when it is done."""
+        with self.line() as line:
+            line.ask(Op.ADD, n, form=ONE)
+
+    def take(self, timeout: float | None) -> bool:
+        """Lower the count by one once it is above zero; False when ``timeout`` is over."""
+        with self.line() as line:
+            return line.ask(Op.TAKE, timeout=timeout).status is Status.OK
+
+    def clear(self) -> int:
+        """Set the count to zero and say what it was."""
+        with self.line() as line:
+            (count,) = line.ask(Op.CLEAR).values
+        return count
+
+    def value(self) -> int:
+        """The count now."""
+        with self.line() as line:
+            (count,) = line.ask(Op.VALUE).values
+        return count
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until the count is above zero, without lowering it."""
+        with self.line() as line:
+            return line.ask(Op.WAIT, timeout=timeout).status is Status.OK
+
+    def changed(self, since: int, timeout: float | None) -> bool:
+        """Wait until the count is not ``since``; False when ``timeout`` is over."""
+        with self.line() as line:
+            reply = line.ask(Op.CHANGED, since, form=ONE, timeout=timeout)
+            return reply.status is Status.OK
+
+    def _settled(self, operation: Op, reply: Reply) -> None:
+        if operation is Op.TAKE:
+            self.add(1)

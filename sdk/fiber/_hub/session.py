@@ -41,9 +41,7 @@ class Request:
         self._session = session
         self._number = number
 
-    def answer(
-        self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()
-    ) -> None:
+    def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
         """Send the reply."""
         if self._session.waiting is self:
             self._session.waiting = None
@@ -230,12 +228,15 @@ class Session:
         self._channel().watch(self)
 
     def check(self, message: Message) -> None:
-        """Say whether there is a message; if so, the stream itself becomes readable, if not, later."""
+        """Say whether there is a message now, and once more on the stream itself when there is."""
         channel, number = self._channel(), HEAD.unpack_from(message.payload)[1]
         channel.forget(self)
-        readable = channel.readable()
-        self.stream.send(ONE.pack(Status.OK if readable else Status.NO, number, 0))
-        channel.watch(self)
+        if channel.readable():
+            self.stream.send(HEAD.pack(Status.OK, number))
+            self.ready()
+        else:
+            self.stream.send(HEAD.pack(Status.NO, number))
+            channel.watch(self)
 
     def ready(self) -> None:
         """The channel that this stream watches is readable."""

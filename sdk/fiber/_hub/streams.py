@@ -172,9 +172,7 @@ class SocketStream:
             if self._paused or self._finishing:
                 return
 
-    def _try(
-        self, payload: BytesLike, buffers: Sequence[memoryview], fds: Sequence[int]
-    ) -> bool:
+    def _try(self, payload: BytesLike, buffers: Sequence[memoryview], fds: Sequence[int]) -> bool:
         try:
             packet.send(self._sock, payload, buffers, fds)
         except BlockingIOError:

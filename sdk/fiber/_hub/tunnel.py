@@ -5,9 +5,9 @@
     process ── unix stream ── its hub ══ link ══ master ══ link ══ another hub
                                 │ splice              │ splice         │ session
 
-Many tunnels share a link with everything else that travels there.  So a message goes in pieces of at
-most PIECE bytes, and a tunnel has at most WINDOW bytes under way: the receiver gives credit as it
-passes them on.  What a tunnel's frames carry (kind first, in the payload; bytes in the buffers)::
+Many tunnels share a link with everything else that travels there.  So a message goes in pieces of
+at most PIECE bytes, and a tunnel has at most WINDOW bytes under way: the receiver gives credit as
+it passes them on.  A frame carries, the kind first in the payload and bytes in the buffers::
 
     WHOLE   a small message: its payload follows the kind, its buffers are the buffers
     FIRST   a large one: the sizes of payload and buffers follow; the first piece is the buffer
@@ -176,13 +176,11 @@ class Tunnels:
     """The tunnels of one link.
 
     ``send`` takes a frame for the link and does not block.  Whoever has the link calls ``on_frame``
-    with each tunnel frame that comes and ``lost`` at its end, on the loop's thread.  Exactly one side
-    of a link is its ``dialer``: both open tunnels, and their numbers must not meet.
+    with each tunnel frame that comes and ``lost`` at its end, on the loop's thread.  Exactly one
+    side of a link is its ``dialer``: both open tunnels, and their numbers must not meet.
     """
 
-    def __init__(
-        self, send: Send, *, dialer: bool, arrived: Callable[[str, Stream], None]
-    ) -> None:
+    def __init__(self, send: Send, *, dialer: bool, arrived: Callable[[str, Stream], None]) -> None:
         self._send = send
         self._arrived = arrived
         self._numbers = itertools.count(1 if dialer else 2, 2)
@@ -261,7 +259,7 @@ class Switch:
         if host == self._host:
             self._accept(stream)
             return
-        tunnels = self._links.get(host) or self._links.get(None)
+        tunnels = self._links.get(host, self._links.get(None))
         if tunnels is None:
             stream.finish(f"host {host!r} cannot be reached: no agent of that name is there")
             return

@@ -15,9 +15,10 @@ from multiprocessing import process as mp_process
 from multiprocessing import spawn, util
 from typing import TYPE_CHECKING, Any
 
-from fiber import config, context, reduction
+from fiber import config, reduction
 from fiber._agent import child
 from fiber._agent.port import AgentPort, ChildObserver, ChildPort, ChildSpec
+from fiber._runtime import methods
 from fiber._transport.loop import Loop
 
 if TYPE_CHECKING:
@@ -71,13 +72,13 @@ class Runtime:
         # What such a process starts itself runs on its own host.
         data["calls"] = [
             (config.install, (replace(self.config, backend="local"),)),
-            (context.inherit, (context.default.get_start_method(allow_none=True), context.preload)),
+            (methods.inherit, (methods.chosen, methods.preload)),
         ]
         del data["start_method"]
         data["same_host"] = same_host
         if same_host:
             data["environ"] = dict(os.environb)
-            data["preload"] = [*context.preload, *_modules_of(process)]
+            data["preload"] = [*methods.preload, *_modules_of(process)]
         else:
             data["preload"] = ["cloudpickle"]
             data.pop("init_main_from_name", None)

@@ -19,7 +19,7 @@ from fiber._engine.ledger import Worker
 from fiber._runtime.state import runtime
 from fiber._wire import work
 from fiber._wire.packet import Message
-from fiber.context import zygote_method
+from fiber._runtime.methods import zygote_method
 from fiber.errors import StartError
 from fiber.process import Process
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from fiber._transport import handshake
 from fiber._transport.credentials import Credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
-from fiber._transport.link import AGENT_PATIENCE, Link, LinkError, Patience, Poller
+from fiber._transport.link import Link, LinkError, Patience, Poller
 from fiber._transport.nng import Pipe, Socket, SocketClosed, Unreachable, Untrusted, url_of
 from fiber._transport.session_link import SessionLink
 from fiber._wire.messages import ProtocolError
@@ -18,14 +18,16 @@ from fiber.errors import AuthenticationError, FiberError
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 2.0
 """Seconds between attempts to dial for the first time, growing."""
 
+_LONGER = 2
+"""How much more patient an agent is than its master."""
+
 
 class AgentDialer:
     """An agent's end: dials the master at ``host:port`` until it answers or ``timeout`` is over.
 
     Calls back once, on the loop's thread: ``on_link`` with the link, or ``on_failed`` with an
     AuthenticationError, VersionMismatch or LinkError.  A link that breaks later is dialled again
-    until it is lost.  The default patience is longer than the master's: an agent answers at all
-    times, while user code in the master may hold the interpreter for long.
+    until it is lost.
     """
 
     def __init__(
@@ -38,7 +40,6 @@ class AgentDialer:
         on_link: Callable[[Link], None],
         on_failed: Callable[[FiberError | AuthenticationError], None],
         timeout: float = 30.0,
-        patience: Patience = AGENT_PATIENCE,
     ) -> None:
         self._loop = loop
         self._address = address
@@ -47,7 +48,6 @@ class AgentDialer:
         self._on_link = on_link
         self._on_failed = on_failed
         self._timeout = timeout
-        self._patience = patience
         self._session = secrets.token_hex(16)
         self._link: SessionLink | None = None
         self._obstacle = "nothing was tried"
@@ -113,7 +113,9 @@ class AgentDialer:
     def _welcomed(self, pipe: Pipe, welcome: Welcome) -> None:
         link = self._link
         if link is None:
-            patience = self._patience._replace(heartbeat=welcome.heartbeat)
+            # An agent answers at all times; user code in the master may hold the interpreter long.
+            lost_after = _LONGER * welcome.lost_after
+            patience = Patience(welcome.heartbeat, welcome.suspect_after, lost_after)
             link = SessionLink(
                 self._loop, welcome.identity, patience, on_end=lambda _: self._stop()
             )

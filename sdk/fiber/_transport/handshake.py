@@ -5,7 +5,7 @@
       │         how much has arrived       │
       ├───────────────────────────────────►│  versions fit, session new or known?
       │◄───────────────────────────────────┤
-         Welcome: identity, how much has arrived, heartbeat      or      Refusal: identity, reason
+         Welcome: identity, how much has arrived, patience       or      Refusal: identity, reason
 
 The same exchange resumes a session on a new connection.  The layout is one byte for the kind and
 JSON.  The fields of an identity stay what they are in every version, so that two sides that do not
@@ -66,7 +66,9 @@ class Welcome(NamedTuple):
     arrived: int
     """The agent's datagrams that the master has."""
     heartbeat: float
-    """How often the agent shall be heard, in seconds."""
+    """How patient the master is: the fields of a ``Patience``."""
+    suspect_after: float
+    lost_after: float
 
     def encode(self) -> bytes:
         """The datagram."""
@@ -151,7 +153,8 @@ def _read_hello(identity: Identity, fields: Mapping[str, Any]) -> Hello:
 
 
 def _read_welcome(identity: Identity, fields: Mapping[str, Any]) -> Welcome:
-    return Welcome(identity, int(fields["arrived"]), float(fields["heartbeat"]))
+    patience = (float(fields[name]) for name in ("heartbeat", "suspect_after", "lost_after"))
+    return Welcome(identity, int(fields["arrived"]), *patience)
 
 
 def _read_refusal(identity: Identity, fields: Mapping[str, Any]) -> Refusal:

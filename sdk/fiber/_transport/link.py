@@ -31,10 +31,7 @@ class Patience(NamedTuple):
     """The link ends; whatever comes later is dropped."""
 
 
-MASTER_PATIENCE = Patience()
-
-AGENT_PATIENCE = Patience(lost_after=30.0)
-"""Longer: an agent answers at all times, user code in the master may hold the interpreter."""
+DEFAULT_PATIENCE = Patience()
 
 
 class LinkObserver(Protocol):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from fiber._transport import handshake
 from fiber._transport.credentials import Credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
-from fiber._transport.link import MASTER_PATIENCE, Link, Patience, Poller
+from fiber._transport.link import DEFAULT_PATIENCE, Link, Patience, Poller
 from fiber._transport.nng import Pipe, Socket
 from fiber._transport.session_link import SessionLink
 from fiber._wire.messages import ProtocolError
@@ -32,7 +32,7 @@ class MasterListener:
         *,
         on_agent: Callable[[Link], None],
         on_refused: Callable[[str], None],
-        patience: Patience = MASTER_PATIENCE,
+        patience: Patience = DEFAULT_PATIENCE,
     ) -> None:
         self._loop = loop
         self._on_agent = on_agent
@@ -134,7 +134,7 @@ class MasterListener:
             )
             self._links[hello.session] = link
         pipe.link = link
-        pipe.put(Welcome(self._identity, link.arrived, self._patience.heartbeat).encode())
+        pipe.put(Welcome(self._identity, link.arrived, *self._patience).encode())
         link.connected(pipe, hello.arrived)
         if new:
             self._on_agent(link)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fiber._transport.handshake import Identity
-from fiber._transport.link import MASTER_PATIENCE, Patience
+from fiber._transport.link import DEFAULT_PATIENCE, Patience
 from fiber._transport.session_link import SessionLink
 
 _NNG_HOLDS = 3
@@ -97,7 +97,7 @@ class Cable:
         delay: tuple[float, float] = (0.0001, 0.001),
         drop: float = 0.0,
         redial_after: float = 0.1,
-        patience: Patience = MASTER_PATIENCE,
+        patience: Patience = DEFAULT_PATIENCE,
     ) -> None:
         self.delay = delay
         self.drop = drop

@@ -1,0 +1,103 @@
+"""Who takes part, what each can do, and how it is drawn. Imports none of them."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+_POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
+_PROCESSES = frozenset({"pipes", "start"})
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A library in one configuration.
+
+    `servers`: it keeps servers that use the processor even when idle, so it is started for its
+    turn only, takes part in fewer rounds and gets a tenth of the no-op tasks.
+    """
+
+    name: str
+    label: str
+    modules: tuple[str, ...]
+    offers: frozenset[str]
+    colour: str
+    marker: str
+    program: str = ""
+    servers: bool = False
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    def missing(self) -> str:
+        """What must be installed before it can take part; empty if nothing."""
+        wanting = [name for name in self.modules if not importlib.util.find_spec(name)]
+        if self.program and not shutil.which(self.program):
+            wanting.append(self.program)
+        return ", ".join(wanting)
+
+
+# Colours: Okabe and Ito's set, told apart by colour-blind readers, and Tol's wine.
+ALL = (
+    Contender(
+        "fiber",
+        "Fiber",
+        ("fiber",),
+        _POOL | _PROCESSES | {"import"},
+        "#0072B2",
+        "o",
+        environment={"FIBER_BACKEND": "local"},
+    ),
+    Contender(
+        "fiber-loopback",
+        "Fiber, loopback agents",
+        ("fiber",),
+        _POOL | _PROCESSES,
+        "#56B4E9",
+        "s",
+        environment={"FIBER_BACKEND": "loopback"},
+    ),
+    Contender(
+        "multiprocessing",
+        "multiprocessing, fork",
+        (),
+        _POOL | _PROCESSES | {"import"},
+        "#000000",
+        "D",
+    ),
+    Contender(
+        "forkserver", "multiprocessing, forkserver", (), frozenset({"start"}), "#666666", "d"
+    ),
+    Contender(
+        "concurrent.futures",
+        "concurrent.futures",
+        (),
+        frozenset({"map", "stream", "submit", "apply"}),
+        "#999999",
+        "v",
+    ),
+    Contender("joblib", "joblib (loky)", ("joblib",), _POOL, "#009E73", "^"),
+    Contender(
+        "dask",
+        "Dask",
+        ("distributed", "dask.bag"),
+        frozenset({"map", "stream", "submit", "apply"}),
+        "#E69F00",
+        "<",
+        servers=True,
+    ),
+    Contender("ipyparallel", "ipyparallel", ("ipyparallel",), _POOL, "#CC79A7", ">", servers=True),
+    Contender("ray", "Ray's Pool", ("ray",), _POOL, "#D55E00", "P", servers=True),
+    Contender(
+        "spark",
+        "PySpark",
+        ("pyspark",),
+        frozenset({"map", "apply"}),
+        "#882255",
+        "X",
+        program="java",
+        servers=True,
+    ),
+)
+
+BY_NAME = {contender.name: contender for contender in ALL}

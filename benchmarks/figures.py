@@ -1,0 +1,224 @@
+"""One picture for each measure, with the same colour and marker for a contender in all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+
+from benchmarks import latency, overhead, pipes, startup, throughput
+from benchmarks.contenders import BY_NAME
+from benchmarks.model import Metric, Run
+from benchmarks.samples import Summary, in_words, summary
+from matplotlib import pyplot as plt
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+_NARROW = 1000
+Points = Sequence[tuple[float, str]]
+
+
+def _overhead(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 2, figsize=(12, 5), sharey=True)
+    for panel, chunks in zip(panels, overhead.CHUNKS, strict=True):
+        points = [
+            (duration, overhead.case_name(duration, chunks)) for duration in overhead.DURATIONS
+        ]
+        panel.axhline(run.about["size"], color="#bbbbbb", linestyle="--", zorder=0)
+        _lines(panel, run, points, overhead.TIME)
+        panel.invert_xaxis()
+        panel.set(title=chunks[0].upper() + chunks[1:], xlabel="duration of a task")
+        _unit(panel.xaxis, "s", list(overhead.DURATIONS))
+    panels[0].set_ylabel("time to finish (dashed: no overhead; ✗: not finished)")
+    _finish(figure, path)
+
+
+def _throughput(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 2, figsize=(12, 5.5), width_ratios=(3, 2))
+    names = [case.name for case in throughput.cases(run.about["size"])]
+    rates = [name for name in names if name.startswith(("map", "imap", "apply"))]
+    _rows(panels[0], run, rates, throughput.RATE)
+    panels[0].set(title="No-op tasks: further right is better", xlabel="tasks a second")
+    _rows(panels[1], run, [name for name in names if name not in rates], throughput.TIME)
+    panels[1].set(title="Batches: further left is better", xlabel="time of the batch")
+    _finish(figure, path)
+
+
+def _latency(run: Run, path: Path) -> None:
+    figure, panel = plt.subplots(figsize=(9, 4))
+    present = [name for name in BY_NAME if _found(run, latency.NAME, name, latency.P50)]
+    for row, name in enumerate(present):
+        middle, slow = (
+            _found(run, latency.NAME, name, metric) for metric in (latency.P50, latency.P95)
+        )
+        if middle and slow:
+            colour, marker = BY_NAME[name].colour, BY_NAME[name].marker
+            panel.plot(
+                [middle.median, slow.median],
+                [row, row],
+                color=colour,
+                marker=marker,
+                markersize=8,
+                markevery=[0],
+            )
+            panel.plot(slow.median, row, color=colour, marker="|", markersize=14)
+    panel.set(
+        yticks=range(len(present)),
+        yticklabels=[BY_NAME[name].label for name in present],
+        xscale="log",
+        xlabel="time of one apply: p50 (marker) to p95 (bar)",
+    )
+    panel.invert_yaxis()
+    _unit(panel.xaxis, "s")
+    _finish(figure, path, legend=False)
+
+
+def _pipes(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 2, figsize=(12, 5), width_ratios=(3, 2))
+    cases = pipes.cases(run.about["size"])
+    trips, steps = (
+        [case.name for case in cases if case.group == group] for group in (pipes.TRIPS, pipes.STEPS)
+    )
+    for panel, names, metric in (
+        (panels[0], trips, pipes.ROUND_TRIP),
+        (panels[1], steps, pipes.STEP),
+    ):
+        _lines(panel, run, list(enumerate(names)), metric, log_x=False)
+        panel.set(xticks=range(len(names)), xticklabels=names, xlim=(-0.5, len(names) - 0.5))
+    panels[0].set(title="Round trip through a Pipe", xlabel="message", ylabel="time")
+    panels[1].set(title="One step of Gymnasium's AsyncVectorEnv", ylabel="time")
+    _finish(figure, path)
+
+
+def _startup(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 3, figsize=(14, 5))
+    points = [(float(count), startup.workers(count)) for count in startup.WORKERS]
+    for panel, metric, title in (
+        (panels[0], startup.START, "Until all workers work"),
+        (panels[1], startup.MEMORY, "Memory of all of them"),
+        (panels[2], startup.STOP, "Until all are gone"),
+    ):
+        _lines(panel, run, points, metric)
+        panel.set(title=title, xlabel="workers", xticks=startup.WORKERS, xlim=(0.7, 1500))
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        panel.xaxis.set_minor_formatter(NullFormatter())
+    _finish(figure, path)
+
+
+DRAW: Mapping[str, Callable[[Run, Path], None]] = {
+    "overhead": _overhead,
+    "throughput": _throughput,
+    "latency": _latency,
+    "pipes": _pipes,
+    "startup": _startup,
+}
+
+
+def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool = True) -> None:
+    """A line for each contender, whose bars go from the least to the greatest of the rounds."""
+    for name, contender in BY_NAME.items():
+        found = [(x, value) for x, case in points if (value := _found(run, case, name, metric))]
+        style = {"color": contender.colour, "marker": contender.marker, "label": contender.label}
+        if found:
+            panel.errorbar(
+                [x for x, _ in found],
+                [value.median for _, value in found],
+                yerr=_bars([value for _, value in found]),
+                capsize=2,
+                markersize=6,
+                **style,
+            )
+        failed = [x for x, case in points if name in run.failures.get(case, {})]
+        if failed:
+            panel.plot(
+                failed,
+                [0.96] * len(failed),
+                transform=panel.get_xaxis_transform(),
+                linestyle="",
+                marker="$✗$",
+                color=contender.colour,
+                markersize=10,
+            )
+    if log_x:
+        panel.set_xscale("log")
+    panel.set_yscale("log")
+    _unit(panel.yaxis, metric.unit)
+    panel.grid(axis="y", color="#eeeeee")
+
+
+def _rows(panel: Any, run: Run, cases: Sequence[str], metric: Metric) -> None:
+    """A row for each case with a marker for each contender."""
+    for name, contender in BY_NAME.items():
+        found = [
+            (row, value)
+            for row, case in enumerate(cases)
+            if (value := _found(run, case, name, metric))
+        ]
+        if found:
+            # Fiber's own on top, where markers meet.
+            panel.errorbar(
+                [value.median for _, value in found],
+                [row for row, _ in found],
+                xerr=_bars([value for _, value in found]),
+                linestyle="",
+                marker=contender.marker,
+                color=contender.colour,
+                label=contender.label,
+                markersize=8,
+                capsize=2,
+                zorder=4 if name.startswith("fiber") else 3,
+            )
+    panel.set(
+        yticks=range(len(cases)), yticklabels=cases, xscale="log", ylim=(len(cases) - 0.5, -0.5)
+    )
+    panel.grid(axis="y", color="#eeeeee")
+    _unit(panel.xaxis, metric.unit)
+
+
+def _found(run: Run, case: str, contender: str, metric: Metric) -> Summary | None:
+    return summary(run.values.get(case, {}).get(contender, {}).get(metric.name, []))
+
+
+def _bars(found: Sequence[Summary]) -> list[list[float]]:
+    return [
+        [each.median - each.least for each in found],
+        [each.greatest - each.median for each in found],
+    ]
+
+
+def _unit(axis: Any, unit: str, ticks: Sequence[float] | None = None) -> None:
+    low, high = axis.get_view_interval()
+    if ticks:
+        axis.set_ticks(ticks)
+    elif high < _NARROW * low:
+        # A decade or two alone would leave one or no number on the axis.
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value, unit)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _short(value: float, unit: str) -> str:
+    """A tick: "1 ms", "10,000"."""
+    number, _, name = in_words(value, unit).partition(" ")
+    short = number.rstrip("0").rstrip(".") if "." in number else number
+    return short if unit == "1/s" else f"{short} {name}"
+
+
+def _finish(figure: Any, path: Path, *, legend: bool = True) -> None:
+    for panel in figure.axes:
+        panel.spines[["top", "right"]].set_visible(False)
+    if legend:
+        entries = {
+            text: line
+            for panel in figure.axes
+            for line, text in zip(*panel.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(
+            entries.values(), entries.keys(), loc="outside lower center", ncols=5, frameon=False
+        )
+    figure.set_layout_engine("constrained")
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    plt.close(figure)

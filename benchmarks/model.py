@@ -1,0 +1,81 @@
+"""The words of the benchmarks.
+
+A case is one thing to measure, a metric one number it gives, a run all that was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+WORKERS = 5
+BASELINE = "multiprocessing"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number of a case. `unit` is "s", "1/s" or "B"."""
+
+    name: str
+    label: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One thing that every able contender does once in every round.
+
+    `limit`: seconds after which it counts as not finished and is not tried again.
+    `fresh`: needs a contender process that has done nothing before.
+    `rounds`: at most so many, for cases that take long.
+    """
+
+    measure: str
+    name: str
+    group: str
+    needs: str
+    params: Mapping[str, Any]
+    metrics: tuple[Metric, ...]
+    limit: float = 15.0
+    fresh: bool = False
+    rounds: int | None = None
+
+
+Series = list[float | None]
+
+
+@dataclass
+class Run:
+    """What one run of one measure gave.
+
+    For each case, contender and metric one value a round, None where there is none.
+    """
+
+    about: dict[str, Any]
+    values: dict[str, dict[str, dict[str, Series]]] = field(default_factory=dict)
+    failures: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def add(self, case: str, contender: str, turn: int, sample: Mapping[str, float]) -> None:
+        """Note the sample of round `turn`, counted from 0."""
+        for metric, value in sample.items():
+            series = self.series(case, contender, metric)
+            series.extend([None] * (turn + 1 - len(series)))
+            series[turn] = value
+
+    def fail(self, case: str, contender: str, why: str) -> None:
+        """Note that a contender did not get through a case."""
+        self.failures.setdefault(case, {})[contender] = why
+
+    def series(self, case: str, contender: str, metric: str) -> Series:
+        """The values by round, shorter than the run where a contender took part in fewer rounds."""
+        return self.values.setdefault(case, {}).setdefault(contender, {}).setdefault(metric, [])
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data from which `from_json` makes the same run."""
+        return {"about": self.about, "values": self.values, "failures": self.failures}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Run:
+        """The run that `as_json` described."""
+        return cls(dict(data["about"]), dict(data["values"]), dict(data["failures"]))

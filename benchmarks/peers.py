@@ -1,0 +1,274 @@
+"""The contenders behind one face: each adapter says in its library's words what measures ask for.
+
+`chunksize` None means what the library does when nothing is said. Where a library has no such
+word, its closest natural one is used and named in the adapter. Libraries are imported by name,
+as hardly any has types to check against and most are not installed where types are checked.
+"""
+
+from __future__ import annotations
+
+import abc
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent import futures
+from importlib import import_module
+from typing import Any
+
+from benchmarks.model import WORKERS
+
+Function = Callable[[Any], Any]
+
+
+class Adapter(abc.ABC):
+    """A pool of five workers, started when made."""
+
+    @abc.abstractmethod
+    def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
+        """All results, in order."""
+
+    @abc.abstractmethod
+    def apply(self, function: Function, item: Any) -> object:
+        """One call, waited for."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Stop the workers and wait until they are gone."""
+
+    def stream(self, function: Function, items: Sequence[Any], chunksize: int) -> Iterable[Any]:
+        """Results as they come, in any order."""
+        raise NotImplementedError(f"{type(self).__name__} has no results in any order")
+
+    def submit(self, function: Function, items: Sequence[Any]) -> list[Any]:
+        """One asynchronous call for each item, then all results."""
+        raise NotImplementedError(f"{type(self).__name__} has no asynchronous calls")
+
+
+class PoolAdapter(Adapter):
+    """multiprocessing's Pool and what has its methods: Fiber's, Ray's."""
+
+    def __init__(self, pool: Any) -> None:
+        self.pool = pool
+
+    def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
+        return list(self.pool.map(function, items, chunksize))
+
+    def stream(self, function: Function, items: Sequence[Any], chunksize: int) -> Iterable[Any]:
+        results: Iterable[Any] = self.pool.imap_unordered(function, items, chunksize)
+        return results
+
+    def submit(self, function: Function, items: Sequence[Any]) -> list[Any]:
+        return [each.get() for each in [self.pool.apply_async(function, (item,)) for item in items]]
+
+    def apply(self, function: Function, item: Any) -> object:
+        return self.pool.apply(function, (item,))
+
+    def close(self) -> None:
+        self.pool.terminate()
+        self.pool.join()
+
+
+class Ray(PoolAdapter):
+    """Ray's replacement for multiprocessing.Pool, on a Ray of its own."""
+
+    def __init__(self) -> None:
+        self.ray = import_module("ray")
+        self.ray.init(
+            num_cpus=WORKERS,
+            include_dashboard=False,
+            logging_level="ERROR",
+            log_to_driver=False,
+            _temp_dir=os.path.join(os.environ["TMPDIR"], "ray"),
+        )
+        super().__init__(import_module("ray.util.multiprocessing").Pool(WORKERS))
+
+    def close(self) -> None:
+        super().close()
+        self.ray.shutdown()
+
+
+class Futures(Adapter):
+    """concurrent.futures: its default chunk is one item."""
+
+    def __init__(self) -> None:
+        self.executor = futures.ProcessPoolExecutor(WORKERS)
+
+    def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
+        return list(self.executor.map(function, items, chunksize=chunksize or 1))
+
+    def stream(self, function: Function, items: Sequence[Any], chunksize: int) -> Iterator[Any]:
+        for future in futures.as_completed(
+            [self.executor.submit(function, item) for item in items]
+        ):
+            yield future.result()
+
+    def submit(self, function: Function, items: Sequence[Any]) -> list[Any]:
+        return [each.result() for each in [self.executor.submit(function, item) for item in items]]
+
+    def apply(self, function: Function, item: Any) -> object:
+        return self.executor.submit(function, item).result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+
+
+class Joblib(Adapter):
+    """joblib.Parallel on its loky executor: the default chunk is joblib's batch_size="auto"."""
+
+    def __init__(self) -> None:
+        self.joblib = import_module("joblib")
+        # The one that joblib.Parallel gets too.
+        self.executor = import_module("joblib.executor").get_memmapping_executor(WORKERS)
+
+    def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
+        return list(self._parallel(function, items, chunksize or "auto", "list"))
+
+    def stream(self, function: Function, items: Sequence[Any], chunksize: int) -> Iterable[Any]:
+        return self._parallel(function, items, chunksize, "generator_unordered")
+
+    def submit(self, function: Function, items: Sequence[Any]) -> list[Any]:
+        return [each.result() for each in [self.executor.submit(function, item) for item in items]]
+
+    def apply(self, function: Function, item: Any) -> object:
+        return self.executor.submit(function, item).result()
+
+    def close(self) -> None:
+        self.executor.shutdown(wait=True)
+
+    def _parallel(
+        self, function: Function, items: Sequence[Any], batch: int | str, kind: str
+    ) -> Iterable[Any]:
+        parallel = self.joblib.Parallel(WORKERS, batch_size=batch, return_as=kind)
+        call = self.joblib.delayed(function)
+        results: Iterable[Any] = parallel(call(item) for item in items)
+        return results
+
+
+class Dask(Adapter):
+    """dask.distributed with one thread a worker.
+
+    Unchunked is Client.map, which has no chunks; default chunks are those of a dask.bag.
+    """
+
+    def __init__(self) -> None:
+        self.distributed = import_module("distributed")
+        self.cluster = self.distributed.LocalCluster(
+            n_workers=WORKERS, threads_per_worker=1, dashboard_address=None
+        )
+        self.client = self.distributed.Client(self.cluster)
+
+    def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
+        if chunksize is None:
+            bag = import_module("dask.bag").from_sequence(items)
+            return list(bag.map(function).compute(scheduler=self.client))
+        return list(self.client.gather(self.client.map(function, items, pure=False)))
+
+    def stream(self, function: Function, items: Sequence[Any], chunksize: int) -> Iterator[Any]:
+        tasks = self.client.map(function, items, pure=False)
+        for _, result in self.distributed.as_completed(tasks, with_results=True):
+            yield result
+
+    def submit(self, function: Function, items: Sequence[Any]) -> list[Any]:
+        tasks = [self.client.submit(function, item, pure=False) for item in items]
+        return list(self.client.gather(tasks))
+
+    def apply(self, function: Function, item: Any) -> object:
+        return self.client.submit(function, item, pure=False).result()
+
+    def close(self) -> None:
+        self.client.close()
+        self.cluster.close()
+
+
+class IPyParallel(Adapter):
+    """ipyparallel.
+
+    Unchunked is the load-balanced view; default chunks are the direct view's, one for each
+    engine.
+    """
+
+    def __init__(self) -> None:
+        self.cluster = import_module("ipyparallel").Cluster(n=WORKERS, log_level=40)
+        self.client = self.cluster.start_and_connect_sync(activate=False)
+        self.balanced = self.client.load_balanced_view()
+        self.direct = self.client[:]
+
+    def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
+        if chunksize is None:
+            return list(self.direct.map_sync(function, items))
+        return list(self.balanced.map_sync(function, items, chunksize=chunksize))
+
+    def stream(self, function: Function, items: Sequence[Any], chunksize: int) -> Iterable[Any]:
+        results: Iterable[Any] = self.balanced.map_async(
+            function, items, chunksize=chunksize, ordered=False
+        )
+        return results
+
+    def submit(self, function: Function, items: Sequence[Any]) -> list[Any]:
+        return [
+            each.get() for each in [self.balanced.apply_async(function, item) for item in items]
+        ]
+
+    def apply(self, function: Function, item: Any) -> object:
+        return self.balanced.apply_sync(function, item)
+
+    def close(self) -> None:
+        self.client.close()
+        self.cluster.stop_cluster_sync()
+
+
+class Spark(Adapter):
+    """PySpark with local[5].
+
+    Unchunked is one partition an item, the default one partition a worker, apply a job of one
+    task.
+    """
+
+    def __init__(self) -> None:
+        spark = import_module("pyspark")
+        scratch = os.environ["TMPDIR"]
+        conf = spark.SparkConf().setMaster(f"local[{WORKERS}]").setAppName("benchmarks")
+        for key, value in {
+            "spark.ui.enabled": "false",
+            "spark.ui.showConsoleProgress": "false",
+            "spark.log.level": "ERROR",
+            "spark.local.dir": scratch,
+            "spark.driver.host": "127.0.0.1",
+            "spark.driver.bindAddress": "127.0.0.1",
+            "spark.driver.extraJavaOptions": f"-Djava.io.tmpdir={scratch} -XX:-UsePerfData",
+        }.items():
+            conf.set(key, value)
+        self.context = spark.SparkContext(conf=conf)
+
+    def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
+        partitions = None if chunksize is None else max(1, len(items) // chunksize)
+        return list(self.context.parallelize(items, partitions).map(function).collect())
+
+    def apply(self, function: Function, item: Any) -> object:
+        return self.context.parallelize([item], 1).map(function).collect()[0]
+
+    def close(self) -> None:
+        self.context.stop()
+
+
+def processes_of(contender: str) -> Any:
+    """What has Process, Pipe and Pool: a context of multiprocessing, or the module fiber."""
+    if contender.startswith("fiber"):
+        return import_module("fiber")
+    multiprocessing = import_module("multiprocessing")
+    return multiprocessing.get_context("forkserver" if contender == "forkserver" else "fork")
+
+
+_ADAPTERS: dict[str, Callable[[], Adapter]] = {
+    "concurrent.futures": Futures,
+    "joblib": Joblib,
+    "dask": Dask,
+    "ipyparallel": IPyParallel,
+    "ray": Ray,
+    "spark": Spark,
+}
+
+
+def start(contender: str) -> Adapter:
+    """The contender's pool, its workers started."""
+    make = _ADAPTERS.get(contender)
+    return make() if make else PoolAdapter(processes_of(contender).Pool(WORKERS))

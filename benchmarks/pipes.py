@@ -1,0 +1,125 @@
+"""Pipes: round trips between two processes, and a vector step over many environments."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.model import Case, Metric
+from benchmarks.tasks import echo, ones
+
+if TYPE_CHECKING:
+    from benchmarks.contender import Bench
+
+TITLE = "Pipes"
+ABOUT = """\
+Round trip: this process sends, a process at the other end of a `Pipe()` receives and sends
+back, this process receives and touches every page of what came. From 28 KB (an Atari
+observation) up the message is a NumPy array. The value of a round is the median of its round
+trips. Vector step: one `step` of Gymnasium's AsyncVectorEnv with `shared_memory=False` over
+environments that do nothing; Fiber runs it by
+`fiber.adopt("gymnasium.vector.async_vector_env")`."""
+
+ROUND_TRIP = Metric("round trip", "round trip", "s")
+STEP = Metric("step", "vector step", "s")
+TRIPS = "round trip"
+STEPS = "vector step"
+
+# Name, bytes (0: an int), round trips.
+MESSAGES = (
+    ("int", 0, 5000),
+    ("100 B", 100, 5000),
+    ("28 KB", 84 * 84 * 4, 2000),
+    ("1 MB", 1 << 20, 300),
+    ("16 MB", 1 << 24, 20),
+)
+_ENVIRONMENTS = {8: 800, 32: 200}
+_PAGE = 4096
+_MODULE = "gymnasium.vector.async_vector_env"
+
+
+def environments(count: int) -> str:
+    """The name of the case with `count` environments."""
+    return f"{count} environments"
+
+
+def cases(size: float) -> list[Case]:
+    """The full measure at size 1; below, fewer round trips."""
+    trips = [
+        (TRIPS, name, ROUND_TRIP, {"nbytes": nbytes}, count) for name, nbytes, count in MESSAGES
+    ]
+    steps = [
+        (STEPS, environments(n), STEP, {"environments": n}, count)
+        for n, count in _ENVIRONMENTS.items()
+    ]
+    return [
+        Case(
+            measure="pipes",
+            name=name,
+            group=group,
+            needs="pipes",
+            params={**params, "count": max(5, round(count * size)), "seconds": 3.0 * size},
+            metrics=(metric,),
+            fresh=True,
+        )
+        for group, name, metric, params, count in [*trips, *steps]
+    ]
+
+
+def run(
+    bench: Bench, count: int, seconds: float, nbytes: int = 0, environments: int = 0
+) -> dict[str, float]:
+    """The median of up to `count` round trips or vector steps, as many as fit in `seconds`."""
+    if environments:
+        return _vector_step(bench, environments, count, seconds)
+    return _round_trip(bench, nbytes, count, seconds)
+
+
+def _round_trip(bench: Bench, nbytes: int, count: int, seconds: float) -> dict[str, float]:
+    message = 1 if not nbytes else b"x" * nbytes if nbytes < 1000 else ones(nbytes)
+    here, there = bench.processes.Pipe()
+    child = bench.processes.Process(target=echo, args=(there,), daemon=True)
+    child.start()
+    there.close()
+
+    def trip() -> None:
+        here.send(message)
+        reply = here.recv()
+        if nbytes >= _PAGE:
+            reply[::_PAGE].max()
+
+    try:
+        return {ROUND_TRIP.name: _median_time(trip, count, seconds)}
+    finally:
+        # Not by closing, as a forked child holds this end too and would never see its end.
+        child.terminate()
+        child.join()
+        here.close()
+
+
+def _vector_step(bench: Bench, environments: int, count: int, seconds: float) -> dict[str, float]:
+    module: Any = importlib.import_module(_MODULE)
+    still = importlib.import_module("benchmarks.environment").Still
+    if bench.contender.startswith("fiber"):
+        importlib.import_module("fiber").adopt(_MODULE)
+    vector = module.AsyncVectorEnv([still] * environments, shared_memory=False)
+    try:
+        vector.reset()
+        actions = [0] * environments
+        return {STEP.name: _median_time(lambda: vector.step(actions), count, seconds)}
+    finally:
+        vector.close()
+
+
+def _median_time(action: Callable[[], object], count: int, seconds: float) -> float:
+    for _ in range(max(3, count // 10)):
+        action()
+    clock, times, end = time.perf_counter, list[float](), time.perf_counter() + seconds
+    while len(times) < count and (not times or clock() < end):
+        begin = clock()
+        action()
+        times.append(clock() - begin)
+    return median(times)

@@ -1,0 +1,219 @@
+"""From runs to pages: one page of tables for each measure, and an index with the budgets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import budgets, figures
+from benchmarks.contenders import BY_NAME
+from benchmarks.model import BASELINE, Case, Metric, Run
+from benchmarks.rounds import LONG, SERVER_ROUNDS
+from benchmarks.samples import Summary, in_words, ratio, summary, times
+from benchmarks.suite import MEASURES
+
+RESULTS = "results.json"
+_NOTES = "notes.md"
+_GENERATED = (
+    "<!-- Written by benchmarks/run.py from results.json; changes made by hand are lost. -->"
+)
+
+
+def load(folder: Path) -> dict[str, Run]:
+    """The runs of an earlier report, by measure, so that one measure can be run again alone."""
+    path = folder / RESULTS
+    if not path.exists():
+        return {}
+    return {
+        name: Run.from_json(data)
+        for name, data in json.loads(path.read_text(encoding="utf-8")).items()
+    }
+
+
+def write(folder: Path, runs: Mapping[str, Run], new: Iterable[str]) -> None:
+    """The results, a page and a picture for each measure in `new`, and the index over all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    data = {name: runs[name].as_json() for name in MEASURES if name in runs}
+    (folder / RESULTS).write_text(json.dumps(data, separators=(",", ":")) + "\n", encoding="utf-8")
+    for name in new:
+        figures.DRAW[name](runs[name], folder / f"{name}.png")
+        (folder / f"{name}.md").write_text(page(name, runs[name]), encoding="utf-8")
+    (folder / "README.md").write_text(
+        index(runs, notes=(folder / _NOTES).exists()), encoding="utf-8"
+    )
+
+
+def page(name: str, run: Run) -> str:
+    """The page of one measure."""
+    measure = MEASURES[name]
+    cases = measure.cases(run.about["size"])
+    groups = {case.group: [each for each in cases if each.group == case.group] for case in cases}
+    sections = [
+        f"## {group[0].upper()}{group[1:]}\n\n{_group_table(run, members)}"
+        for group, members in groups.items()
+    ]
+    parts = [
+        _GENERATED,
+        f"# {measure.TITLE}",
+        measure.ABOUT,
+        f"![{measure.TITLE}]({name}.png)",
+        _reading(run),
+        *sections,
+        _failures(run),
+        f"## Made on\n\n{_origin(run.about)}",
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def index(runs: Mapping[str, Run], *, notes: bool) -> str:
+    """The index: where the pages are, and every budget with its verdict."""
+    pages = [f"* [{MEASURES[name].TITLE}]({name}.md)" for name in MEASURES if name in runs]
+    if notes:
+        pages.append(f"* [Notes]({_NOTES}): why a budget is missed and what was tried")
+    found = budgets.verdicts(runs)
+    rows = [
+        (v.budget.what, _against(v.budget), v.budget.in_words(), v.measured, v.verdict)
+        for v in found
+    ]
+    met = sum(v.kept is True for v in found)
+    parts = [
+        _GENERATED,
+        "# Benchmarks",
+        "`make bench` writes these pages. A ratio is taken within each round; then the median over "
+        "the rounds is given.",
+        "\n".join(pages),
+        "## Budgets",
+        f"{met} of {len(found)} met. Contender: Fiber with local processes, if not said otherwise.",
+        table(("what", "against", "budget", "measured", "verdict"), rows),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _against(budget: budgets.Budget) -> str:
+    return "—" if budget.unit else BY_NAME[budget.against].label
+
+
+def _group_table(run: Run, cases: Sequence[Case]) -> str:
+    several = len({metric.label for case in cases for metric in case.metrics}) > 1
+    head = (
+        "case",
+        *(["what"] if several else []),
+        "contender",
+        "median",
+        "least to greatest",
+        "ratio",
+        "budget",
+        "verdict",
+    )
+    rows = []
+    for case in cases:
+        for metric in case.metrics:
+            title = [case.name, *([metric.label] if several else [])]
+            for row in _rows(run, case, metric):
+                rows.append((*title, *row))
+                title = [""] * len(title)
+    return table(head, rows)
+
+
+def _rows(run: Run, case: Case, metric: Metric) -> list[tuple[str, ...]]:
+    baseline = run.series(case.name, BASELINE, metric.name)
+    rows: list[tuple[str, ...]] = []
+    for name, contender in BY_NAME.items():
+        values = run.series(case.name, name, metric.name)
+        found = summary(values)
+        if not found:
+            continue
+        to_baseline = ratio(values, baseline) if name != BASELINE else None
+        spread = f"{in_words(found.least, metric.unit)} to {in_words(found.greatest, metric.unit)}"
+        if found.rounds == 1:
+            spread = "one round"
+        verdict = _verdict(run, case, metric, name)
+        rows.append(
+            (
+                contender.label,
+                in_words(found.median, metric.unit),
+                spread,
+                _ratio(to_baseline),
+                *verdict,
+            )
+        )
+    return rows
+
+
+def _ratio(found: Summary | None) -> str:
+    if not found:
+        return "—"
+    if found.rounds == 1:
+        return times(found.median)
+    return f"{times(found.median)} ({times(found.least)} to {times(found.greatest)})"
+
+
+def _verdict(run: Run, case: Case, metric: Metric, contender: str) -> tuple[str, str]:
+    keys = (case.measure, case.name, metric.name, contender)
+    for budget in budgets.BUDGETS:
+        if (budget.measure, budget.case, budget.metric, budget.contender) == keys:
+            against = (
+                ""
+                if budget.unit or budget.against == BASELINE
+                else f" {BY_NAME[budget.against].label}"
+            )
+            return f"{budget.in_words()}{against}", budgets.judge(
+                budget, {case.measure: run}
+            ).verdict
+    return "", ""
+
+
+def _reading(run: Run) -> str:
+    rounds = run.about["rounds"]
+    text = (
+        f"Median of {rounds} round{'s' if rounds > 1 else ''}; contenders with servers of their "
+        f"own take part in at most {SERVER_ROUNDS}, and what takes more than {LONG:g} s is "
+        "measured once. The ratio is to multiprocessing in the same round: its median, least and "
+        "greatest."
+    )
+    if run.about["size"] < 1:
+        size = f"{run.about['size']:g}"
+        text += f"\n\n**Run at {size} of the full size: it shows that everything works, no more.**"
+    return text
+
+
+def _failures(run: Run) -> str:
+    rows = [
+        (case, BY_NAME[contender].label, why.replace("|", "\\|").replace("\n", " "))
+        for case, failed in run.failures.items()
+        for contender, why in failed.items()
+    ]
+    skipped = [
+        (BY_NAME[name].label, "all", f"skipped, not installed: {what}")
+        for name, what in _skipped(run)
+    ]
+    if not rows and not skipped:
+        return ""
+    rows += [(case, contender, why) for contender, case, why in skipped]
+    return "## Not measured\n\n" + table(("case", "contender", "why"), rows)
+
+
+def _skipped(run: Run) -> list[tuple[str, str]]:
+    return sorted(run.about.get("skipped", {}).items())
+
+
+def _origin(about: Mapping[str, Any]) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
+    rows = {
+        "machine": f"{about['cores']} cores ({about['processor']}), {about['memory']} of memory",
+        "system": about["system"],
+        "Python": about["python"],
+        "versions": versions or "—",
+        "date": about["date"],
+        "load before": f"{about['load']} (1 minute average of running processes)",
+        "command": f"`{about['command']}`",
+    }
+    return table(("", ""), rows.items())

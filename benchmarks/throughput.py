@@ -1,0 +1,140 @@
+"""Throughput: how many tasks a second when the tasks do nothing, and how fast large data passes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.model import WORKERS, Case, Metric
+from benchmarks.tasks import no_op, ones, size, sleep
+
+if TYPE_CHECKING:
+    from benchmarks.contender import Bench
+
+TITLE = "Throughput"
+ABOUT = f"""\
+{WORKERS} workers. No-op tasks give their argument, an int, back. Contenders with servers of
+their own (Dask, ipyparallel, Ray, Spark) get a tenth of the no-op tasks, so that a round ends
+in bearable time. The batches of arrays are 100 different ones of 1 MB, sent with chunksize 1.
+The long task stands in the middle of its batch, which is sent in default chunks: the time
+shows whether short tasks wait behind the long one, and whether the long one waited for its
+turn.
+Each batch but this one is the median of up to five in a row."""
+
+RATE = Metric("rate", "tasks a second", "1/s")
+TIME = Metric("time", "time of the batch", "s")
+NO_OPS = "no-op tasks"
+ARRAYS = "arrays of 1 MB"
+LONG = "one long task"
+MEGABYTE = 1 << 20
+
+# Name, what it needs, method, chunk size, tasks.
+_NO_OPS: tuple[tuple[str, str, str, int | None, int], ...] = (
+    ("map, chunksize 1", "map", "map", 1, 10_000),
+    ("map, default chunks", "map", "map", None, 100_000),
+    ("imap_unordered, chunksize 1", "stream", "stream", 1, 10_000),
+    ("imap_unordered, chunksize 100", "stream in chunks", "stream", 100, 100_000),
+    ("apply_async", "submit", "submit", None, 10_000),
+)
+ARRAY_KINDS = {
+    "1 MB arguments": "arguments",
+    "1 MB results": "results",
+    "1 MB arguments and results": "both",
+}
+LONG_NAME = "1 s among 10,000 no-ops"
+
+
+def cases(size: float) -> list[Case]:
+    """The full measure at size 1; below, fewer tasks."""
+
+    def case(name: str, group: str, needs: str, metric: Metric, **params: Any) -> Case:
+        return Case("throughput", name, group, needs, params, (metric,))
+
+    return [
+        *(
+            case(
+                name,
+                NO_OPS,
+                needs,
+                RATE,
+                kind=method,
+                tasks=max(100, round(tasks * size)),
+                chunksize=chunksize,
+            )
+            for name, needs, method, chunksize, tasks in _NO_OPS
+        ),
+        *(
+            case(
+                name, ARRAYS, "map", TIME, kind=kind, tasks=max(10, round(100 * size)), chunksize=1
+            )
+            for name, kind in ARRAY_KINDS.items()
+        ),
+        case(LONG_NAME, LONG, "map", TIME, kind="long", tasks=10_000, chunksize=None),
+    ]
+
+
+def run(bench: Bench, kind: str, tasks: int, chunksize: int | None) -> dict[str, float]:
+    """Tasks a second for no-ops; for the others the seconds of the batch."""
+    if kind == "long":
+        return _long(bench, tasks)
+    if kind in ARRAY_KINDS.values():
+        return _arrays(bench, kind, tasks)
+    return _no_ops(bench, kind, tasks if bench.light else max(100, tasks // 10), chunksize)
+
+
+def _no_ops(bench: Bench, method: str, tasks: int, chunksize: int | None) -> dict[str, float]:
+    pool = bench.pool
+
+    def batch(items: Sequence[int]) -> Iterable[Any]:
+        if method == "map":
+            return pool.map(no_op, items, chunksize)
+        if method == "stream":
+            return pool.stream(no_op, items, chunksize or 1)
+        return pool.submit(no_op, items)
+
+    sum(batch(range(WORKERS)))
+    took = _time(lambda: sum(batch(range(tasks))), sum(range(tasks)))
+    return {RATE.name: tasks / took}
+
+
+def _arrays(bench: Bench, kind: str, tasks: int) -> dict[str, float]:
+    arrays = [ones(MEGABYTE) for _ in range(tasks)]
+
+    def batch(count: int) -> int:
+        if kind == "arguments":
+            return sum(bench.pool.map(size, arrays[:count], 1))
+        if kind == "results":
+            return sum(size(each) for each in bench.pool.map(ones, [MEGABYTE] * count, 1))
+        return sum(size(each) for each in bench.pool.map(no_op, arrays[:count], 1))
+
+    batch(2 * WORKERS)
+    return {TIME.name: _time(lambda: batch(tasks), tasks * MEGABYTE)}
+
+
+def _long(bench: Bench, tasks: int) -> dict[str, float]:
+    naps = [0.0] * tasks
+    naps[tasks // 2] = 1.0
+    bench.pool.map(nap, naps[:WORKERS], None)
+    begin = time.perf_counter()
+    bench.pool.map(nap, naps, None)
+    return {TIME.name: time.perf_counter() - begin}
+
+
+def nap(seconds: float) -> None:
+    """Sleep if there is anything to sleep; even a sleep of 0 s is a system call."""
+    if seconds:
+        sleep(seconds)
+
+
+def _time(batch: Callable[[], int], expected: int) -> float:
+    """The median of up to five batches, or of as many as fit in half a second, at least one."""
+    clock, times, end = time.perf_counter, list[float](), time.perf_counter() + 0.5
+    while not times or (len(times) < 5 and clock() < end):
+        begin = clock()
+        total = batch()
+        times.append(clock() - begin)
+        if total != expected:
+            raise RuntimeError(f"the results add up to {total}, not to {expected}")
+    return median(times)

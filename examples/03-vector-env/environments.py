@@ -1,0 +1,68 @@
+"""The environments that both programs step, and the clock that times them."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+
+MakeEnv = Callable[[], gym.Env[Any, Any]]
+
+
+class Simulator(gym.Wrapper[Any, Any, Any, Any]):
+    """Keeps a core busy for so many milliseconds more in each step, as a real simulator would."""
+
+    def __init__(self, env: gym.Env[Any, Any], milliseconds: float) -> None:
+        super().__init__(env)
+        self._seconds = milliseconds / 1000
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        end = time.perf_counter() + self._seconds
+        result = self.env.step(action)
+        while time.perf_counter() < end:
+            pass
+        return result
+
+
+def make(name: str, milliseconds: float) -> gym.Env[Any, Any]:
+    """One environment, slowed down to `milliseconds` a step if it is faster than that."""
+    env: gym.Env[Any, Any] = gym.make(name)
+    return Simulator(env, milliseconds) if milliseconds else env
+
+
+def makers(options: argparse.Namespace, milliseconds: float) -> list[MakeEnv]:
+    """A function for each environment that makes it, in whatever process calls it."""
+    return [partial(make, options.env, milliseconds)] * options.envs
+
+
+def rate(step: Callable[[], object], options: argparse.Namespace) -> float:
+    """Environment steps a second, when `step` steps all of the environments once."""
+    steps: int = options.steps
+    envs: int = options.envs
+    started = time.perf_counter()
+    for _ in range(steps):
+        step()
+    return steps * envs / (time.perf_counter() - started)
+
+
+def parse(description: str, arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The options that both programs have."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--env", default="CartPole-v1")
+    parser.add_argument("--envs", type=int, default=8, help="how many environments")
+    parser.add_argument("--steps", type=int, default=300, help="steps of each environment")
+    parser.add_argument(
+        "--ms", type=float, default=2.0, help="milliseconds of a slow simulator's step"
+    )
+    options = parser.parse_args(arguments)
+    if options.envs < 1 or options.steps < 1 or options.ms < 0:
+        parser.error("--envs and --steps must be at least 1, --ms at least 0")
+    try:
+        gym.make(options.env).close()
+    except gym.error.Error as error:
+        parser.error(f"--env {options.env}: {error}")
+    return options

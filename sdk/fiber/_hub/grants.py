@@ -1,0 +1,177 @@
+"""Making the grants that pickled handles carry, and taking them back."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from fiber._hub import access
+from fiber._hub.access import Access
+from fiber._hub.client import Line
+from fiber._hub.protocol import ONE, TWO, Kind, Op
+from fiber._hub.registry import Registry
+from fiber._hub.remote import RemoteObject
+from fiber.errors import ConnectionClosed
+
+
+class Granted(NamedTuple):
+    """What a handle is made of."""
+
+    home: Access
+    number: int
+    grant: int
+
+
+class GrantSet:
+    """Grants that last until they are released, or until this process ends.  Any thread.
+
+    For what may be unpickled any number of times: a process's start, a task that may run again.
+    """
+
+    __slots__ = ("_direct", "_lines")
+
+    def __init__(self) -> None:
+        self._direct: list[tuple[Registry, int]] = []
+        self._lines: dict[Access, Line] = {}
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to release."""
+        return bool(self._direct or self._lines)
+
+    def for_local(self, kind: Kind, fd: int) -> Granted:
+        """A grant for an object of this host."""
+        hub = access.own_hub()
+        if hub is not None:
+            number, grant = hub.registry.register(kind, fd, reusable=True)
+            self._direct.append((hub.registry, grant))
+            return Granted(hub.access, number, grant)
+        own = access.current()
+        return _ask_local(self._line(own), own, kind, fd, reusable=True)
+
+    def for_remote(self, end: RemoteObject) -> Granted:
+        """A grant for an object of another host."""
+        reply = self._line(end.home).ask(Op.GRANT, end.number, True, form=TWO)
+        return Granted(end.home, *reply.values)
+
+    def release(self) -> None:
+        """Nobody unpickles the handles any more."""
+        direct, self._direct = self._direct, []
+        lines, self._lines = self._lines, {}
+        for registry, grant in direct:
+            registry.release(grant)
+        for line in lines.values():
+            line.close()  # a hub takes back what was granted on a stream when it ends
+
+    def _line(self, home: Access) -> Line:
+        if home not in self._lines:
+            self._lines[home] = Line(home)
+        return self._lines[home]
+
+
+class _SingleUse:
+    """Grants for whoever unpickles a handle first; they outlive this process."""
+
+    def __init__(self) -> None:
+        self._forget()
+        os.register_at_fork(after_in_child=self._forget)
+
+    def _forget(self) -> None:
+        self._lock = threading.Lock()
+        self._line: Line | None = None
+
+    def for_local(self, kind: Kind, fd: int) -> Granted:
+        """A grant for an object of this host."""
+        hub = access.own_hub()
+        if hub is not None:
+            number, grant = hub.registry.register(kind, fd, reusable=False)
+            _attempt.undo.append(lambda: hub.registry.release(grant))
+            return Granted(hub.access, number, grant)
+        with self._lock:
+            granted = self._register(access.current(), kind, fd)
+        _attempt.undo.append(lambda: self._release(granted.grant))
+        return granted
+
+    def for_remote(self, end: RemoteObject) -> Granted:
+        """A grant for an object of another host."""
+        with end.line() as line:
+            reply = line.ask(Op.GRANT, end.number, False, form=TWO)
+        granted = Granted(end.home, *reply.values)
+        _attempt.undo.append(lambda: _release_remote(end, granted.grant))
+        return granted
+
+    def _register(self, own: Access, kind: Kind, fd: int) -> Granted:
+        if self._line is None:
+            self._line = Line(own)
+        try:
+            return _ask_local(self._line, own, kind, fd, reusable=False)
+        except BaseException:
+            # Whatever it was, Ctrl-C or the hub's refusal, the next one begins anew.
+            self._line.close()
+            self._line = None
+            raise
+
+    def _release(self, grant: int) -> None:
+        with self._lock:
+            if self._line is not None:
+                self._line.say(Op.RELEASE, grant, form=ONE)
+
+
+def _ask_local(line: Line, own: Access, kind: Kind, fd: int, *, reusable: bool) -> Granted:
+    reply = line.ask(Op.REGISTER, kind, reusable, form=TWO, fds=[fd])
+    return Granted(own, *reply.values)
+
+
+def _release_remote(end: RemoteObject, grant: int) -> None:
+    with end.line() as line:
+        line.say(Op.RELEASE, grant, form=ONE)
+
+
+class _Attempt(threading.local):
+    """The pickling that this thread is at."""
+
+    def __init__(self) -> None:
+        self.collecting: GrantSet | None = None
+        self.undo: list[Callable[[], None]] = []
+
+
+_attempt = _Attempt()
+_single_use = _SingleUse()
+
+
+def current() -> GrantSet | _SingleUse:
+    """What the handle that is being pickled gets its grant from."""
+    collecting = _attempt.collecting
+    return _single_use if collecting is None else collecting
+
+
+@contextlib.contextmanager
+def collecting_grants() -> Iterator[GrantSet]:
+    """Handles pickled on this thread within the block work until the yielded set is released.
+
+    If the block raises, it is released.
+    """
+    grants = GrantSet()
+    before, _attempt.collecting = _attempt.collecting, grants
+    try:
+        yield grants
+    except BaseException:
+        grants.release()
+        raise
+    finally:
+        _attempt.collecting = before
+
+
+def begin_attempt() -> None:
+    """This thread begins to pickle something outside of ``collecting_grants``."""
+    _attempt.undo.clear()
+
+
+def undo_attempt() -> None:
+    """It did not work out: what was granted meanwhile, nobody will ever use."""
+    undo, _attempt.undo = _attempt.undo, []
+    for step in undo:
+        with contextlib.suppress(OSError, ConnectionClosed):  # the hub is gone, and all with it
+            step()

@@ -1,0 +1,38 @@
+"""Start methods: the one in force for this program, and what the zygote imports for it.
+
+A child starts with its parent's.
+"""
+
+from __future__ import annotations
+
+START_METHODS = ("forkserver", "spawn", "fork")
+"""``forkserver`` and ``fork`` both fork from Fiber's zygote; the default comes first."""
+
+chosen: str | None = None
+"""What ``set_start_method`` set, or the first use settled."""
+
+preload: list[str] = []
+"""Modules that the zygote imports before it forks."""
+
+
+def settle() -> str:
+    """The start method in force; from now on it counts as set."""
+    choose(chosen or START_METHODS[0])
+    return chosen or START_METHODS[0]
+
+
+def choose(method: str | None) -> None:
+    """Set it, or forget what was set."""
+    global chosen
+    chosen = method
+
+
+def inherit(method: str | None, modules: list[str]) -> None:
+    """In a child: what its parent had set."""
+    choose(method)
+    preload[:] = modules
+
+
+def zygote_method(method: str | None) -> str:
+    """What the zygote is asked to do for a start method, None being the one in force."""
+    return "spawn" if (method or settle()) == "spawn" else "fork"

@@ -1,0 +1,129 @@
+"""Which of CPython's tests say what about a distributed drop-in.
+
+A test belongs to the first table that names it, as ``Class.test``, ``Class.test[type]`` (type is
+processes or manager) or ``Class.*``; ``Class`` is CPython's base name without the leading
+underscore. What no table names is `core` when its class is known, else `ext`: a class that a newer
+Python added is looked at before anything is promised about it.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Tier = Literal["core", "local", "ext", "na"]
+
+# Needs one host: pids, signals, shared files, raw sockets.
+LOCAL = {
+    "TestProcess.test_set_executable": "path of a local interpreter",
+    "TestProcess.test_process_mainthread_native_id": "kernel thread ids",
+    "TestProcess.test_child_fd_inflation": "number of open files of children",
+    "TestSubclassingProcess.test_stderr_flush": "file shared with the child",
+    "TestSubclassingProcess.test_sys_exit": "file shared with the child",
+    "TestCondition.test_wait_result[processes]": "child signals the parent's pid",
+    "TestListenerClient.*": "Listener and Client, AF_UNIX among them",
+    "TestPollEintr.*": "child signals the parent's pid",
+    "TestWait.test_wait_socket": "raw sockets in wait()",
+    "TestWait.test_wait_socket_slow": "raw sockets in wait()",
+    "TestTimeouts.*": "Listener and Client on one host",
+    "TestIgnoreEINTR.*": "parent signals the child's pid",
+}
+
+# Private attributes, cosmetics, names of contexts, internals of the standard library.
+EXT = {
+    "TestQueue.test_queue_feeder_on_queue_feeder_error": "private hook",
+    "TestEvent.test_repr": "cosmetic",
+    "TestPool.test_make_pool[processes]": "Pool._pool",
+    "TestPool.test_resource_warning": "Pool._state",
+    "TestPoolWorkerLifetime.test_pool_worker_lifetime": "_pool, _repopulate_pool",
+    "TestRemoteManager.*": "xmlrpclib serializer",
+    "TestManagerRestart.*": "Server.listener",
+    "TestListener.test_multiple_bind": "address families",
+    "OtherTest.*": "HMAC challenge internals",
+    "TestInvalidFamily.test_invalid_family": "address families",
+    "TestSimpleQueue.test_closed": "_reader, _writer",
+    "TestStartMethod.test_context": "child reports the parent's method",
+    "TestStartMethod.test_context_check_module_types": "types of forkserver preload",
+    "TestStartMethod.test_set_get": "class names of contexts",
+    "TestStartMethod.test_get_all": "exact list of methods",
+}
+
+# Never expected: shared memory, descriptors, forkserver, resource tracker, or the text of the
+# test itself runs the standard library in another interpreter.
+NOT_APPLICABLE = {
+    "TestInternalDecorators.*": "tests the suite itself",
+    "TestProcess.test_forkserver_sigint": "forkserver internals",
+    "TestProcess.test_forkserver_sigkill": "forkserver internals",
+    "TestQueue.test_no_import_lock_contention": "text imports the standard library",
+    "TestPoolWorkerLifetime.test_worker_finalization_via_atexit_handler_of_multiprocessing": (
+        "text runs the standard library in another interpreter"
+    ),
+    "TestConnection.test_fd_transfer": "passes descriptors",
+    "TestConnection.test_large_fd_transfer": "passes descriptors",
+    "TestConnection.test_missing_fd_transfer": "passes descriptors",
+    "TestListener.test_abstract_socket": "abstract AF_UNIX",
+    "TestPicklingConnections.test_pickling": "pickles raw sockets",
+    "TestHeap.*": "mmap heap internals",
+    "TestSharedMemory.*": "memory shared on one host",
+    "TestFinalize.*": "util internals",
+    "TestImportStar.*": "files of the standard library",
+    "TestInvalidHandle.*": "Connection(fd) internals",
+    "TestInvalidFamily.test_invalid_family_win32": "Windows",
+    "TestFlags.*": "another interpreter imports the standard test module",
+    "TestNoForkBomb.*": "script uses the standard library",
+    "TestForkAwareThreadLock.*": "util internals",
+    "TestCloseFds.*": "inherits descriptors",
+    "TestStartMethod.test_preload_resources": "forkserver preload",
+    "TestStartMethod.test_mixed_startmethod": "SemLocks of fork",
+    "TestResourceTracker.*": "resource tracker",
+    "TestPoolNotLeakOnFailure.*": "mocks internals of Pool",
+    "TestNamedResource.*": "script uses the standard library",
+    "MiscTestCase.*": "__all__ of the standard library, another interpreter",
+    "SemLockTests.*": "_multiprocessing.SemLock",
+}
+
+KNOWN_CLASSES = frozenset(
+    {
+        "TestArray",
+        "TestBarrier",
+        "TestCondition",
+        "TestConnection",
+        "TestContainers",
+        "TestEvent",
+        "TestInitializers",
+        "TestListener",
+        "TestLock",
+        "TestLogging",
+        "TestMyManager",
+        "TestPicklingConnections",
+        "TestPoll",
+        "TestPool",
+        "TestPoolWorkerErrors",
+        "TestPoolWorkerLifetime",
+        "TestProcess",
+        "TestQueue",
+        "TestSemaphore",
+        "TestSharedCTypes",
+        "TestSimpleQueue",
+        "TestStartMethod",
+        "TestStdinBadfiledescriptor",
+        "TestSubclassingProcess",
+        "TestSyncManagerTypes",
+        "TestValue",
+        "TestWait",
+    }
+)
+
+_TABLES: tuple[tuple[Tier, dict[str, str]], ...] = (
+    ("na", NOT_APPLICABLE),
+    ("local", LOCAL),
+    ("ext", EXT),
+)
+
+
+def tier_of(class_name: str, method: str, type_: str | None = None) -> Tier:
+    """The tier of one test; `type_` is processes, manager, or None for an untyped class."""
+    keys = (f"{class_name}.{method}[{type_}]", f"{class_name}.{method}", f"{class_name}.*")
+    for tier, table in _TABLES:
+        if any(key in table for key in keys):
+            return tier
+    return "core" if class_name in KNOWN_CLASSES else "ext"

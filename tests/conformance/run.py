@@ -1,0 +1,108 @@
+"""Runs CPython's own multiprocessing tests against Fiber.
+
+    python tests/conformance/run.py --backend local
+    python tests/conformance/run.py --backend loopback --method spawn -k TestPool
+    python tests/conformance/run.py --module multiprocessing      (checks the harness itself)
+
+Exits with 1 when a test fails that `exclusions` does not list, or when a listed one passes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from conformance.exclusions import EXCLUSIONS
+from conformance.runner import Target, list_cases, run_groups
+from conformance.verdict import Verdict
+
+CLASSES = (
+    "TestProcess",
+    "TestSubclassingProcess",
+    "TestQueue",
+    "TestSimpleQueue",
+    "TestConnection",
+    "TestPicklingConnections",
+    "TestPoll",
+    "TestWait",
+    "TestPool",
+    "TestPoolWorkerErrors",
+    "TestPoolWorkerLifetime",
+    "TestStartMethod",
+    "TestInitializers",
+    "TestStdinBadfiledescriptor",
+    "TestTimeouts",
+    "TestIgnoreEINTR",
+    "TestLogging",
+)
+# An agent on another host cannot share a pid or a file with the master.
+TIERS = {"local": ("core", "local"), "loopback": ("core",)}
+METHODS = {"local": ("spawn", "forkserver"), "loopback": ("spawn",)}
+LIMIT = 60.0  # seconds for one test
+JOBS = 2
+
+
+def run_once(
+    backend: str,
+    method: str,
+    *,
+    module: str = "fiber",
+    substring: str = "",
+    limit: float = LIMIT,
+    jobs: int = JOBS,
+) -> Verdict:
+    """One pass over the selected classes with one backend and one start method."""
+    target = Target(module, method, frozenset(TIERS[backend]), limit, (("FIBER_BACKEND", backend),))
+    started = time.monotonic()
+    report = run_groups(target, select(target, substring), jobs)
+    listed = EXCLUSIONS[backend] if module == "fiber" else {}
+    title = f"{module}, {backend}, {method}" if module == "fiber" else f"{module}, {method}"
+    return Verdict(title, report, listed, time.monotonic() - started)
+
+
+def select(target: Target, substring: str = "") -> list[list[str]]:
+    """The ids to run, one list per class."""
+    groups: dict[str, list[str]] = {}
+    for case in list_cases(target):
+        id_ = f"{case['class_name']}.{case['method']}"
+        wanted = case["base_name"] in CLASSES and case["type"] in ("processes", None)
+        if wanted and case["tier"] in target.tiers and substring in id_:
+            groups.setdefault(case["class_name"], []).append(id_)
+    # The largest first, so that no long class is left for one job at the end.
+    return sorted(groups.values(), key=len, reverse=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
+    parser.add_argument("--backend", choices=sorted(TIERS), default="local")
+    parser.add_argument("--method", help="default: every method that the backend is tested with")
+    parser.add_argument("--module", default="fiber", help="the module under test")
+    parser.add_argument("--limit", type=float, default=LIMIT, help="seconds for one test")
+    parser.add_argument("--jobs", type=int, default=JOBS, help="classes run at a time")
+    parser.add_argument("-k", dest="substring", default="", help="only ids with this in them")
+    options = parser.parse_args(arguments)
+    verdicts = []
+    for method in [options.method] if options.method else METHODS[options.backend]:
+        verdict = run_once(
+            options.backend,
+            method,
+            module=options.module,
+            substring=options.substring,
+            limit=options.limit,
+            jobs=options.jobs,
+        )
+        print(verdict.text(), end="\n\n", flush=True)
+        verdicts.append(verdict)
+    for verdict in verdicts:
+        print(verdict.closing_line())
+    return 0 if all(verdict.ok for verdict in verdicts) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

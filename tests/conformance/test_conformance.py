@@ -1,0 +1,17 @@
+"""Fiber passes CPython's own multiprocessing tests, but for those that `exclusions` explains."""
+
+from __future__ import annotations
+
+import pytest
+
+from conformance.run import METHODS, run_once
+
+RUNS = [(backend, method) for backend, methods in METHODS.items() for method in methods]
+
+
+@pytest.mark.parametrize(("backend", "method"), RUNS)
+def test_cpython_tests(backend: str, method: str, capsys: pytest.CaptureFixture[str]) -> None:
+    verdict = run_once(backend, method)
+    with capsys.disabled():
+        print("", verdict.closing_line(), sep="\n")
+    assert verdict.ok, verdict.text()

@@ -1,0 +1,71 @@
+"""The harness finds what it is there to find: hangs, crashes, leftovers, stale exclusions."""
+
+from __future__ import annotations
+
+import pytest
+
+from conformance.runner import Outcome, Report, Target, list_cases, run_group
+from conformance.verdict import Verdict
+
+FAULTY = "TestSimpleQueue.test_close"
+SOUND = "WithProcessesTestProcess.test_cpu_count"
+
+
+def broken(how: str, limit: float = 60) -> Target:
+    environment = (("BROKEN", how),)
+    module = "conformance.broken_multiprocessing"
+    return Target(module, "spawn", frozenset({"core"}), limit, environment)
+
+
+def results(report: Report) -> dict[str, str]:
+    return {outcome.id: outcome.result for outcome in report.outcomes}
+
+
+def test_a_hang_is_named_with_its_stack_and_the_rest_runs() -> None:
+    report = run_group(broken("hang", limit=4), [FAULTY, SOUND])
+    assert results(report) == {FAULTY: "hang", SOUND: "pass"}
+    detail = report.outcomes[0].detail
+    assert "broken_multiprocessing.py" in detail
+    assert "in close" in detail
+    assert "Alone in an interpreter: hang." in detail
+
+
+def test_a_crash_is_named_with_its_status_and_the_rest_runs() -> None:
+    report = run_group(broken("crash"), [FAULTY, SOUND])
+    assert results(report) == {FAULTY: "crash", SOUND: "pass"}
+    assert "ended with 3" in report.outcomes[0].detail
+
+
+def test_a_process_left_behind_fails_the_group_and_is_killed() -> None:
+    report = run_group(broken("leave"), [FAULTY])
+    assert results(report) == {FAULTY: "pass", "TestSimpleQueue.<left behind>": "fail"}
+
+
+def test_a_module_that_cannot_be_loaded_is_said_at_once() -> None:
+    target = Target("no_such_module", "spawn", frozenset({"core"}), 60)
+    with pytest.raises(RuntimeError, match="No module named 'no_such_module'"):
+        list_cases(target)
+
+
+@pytest.mark.parametrize("result", ["fail", "hang", "crash"])
+def test_an_unlisted_failure_fails_the_run_and_a_listed_one_does_not(result: str) -> None:
+    report = Report([Outcome("C.a", result), Outcome("C.b", "pass")])
+    assert not Verdict("t", report, {}, 0).ok
+    assert Verdict("t", report, {"C.a": "a reason"}, 0).ok
+
+
+def test_a_listed_test_that_passes_fails_the_run() -> None:
+    verdict = Verdict("t", Report([Outcome("C.a", "pass")]), {"C.a": "a reason"}, 0)
+    assert not verdict.ok
+    assert "1 listed but passing" in verdict.closing_line()
+
+
+def test_a_run_of_nothing_fails() -> None:
+    assert not Verdict("t", Report(), {}, 0).ok
+
+
+def test_the_report_gives_each_exclusion_its_reason() -> None:
+    report = Report([Outcome("C.a", "fail"), Outcome("C.b", "fail", detail="its traceback")])
+    text = Verdict("t", report, {"C.a": "a reason"}, 0).text()
+    assert "C.a: a reason" in text
+    assert "=== fail: C.b\nits traceback" in text

@@ -1,0 +1,76 @@
+"""Every test has a time limit and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from leaks import Snapshot, Watch, shut_down_runtime
+
+# Seconds for one test, by folder; a test with its own timeout marker keeps that.
+LIMITS = {"unit": 20, "simulation": 60, "faults": 60, "examples": 180, "conformance": 900}
+
+_CALL = pytest.StashKey[pytest.CallInfo[None]]()
+_WATCH = pytest.StashKey[Watch]()
+_BEFORE = pytest.StashKey[Snapshot]()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    root = Path(__file__).parent
+    for item in items:
+        limit = LIMITS.get(item.path.relative_to(root).parts[0])
+        if limit is not None and item.get_closest_marker("timeout") is None:
+            item.add_marker(pytest.mark.timeout(limit))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+    if call.when == "call":
+        item.stash[_CALL] = call
+    return (yield)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _nothing_left_at_the_end(pytestconfig: pytest.Config) -> Iterator[None]:
+    """Gives the session its own folder for temporary files and takes stock at its end."""
+    outside = tempfile.gettempdir()
+    # Short, because paths of unix sockets are.
+    folder = Path(tempfile.mkdtemp(prefix="ft-"))
+    marker = uuid.uuid4().hex
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", outside)  # pytest keeps its own files there
+    os.environ.update(TMPDIR=str(folder), LEAK_CHECK_SESSION=marker)
+    tempfile.tempdir = None
+    watch = Watch(f"LEAK_CHECK_SESSION={marker}", folder)
+    before = watch.look()
+    pytestconfig.stash[_WATCH] = watch
+    pytestconfig.stash[_BEFORE] = before
+    yield
+    shut_down_runtime()
+    left = watch.left_since(before, excuse_runtime=False)
+    watch.kill_processes_since(before)
+    os.environ["TMPDIR"] = outside
+    tempfile.tempdir = None
+    shutil.rmtree(folder)
+    if left:
+        pytest.fail("left at the end of the session: " + "; ".join(left), pytrace=False)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left(request: pytest.FixtureRequest, _nothing_left_at_the_end: None) -> Iterator[None]:
+    """After each test: no process, thread, open file or temporary file more than before."""
+    watch = request.config.stash[_WATCH]
+    before = watch.look()
+    yield
+    call = request.node.stash.get(_CALL, None)
+    failed = call is None or call.excinfo is not None
+    marker = request.node.get_closest_marker("may_leak")
+    left = [] if failed or marker else watch.left_since(before)
+    watch.kill_processes_since(before)
+    if left:
+        pytest.fail("this test left behind: " + "; ".join(left), pytrace=False)

@@ -1,0 +1,72 @@
+"""What the fault tests share: programs under control, and a runtime on either backend."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from faults.program import Program
+from fiber import config
+from fiber._runtime import state
+
+BACKENDS = ("local", "loopback")
+
+
+@pytest.fixture
+def launch() -> Iterator[Callable[..., Program]]:
+    """Starts a script as a ``Program``; what is left of it is ended after the test."""
+    programs: list[Program] = []
+
+    def start(script: str, *arguments: str, **options: Any) -> Program:
+        programs.append(Program(script, *arguments, **options))
+        return programs[-1]
+
+    yield start
+    for program in programs:
+        program.close()
+
+
+@pytest.fixture(params=BACKENDS)
+def launch_on(
+    request: pytest.FixtureRequest, launch: Callable[..., Program]
+) -> Callable[..., Program]:
+    """``launch`` on each backend in turn."""
+
+    def start(script: str, *arguments: str, **options: Any) -> Program:
+        env = {"FIBER_BACKEND": request.param, **options.pop("env", {})}
+        return launch(script, *arguments, env=env, **options)
+
+    return start
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def backend(request: pytest.FixtureRequest) -> Iterator[str]:
+    """The runtime of this very process, on each backend in turn."""
+    with running(backend=request.param):
+        yield request.param
+
+
+@pytest.fixture(scope="module")
+def local() -> Iterator[None]:
+    """The runtime of this very process, on the local backend."""
+    with running(backend="local"):
+        yield
+
+
+class running:
+    """A fresh runtime with the given settings, for a ``with`` block."""
+
+    def __init__(self, **settings: Any) -> None:
+        self._settings = settings
+
+    def __enter__(self) -> state.Runtime:
+        state.shutdown()
+        self._before = config._current
+        config.install(config.load(self._settings))
+        return state.runtime()
+
+    def __exit__(self, *_: object) -> None:
+        state.shutdown()
+        config._current = self._before

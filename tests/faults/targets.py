@@ -1,0 +1,68 @@
+"""Functions that the processes of the fault tests run."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+from typing import Any, NoReturn
+
+
+def nothing() -> None:
+    pass
+
+
+def exit_by(way: str) -> None:
+    """End this process in one of the ways that a person's code does."""
+    if way == "return":
+        return
+    if way == "raise":
+        raise ValueError("on purpose")
+    if way == "sys.exit":
+        sys.exit(7)
+    if way == "sys.exit text":
+        sys.exit("a last word")
+    if way == "os._exit":
+        os._exit(9)
+    if way == "abort":
+        os.abort()
+    if way == "segfault":
+        ctypes.string_at(0)
+    os.kill(os.getpid(), getattr(signal, way))
+    block()
+
+
+def block() -> NoReturn:
+    """Wait for a signal that ends this process."""
+    while True:
+        threading.Event().wait()
+
+
+def report_and_block(connection: Any) -> None:
+    connection.send(os.getpid())
+    block()
+
+
+def hold(connection: Any) -> None:
+    """Keep an end of a pipe until killed."""
+    connection.send("held")
+    block()
+
+
+def echo(connection: Any) -> None:
+    """Send back what comes, until the other end is closed."""
+    while True:
+        try:
+            message = connection.recv()
+        except EOFError:
+            return
+        connection.send(message)
+
+
+def close_every_descriptor(connection: Any) -> None:
+    """Close all that this process holds open, and go on."""
+    connection.send("closing")
+    os.closerange(3, 1 << 16)
+    sys.exit(5)

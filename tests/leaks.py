@@ -1,0 +1,152 @@
+"""What a test may not leave behind: processes, threads, open files, temporary files.
+
+The process-wide runtime of Fiber (thread, zygotes, agents) lives as long as the session. Its own
+processes are known by their command line, and open files are compared only between two moments at
+which it has the same ones; at the end of the session it is shut down, and then nothing is excused.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import census
+from fiber._wire.arena import RETAINED_BLOCKS
+
+SETTLE = 5.0  # seconds for what is ending to have ended
+_RUNTIME_THREADS = ("fiber-io",)
+_ZYGOTE = "fiber._agent.zygote import main"
+_AGENT = "'fiber.agent'"
+# nng's poller, made at the first use in a process, stays until the process ends.
+_NNG_THREAD = "nng:"
+_NNG_OPENS = Counter(["anon_inode:[eventpoll]", "anon_inode:[eventfd]"])
+# Memory for large messages is kept for the next ones; each block holds two descriptors.
+_MESSAGE_MEMORY = "/memfd:fiber-message (deleted)"
+_MESSAGE_MEMORY_LIMIT = 2 * RETAINED_BLOCKS
+
+
+class Lasting(NamedTuple):
+    """What outlives a test by design and holds files open."""
+
+    runtime: object | None
+    processes: frozenset[int]
+    nng: bool
+
+
+class Snapshot(NamedTuple):
+    """What there is at one moment."""
+
+    lasting: Lasting
+    processes: frozenset[int]
+    threads: frozenset[threading.Thread]
+    descriptors: frozenset[tuple[int, str]]
+    files: frozenset[str]
+
+
+class Watch:
+    """Looks at this process, what it started, and its folder for temporary files."""
+
+    def __init__(self, marker: str, folder: Path) -> None:
+        self._marker = marker
+        self._folder = folder
+
+    def look(self) -> Snapshot:
+        return Snapshot(
+            lasting=Lasting(_runtime(), self._excused(), _nng_runs()),
+            processes=frozenset(found.pid for found in self._started()),
+            threads=frozenset(threading.enumerate()),
+            descriptors=frozenset(_descriptors()),
+            files=frozenset(os.listdir(self._folder)),
+        )
+
+    def left_since(self, before: Snapshot, *, excuse_runtime: bool = True) -> list[str]:
+        """What is there now and was not before, in words, once all that is ending has ended."""
+        deadline = time.monotonic() + SETTLE
+        pause = 0.001
+        while left := self._compare(before, excuse_runtime):
+            if time.monotonic() > deadline:
+                break
+            gc.collect()
+            multiprocessing.active_children()  # joins what has ended, which holds a descriptor
+            time.sleep(pause)
+            pause = min(pause * 2, 0.1)
+        return left
+
+    def kill_processes_since(self, before: Snapshot) -> None:
+        """End what a failed test left, so that the next one is judged by its own deeds."""
+        spared = before.processes | before.lasting.processes | self._excused()
+        census.kill(found for found in self._started() if found.pid not in spared)
+
+    def _compare(self, before: Snapshot, excuse_runtime: bool) -> list[str]:
+        now = self.look()
+        new = now.processes - before.processes
+        if excuse_runtime:
+            new -= now.lasting.processes
+        left = [f"process {found}" for pid in sorted(new) if (found := census.read(pid))]
+        left += [
+            f"thread {thread.name}"
+            for thread in now.threads - before.threads
+            if thread.is_alive() and not (excuse_runtime and thread.name in _RUNTIME_THREADS)
+        ]
+        if now.lasting == before.lasting or not excuse_runtime:
+            left += _opened(before, now)
+            left += [f"temporary file {name}" for name in sorted(now.files - before.files)]
+        return left
+
+    def _started(self) -> list[census.Found]:
+        return census.started_by(os.getpid(), self._marker)
+
+    def _excused(self) -> frozenset[int]:
+        """The agents of this process, its zygotes, and theirs."""
+        found = self._started()
+        agents = {p.pid for p in found if p.parent == os.getpid() and _AGENT in p.command}
+        owners = agents | {os.getpid()}
+        zygotes = {p.pid for p in found if p.parent in owners and _ZYGOTE in p.command}
+        return frozenset(agents | zygotes)
+
+
+def shut_down_runtime() -> None:
+    """End Fiber's runtime, where the tests have made one."""
+    state = sys.modules.get("fiber._runtime.state")
+    if state is not None:
+        state.shutdown()
+
+
+def _runtime() -> object | None:
+    return getattr(sys.modules.get("fiber._runtime.state"), "_runtime", None)
+
+
+def _nng_runs() -> bool:
+    names = (Path(task, "comm") for task in Path("/proc/self/task").iterdir())
+    return any(name.read_text().startswith(_NNG_THREAD) for name in names if name.exists())
+
+
+def _opened(before: Snapshot, now: Snapshot) -> list[str]:
+    excused = _NNG_OPENS.copy() if now.lasting.nng and not before.lasting.nng else Counter[str]()
+    kept = sum(target == _MESSAGE_MEMORY for _, target in now.descriptors)
+    if kept <= _MESSAGE_MEMORY_LIMIT:
+        excused[_MESSAGE_MEMORY] = kept
+    opened = []
+    for number, target in sorted(now.descriptors - before.descriptors):
+        if excused[target]:
+            excused[target] -= 1
+        else:
+            opened.append(f"open file {number}: {target}")
+    return opened
+
+
+def _descriptors() -> list[tuple[int, str]]:
+    found = []
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            found.append((int(name), os.readlink(f"/proc/self/fd/{name}")))
+        except FileNotFoundError:
+            pass  # the one that listed the folder
+    return found

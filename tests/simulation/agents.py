@@ -1,0 +1,215 @@
+"""Simulated hosts: the lines to them, the kernel's part of a worker's channel, and exit reports.
+
+A ``Child`` is a ``ChildPort`` that keeps what ``ExitReport`` promises: ``unread`` names every packet
+that was delivered and that the worker never read, wherever it was when the worker died.
+"""
+
+from __future__ import annotations
+
+import random
+import signal
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from fiber._agent.port import ChildObserver, ExitReport
+from fiber._transport.link import Patience
+from fiber._transport.memory import SimulatedLoop
+from simulation import schedule
+from simulation.workers import Worker
+
+if TYPE_CHECKING:
+    from simulation.world import World
+
+LOST_AFTER = Patience().lost_after
+"""Seconds of silence after which the master gives a host up."""
+
+SAME_HOST = schedule.Agent(1e-5, 5e-5)
+
+
+class Line:
+    """One direction of the way to a host: nothing is lost or overtaken, but all of it may wait."""
+
+    def __init__(self, loop: SimulatedLoop, rng: random.Random, plan: schedule.Agent) -> None:
+        self._loop = loop
+        self._rng = rng
+        self._plan = plan if plan.delay else SAME_HOST
+        self._under_way: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
+        self._held: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
+        self._free_at = 0.0
+        self.is_cut = False
+
+    def send(self, callback: Callable[..., None], *args: Any) -> None:
+        """Call it at the other end."""
+        now = self._loop.now()
+        arrival = now + self._plan.delay + self._plan.jitter * self._rng.random()
+        self._free_at = max(self._free_at, arrival)
+        self._under_way.append((callback, args))
+        self._loop.call_later(self._free_at - now, self._arrive)
+
+    def _arrive(self) -> None:
+        callback, args = self._under_way.popleft()
+        if self.is_cut:
+            self._held.append((callback, args))
+        else:
+            callback(*args)
+
+    def mend(self) -> None:
+        """Let everything through that waited."""
+        self.is_cut = False
+        held, self._held = self._held, []
+        for callback, args in held:
+            callback(*args)
+
+    def forget(self) -> None:
+        """What waited is lost."""
+        self._held.clear()
+
+
+class Agent:
+    """One host with its workers."""
+
+    def __init__(self, world: World, number: int, plan: schedule.Agent) -> None:
+        self.world = world
+        self.host = f"host {number}"
+        rng = random.Random(f"{world.schedule.seed} {self.host}")
+        self.up = Line(world.loop, rng, plan)
+        self.down = Line(world.loop, rng, plan)
+        self.lost = False
+        self._cut_number = 0
+        self._children: list[Child] = []
+
+    def start(self, observer: ChildObserver) -> Child:
+        """Start a worker."""
+        child = Child(self, self.world.next_worker(), observer)
+        self._children.append(child)
+        self.down.send(child.worker.be_born)
+        return child
+
+    def cut(self, seconds: float) -> None:
+        """Let nothing through for a while."""
+        if self.up.is_cut:
+            return
+        self.world.note("%s is cut off for %g s", self.host, seconds)
+        self.up.is_cut = self.down.is_cut = True
+        self._cut_number += 1
+        self.world.loop.call_later(LOST_AFTER, self._lose, self._cut_number)
+        if seconds == schedule.FOREVER:
+            self._kill_all()
+        else:
+            self.world.loop.call_later(seconds, self._mend)
+
+    def forget(self, child: Child) -> None:
+        """The master knows that it is gone."""
+        self._children.remove(child)
+
+    def _lose(self, cut_number: int) -> None:
+        if not self.up.is_cut or cut_number != self._cut_number:
+            return
+        self.world.note("%s is given up", self.host)
+        self.lost = True
+        for child in list(self._children):
+            child.give_up()
+
+    def _mend(self) -> None:
+        self.world.note("%s is back", self.host)
+        if self.lost:
+            # The session has ended: the agent ends its workers, and what was on its way to them is
+            # gone.  Their last words come late.
+            self.down.forget()
+            self._kill_all()
+            self._children.clear()
+        self.lost = False
+        self.down.mend()
+        self.up.mend()
+
+    def _kill_all(self) -> None:
+        for child in self._children:
+            child.worker.die(-signal.SIGKILL)
+
+
+class Child:
+    """One worker, as the master holds it (a ``ChildPort``) and as its agent does."""
+
+    pid: int | None = None
+
+    def __init__(self, agent: Agent, number: int, observer: ChildObserver) -> None:
+        self.name = f"worker {number}"
+        self.host = agent.host
+        self.agent = agent
+        self.worker = Worker(agent.world, number, self)
+        self.inbox: deque[tuple[int, Any, Sequence[memoryview]]] = deque()
+        self.gone = False
+        """The master knows, or believes."""
+        self._observer = observer
+        self._unread: dict[int, None] = {}
+
+    def deliver(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a packet to it."""
+        self._unread[seq] = None
+        self.agent.down.send(self._put, seq, payload, buffers)
+
+    def take_back(self) -> None:
+        """Recall the packets that it has not read."""
+        self.agent.down.send(self._recall)
+
+    def signal(self, signum: int) -> None:
+        """Send it a signal; each one is deadly here."""
+        self.agent.down.send(self.worker.die, -signum)
+
+    # At the agent
+
+    def _put(self, seq: int, payload: Any, buffers: Sequence[memoryview]) -> None:
+        self.inbox.append((seq, payload, buffers))
+        self.worker.wake()
+
+    def _recall(self) -> None:
+        if self.worker.dead:
+            return
+        seqs = [seq for seq, _, _ in self.inbox]
+        self.inbox.clear()
+        self.agent.up.send(self._taken_back, seqs)
+
+    def read(self) -> tuple[int, Any, Sequence[memoryview]]:
+        """The worker takes its next packet."""
+        packet = self.inbox.popleft()
+        del self._unread[packet[0]]
+        return packet
+
+    def say(self, message: Any) -> None:
+        """The worker sends a packet."""
+        self.agent.up.send(self._said, message)
+
+    def died(self, exitcode: int, running: tuple[int, int] | None) -> None:
+        """The worker is gone."""
+        self.agent.up.send(self._exited, exitcode, running)
+
+    # At the master
+
+    def give_up(self) -> None:
+        """Its agent is lost, and nothing is known of it any more."""
+        report = ExitReport(-signal.SIGKILL, f"agent {self.host} lost", host=self.host)
+        self._end(report)
+
+    def _said(self, message: Any) -> None:
+        if self.gone:
+            self.agent.world.heard_late(self, message)
+        else:
+            self._observer.said(self.agent.world.language.message(message))
+
+    def _taken_back(self, seqs: list[int]) -> None:
+        for seq in seqs:
+            self._unread.pop(seq, None)
+        if not self.gone:
+            self._observer.taken_back(seqs)
+
+    def _exited(self, exitcode: int, running: tuple[int, int] | None) -> None:
+        if not self.gone:
+            self.agent.forget(self)
+            unread = tuple(self._unread)
+            self._end(ExitReport(exitcode, f"exit {exitcode}", unread, running, host=self.host))
+
+    def _end(self, report: ExitReport) -> None:
+        self.gone = True
+        self.agent.world.oracle.lost(self.worker)
+        self._observer.exited(report)

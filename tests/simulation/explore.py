@@ -1,0 +1,116 @@
+"""Runs schedules; makes one that fails as small as it can, and tells how to run it again."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import re
+import traceback
+from collections.abc import Callable, Iterable
+
+from simulation.oracle import Violation
+from simulation.schedule import Schedule, draw, simpler
+from simulation.world import Master, World
+
+ATTEMPTS = 600
+"""Runs spent on making a schedule smaller."""
+
+MakeMaster = Callable[[World], Master]
+
+
+class Failure(Exception):
+    """A schedule that breaks a promise, as small as it was made, and what happens in it."""
+
+    def __init__(self, schedule: Schedule, error: Exception, trace: list[str], again: str) -> None:
+        self.schedule = schedule
+        self.error = error
+        self.trace = trace
+        self.again = again
+        super().__init__(schedule, error)
+
+    def __str__(self) -> str:
+        where = "".join(traceback.format_exception(self.error)[-2:])
+        return "\n".join(
+            (
+                f"seed {self.schedule.seed} breaks a promise; run it again with\n\n    {self.again}\n",
+                "made smaller:",
+                *(f"    {line}" for line in describe(self.schedule)),
+                "what happens:",
+                *(f"  {line}" for line in self.trace[-60:]),
+                "",
+                where,
+            )
+        )
+
+
+def run(schedule: Schedule, make: MakeMaster, trace: list[str] | None = None) -> Exception | None:
+    """What goes wrong in one run."""
+    try:
+        World(schedule, make, trace).run()
+    except Exception as error:  # also what the code under test raises by mistake
+        return error
+    return None
+
+
+def examine(seed: int, make: MakeMaster, again: str) -> None:
+    """Run the schedule of ``seed``; Failure if it breaks a promise."""
+    schedule = draw(seed)
+    if run(schedule, make) is None:
+        return
+    schedule = shrink(schedule, make)
+    trace: list[str] = []
+    error = run(schedule, make, trace)
+    assert error is not None
+    raise Failure(schedule, error, trace, again)
+
+
+def first_failure(seeds: Iterable[int], make: MakeMaster) -> tuple[int, Exception] | None:
+    """The first seed that breaks a promise, and how."""
+    for seed in seeds:
+        error = run(draw(seed), make)
+        if error is not None:
+            return seed, error
+    return None
+
+
+def shrink(schedule: Schedule, make: MakeMaster) -> Schedule:
+    """The smallest schedule found that fails in the same way."""
+    kind = _kind(run(schedule, make))
+    budget = itertools.count()
+    while True:
+        for smaller in simpler(schedule):
+            if next(budget) == ATTEMPTS:
+                return schedule
+            if _kind(run(smaller, make)) == kind:
+                schedule = smaller
+                break
+        else:
+            return schedule
+
+
+def _kind(error: Exception | None) -> tuple[type | None, str]:
+    """What makes two failures the same: all but the numbers."""
+    return type(error) if error else None, re.sub(r"\d+", "", str(error))
+
+
+def describe(schedule: Schedule) -> list[str]:
+    """A schedule for a person; what is as usual is left out."""
+    lines = [f"seed={schedule.seed}, workers={schedule.min_workers} to {schedule.max_workers}"]
+    lines[0] += f", left={schedule.left}, linger={schedule.linger}"
+    lines += [f"host {number}: {agent}" for number, agent in enumerate(schedule.agents)]
+    lines += [_unusual(job) for job in schedule.jobs]
+    lines += [str(fault) for fault in schedule.faults]
+    return lines
+
+
+def _unusual(job: object) -> str:
+    assert dataclasses.is_dataclass(job)
+    fields = [
+        f"{field.name}={getattr(job, field.name)}"
+        for field in dataclasses.fields(job)
+        if getattr(job, field.name) != field.default
+    ]
+    return f"Job({', '.join(fields)})"
+
+
+__all__ = ["Failure", "Violation", "describe", "examine", "first_failure", "run", "shrink"]

@@ -1,0 +1,342 @@
+"""The least that a dispatcher does: what the ledger says, followed to the letter, and checked."""
+
+from __future__ import annotations
+
+import random
+import signal
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from fiber._agent.port import ExitReport
+from fiber._engine import ledger as engine
+from fiber._engine.ledger import Ledger
+from simulation.agents import Child
+from simulation.audit import Audit
+from simulation.oracle import Account
+from simulation.schedule import Act, Job
+from simulation.workers import Ready, Ref, Results, Unreadable, Work
+from simulation.world import World
+
+
+class Plain:
+    """Everything is said as it is."""
+
+    def work(self, seq: int, payload: Any, buffers: Sequence[memoryview]) -> Work | None:
+        """``payload`` is it."""
+        work: Work | None = payload
+        return work
+
+    def message(self, said: Any) -> Any:
+        """``said`` is it."""
+        return said
+
+
+STOP = 0
+
+
+class Member:
+    """One worker of the pool; a ``ChildObserver``."""
+
+    def __init__(self, master: LedgerMaster) -> None:
+        self.child: Child
+        self.worker: engine.Worker | None = None
+        self.leaving = False
+        self._master = master
+
+    def started(self, pid: int) -> None:
+        """It exists."""
+
+    def said(self, message: Any) -> None:
+        """It said something."""
+        self._master.heard(self, message)
+
+    def taken_back(self, seqs: list[int]) -> None:
+        """It did not read these."""
+        self._master.taken_back(self, seqs)
+
+    def exited(self, report: ExitReport) -> None:
+        """It is gone."""
+        self._master.exited(self, report)
+
+    def stop(self) -> None:
+        """Ask it to end after what it has."""
+        self.leaving = True
+        self.child.deliver(STOP, None)
+
+
+class LedgerMaster:
+    """Gives work as one ledger says."""
+
+    language = Plain()
+
+    def __init__(self, world: World, ledger: Ledger) -> None:
+        self.world = world
+        self.ledger = ledger
+        self.jobs: dict[int, engine.Job] = {}
+        self._audit = Audit(world, ledger)
+        self._rng = random.Random(f"{world.schedule.seed} master")
+        self._members: dict[Child, Member] = {}
+        self._terminated = False
+        self._pace = engine.Pace()
+        self._recall_at: float | None = None
+        self._idle_since: dict[engine.Worker, float] = {}
+
+    def begin(self) -> None:
+        """Plan the jobs, and start the first workers."""
+        for account in self.world.oracle.accounts:
+            self._later(account.plan.at, self._open, account)
+        self._settle()
+
+    def _later(self, seconds: float, callback: Callable[..., None], *args: Any) -> None:
+        self.world.loop.call_later(seconds, self._call, callback, args)
+
+    def _call(self, callback: Callable[..., None], args: tuple[Any, ...]) -> None:
+        callback(*args)
+        self._settle()
+
+    @property
+    def _now(self) -> float:
+        return self.world.loop.now()
+
+    # The user
+
+    def _open(self, account: Account) -> None:
+        if account.cancelled:
+            return
+        plan = account.plan
+        # Every other job runs a function that is known already.
+        pace = self._pace if account.number % 2 else None
+        job = self.ledger.open(
+            account, pace=pace, retries=plan.retries, unit=plan.unit, alone=plan.alone
+        )
+        self._pace = engine.Pace(job.pace)
+        self.jobs[account.number] = job
+        if plan.cancelled_at is not None:
+            self._later(max(0.0, plan.cancelled_at - self._now), self._cancel, account)
+        if plan.everywhere:
+            self._broadcast(account, job)
+        else:
+            self._feed(account, job)
+
+    def _broadcast(self, account: Account, job: engine.Job) -> None:
+        for member in self._members.values():
+            if not member.leaving and account.plan.tasks:
+                self.ledger.pin(job, member.worker, Ref(account.number, job.fed))
+                self.world.oracle.fed(account.number, 1)
+        self._close(account, job)
+
+    def _feed(self, account: Account, job: engine.Job, start: int = 0) -> None:
+        plan = account.plan
+        stop = min(start + plan.bite, len(plan.tasks))
+        items = [Ref(account.number, index) for index in range(start, stop)]
+        self.world.note("job %d is fed %d tasks", account.number, len(items))
+        self.ledger.feed(job, items if plan.bite > 1 else tuple(items))
+        if not account.cancelled:  # otherwise they are for nobody
+            self.world.oracle.fed(account.number, len(items))
+        if stop < len(plan.tasks):
+            self._later(plan.pause, self._feed, account, job, stop)
+        else:
+            self._close(account, job)
+
+    def _close(self, account: Account, job: engine.Job) -> None:
+        self.world.oracle.closed(account.number)
+        if not account.cancelled and self.ledger.close(job):
+            self._finished(account)
+
+    def _finished(self, account: Account) -> None:
+        self.world.note("job %d is finished", account.number)
+        self.world.oracle.finished(account.number)
+
+    def _cancel(self, account: Account) -> None:
+        if account.finished or account.cancelled:
+            return
+        self.world.note("job %d is cancelled", account.number)
+        account.cancelled = True
+        job = self.jobs.get(account.number)
+        if job is not None:
+            for worker in self._audit.cancel(job):
+                worker.key.child.take_back()
+
+    def terminate(self) -> None:
+        """Cancel all jobs."""
+        self._terminated = True
+        for account in self.world.oracle.accounts:
+            self._cancel(account)
+        self._settle()
+
+    # The workers
+
+    def heard(self, member: Member, said: Any) -> None:
+        """A worker said something."""
+        self.world.note("%s says %s", member.child.name, said)
+        if isinstance(said, Ready):
+            self.ledger.starting -= 1
+            member.worker = self.ledger.add(member, self._now, self.world.schedule.left)
+        elif isinstance(said, Results):
+            self._take(said)
+        elif isinstance(said, Unreadable):
+            receipt = self.ledger.split(said.seq, self._now)
+            if receipt is not None:
+                self._deliver(receipt.job, receipt.item(receipt.start), "unreadable")
+        self._settle()
+
+    def heard_late(self, child: Child, said: Any) -> None:
+        """A worker that was given up says something: it must count for nothing."""
+        if isinstance(said, Results):
+            self._audit.dropped(self._receive(said))
+        elif isinstance(said, Unreadable):
+            self._audit.dropped(self.ledger.split(said.seq, self._now))
+        self._settle()
+
+    def _receive(self, said: Results) -> engine.Receipt | None:
+        seq, offset, tasks, seconds, kept = said
+        return self.ledger.receive(seq, offset, len(tasks), self._now, seconds=seconds, kept=kept)
+
+    def _take(self, said: Results) -> None:
+        receipt = self._receive(said)
+        if receipt is None:
+            return
+        self._audit.received(receipt, said.tasks)
+        for at, (ref, act) in enumerate(said.tasks, receipt.start):
+            if act is Act.RETRIED and self.ledger.retry(receipt, at):
+                self.world.oracle.tried_again(ref)
+            else:
+                self._deliver(receipt.job, ref, act)
+
+    def _deliver(self, job: engine.Job, ref: Ref, outcome: Act | str) -> None:
+        self.world.oracle.delivered(ref, outcome)
+        self._look(job)
+
+    def _look(self, job: engine.Job) -> None:
+        account: Account = job.owner
+        # Of several results that come at once the job has counted all before the first is told.
+        if job.finished and account.delivered == account.everything:
+            self._finished(account)
+
+    def taken_back(self, member: Member, seqs: list[int]) -> None:
+        """A worker did not read these."""
+        self.world.note("%s gives back %s", member.child.name, seqs)
+        if member.worker is not None:
+            self.ledger.put_back(member.worker, seqs, self._now)
+        self._settle()
+
+    def exited(self, member: Member, report: ExitReport) -> None:
+        """A worker is gone."""
+        self.world.note(
+            "%s is gone: unread %s, in %s", member.child.name, report.unread, report.running
+        )
+        del self._members[member.child]
+        if member.worker is None:
+            self.ledger.starting -= 1
+        else:
+            self._lose(member, member.worker, report)
+        self._settle()
+
+    def _lose(self, member: Member, worker: engine.Worker, report: ExitReport) -> None:
+        held = self._audit.before_loss(worker)
+        losses = self.ledger.lose(worker, report.unread, report.running)
+        self._audit.after_loss(member.child, held, losses)
+        for loss in losses:
+            self.world.note("%s is given up", loss.item)
+            self.world.oracle.died(loss.item, loss.attempts)
+            self._audit.named(loss)
+        for job in {loss.job for loss in losses}:
+            self._look(job)
+
+    def _expire(self, batch: engine.Batch) -> None:
+        if self.ledger.batches.get(batch.seq) is not batch:
+            return
+        receipt = self.ledger.expire(batch.seq)
+        if receipt is not None:
+            self._deliver(receipt.job, receipt.item(receipt.start), "too late")
+        batch.worker.key.leaving = True
+        batch.worker.key.child.signal(signal.SIGKILL)
+
+    def drain(self) -> None:
+        """Ask some worker to leave."""
+        able = sorted(self._members.values(), key=lambda member: member.child.name)
+        able = [member for member in able if member.worker and not member.leaving]
+        if able:
+            self._leave(self._rng.choice(able))
+        self._settle()
+
+    def _leave(self, member: Member) -> None:
+        assert member.worker is not None
+        if self._audit.leave(member.worker):
+            self.world.note("%s leaves", member.child.name)
+            member.stop()
+
+    # After each event
+
+    def _settle(self) -> None:
+        self.world.count()
+        self._assign()
+        for worker in self.ledger.recall(self._now):
+            self.world.note("%s is asked for its unread batches", worker.key.child.name)
+            worker.key.child.take_back()
+        self._let_go()
+        self._scale()
+        self._set_timer()
+        self._audit.check()
+
+    def _assign(self) -> None:
+        self._audit.before_assignment()
+        while (batch := self.ledger.assign(self._now)) is not None:
+            self._audit.assigned(batch)
+            member: Member = batch.worker.key
+            account: Account = batch.job.owner
+            self.world.note(
+                "%s gets batch %d: %d:%d of job %d",
+                member.child.name, batch.seq, batch.start, batch.stop, account.number,
+            )
+            work = Work(batch.seq, batch.items, batch.stride, account.plan.unit)
+            member.child.deliver(batch.seq, work)
+            if account.plan.timeout is not None:
+                self._later(account.plan.timeout, self._expire, batch)
+
+    def _let_go(self) -> None:
+        for member in self._members.values():
+            if member.worker is not None and member.worker.spent and not member.leaving:
+                member.stop()
+
+    def _scale(self) -> None:
+        staying = sum(not member.leaving for member in self._members.values())
+        schedule = self.world.schedule
+        wanted = min(schedule.max_workers, self.ledger.demand())
+        if not self._terminated:
+            for _ in range(max(wanted, schedule.min_workers) - staying):
+                self._start()
+        if schedule.linger is not None and staying > schedule.min_workers:
+            for worker in self.ledger.idle():
+                if self._idle_since.get(worker) != worker.since:
+                    self._idle_since[worker] = worker.since
+                    self._later(schedule.linger, self._dismiss, worker, worker.since)
+
+    def _start(self) -> None:
+        member = Member(self)
+        agents = [agent for agent in self.world.agents if not agent.lost]
+        member.child = self.world.start(self._rng.choice(agents), member)
+        self._members[member.child] = member
+        self.ledger.starting += 1
+
+    def _dismiss(self, worker: engine.Worker, since: float) -> None:
+        """It had nothing to do for a while."""
+        member: Member = worker.key
+        staying = sum(not member.leaving for member in self._members.values())
+        idle = worker in self.ledger.idle() and worker.since == since
+        if idle and staying > self.world.schedule.min_workers:
+            self._leave(member)
+
+    def _set_timer(self) -> None:
+        due = self.ledger.next_recall()
+        if due is not None and due != self._recall_at:
+            self._recall_at = due
+            self._later(max(0.0, due - self._now), self._recall, due)
+
+    def _recall(self, due: float) -> None:
+        if self._recall_at == due:
+            self._recall_at = None
+
+    def check_end(self) -> None:
+        """Nothing may be left over."""
+        self._audit.check_end()

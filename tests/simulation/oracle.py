@@ -1,0 +1,168 @@
+"""What must hold: compares what the user sees with what truly happened to each task.
+
+The oracle knows what no dispatcher can know: when each simulated worker began and ended each task.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING
+
+from simulation.schedule import Act, Job, Schedule
+from simulation.workers import Ref, Worker
+
+if TYPE_CHECKING:
+    from simulation.agents import Child
+
+
+class Violation(AssertionError):
+    """A promise was broken."""
+
+
+class Account:
+    """The truth about one job."""
+
+    def __init__(self, number: int, plan: Job) -> None:
+        self.number = number
+        self.plan = plan
+        self.fed = 0
+        self.closed = False
+        self.cancelled = False
+        self.finished = False
+        self.delivered = 0
+        """A bit for each task of which the user has heard."""
+        self.runs: dict[int, list[Worker]] = defaultdict(list)
+        self.forgiven: dict[int, int] = defaultdict(int)
+        """Runs of a task that ended in an error which the pool was told to retry."""
+        self.charges: dict[int, int] = defaultdict(int)
+
+    @property
+    def everything(self) -> int:
+        """A bit for each task that was fed."""
+        return (1 << self.fed) - 1
+
+
+class Oracle:
+    """Watches one run."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        self.accounts = [Account(number, plan) for number, plan in enumerate(schedule.jobs)]
+        self._left = schedule.left
+        self._lost: set[Worker] = set()
+
+    # What truly happens
+
+    def begins(self, ref: Ref, worker: Worker) -> None:
+        """``worker`` begins a task: the first time, or because an earlier run came to nothing."""
+        account = self.accounts[ref.job]
+        runs = account.runs[ref.index]
+        living = sum(earlier not in self._lost for earlier in runs)
+        if living > account.forgiven[ref.index]:
+            raise Violation(f"{ref} runs again, though {runs[-1].name} was not lost")
+        if runs and not account.plan.retries:
+            raise Violation(f"{ref} runs again, though it has no retries")
+        if account.plan.everywhere and not runs:
+            others = (run for index in account.runs for run in account.runs[index])
+            if worker in others:
+                raise Violation(f"job {ref.job} runs twice on {worker.name}")
+        runs.append(worker)
+
+    def runs(self, ref: Ref) -> int:
+        """How often a task was begun."""
+        return len(self.accounts[ref.job].runs[ref.index])
+
+    def lost(self, worker: Worker) -> None:
+        """The master knows, or believes, that a worker is gone."""
+        self._lost.add(worker)
+        if self._left is not None and worker.units > self._left:
+            raise Violation(f"{worker.name} ran {worker.units} units, more than {self._left}")
+
+    def stopped(self, worker: Worker, unread: int) -> None:
+        """A worker obeys a request to stop."""
+        if unread:
+            raise Violation(f"{worker.name} is stopped with {unread} unread batches")
+
+    # What the user sees
+
+    def fed(self, number: int, count: int) -> None:
+        """The user gave ``count`` more tasks."""
+        self.accounts[number].fed += count
+
+    def delivered(self, ref: Ref, outcome: Act | str) -> None:
+        """The user sees how a task ended."""
+        account = self.accounts[ref.job]
+        bit = 1 << ref.index
+        if account.delivered & bit:
+            raise Violation(f"{ref} is delivered twice")
+        if account.cancelled:
+            raise Violation(f"{ref} is delivered, though its job was cancelled")
+        if account.finished:
+            raise Violation(f"{ref} is delivered after its job was finished")
+        account.delivered |= bit
+        if isinstance(outcome, Act) and not account.runs[ref.index]:
+            raise Violation(f"{ref} has a result, but never ran")
+        if outcome is Act.RETRIED and self._tries(account, ref) < account.plan.retries:
+            raise Violation(f"{ref} fails, though it could have been tried again")
+
+    def died(self, ref: Ref, attempts: int) -> None:
+        """The user hears that a task killed its last worker."""
+        account = self.accounts[ref.job]
+        if attempts != account.plan.retries + 1:
+            raise Violation(f"{ref} is given up after {attempts} of {account.plan.retries} retries")
+        if self._tries(account, ref) < attempts:
+            raise Violation(f"{ref} is blamed for {attempts} losses that it was no part of")
+        self.delivered(ref, "died")
+
+    def tried_again(self, ref: Ref) -> None:
+        """A task is tried again after an error."""
+        account = self.accounts[ref.job]
+        account.forgiven[ref.index] += 1
+        if self._tries(account, ref) > account.plan.retries:
+            raise Violation(f"{ref} is tried again more than {account.plan.retries} times")
+
+    def _tries(self, account: Account, ref: Ref) -> int:
+        return account.forgiven[ref.index] + account.charges[ref.index]
+
+    def closed(self, number: int) -> None:
+        """The user has no more tasks for a job."""
+        self.accounts[number].closed = True
+
+    def finished(self, number: int) -> None:
+        """The user hears that a job is over."""
+        account = self.accounts[number]
+        if account.finished or account.cancelled:
+            raise Violation(f"job {number} is finished twice or after it was cancelled")
+        if not account.closed or account.delivered != account.everything:
+            raise Violation(f"job {number} is finished before all of its tasks are")
+        account.finished = True
+
+    # Who is to blame
+
+    def blamed(self, child: Child, seq: int, offset: int, ref: Ref) -> None:
+        """A task is charged for the end of the worker that held it."""
+        if not child.agent.lost and not self._is_suspect(child.worker, seq, offset):
+            raise Violation(f"{ref} is blamed for the end of {child.name}, which was not in it")
+        self.accounts[ref.job].charges[ref.index] += 1
+
+    def spared(self, child: Child, ref: Ref) -> None:
+        """A task that a lost worker held is not charged."""
+        if child.worker.running == ref:
+            raise Violation(f"{ref} is not blamed for the end of {child.name}, which was in it")
+
+    @staticmethod
+    def _is_suspect(worker: Worker, seq: int, offset: int) -> bool:
+        if worker.work is None or worker.work.seq != seq:
+            return False  # never read, or answered in full
+        if worker.board is None or worker.board[0] != seq:
+            return True  # it died before it noted anything
+        return worker.board[1] <= offset < worker.board[1] + worker.work.stride
+
+    # At the end
+
+    def check_end(self) -> None:
+        """Nothing happens any more."""
+        for account in self.accounts:
+            if not account.cancelled and not account.finished:
+                missing = account.everything & ~account.delivered
+                indexes = [index for index in range(account.fed) if missing >> index & 1]
+                raise Violation(f"job {account.number} never ends; it waits for tasks {indexes}")

@@ -1,0 +1,212 @@
+"""The simulation finds what it is there to find: each of these ledgers breaks one promise."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
+from simulation.explore import Failure, MakeMaster, examine, first_failure, run
+from simulation.ledger_master import LedgerMaster
+from simulation.schedule import draw
+from simulation.suites import SUITES, again, with_ledger
+from simulation.world import World
+
+SEEDS = range(300)
+"""Among these each fault must show."""
+
+
+class ForgetsLostBatches(Ledger):
+    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+        for batch in worker.queue:
+            del self.batches[batch.seq]
+        worker.queue.clear()
+        return super().lose(worker, unread, running)
+
+
+class KeepsLostBatches(Ledger):
+    """Late results of a lost worker count."""
+
+    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+        batches = dict(self.batches)
+        losses = super().lose(worker, unread, running)
+        self.batches = batches
+        return losses
+
+
+class TakesResultsTwice(Ledger):
+    def receive(self, seq: int, offset: int, count: int, now: float, **rest: Any) -> Receipt | None:
+        batch = self.batches.get(seq)
+        return super().receive(seq, batch.received if batch else offset, count, now, **rest)
+
+
+class ChargesUnread(Ledger):
+    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+        return super().lose(worker, (), running)
+
+
+class ChargesAllThatWasRead(Ledger):
+    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+        return super().lose(worker, unread, None)
+
+
+class ChargesNobody(Ledger):
+    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+        return super().lose(worker, [batch.seq for batch in worker.queue], running)
+
+
+class GivesUpTooEarly(Ledger):
+    def open(self, owner: Any = None, **options: Any) -> Job:
+        job = super().open(owner, **options)
+        job.retries = max(0, job.retries - 1)
+        return job
+
+
+class RetriesForEver(Ledger):
+    def retry(self, receipt: Receipt, index: int) -> bool:
+        receipt.job.attempts.pop(index, None)
+        return super().retry(receipt, index)
+
+
+class LetsTheBusyLeave(Ledger):
+    def leave(self, worker: Worker) -> bool:
+        super().leave(worker)
+        worker.leaving = True
+        return True
+
+
+class GivesToWhoLeaves(Ledger):
+    def leave(self, worker: Worker) -> bool:
+        return not worker.queue and not worker.pinned
+
+
+class DropsWhatIsTakenBack(Ledger):
+    def put_back(self, worker: Worker, seqs: Iterable[int], now: float) -> None:
+        seqs = list(seqs)
+        for seq in seqs:
+            if seq in self.batches:
+                self.batches[seq].job = None
+        super().put_back(worker, seqs, now)
+
+
+class IgnoresWhatIsKept(Ledger):
+    def receive(self, seq: int, offset: int, count: int, now: float, **rest: Any) -> Receipt | None:
+        return super().receive(seq, offset, count, now, **{**rest, "kept": None})
+
+
+class NeverRecalls(Ledger):
+    def recall(self, now: float) -> list[Worker]:
+        return []
+
+
+class ForgetsToRecallLater(Ledger):
+    def next_recall(self) -> float | None:
+        return None
+
+
+class ForgetsToCancel(Ledger):
+    def cancel(self, job: Job) -> list[Worker]:
+        self.jobs.discard(job)
+        return []
+
+
+class IgnoresMaxTasks(Ledger):
+    def add(self, key: Any, now: float, left: int | None = None) -> Worker:
+        return super().add(key, now, left and left + 1)
+
+
+class PinsToAnyone(Ledger):
+    def pin(self, job: Job, worker: Worker | None, item: Any) -> None:
+        super().pin(job, next(iter(self.workers), worker), item)
+
+
+class NeverFinishes(Ledger):
+    def _finish(self, job: Job) -> bool:
+        return False
+
+
+BROKEN = [
+    ForgetsLostBatches,
+    KeepsLostBatches,
+    TakesResultsTwice,
+    ChargesUnread,
+    ChargesAllThatWasRead,
+    ChargesNobody,
+    GivesUpTooEarly,
+    RetriesForEver,
+    LetsTheBusyLeave,
+    GivesToWhoLeaves,
+    DropsWhatIsTakenBack,
+    IgnoresWhatIsKept,
+    NeverRecalls,
+    ForgetsToRecallLater,
+    ForgetsToCancel,
+    IgnoresMaxTasks,
+    PinsToAnyone,
+    NeverFinishes,
+]
+
+
+def with_broken(ledger: type[Ledger]) -> MakeMaster:
+    return lambda world: LedgerMaster(world, ledger())
+
+
+@pytest.mark.parametrize("ledger", BROKEN)
+def test_a_broken_ledger_is_found_out(ledger: type[Ledger]) -> None:
+    assert first_failure(SEEDS, with_broken(ledger)) is not None
+
+
+@contextmanager
+def failing(ledger: type[Ledger]) -> Iterator[pytest.ExceptionInfo[Failure]]:
+    make = with_broken(ledger)
+    found = first_failure(SEEDS, make)
+    assert found is not None
+    with pytest.raises(Failure) as caught:
+        examine(found[0], make, again("ledger", found[0]))
+    yield caught
+
+
+def test_a_failure_is_made_small_and_says_how_to_run_it_again() -> None:
+    with failing(ForgetsLostBatches) as caught:
+        schedule = caught.value.schedule
+        assert len(schedule.faults) <= 1
+        assert sum(len(job.tasks) for job in schedule.jobs) <= 2
+        text = str(caught.value)
+        assert f"python tests/simulation/run.py ledger {schedule.seed}" in text
+        assert "Violation: " in text
+        assert "is gone: unread" in text
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_a_seed_runs_exactly_the_same_again(suite: str) -> None:
+    for seed in range(20):
+        first: list[str] = []
+        second: list[str] = []
+        assert run(draw(seed), SUITES[suite], first) is None
+        assert run(draw(seed), SUITES[suite], second) is None
+        assert first == second
+
+
+class Tally(list[str]):
+    """A trace that counts what kinds of things happen."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kinds: Counter[str] = Counter()
+
+
+def test_everything_happens() -> None:
+    kinds: Counter[str] = Counter()
+    for seed in SEEDS:
+        trace: list[str] = []
+        World(draw(seed), with_ledger, trace).run()
+        kinds.update(word for line in trace for word in TELLING if word in line)
+    rare = [word for word in TELLING if kinds[word] < 5]
+    assert not rare, kinds
+
+
+TELLING = ()

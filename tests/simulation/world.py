@@ -1,0 +1,150 @@
+"""One simulated run: time, hosts, workers, and whoever gives them work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from fiber._agent.port import ChildObserver
+from fiber._transport.memory import SimulatedLoop
+from simulation.agents import Agent, Child
+from simulation.oracle import Oracle, Violation
+from simulation.schedule import (
+    Crash,
+    Cut,
+    Drain,
+    Fault,
+    Kill,
+    Repeat,
+    Schedule,
+    Slow,
+    StillBirth,
+    Stop,
+    Task,
+    Terminate,
+)
+from simulation.workers import Ref, Work, Worker
+
+CALLS = 50_000
+"""More calls than any schedule needs: it goes round in circles."""
+
+END = 1e6
+"""Simulated seconds after which nothing can be left to happen."""
+
+
+class Language(Protocol):
+    """How the giver of work and its workers write down what they say."""
+
+    def work(self, seq: int, payload: Any, buffers: Sequence[memoryview]) -> Work | None:
+        """What a delivered packet says; None: stop."""
+
+    def message(self, said: Any) -> Any:
+        """What a worker says, as its observer gets it."""
+
+
+class Master(Protocol):
+    """Whoever gives the workers work."""
+
+    language: Language
+
+    def begin(self) -> None:
+        """Set the schedule's jobs and workers going."""
+
+    def heard_late(self, child: Child, said: Any) -> None:
+        """A worker that was given up says something."""
+
+    def drain(self) -> None:
+        """Ask some worker to leave."""
+
+    def terminate(self) -> None:
+        """Cancel all jobs."""
+
+    def check_end(self) -> None:
+        """Everything has happened: nothing may be left over."""
+
+
+class World:
+    """Runs one schedule."""
+
+    def __init__(
+        self,
+        schedule: Schedule,
+        make_master: Callable[[World], Master],
+        trace: list[str] | None = None,
+    ) -> None:
+        self.schedule = schedule
+        self.loop = SimulatedLoop()
+        self.oracle = Oracle(schedule)
+        self.agents = [Agent(self, number, plan) for number, plan in enumerate(schedule.agents)]
+        self._trace = trace
+        self._workers: list[Worker | None] = []
+        self._calls = 0
+        self._faults: dict[int, list[Fault]] = {}
+        for fault in schedule.faults:
+            if isinstance(fault, Crash | StillBirth | Slow | Repeat):
+                self._faults.setdefault(fault.worker, []).append(fault)
+        self._master = make_master(self)
+        self.language = self._master.language
+
+    def run(self) -> None:
+        """Let everything happen; Violation if a promise is broken."""
+        self._master.begin()
+        for fault in self.schedule.faults:
+            self._plan(fault)
+        self.loop.run_for(END)
+        self.oracle.check_end()
+        self._master.check_end()
+
+    def note(self, text: str, *args: object) -> None:
+        """Write it into the trace, if there is one."""
+        if self._trace is not None:
+            self._trace.append(f"{self.loop.now():12.6f}  {text % args}")
+
+    def count(self) -> None:
+        """The master did something; it must come to an end."""
+        self._calls += 1
+        if self._calls > CALLS:
+            raise Violation("it goes round in circles")
+
+    def start(self, agent: Agent, observer: ChildObserver) -> Child:
+        """Start a worker on ``agent``."""
+        child = agent.start(observer)
+        self._workers.append(child.worker)
+        self.note("%s is started on %s", child.name, agent.host)
+        return child
+
+    def next_worker(self) -> int:
+        """The number of the next worker."""
+        return len(self._workers)
+
+    def faults_of(self, worker: int) -> list[Fault]:
+        """What happens to a worker as it goes on."""
+        return self._faults.get(worker, [])
+
+    def task(self, ref: Ref) -> Task:
+        """What a task does."""
+        job = self.schedule.jobs[ref.job]
+        return job.tasks[0 if job.everywhere else ref.index]
+
+    def heard_late(self, child: Child, said: Any) -> None:
+        """A worker that was given up says something."""
+        self.note("%s is late: %s", child.name, said)
+        self._master.heard_late(child, said)
+
+    def _plan(self, fault: Fault) -> None:
+        later = self.loop.call_later
+        if isinstance(fault, Kill):
+            later(fault.at, self._on_worker, fault.worker, lambda worker: worker.die(-9))
+        elif isinstance(fault, Stop):
+            seconds = fault.seconds
+            later(fault.at, self._on_worker, fault.worker, lambda it: it.stop_for(seconds))
+        elif isinstance(fault, Cut) and fault.agent < len(self.agents):
+            later(fault.at, self.agents[fault.agent].cut, fault.seconds)
+        elif isinstance(fault, Drain):
+            later(fault.at, self._master.drain)
+        elif isinstance(fault, Terminate):
+            later(fault.at, self._master.terminate)
+
+    def _on_worker(self, number: int, act: Callable[[Worker], None]) -> None:
+        if number < len(self._workers):
+            act(self._workers[number])

@@ -1,0 +1,115 @@
+"""What the children in test_agent.py run, and who observes them."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import threading
+from typing import Any, NoReturn
+
+from fiber._agent import child
+from fiber._agent.port import ExitReport
+from fiber._wire import packet
+
+PATIENCE = 10
+
+
+class Recorder:
+    """A ``ChildObserver`` that a test can wait for."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+        self.words: list[Any] = []
+        self.recalled: list[int] | None = None
+        self.pid: int | None = None
+        self.report: ExitReport | None = None
+        self._changed = threading.Condition()
+
+    def started(self, pid: int) -> None:
+        self.pid = pid
+        self._note("started")
+
+    def said(self, message: packet.Message) -> None:
+        self.words.append(packet.loads(message))
+        self._note("said")
+
+    def taken_back(self, seqs: list[int]) -> None:
+        self.recalled = seqs
+        self._note("taken back")
+
+    def exited(self, report: ExitReport) -> None:
+        self.report = report
+        self._note("exited")
+
+    def _note(self, event: str) -> None:
+        with self._changed:
+            self.events.append(event)
+            self._changed.notify_all()
+
+    def wait_for_start(self) -> int:
+        self._wait("started")
+        assert self.pid is not None
+        return self.pid
+
+    def wait_for_exit(self) -> ExitReport:
+        self._wait("exited")
+        assert self.report is not None
+        return self.report
+
+    def wait_for_recall(self) -> list[int]:
+        self._wait("taken back")
+        assert self.recalled is not None
+        return self.recalled
+
+    def wait_for_words(self, count: int) -> list[Any]:
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.words) >= count, PATIENCE), self.events
+        return self.words
+
+    def _wait(self, event: str) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: event in self.events, PATIENCE), self.events
+
+
+def run_forever() -> NoReturn:
+    while True:
+        threading.Event().wait()
+
+
+def read_never() -> NoReturn:
+    """A worker that says it is in task 4 of batch 17 and reads nothing."""
+    place = child.progress()
+    place[0] = 0
+    place[1] = 4
+    place[0] = 17
+    child.task_channel().send(pickle.dumps("ready"))
+    run_forever()
+
+
+def answer_sums() -> None:
+    """A worker that answers each number with it plus the size of what came beside it."""
+    channel = child.task_channel()
+    while True:
+        message = channel.recv()
+        seq = int.from_bytes(message.payload[:8], "little")
+        value = pickle.loads(message.payload[8:])
+        size = sum(buffer.nbytes for buffer in message.buffers)
+        message.release()
+        if value == "stop":
+            return
+        channel.send(pickle.dumps((seq, value + size)))
+
+
+class Handle:
+    """Becomes, in the child, descriptor ``index`` of those that came with the start message."""
+
+    def __init__(self, index: int) -> None:
+        self._index = index
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return child.take_descriptor, (self._index,)
+
+
+def write_own_index(fds: list[int]) -> None:
+    for index, fd in enumerate(fds):
+        os.write(fd, str(index).encode())

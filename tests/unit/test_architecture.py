@@ -1,0 +1,86 @@
+"""The structure that CONTRIBUTING.md describes is the structure there is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+OURS = ("sdk", "tests", "examples", "benchmarks")
+MOST_LINES = 600
+USUAL_LINES = 300
+VAGUE_NAMES = {"utils", "helpers", "common", "misc"}
+# What only a part of Fiber needs; a program that imports Fiber and does nothing has none of it.
+HEAVY = {"asyncio", "cloudpickle", "cryptography", "kubernetes", "numpy", "pydantic", "pynng"}
+
+
+def python_files() -> list[Path]:
+    return [path for folder in OURS for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+def run(*command: str) -> None:
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    if done.returncode:
+        pytest.fail(f"{' '.join(command)}\n{done.stdout}{done.stderr}", pytrace=False)
+
+
+def in_fresh_interpreter(statement: str) -> str:
+    command = [sys.executable, "-c", statement]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+
+
+@pytest.mark.timeout(120)
+def test_imports_follow_the_layers() -> None:
+    run(str(Path(sys.executable).with_name("lint-imports")), "--no-cache")
+
+
+@pytest.mark.timeout(300)
+def test_types() -> None:
+    run(sys.executable, "-m", "mypy")
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("arguments", [("check",), ("format", "--check")], ids=" ".join)
+def test_style(arguments: tuple[str, ...]) -> None:
+    run(sys.executable, "-m", "ruff", *arguments, "--no-cache", ".")
+
+
+def test_import_is_cheap() -> None:
+    printed = in_fresh_interpreter("import fiber, sys; print(*sys.modules)")
+    assert HEAVY.isdisjoint(printed.split())
+
+
+def test_import_has_no_effect() -> None:
+    """No thread, no child, no open file, no signal handler, and nothing printed."""
+    statement = (
+        "import os, signal, threading\n"
+        "def state():\n"
+        "    handlers = [signal.getsignal(number) for number in signal.valid_signals()]\n"
+        "    with open('/proc/thread-self/children') as file:\n"
+        "        return os.listdir('/proc/self/fd'), threading.enumerate(), handlers, file.read()\n"
+        "before = state()\n"
+        "import fiber\n"
+        "assert state() == before\n"
+    )
+    assert in_fresh_interpreter(statement) == ""
+
+
+def test_files_are_short() -> None:
+    lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in python_files()}
+    longest = {str(path): lines for path, lines in lengths.items() if lines > MOST_LINES}
+    assert longest == {}
+    usual = sum(lines <= USUAL_LINES for lines in lengths.values())
+    assert usual >= 0.75 * len(lengths)
+
+
+def test_names_say_what_is_inside() -> None:
+    assert [path for path in python_files() if path.stem.strip("_") in VAGUE_NAMES] == []
+
+
+def test_nothing_shadows_the_standard_library() -> None:
+    """A regular package named operator, ours or a test's, would hide the standard library's."""
+    packages = {path.parent.name for path in ROOT.glob("[!.]*/**/__init__.py")}
+    assert packages & sys.stdlib_module_names == set()

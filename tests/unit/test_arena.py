@@ -1,0 +1,121 @@
+"""The arena: memory is used again only when its reader is done with it."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from fiber._wire import arena
+from fiber._wire.arena import DATA_OFFSET, RETAINED_BLOCKS, RETAINED_LIMIT, Arena, Block, fill, release
+
+
+@pytest.fixture
+def blocks() -> Iterator[Arena]:
+    made = Arena()
+    yield made
+    made._forget()
+
+
+def test_a_block_is_used_again_once_its_reader_released_it(blocks: Arena) -> None:
+    block = blocks.claim(1000)
+    blocks.settle(block, sent=True)
+    other = blocks.claim(1000)
+    assert other is not block, "its reader still needs what is in it"
+    blocks.settle(other, sent=True)
+    release(block.fd)
+    assert blocks.claim(1000) is block
+    blocks.settle(block, sent=False)
+
+
+def test_a_message_that_did_not_go_out_frees_its_block(blocks: Arena) -> None:
+    block = blocks.claim(1000)
+    blocks.settle(block, sent=False)
+    assert blocks.claim(1000) is block
+    blocks.settle(block, sent=False)
+
+
+def test_a_block_that_is_far_too_large_is_not_spent_on_little(blocks: Arena) -> None:
+    large = blocks.claim(10 << 20)
+    blocks.settle(large, sent=False)
+    little = blocks.claim(1000)
+    assert little.capacity < large.capacity
+    blocks.settle(little, sent=False)
+    assert blocks.claim(9 << 20) is large
+    blocks.settle(large, sent=False)
+
+
+def test_blocks_of_readers_that_died_are_forgotten_in_their_turn(blocks: Arena) -> None:
+    size = RETAINED_LIMIT // 8
+    for _ in range(100):
+        blocks.settle(blocks.claim(size), sent=True)  # nobody will ever release these
+    assert sum(block.capacity for block in blocks._blocks) <= RETAINED_LIMIT
+
+
+def test_many_small_messages_that_nobody_reads_do_not_eat_the_descriptors(blocks: Arena) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(300):
+        blocks.settle(blocks.claim(70_000), sent=True)
+    assert len(os.listdir("/proc/self/fd")) <= before + 2 * RETAINED_BLOCKS
+
+
+def test_memory_beyond_the_limit_is_not_kept(blocks: Arena) -> None:
+    block = blocks.claim(RETAINED_LIMIT + 1)
+    fd = block.fd
+    blocks.settle(block, sent=True)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(fd)
+
+
+def test_no_two_senders_get_one_block(blocks: Arena) -> None:
+    inside: set[int] = set()
+    shared: list[int] = []
+
+    def send() -> None:
+        for _ in range(200):
+            block = blocks.claim(100)
+            if block.fd in inside:
+                shared.append(block.fd)
+            inside.add(block.fd)
+            inside.discard(block.fd)
+            blocks.settle(block, sent=False)
+
+    threads = [threading.Thread(target=send) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert shared == []
+
+
+def test_a_forked_child_starts_with_no_blocks(blocks: Arena) -> None:
+    block = blocks.claim(1000)
+    blocks.settle(block, sent=False)
+    pid = os.fork()
+    if pid == 0:
+        os._exit(0 if blocks.claim(1000) is not block and not blocks._blocks else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    assert blocks.claim(1000) is block, "the parent's are untouched"
+    blocks.settle(block, sent=False)
+
+
+def test_the_parts_lie_where_they_were_put(blocks: Arena) -> None:
+    block = blocks.claim(1000)
+    fill(block, [memoryview(b"one"), memoryview(b"two")], [DATA_OFFSET, DATA_OFFSET + 100])
+    assert os.pread(block.fd, 3, DATA_OFFSET) == b"one"
+    assert os.pread(block.fd, 3, DATA_OFFSET + 100) == b"two"
+    assert block.flag[0] == arena._BUSY
+    blocks.settle(block, sent=False)
+
+
+def test_a_block_without_memory_leaves_no_descriptor(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError("no memory")
+
+    before = os.listdir("/proc/self/fd")
+    with monkeypatch.context() as short, pytest.raises(OSError, match="no memory"):
+        short.setattr(arena.mmap, "mmap", refuse)
+        Block(1 << 16)
+    assert os.listdir("/proc/self/fd") == before

@@ -1,0 +1,346 @@
+"""Configuration: four sources in order, and errors that name key, value and source."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import os
+import pickle
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from fiber import config
+from fiber.config import Config, load
+from fiber.errors import ConfigError, FiberError
+
+
+@pytest.fixture(autouse=True)
+def _bare_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """No configuration in force, none in the environment, none above the directory."""
+    monkeypatch.setattr(config, "_current", None)
+    monkeypatch.setattr(config, "_in_use", config._not_in_use)
+    for name in [name for name in os.environ if name.startswith("FIBER_")]:
+        monkeypatch.delenv(name)
+    (tmp_path / "pyproject.toml").write_text("")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def pyproject(tmp_path: Path) -> Callable[[str], Path]:
+    def write(text: str) -> Path:
+        path = tmp_path / "pyproject.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+class TestSources:
+    def test_defaults(self) -> None:
+        assert load() == Config()
+        assert Config().backend == "local"
+        assert Config().retries == 3
+        assert Config().lost_after == 15
+
+    def test_each_source_wins_over_the_one_before(
+        self, pyproject: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        pyproject("[tool.fiber]\nagents = 3\nretries = 4\nbackend = 'loopback'")
+        monkeypatch.setenv("FIBER_RETRIES", "5")
+        monkeypatch.setenv("FIBER_LISTEN_PORT", "5000")
+        found = load({"listen_port": 6000})
+        assert (found.backend, found.agents) == ("loopback", 3)
+        assert (found.retries, found.listen_port) == (5, 6000)
+
+    def test_pyproject_is_found_upward(
+        self, pyproject: Callable[[str], Path], tmp_path: Path
+    ) -> None:
+        pyproject("[tool.fiber]\nagents = 7")
+        inner = tmp_path / "a" / "b"
+        inner.mkdir(parents=True)
+        assert load(directory=str(inner)).agents == 7
+
+    def test_the_nearest_pyproject_hides_those_above(
+        self, pyproject: Callable[[str], Path], tmp_path: Path
+    ) -> None:
+        pyproject("[tool.fiber]\nagents = 7")
+        (tmp_path / "inner").mkdir()
+        (tmp_path / "inner" / "pyproject.toml").write_text("[project]\nname = 'x'\n")
+        assert load(directory=str(tmp_path / "inner")).agents == Config().agents
+
+    def test_a_deleted_working_directory_has_no_pyproject(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        gone = tmp_path / "gone"
+        gone.mkdir()
+        monkeypatch.chdir(gone)
+        gone.rmdir()
+        assert load() == Config()
+
+    @pytest.mark.parametrize(
+        ("variable", "text", "key", "value"),
+        [
+            ("FIBER_BACKEND", "loopback", "backend", "loopback"),
+            ("FIBER_AGENTS", "8", "agents", 8),
+            ("FIBER_START_TIMEOUT", "2.5", "start_timeout", 2.5),
+            ("FIBER_LISTEN_HOST", "::1", "listen_host", "::1"),
+            ("FIBER_LOG_LEVEL", "debug", "log_level", "DEBUG"),
+        ],
+    )
+    def test_text_of_the_environment_becomes_the_keys_type(
+        self, variable: str, text: str, key: str, value: object
+    ) -> None:
+        found = getattr(load(environ={variable: text}), key)
+        assert found == value
+        assert type(found) is type(value)
+
+    def test_whole_seconds_become_floats(self, pyproject: Callable[[str], Path]) -> None:
+        pyproject("[tool.fiber]\nstart_timeout = 3")
+        assert isinstance(load().start_timeout, float)
+
+    def test_a_directory_is_a_path_object_or_a_text(self, tmp_path: Path) -> None:
+        environ = {"FIBER_RUNTIME_DIRECTORY": str(tmp_path)}
+        assert load(environ=environ).runtime_directory == str(tmp_path)
+        assert load({"runtime_directory": tmp_path}).runtime_directory == str(tmp_path)
+
+    def test_variables_between_fibers_own_processes_are_not_configuration(self) -> None:
+        environ = {"FIBER_AGENT_ADDRESS": "x", "FIBER_CHILD_FD": "3", "OTHER": "y"}
+        assert load(environ=environ) == Config()
+
+    def test_kubernetes_service_variables_are_not_configuration(self) -> None:
+        environ = {
+            "FIBER_OPERATOR_SERVICE_HOST": "10.0.0.1",
+            "FIBER_OPERATOR_SERVICE_PORT": "443",
+            "FIBER_OPERATOR_SERVICE_PORT_HTTPS": "443",
+            "FIBER_OPERATOR_PORT": "tcp://10.0.0.1:443",
+            "FIBER_OPERATOR_PORT_443_TCP": "tcp://10.0.0.1:443",
+            "FIBER_OPERATOR_PORT_443_TCP_ADDR": "10.0.0.1",
+            "FIBER_SERVICE_HOST": "10.0.0.2",
+            "FIBER_PORT": "tcp://10.0.0.2:80",
+        }
+        assert load(environ=environ) == Config()
+
+    def test_a_port_variable_without_its_service_is_a_mistake(self) -> None:
+        with pytest.raises(ConfigError, match="FIBER_LISTEN_PORT"):
+            load(environ={"FIBER_PORT": "5000"})
+
+
+class TestUnknownKeys:
+    def test_in_init(self) -> None:
+        with pytest.raises(ConfigError) as caught:
+            load({"agent": 3})
+        text = str(caught.value)
+        assert "unknown key 'agent' in fiber.init()" in text
+        assert "Did you mean 'agents'?" in text
+        assert all(entry.name in text for entry in dataclasses.fields(Config))
+
+    def test_in_the_environment(self) -> None:
+        with pytest.raises(ConfigError) as caught:
+            load(environ={"FIBER_BAKEND": "local"})
+        text = str(caught.value)
+        assert "environment variable FIBER_BAKEND" in text
+        assert "Did you mean 'FIBER_BACKEND'?" in text
+
+    def test_in_pyproject(self, pyproject: Callable[[str], Path]) -> None:
+        path = pyproject("[tool.fiber]\nlisten-port = 1")
+        with pytest.raises(ConfigError) as caught:
+            load()
+        text = str(caught.value)
+        assert "unknown key 'listen-port'" in text
+        assert str(path) in text
+        assert "Did you mean 'listen_port'?" in text
+
+    def test_nothing_is_guessed_for_a_name_like_no_other(self) -> None:
+        with pytest.raises(ConfigError) as caught:
+            load({"zzz": 3})
+        assert "Did you mean" not in str(caught.value)
+
+    def test_it_can_be_caught_as_value_error_and_as_fibers(self) -> None:
+        with pytest.raises(ValueError, match="zzz"):
+            load({"zzz": 3})
+        assert issubclass(ConfigError, FiberError)
+
+
+class TestBadValues:
+    @pytest.mark.parametrize(
+        ("key", "value", "expected"),
+        [
+            ("backend", "lokal", "one of 'local', 'loopback'"),
+            ("backend", 3, "one of 'local', 'loopback'"),
+            ("agents", 0, "a whole number of at least 1"),
+            ("agents", 2.0, "a whole number of at least 1"),
+            ("agents", True, "a whole number of at least 1"),
+            ("agents", "3", "a whole number of at least 1"),
+            ("retries", -1, "a whole number of at least 0"),
+            ("listen_port", 65536, "a whole number from 0 to 65535"),
+            ("listen_host", " ", "a host name or address"),
+            ("start_timeout", 0, "a number of seconds above 0"),
+            ("start_timeout", float("nan"), "a number of seconds above 0"),
+            ("start_timeout", float("inf"), "a number of seconds above 0"),
+            ("start_timeout", True, "a number of seconds above 0"),
+            ("log_level", "LOUD", "one of 'DEBUG'"),
+            ("runtime_directory", "relative", "the absolute path of a directory"),
+            ("runtime_directory", "/does/not/exist", "the absolute path of a directory"),
+            ("runtime_directory", 7, "the absolute path of a directory"),
+        ],
+    )
+    def test_in_init(self, key: str, value: object, expected: str) -> None:
+        with pytest.raises(ConfigError) as caught:
+            load({key: value})
+        text = str(caught.value)
+        assert f"bad value {value!r} for {key!r} in fiber.init()" in text
+        assert expected in text
+
+    @pytest.mark.parametrize(
+        ("variable", "text"),
+        [
+            ("FIBER_BACKEND", "typo"),
+            ("FIBER_AGENTS", "two"),
+            ("FIBER_AGENTS", ""),
+            ("FIBER_START_TIMEOUT", "1m"),
+        ],
+    )
+    def test_in_the_environment(self, variable: str, text: str) -> None:
+        with pytest.raises(ConfigError) as caught:
+            load(environ={variable: text})
+        assert f"bad value {text!r}" in str(caught.value)
+        assert f"environment variable {variable}" in str(caught.value)
+
+    def test_in_pyproject(self, pyproject: Callable[[str], Path]) -> None:
+        path = pyproject("[tool.fiber]\nretries = 'three'")
+        with pytest.raises(ConfigError, match="bad value 'three' for 'retries'") as caught:
+            load()
+        assert str(path) in str(caught.value)
+
+    def test_a_weaker_source_is_checked_too(self) -> None:
+        with pytest.raises(ConfigError, match="FIBER_AGENTS"):
+            load({"agents": 3}, environ={"FIBER_AGENTS": "0"})
+
+    @pytest.mark.parametrize("text", ["[tool.fiber", "\xff"])
+    def test_a_broken_pyproject_is_named(self, tmp_path: Path, text: str) -> None:
+        path = tmp_path / "pyproject.toml"
+        path.write_bytes(text.encode("latin-1"))
+        with pytest.raises(ConfigError, match="cannot read") as caught:
+            load()
+        assert str(path) in str(caught.value)
+
+    def test_a_fiber_entry_that_is_no_table(self, pyproject: Callable[[str], Path]) -> None:
+        pyproject("[tool]\nfiber = 3")
+        with pytest.raises(ConfigError, match="expected a table"):
+            load()
+
+    def test_liveness_times_out_of_order_name_both_and_their_sources(self) -> None:
+        with pytest.raises(ConfigError) as caught:
+            load(environ={"FIBER_LOST_AFTER": "4"})
+        text = str(caught.value)
+        assert "lost_after must be longer than suspect_after" in text
+        assert "environment variable FIBER_LOST_AFTER" in text
+        assert "5 s (default)" in text
+
+
+class TestCurrent:
+    def test_is_read_once(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        first = config.current()
+        monkeypatch.setenv("FIBER_AGENTS", "9")
+        assert config.current() is first
+
+    def test_is_read_once_by_many_threads(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        loads = []
+        all_there = threading.Barrier(4, timeout=10)
+
+        def slow_load() -> Config:
+            loads.append(1)
+            return load()
+
+        def ask(_: int) -> Config:
+            all_there.wait()
+            return config.current()
+
+        monkeypatch.setattr(config, "load", slow_load)
+        with ThreadPoolExecutor(4) as threads:
+            found = list(threads.map(ask, range(4)))
+        assert len(loads) == 1
+        assert all(one is found[0] for one in found)
+
+    def test_a_bad_source_is_reported_again_at_the_next_use(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("FIBER_BACKEND", "typo")
+        for _ in range(2):
+            with pytest.raises(ConfigError, match="typo"):
+                config.current()
+
+    def test_a_fork_while_another_thread_reads_does_not_block_the_child(self) -> None:
+        with config._lock:
+            pid = os.fork()
+            if pid == 0:
+                signal.alarm(10)
+                config.install(Config(agents=5))
+                os._exit(config.current().agents)
+        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 5
+
+    def test_install_hands_over_a_parents_configuration(self) -> None:
+        parents = pickle.loads(pickle.dumps(Config(backend="loopback", agents=4)))
+        config.install(parents)
+        assert config.current() == Config(backend="loopback", agents=4)
+
+
+class TestInit:
+    def test_sets_and_returns_the_configuration(self) -> None:
+        assert config.init(agents=4) is config.current()
+        assert config.current().agents == 4
+
+    def test_starts_anew_each_time(self) -> None:
+        config.init(agents=4)
+        config.init(retries=1)
+        assert config.current() == Config(retries=1)
+
+    def test_a_refused_call_changes_nothing(self) -> None:
+        config.init(agents=4)
+        with pytest.raises(ConfigError):
+            config.init(agents=0)
+        assert config.current().agents == 4
+
+    def test_another_backend_once_the_runtime_is_in_use(self) -> None:
+        config.init(backend="local")
+        config.guard(lambda: True)
+        with pytest.raises(ConfigError) as caught:
+            config.init(backend="loopback")
+        text = str(caught.value)
+        assert "too late for backend='loopback'" in text
+        assert "backend='local'" in text
+        assert "Call fiber.init() before" in text
+        assert "FIBER_BACKEND" in text
+        assert config.current().backend == "local"
+
+    def test_keys_of_later_calls_may_change_while_in_use(self) -> None:
+        config.init(backend="loopback")
+        config.guard(lambda: True)
+        config.init(backend="loopback", retries=0, start_timeout=5, log_level="info")
+        assert config.current().retries == 0
+
+    def test_any_backend_while_not_in_use(self) -> None:
+        config.init(backend="loopback")
+        config.guard(lambda: False)
+        assert config.init(backend="local").backend == "local"
+
+
+class TestConfig:
+    def test_is_frozen(self) -> None:
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            Config().agents = 3  # type: ignore[misc]
+
+    @pytest.mark.parametrize("entry", dataclasses.fields(Config), ids=lambda entry: entry.name)
+    def test_every_key_is_documented(self, entry: dataclasses.Field[object]) -> None:
+        star = "*" if entry.metadata["fixed"] else ""
+        assert f"\n{entry.name}{star}: " in (inspect.getdoc(Config) or "")
+
+    @pytest.mark.parametrize("entry", dataclasses.fields(Config), ids=lambda entry: entry.name)
+    def test_every_default_passes_its_own_rule(self, entry: dataclasses.Field[object]) -> None:
+        if entry.default is not None:
+            assert load({entry.name: entry.default}) == Config()

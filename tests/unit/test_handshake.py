@@ -1,0 +1,89 @@
+"""The first words on a connection."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fiber._transport.handshake import Hello, Identity, Refusal, Welcome, decode, mismatch
+from fiber._wire.messages import PROTOCOL, ProtocolError
+
+OURS = Identity("the master", PROTOCOL, "3.11.7", "1.0", {"host": "here"})
+
+
+@pytest.mark.parametrize(
+    "greeting",
+    [
+        Hello(OURS, "ab12", 7, True),
+        Welcome(OURS, 0, 0.5, 1.0, 2.0),
+        Refusal(OURS, "no such session"),
+    ],
+)
+def test_there_and_back(greeting: Hello | Welcome | Refusal) -> None:
+    assert decode(greeting.encode()) == greeting
+
+
+def test_a_hello_of_another_protocol_still_says_who_it_is() -> None:
+    strange = {"identity": {**vars(OURS), "protocol": 99, "facts": {}}, "ticket": "whatever"}
+    hello = decode(b"\x10" + json.dumps(strange).encode())
+    assert hello.identity == replace(OURS, protocol=99, facts={})
+
+
+@pytest.mark.parametrize(
+    ("datagram", "complaint"),
+    [
+        (b"", "first 0 bytes are no greeting"),
+        (b"GET / HTTP/1.1", "first 14 bytes are no greeting"),
+        (b"\x10", "malformed"),
+        (b"\x10[]", "malformed"),
+        (b'\x10{"identity": {}}', "malformed"),
+        (Hello(OURS, "ab12", 7, True).encode().replace(b"arrived", b"arrival"), "'arrived'"),
+        (Welcome(OURS, 0, 0.5, 1.0, 2.0).encode().replace(b"0.5", b'"x"'), "malformed"),
+        (b"\x12\xff", "malformed"),
+    ],
+)
+def test_what_is_no_greeting_is_named(datagram: bytes, complaint: str) -> None:
+    with pytest.raises(ProtocolError, match=complaint):
+        decode(datagram)
+
+
+@given(st.sampled_from([0x10, 0x11, 0x12, 0x13]), st.binary(max_size=50))
+def test_noise_raises_nothing_but_protocol_error(kind: int, noise: bytes) -> None:
+    try:
+        decode(bytes([kind]) + noise)
+    except ProtocolError:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("theirs", "complaint"),
+    [
+        (replace(OURS, name="agent-1"), None),
+        (replace(OURS, name="agent-1", python="3.11.0"), None),
+        (replace(OURS, name="agent-1", fiber="1.1"), None),
+        (
+            replace(OURS, name="agent-1", python="3.12.1"),
+            "Python version mismatch: agent-1 has 3.12.1, this process has 3.11.7",
+        ),
+        (
+            replace(OURS, name="agent-1", protocol=99, fiber="9.0"),
+            f"Fiber protocol version mismatch: agent-1 has 99 (fiberpool 9.0), this process has "
+            f"{PROTOCOL} (fiberpool 1.0)",
+        ),
+    ],
+)
+def test_versions_must_fit(theirs: Identity, complaint: str | None) -> None:
+    error = mismatch(OURS, theirs)
+    assert (error is None) == (complaint is None)
+    assert complaint is None or str(error).startswith(complaint)
+
+
+def test_this_process_says_what_it_is() -> None:
+    identity = Identity.of_this_process("agent-1", host="here")
+    assert identity.protocol == PROTOCOL
+    assert identity.facts == {"host": "here"}
+    assert identity.fiber

@@ -1,0 +1,241 @@
+"""The loop: order, timers, descriptors, errors in callbacks, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from fiber._transport.loop import Loop
+
+PATIENCE = 10
+
+
+@pytest.fixture
+def loop() -> Iterator[Loop]:
+    running = Loop()
+    running.start_thread("loop under test")
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, int]]:
+    ends = os.pipe()
+    yield ends
+    for fd in ends:
+        try:
+            os.close(fd)
+        except OSError:
+            pass  # the test closed it itself
+
+
+@pytest.fixture
+def complaints(monkeypatch: pytest.MonkeyPatch) -> list[BaseException]:
+    """What callbacks raised."""
+    seen: list[BaseException] = []
+    monkeypatch.setattr(sys, "excepthook", lambda _kind, error, _trace: seen.append(error))
+    return seen
+
+
+def settled(loop: Loop) -> None:
+    """Wait until the loop has done what was asked of it so far."""
+    done = threading.Event()
+    loop.call_soon(done.set)
+    assert done.wait(PATIENCE)
+
+
+def test_calls_are_made_in_order_on_its_thread(loop: Loop) -> None:
+    calls: list[tuple[int, bool]] = []
+    for number in range(100):
+        loop.call_soon(lambda n: calls.append((n, loop.on_thread())), number)
+    settled(loop)
+    assert calls == [(number, True) for number in range(100)]
+    assert not loop.on_thread()
+
+
+def test_calls_from_many_threads_all_arrive_each_thread_in_order(loop: Loop) -> None:
+    calls: list[tuple[int, int]] = []
+
+    def ask(me: int) -> None:
+        for number in range(200):
+            loop.call_soon(calls.append, (me, number))
+
+    threads = [threading.Thread(target=ask, args=(me,)) for me in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    settled(loop)
+    for me in range(4):
+        assert [number for who, number in calls if who == me] == list(range(200))
+
+
+def test_timers_fire_in_order_of_their_time(loop: Loop) -> None:
+    fired: list[str] = []
+    last = threading.Event()
+    loop.call_later(0.03, lambda: (fired.append("third"), last.set()))
+    loop.call_later(0.02, fired.append, "second")
+    loop.call_later(0.0, fired.append, "first")
+    assert last.wait(PATIENCE)
+    assert fired == ["first", "second", "third"]
+
+
+def test_a_cancelled_timer_never_fires(loop: Loop) -> None:
+    fired: list[str] = []
+    last = threading.Event()
+    cancelled = loop.call_later(0.01, fired.append, "cancelled")
+    loop.call_later(0.02, last.set)
+    cancelled.cancel()
+    assert last.wait(PATIENCE)
+    assert fired == []
+
+
+def test_a_timer_asked_for_by_a_callback_fires(loop: Loop) -> None:
+    fired = threading.Event()
+    loop.call_soon(lambda: loop.call_later(0.001, fired.set))
+    assert fired.wait(PATIENCE)
+
+
+def test_calls_that_ask_for_more_calls_do_not_keep_descriptors_waiting(
+    loop: Loop, pipe: tuple[int, int]
+) -> None:
+    heard = threading.Event()
+
+    def again() -> None:
+        if not heard.is_set():
+            loop.call_soon(again)
+
+    loop.register(pipe[0], lambda: (os.read(pipe[0], 1), heard.set()))
+    loop.call_soon(again)
+    os.write(pipe[1], b"x")
+    assert heard.wait(PATIENCE)
+    loop.unregister(pipe[0])
+
+
+def test_a_reader_hears_data_and_the_end(loop: Loop, pipe: tuple[int, int]) -> None:
+    heard: list[bytes] = []
+    ended = threading.Event()
+
+    def read() -> None:
+        heard.append(os.read(pipe[0], 100))
+        if not heard[-1]:
+            loop.unregister(pipe[0])
+            ended.set()
+
+    loop.register(pipe[0], read)
+    os.write(pipe[1], b"data")
+    os.close(pipe[1])
+    assert ended.wait(PATIENCE)
+    assert heard == [b"data", b""]
+
+
+def test_a_writer_is_called_until_it_is_taken_back(loop: Loop, pipe: tuple[int, int]) -> None:
+    calls: list[int] = []
+    enough = threading.Event()
+
+    def write() -> None:
+        calls.append(len(calls))
+        if len(calls) == 3:
+            loop.want_write(pipe[1], None)
+            enough.set()
+
+    loop.register(pipe[1], lambda: None)
+    loop.call_soon(loop.want_write, pipe[1], write)
+    assert enough.wait(PATIENCE)
+    settled(loop)
+    assert calls == [0, 1, 2]
+    loop.unregister(pipe[1])
+
+
+def test_a_descriptor_that_a_callback_forgot_is_not_called_in_the_same_round(loop: Loop) -> None:
+    ends = [os.pipe() for _ in range(2)]
+    readers = [reader for reader, _ in ends]
+    calls: list[int] = []
+
+    def first_come(me: int) -> None:
+        calls.append(me)
+        for reader in readers:
+            loop.unregister(reader)
+
+    def both_ready() -> None:
+        for reader in readers:
+            loop.register(reader, lambda me=reader: first_come(me))
+        for _, writer in ends:
+            os.write(writer, b"x")
+
+    loop.call_soon(both_ready)  # on its thread, so that one poll sees both
+    settled(loop)
+    settled(loop)
+    assert len(calls) == 1
+    for fd in (fd for pair in ends for fd in pair):
+        os.close(fd)
+
+
+def test_an_error_in_a_callback_is_shown_and_stops_nothing(
+    loop: Loop, pipe: tuple[int, int], complaints: list[BaseException]
+) -> None:
+    def broken(*_: Any) -> None:
+        raise ValueError("broken callback")
+
+    def broken_reader() -> None:
+        os.read(pipe[0], 1)
+        broken()
+
+    loop.call_soon(broken)
+    loop.call_later(0, broken)
+    loop.register(pipe[0], broken_reader)
+    os.write(pipe[1], b"x")
+    deadline = time.monotonic() + PATIENCE
+    while len(complaints) < 3 and time.monotonic() < deadline:
+        settled(loop)
+    assert [str(error) for error in complaints] == ["broken callback"] * 3
+    loop.unregister(pipe[0])
+
+
+def test_stop_waits_for_the_end_and_leaves_no_descriptor() -> None:
+    before = os.listdir("/proc/self/fd")
+    loop = Loop()
+    loop.start_thread("short")
+    calls: list[str] = []
+    loop.call_soon(calls.append, "asked before the stop")
+    loop.stop()
+    assert calls == ["asked before the stop"]
+    assert not any(thread.name == "short" for thread in threading.enumerate())
+    assert os.listdir("/proc/self/fd") == before
+    loop.stop()  # again is nothing
+
+
+@pytest.mark.parametrize("late", ["call_soon", "interrupt"])
+def test_a_call_after_the_end_writes_into_nobody_elses_descriptor(late: str) -> None:
+    loop = Loop()
+    loop.start_thread("short")
+    loop.stop()
+    # Whatever opens next gets the numbers that the loop had.
+    others = [os.eventfd(0, os.EFD_NONBLOCK) for _ in range(4)]
+    getattr(loop, late)(lambda: None)
+    for fd in others:
+        with pytest.raises(BlockingIOError):
+            os.eventfd_read(fd)
+        os.close(fd)
+
+
+def test_a_signal_handler_interrupts_the_loop_of_the_main_thread() -> None:
+    loop = Loop()
+    before = signal.signal(signal.SIGALRM, lambda *_: loop.interrupt(loop.stop))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+        loop.run()
+    finally:
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_now_is_monotonic_seconds() -> None:
+    before: Callable[[], float] = time.monotonic
+    assert before() <= Loop.now() <= time.monotonic()

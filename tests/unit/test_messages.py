@@ -1,0 +1,179 @@
+"""The frames between master and agent."""
+
+from __future__ import annotations
+
+import pickle
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fiber._wire.messages import (
+    PROTOCOL,
+    Deliver,
+    Exited,
+    Log,
+    Message,
+    Output,
+    Problem,
+    ProtocolError,
+    Said,
+    Shutdown,
+    Signal,
+    Start,
+    Started,
+    TakeBack,
+    TakenBack,
+    TunnelClose,
+    TunnelData,
+    TunnelOpen,
+    decode,
+)
+
+SECRET = "the user's own"
+
+ids = st.integers(0, 2**64 - 1)
+numbers = st.integers(-(2**63), 2**63 - 1)
+data = st.binary(max_size=200)
+buffers = st.lists(data, max_size=4)
+any_text = st.text(st.characters(), max_size=50)
+
+messages: st.SearchStrategy[Message] = st.one_of(
+    st.builds(Start, ids, data),
+    st.builds(Started, ids, numbers),
+    st.builds(Signal, ids, numbers),
+    st.builds(Deliver, ids, ids, data, buffers),
+    st.builds(Said, ids, data, buffers),
+    st.builds(TakeBack, ids),
+    st.builds(TakenBack, ids, st.lists(ids).map(tuple)),
+    st.builds(
+        Exited,
+        ids,
+        numbers,
+        any_text,
+        st.lists(ids, max_size=3).map(tuple),
+        st.none() | st.tuples(ids, ids),
+        st.lists(any_text, max_size=3).map(tuple),
+        any_text,
+    ),
+    st.builds(Output, ids, any_text),
+    st.builds(Log, ids, any_text, numbers, any_text, any_text),
+    st.builds(TunnelOpen, ids, any_text),
+    st.builds(TunnelData, ids, data, buffers),
+    st.builds(TunnelClose, ids, any_text),
+    st.builds(Shutdown, st.floats(allow_nan=False)),
+    st.builds(Problem, any_text),
+)
+
+
+@given(messages)
+def test_there_and_back(message: Message) -> None:
+    assert decode(message.encode()) == message
+
+
+@given(messages, st.data())
+def test_a_damaged_frame_raises_nothing_but_protocol_error(
+    message: Message, draw: st.DataObject
+) -> None:
+    frame = bytearray(message.encode())
+    for _ in range(draw.draw(st.integers(0, 3))):
+        position = draw.draw(st.integers(0, len(frame) - 1))
+        frame[position] = draw.draw(st.integers(0, 255))
+    size = draw.draw(st.integers(0, len(frame)))
+    try:
+        decode(bytes(frame[:size]))
+    except ProtocolError:
+        pass
+
+
+@given(st.integers(0, 20), data)
+def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: bytes) -> None:
+    try:
+        decode(bytes([PROTOCOL, kind]) + noise)
+    except ProtocolError:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("frame", "complaint"),
+    [
+        (b"", "a frame of 0 bytes is too short"),
+        (bytes([PROTOCOL + 1, 1]), f"protocol version {PROTOCOL + 1}; this process has {PROTOCOL}"),
+        (bytes([PROTOCOL, 99]), "unknown kind 99"),
+        (Signal(1, 15).encode()[:-1], "of kind signal and 17 bytes is malformed"),
+        (TakeBack(1).encode() + b"!", "of kind take_back and 11 bytes is malformed"),
+        (TakenBack(1, (5,)).encode()[:-1], "sequence numbers is cut short"),
+        (Said(1, b"", [b"12"]).encode()[:-1], "announces buffers of 2 bytes"),
+        (bytes([PROTOCOL, 5]) + bytes(8) + b"\xff\xff\xff\xff", "announces 4294967295 buffers"),
+        (Output(1, "x").encode() + b"\xff", "of kind output .* is malformed"),
+        (Exited(1, 0, "").encode()[:-1], "of kind exited .* is malformed"),
+        (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b'["0", "", [], null, [], ""]', "number"),
+        (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, 1, [], null, [], ""]', "text"),
+        (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b"7", "of kind exited .* is malformed"),
+    ],
+)
+def test_an_error_names_what_is_wrong(frame: bytes, complaint: str) -> None:
+    with pytest.raises(ProtocolError, match=complaint):
+        decode(frame)
+
+
+def test_a_pickle_is_only_bytes() -> None:
+    class Bomb:
+        def __reduce__(self) -> tuple[object, ...]:
+            return pytest.fail, ("it was unpickled",)
+
+    packet = pickle.dumps(Bomb())
+    received = decode(Said(1, packet, [packet]).encode())
+    assert isinstance(received, Said)
+    assert received.payload == packet
+
+
+def test_a_packet_is_not_copied_and_writable_where_the_frame_is() -> None:
+    frame = bytearray(Deliver(1, 2, b"payload", [b"buffer"]).encode())
+    message = decode(frame)
+    assert isinstance(message, Deliver)
+    (buffer,) = message.buffers
+    assert isinstance(buffer, memoryview)
+    buffer[:3] = b"BUF"
+    assert frame.endswith(b"payloadBUFfer")
+
+
+def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
+    floats = memoryview(struct.pack("<2d", 1.5, 2.5)).cast("d")
+    message = decode(Said(1, b"", [floats]).encode())
+    assert isinstance(message, Said)
+    assert bytes(message.buffers[0]) == floats.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        (Start(3, SECRET.encode()), "Start(child=3, spec=<14 bytes>)"),
+        (
+            Deliver(3, 4, SECRET.encode(), [SECRET.encode()]),
+            "Deliver(child=3, seq=4, payload=<14 bytes>, buffers=<1 items>)",
+        ),
+        (Said(3, memoryview(SECRET.encode())), "Said(child=3, payload=<14 bytes>, buffers=())"),
+        (Output(3, SECRET), "Output(child=3, text=<14 characters>)"),
+        (
+            Exited(3, -9, SECRET, (1, 2), (1, 0), (SECRET,), SECRET),
+            "Exited(child=3, exitcode=-9, reason=<14 characters>, unread=(1, 2), running=(1, 0), "
+            "log=<1 items>, host=<14 characters>)",
+        ),
+        (
+            Log(3, SECRET, 20, SECRET, SECRET),
+            "Log(child=3, logger=<14 characters>, level=20, process=<14 characters>, "
+            "text=<14 characters>)",
+        ),
+        (
+            TunnelData(3, bytearray(SECRET.encode())),
+            "TunnelData(tunnel=3, payload=<14 bytes>, buffers=())",
+        ),
+        (Problem(SECRET), "Problem(text=<14 characters>)"),
+        (Signal(3, 15), "Signal(child=3, signum=15)"),
+    ],
+)
+def test_a_repr_shows_no_data_of_the_user(message: Message, shown: str) -> None:
+    assert repr(message) == shown
+    assert str(message) == shown

@@ -1,0 +1,372 @@
+"""The session: every frame once and in order, whatever the link does."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fiber._transport.session import (
+    ACK_DELAY,
+    BUDGET,
+    HEARTBEAT,
+    RESEND_MIN,
+    Session,
+)
+from fiber._wire.messages import ProtocolError
+
+BUDGET_SMALL = 64
+
+
+class Network:
+    """Two sessions and a link between them that does what ``rng`` says."""
+
+    def __init__(self, rng: random.Random, *, drop: float = 0, repeat: float = 0, swap: float = 0):
+        self.rng = rng
+        self.drop, self.repeat, self.swap = drop, repeat, swap
+        self.now = 100.0
+        self.ends = [Session(self.now, budget=BUDGET_SMALL) for _ in range(2)]
+        self.flying: list[list[bytes]] = [[], []]
+        self.got: list[list[bytes]] = [[], []]
+        self.sent: list[list[bytes]] = [[], []]
+        self.connect()
+
+    def connect(self) -> None:
+        one, other = self.ends
+        one.connected(other.arrived, self.now)
+        other.connected(one.arrived, self.now)
+
+    def reconnect(self) -> None:
+        """Break the link; what was under way is lost or, from the old pipe, still arrives."""
+        for end in self.ends:
+            end.disconnected()
+        for flying in self.flying:
+            flying[:] = [datagram for datagram in flying if self.rng.random() < 0.5]
+        self.connect()
+
+    def send(self, side: int, frame: bytes) -> None:
+        self.sent[side].append(frame)
+        self.ends[side].send(frame)
+
+    def speak(self, side: int) -> None:
+        for datagram in self.ends[side].outgoing(self.now):
+            if self.rng.random() < self.drop:
+                continue
+            self.flying[side].append(datagram)
+            if self.rng.random() < self.repeat:
+                self.flying[side].append(datagram)
+
+    def arrive(self, side: int) -> None:
+        """Hand the oldest datagram under way (or the one after it) to the other side."""
+        flying = self.flying[side]
+        if flying:
+            late = len(flying) > 1 and self.rng.random() < self.swap
+            datagram = flying.pop(1 if late else 0)
+            self.got[1 - side] += map(bytes, self.ends[1 - side].received(datagram, self.now))
+
+    def settle(self) -> None:
+        """A link without faults and time to recover: everything must arrive."""
+        self.drop = self.repeat = self.swap = 0
+        deadline = self.now + 60
+        while not all(end.idle for end in self.ends):
+            for side in (0, 1):
+                self.speak(side)
+                while self.flying[side]:
+                    self.arrive(side)
+            if not any(self.flying):
+                self.now = max(self.now, min(end.next_timer() for end in self.ends))
+                for end in self.ends:
+                    end.tick(self.now)
+            assert self.now < deadline, "no progress"
+
+    def check(self) -> None:
+        assert self.got[1] == self.sent[0]
+        assert self.got[0] == self.sent[1]
+
+
+def steps_of(network: Network) -> list[Callable[[], None]]:
+    rng = network.rng
+
+    def frame() -> bytes:
+        size = rng.choice((0, 1, 10, BUDGET_SMALL - 1, BUDGET_SMALL, BUDGET_SMALL + 1, 300))
+        return rng.randbytes(size)
+
+    def pass_time() -> None:
+        network.now += rng.choice((0.0, 0.001, ACK_DELAY, RESEND_MIN))
+
+    def check_so_far() -> None:
+        for side in (0, 1):
+            got = network.got[1 - side]
+            assert got == network.sent[side][: len(got)]
+
+    return [
+        *(lambda side=side: network.send(side, frame()) for side in (0, 1)),
+        *(lambda side=side: network.speak(side) for side in (0, 1)),
+        *(lambda side=side: network.arrive(side) for side in (0, 1) for _ in range(2)),
+        pass_time,
+        check_so_far,
+    ]
+
+
+@pytest.mark.parametrize("block", range(10))
+def test_every_frame_arrives_once_and_in_order(block: int) -> None:
+    for seed in range(50 * block, 50 * (block + 1)):
+        try:
+            run_schedule(seed)
+        except BaseException as error:
+            error.add_note(f"with seed {seed}")
+            raise
+
+
+def run_schedule(seed: int) -> None:
+    rng = random.Random(seed)
+    faults = {name: rng.choice((0, 0.05, 0.4)) for name in ("drop", "repeat", "swap")}
+    network = Network(rng, **faults)
+    steps = [*steps_of(network), *[network.reconnect] * rng.choice((0, 1))]
+    for _ in range(200):
+        rng.choice(steps)()
+    network.settle()
+    network.check()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    sizes=st.lists(st.integers(0, 5 * BUDGET_SMALL), max_size=12),
+    cuts=st.sets(st.integers(0, 60)),
+    seed=st.integers(0, 2**32),
+)
+def test_a_break_at_any_step_loses_nothing(sizes: list[int], cuts: set[int], seed: int) -> None:
+    network = Network(random.Random(seed))
+    for number, size in enumerate(sizes):
+        network.send(number % 2, bytes([number]) * size)
+    for step in range(60):
+        if step in cuts:
+            network.reconnect()
+        network.speak(step % 2)
+        network.arrive(1 - step % 2)
+    network.settle()
+    network.check()
+
+
+def pair(now: float = 0.0) -> tuple[Session, Session]:
+    one, other = Session(now), Session(now)
+    one.connected(0, now)
+    other.connected(0, now)
+    return one, other
+
+
+def test_frames_that_wait_travel_in_one_datagram() -> None:
+    one, other = pair()
+    frames = [b"%d" % number for number in range(1000)]
+    for frame in frames:
+        one.send(frame)
+    (datagram,) = one.outgoing(0)
+    assert other.received(datagram, 0) == frames
+
+
+def test_the_window_bounds_what_is_under_way() -> None:
+    one, other = pair()
+    frame = bytes(4 * BUDGET)
+    one.send(frame)
+    first = one.outgoing(0)
+    assert len(first) == 2
+    assert one.outgoing(0) == []
+    assert one.statistics().queued_bytes == 2 * BUDGET
+    assert one.statistics().unacknowledged_datagrams == 2
+    for datagram in first:
+        assert other.received(datagram, 0) == []
+    assert other.statistics().partial_bytes == 2 * BUDGET
+    (acknowledgement,) = other.outgoing(0)
+    one.received(acknowledgement, 0)
+    second = one.outgoing(0)
+    assert len(second) == 2
+    assert [f for datagram in second for f in other.received(datagram, 0)] == [frame]
+
+
+def test_request_and_reply_need_no_acknowledgement_of_their_own() -> None:
+    one, other = pair()
+    now = 0.0
+    for number in range(10):
+        one.send(b"request %d" % number)
+        (request,) = one.outgoing(now)
+        assert other.received(request, now) == [b"request %d" % number]
+        assert other.outgoing(now) == []
+        now += ACK_DELAY / 2
+        other.send(b"reply")
+        (reply,) = other.outgoing(now)
+        assert one.received(reply, now) == [b"reply"]
+    assert one.outgoing(now) == []
+    assert one.statistics().datagrams_sent == 10
+
+
+def test_an_acknowledgement_waits_only_so_long() -> None:
+    one, other = pair()
+    one.send(b"note")
+    other.received(one.outgoing(0)[0], 0)
+    assert other.outgoing(0) == []
+    assert other.next_timer() == ACK_DELAY
+    (acknowledgement,) = other.outgoing(ACK_DELAY)
+    one.received(acknowledgement, ACK_DELAY)
+    assert one.idle
+
+
+def test_a_loss_is_noticed_by_what_follows() -> None:
+    one, other = pair()
+    one.send(b"lost")
+    one.outgoing(0)
+    one.send(b"next")
+    (after,) = one.outgoing(0)
+    assert other.received(after, 0) == []
+    (complaint,) = other.outgoing(0)
+    one.received(complaint, 0)
+    frames = [frame for datagram in one.outgoing(0) for frame in other.received(datagram, 0)]
+    assert frames == [b"lost", b"next"]
+    assert other.statistics().missed == 1
+    assert one.statistics().resent == 2
+
+
+def test_a_last_loss_is_healed_by_the_timer_which_backs_off() -> None:
+    one, _ = pair()
+    one.send(b"lost again and again")
+    (datagram,) = one.outgoing(0)
+    now, sent_at = 0.0, [0.0]
+    while now < 36:
+        now = one.next_timer()
+        one.tick(now)
+        if datagram in one.outgoing(now):
+            sent_at.append(now)
+    assert [after - before for before, after in pairwise(sent_at)] == [1, 2, 4, 8, 10, 10]
+
+
+def test_a_repetition_is_dropped_and_acknowledged_at_once() -> None:
+    one, other = pair()
+    one.send(b"twice")
+    (datagram,) = one.outgoing(0)
+    assert other.received(datagram, 0) == [b"twice"]
+    assert other.received(datagram, 0) == []
+    assert len(other.outgoing(0)) == 1
+    assert other.statistics().repeated == 1
+
+
+def test_a_repetition_does_not_pass_for_an_acknowledgement() -> None:
+    one, other = pair()
+    one.send(b"lost")
+    one.outgoing(0)
+    other.send(b"wants an answer")
+    one.received(other.outgoing(0.99)[0], 0.99)
+    (repeated,) = one.outgoing(RESEND_MIN)
+    other.received(repeated, RESEND_MIN)
+    assert not other.idle
+    (acknowledgement,) = one.outgoing(0.99 + ACK_DELAY)
+    other.received(acknowledgement, 0.99 + ACK_DELAY)
+    assert other.idle
+
+
+def test_an_acknowledgement_puts_off_the_timer() -> None:
+    one, other = pair()
+    one.send(b"first")
+    (first,) = one.outgoing(0)
+    one.send(b"second")
+    one.outgoing(0.9)
+    other.received(first, 0.9)
+    one.received(other.outgoing(0.9 + ACK_DELAY)[0], 0.95)
+    assert one.outgoing(1.9) == []
+    assert len(one.outgoing(1.95)) == 1
+
+
+def test_nothing_leaves_while_disconnected_and_all_of_it_afterwards() -> None:
+    one, other = pair()
+    one.send(b"under way")
+    one.outgoing(0)
+    one.disconnected()
+    other.disconnected()
+    one.send(b"queued")
+    assert one.outgoing(50) == []
+    one.connected(other.arrived, 50)
+    other.connected(one.arrived, 50)
+    frames = [frame for datagram in one.outgoing(50) for frame in other.received(datagram, 50)]
+    assert frames == [b"under way", b"queued"]
+    assert one.statistics().breaks == 1
+
+
+@pytest.mark.parametrize("arrived", [-1, 3])
+def test_a_peer_that_lost_its_place_cannot_resume(arrived: int) -> None:
+    one, other = pair()
+    for frame in (b"1", b"2"):
+        one.send(frame)
+        other.received(one.outgoing(0)[0], 0)
+    one.received(other.outgoing(0)[0], 0)
+    one.disconnected()
+    with pytest.raises(ProtocolError, match=f"cannot resume after datagram {arrived}"):
+        one.connected(arrived, 0)
+
+
+def test_an_idle_session_says_that_it_is_alive() -> None:
+    one, other = pair()
+    assert one.outgoing(HEARTBEAT - 0.1) == []
+    (beat,) = one.outgoing(HEARTBEAT)
+    assert other.received(beat, HEARTBEAT) == []
+    assert other.tick(HEARTBEAT) == 0
+    assert other.outgoing(HEARTBEAT - 0.1) == [], "a heartbeat needs no answer"
+
+
+def test_silence_counts_only_while_this_process_runs() -> None:
+    session, _ = pair()
+    for now in range(1, 8):
+        assert session.next_timer() <= now
+        assert session.tick(now) == now
+    assert session.tick(1000) == 7 + 2 * HEARTBEAT / 3
+
+
+def test_statistics_count_bytes_and_frames() -> None:
+    one, other = pair()
+    one.send(b"abc")
+    assert one.statistics().queued_frames == 1
+    (datagram,) = one.outgoing(0)
+    other.received(datagram, 0)
+    counts = other.statistics()
+    assert (counts.frames_received, counts.bytes_received) == (1, len(datagram))
+    assert one.statistics().unacknowledged_bytes == len(datagram)
+    assert one.statistics().frames_sent == 1
+
+
+def numbered(frames: int) -> bytes:
+    one, _ = pair()
+    for _ in range(frames):
+        one.send(b"frame")
+    return one.outgoing(0)[0]
+
+
+@pytest.mark.parametrize(
+    ("datagram", "complaint"),
+    [
+        (b"", "0 bytes has no header"),
+        (b"\x07" + bytes(23), "unknown kind 7"),
+        (numbered(3)[:-1], "does not hold the 3 frames"),
+        (numbered(3) + b"!", "does not hold the 3 frames"),
+        (
+            b"\x01\x00\x00\x00\xff\xff\xff\xff\x01" + bytes(15),
+            "does not hold the 4294967295 frames",
+        ),
+        (b"\x01\x00\x00\x00\x00\x00\x00\x00\x01" + bytes(15), "does not hold the 0 frames"),
+        (b"\x01\x02" + numbered(1)[2:], "does not go on"),
+        (b"\x02" + bytes(15) + b"\x09" + bytes(7), "acknowledges datagram 9, but only 0 were sent"),
+    ],
+)
+def test_what_no_session_sends_is_refused(datagram: bytes, complaint: str) -> None:
+    session, _ = pair()
+    with pytest.raises(ProtocolError, match=complaint):
+        session.received(datagram, 0)
+
+
+@given(st.binary(max_size=80))
+def test_noise_never_raises_anything_else(datagram: bytes) -> None:
+    session, _ = pair()
+    try:
+        session.received(datagram, 0)
+    except ProtocolError:
+        pass

@@ -1,0 +1,150 @@
+"""Event, Semaphore, BoundedSemaphore."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import fiber
+import pytest
+from fiber import synchronize
+from fiber._hub.absent import NotInFiber
+
+PATIENCE = 15.0
+
+
+def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
+    process = fiber.Process(target=target, args=args, daemon=True)
+    process.start()
+    return process
+
+
+def test_a_semaphore_counts() -> None:
+    semaphore = fiber.Semaphore(2)
+    assert semaphore.acquire()
+    assert semaphore.get_value() == 1
+    assert semaphore.acquire()
+    assert semaphore.get_value() == 0
+    assert not semaphore.acquire(False)
+    assert not semaphore.acquire(False, 100)
+    assert not semaphore.acquire(timeout=0.01)
+    assert not semaphore.acquire(timeout=-1)
+    semaphore.release()
+    assert semaphore.acquire(timeout=-1)
+    for _ in range(3):
+        semaphore.release()
+    assert semaphore.get_value() == 3
+    assert repr(semaphore) == "<Semaphore(value=3)>"
+
+
+def test_a_semaphore_is_a_context() -> None:
+    semaphore = fiber.Semaphore()
+    with semaphore as acquired:
+        assert acquired
+        assert semaphore.get_value() == 0
+    assert semaphore.get_value() == 1
+
+
+def test_a_bounded_semaphore_refuses_what_was_not_acquired() -> None:
+    semaphore = fiber.BoundedSemaphore(2)
+    with pytest.raises(ValueError, match="too many times"):
+        semaphore.release()
+    semaphore.acquire()
+    semaphore.release()
+    assert repr(semaphore) == "<BoundedSemaphore(value=2, maxvalue=2)>"
+
+
+@pytest.mark.parametrize("value", [-1, synchronize.SEM_VALUE_MAX + 1])
+def test_a_value_that_cannot_be(value: int) -> None:
+    with pytest.raises(ValueError, match=str(value)):
+        fiber.Semaphore(value)
+
+
+def in_turn(semaphore: Any, inside: Any, times: int) -> None:
+    for _ in range(times):
+        with semaphore:
+            assert inside.acquire(False)  # nobody else is here
+            inside.release()
+
+
+def test_a_semaphore_of_one_excludes() -> None:
+    semaphore, inside = fiber.Semaphore(1), fiber.Semaphore(1)
+    processes = [start(in_turn, semaphore, inside, 300) for _ in range(3)]
+    for process in processes:
+        process.join(PATIENCE)
+        assert process.exitcode == 0
+    assert semaphore.get_value() == 1
+
+
+def announce_and_acquire(semaphore: Any, ready: Any) -> None:
+    ready.set()
+    semaphore.acquire()
+
+
+def test_who_is_killed_while_waiting_takes_nothing() -> None:
+    semaphore, ready = fiber.Semaphore(0), fiber.Event()
+    process = start(announce_and_acquire, semaphore, ready)
+    assert ready.wait(PATIENCE)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join(PATIENCE)
+    semaphore.release()
+    assert semaphore.acquire(timeout=PATIENCE)
+
+
+def test_an_event() -> None:
+    event = fiber.Event()
+    assert not event.is_set()
+    assert not event.wait(0)
+    assert not event.wait(0.01)
+    assert not event.wait(-1)
+    assert "unset" in repr(event)
+    event.set()
+    event.set()
+    assert event.is_set()
+    assert event.wait()
+    assert event.wait(0)
+    assert repr(event).endswith(" set>")
+    event.clear()
+    event.clear()
+    assert not event.is_set()
+
+
+def wait_and_answer(event: Any, ready: Any, answers: Any) -> None:
+    ready.release()
+    answers.put(event.wait(PATIENCE))
+
+
+def test_an_event_wakes_all_processes() -> None:
+    event, ready, answers = fiber.Event(), fiber.Semaphore(0), fiber.Queue()
+    processes = [start(wait_and_answer, event, ready, answers) for _ in range(3)]
+    for _ in processes:
+        assert ready.acquire(timeout=PATIENCE)
+    event.set()
+    assert [answers.get(timeout=PATIENCE) for _ in processes] == [True] * 3
+    for process in processes:
+        process.join(PATIENCE)
+
+
+def test_who_waits_is_woken_even_if_the_event_is_cleared_at_once() -> None:
+    event = fiber.Event()
+    woken: list[bool] = []
+    for _ in range(50):
+        threads = [
+            threading.Thread(target=lambda: woken.append(event.wait(PATIENCE))) for _ in range(2)
+        ]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            event.set()
+            event.clear()
+    assert woken == [True] * 100
+
+
+@pytest.mark.parametrize("name", ["Lock", "RLock", "Condition", "Barrier"])
+def test_what_is_not_there_says_what_to_use(name: str) -> None:
+    with pytest.raises(NotInFiber, match=f"no {name} yet.*Semaphore|Event"):
+        getattr(synchronize, name)()

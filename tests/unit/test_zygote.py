@@ -1,0 +1,319 @@
+"""The zygote by its own protocol: what it answers, and what becomes of its children."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from multiprocessing import spawn
+from typing import Any
+
+import census
+import pytest
+
+from fiber import reduction
+from fiber._agent import agent, child, zygote
+from fiber._agent.board import Board
+from fiber._transport.unix import socketpair
+from fiber._wire import packet
+from fiber.process import Process
+from unit.agent_children import run_forever
+
+PATIENCE = 10
+
+
+class Master:
+    """The agent's end of a zygote, spoken by hand."""
+
+    def __init__(self, board: Board, *, preload: bool = False) -> None:
+        self.sock, theirs = socketpair("a test")
+        self.sock.settimeout(PATIENCE)
+        self.process = agent._launch(theirs.fileno(), board.fd, preload=preload)
+        theirs.close()
+
+    def start(self, number: int, **options: Any) -> None:
+        """Ask for a child that runs for ever, unless ``options`` say otherwise."""
+        fds = [os.dup(1), os.dup(2), *options.pop("fds", ())]
+        for first in range(0, len(fds), 200):
+            last = first + 200 >= len(fds)
+            message = (zygote.START, number, tuple(_start(**options)))
+            request = message if last else (zygote.DESCRIPTORS,)
+            packet.send(self.sock, pickle.dumps(request), fds=fds[first : first + 200])
+        for fd in fds:
+            os.close(fd)
+
+    def say(self, *request: Any) -> None:
+        packet.send(self.sock, pickle.dumps(request))
+
+    def hear(self) -> tuple[Any, ...]:
+        answer: tuple[Any, ...] = packet.loads(packet.receive(self.sock))
+        return answer
+
+    def started(self, number: int, **options: Any) -> int:
+        """Start a child and return its pid."""
+        self.start(number, **options)
+        kind, who, pid = self.hear()
+        assert (kind, who) == (zygote.STARTED, number)
+        assert isinstance(pid, int)
+        return pid
+
+    def close(self) -> None:
+        self.sock.close()
+        self.process.wait(PATIENCE)
+
+
+def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.Start:
+    process = Process(target=target, args=args)
+    preparation = spawn.get_preparation_data(process.name)
+    preparation |= {"authkey": b"key", "host": "here", "calls": [], "same_host": True}
+    preparation |= options.pop("preparation", {})
+    for key in ("start_method", "init_main_from_name", "init_main_from_path"):
+        preparation.pop(key, None)
+    return zygote.Start(
+        method=options.pop("method", "fork"),
+        preparation=pickle.dumps(preparation),
+        payload=reduction.dump_process(process, same_host=True)[0],
+        slot=None,
+        executable=options.pop("executable", None),
+        captured=False,
+        open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
+    )
+
+
+@pytest.fixture
+def board() -> Iterator[Board]:
+    made = Board()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def master(board: Board) -> Iterator[Master]:
+    made = Master(board)
+    yield made
+    made.close()
+
+
+def gone(pid: int) -> bool:
+    found = census.read(pid)
+    return found is None or found.state == "Z"
+
+
+def test_a_child_is_started_signalled_and_reaped(master: Master) -> None:
+    pid = master.started(7)
+    master.say(zygote.SIGNAL, 7, signal.SIGTERM)
+    assert master.hear() == (zygote.EXITED, 7, -signal.SIGTERM)
+    assert census.read(pid) is None, "no zombie is left"
+    master.say(zygote.SIGNAL, 7, signal.SIGTERM)  # gone: nothing happens
+    assert master.started(8) > 0
+
+
+def test_a_signal_right_after_the_birth_is_not_lost(master: Master) -> None:
+    for number in range(20):
+        master.start(number)
+        master.say(zygote.SIGNAL, number, signal.SIGTERM)
+    answers = [master.hear() for _ in range(40)]
+    assert [a[2] for a in answers if a[0] == zygote.EXITED] == [-signal.SIGTERM] * 20
+
+
+def test_many_deaths_at_once_are_all_told(master: Master) -> None:
+    pids = [master.started(number) for number in range(10)]
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+    answers = {master.hear() for _ in pids}
+    assert answers == {(zygote.EXITED, number, -signal.SIGKILL) for number in range(10)}
+
+
+def test_told_to_quit_it_kills_and_reports_its_children(master: Master) -> None:
+    pids = [master.started(number) for number in range(3)]
+    master.say(zygote.QUIT)
+    answers = {master.hear() for _ in pids}
+    assert answers == {(zygote.EXITED, number, -signal.SIGKILL) for number in range(3)}
+    with pytest.raises(EOFError):
+        master.hear()
+    assert all(gone(pid) for pid in pids)
+
+
+def test_no_signal_of_the_terminal_ends_it(master: Master) -> None:
+    first = master.started(1)
+    for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        master.process.send_signal(signum)
+    assert master.started(2) > 0
+    assert not gone(first)
+
+
+def test_its_children_do_not_outlive_its_own_sudden_death(master: Master) -> None:
+    pids = [master.started(number, method=method) for number, method in enumerate(("fork", "spawn"))]
+    master.process.kill()
+    assert census.wait_until(lambda: all(gone(pid) for pid in pids), PATIENCE)
+
+
+def test_a_hang_up_ends_it(board: Board) -> None:
+    master = Master(board)
+    pid = master.started(1)
+    master.close()
+    assert gone(pid)
+
+
+def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
+    script = """
+        import os, signal, subprocess
+        from unit.test_zygote import Board, Master
+        master = Master(Board())
+        child, socket = master.started(1), master.sock.fileno()
+        holder = subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL, pass_fds=[socket])
+        print(holder.pid, master.process.pid, child, flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    holder, *ours = map(int, _run(script, expect=-signal.SIGKILL).split())
+    try:
+        assert census.wait_until(lambda: all(map(gone, ours)), PATIENCE)
+        assert not gone(holder)
+    finally:
+        os.kill(holder, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("parent", ["os.getppid()", "os.getppid() + 1"])
+def test_a_child_whose_zygote_died_first_does_not_live_on(parent: str) -> None:
+    script = f"""
+        import os
+        from fiber._agent.child import die_with
+        die_with({parent})
+        print("alive")
+    """
+    alive = parent == "os.getppid()"
+    assert _run(script, expect=0 if alive else 1) == ("alive\n" if alive else "")
+
+
+def _run(script: str, expect: int) -> str:
+    path = os.pathsep.join(filter(None, sys.path))
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert done.returncode == expect
+    return done.stdout
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_once_its_imports_made_forking_unsafe_it_forks_no_more(board: Board, method: str) -> None:
+    master = Master(board, preload=True)
+    threads = {"preload": ["unit.threads_at_import"]}
+    master.started(1, method="spawn")
+    for number in (2, 3):
+        master.start(number, preparation=threads)
+        kind, who, reason = master.hear()
+        assert (kind, who) == (zygote.UNFIT, number)
+        assert "started at import" in reason
+    assert master.started(4, method="spawn") > 0, "a new interpreter is safe all the same"
+    master.close()
+
+
+def test_the_main_module_is_imported_once_for_all(board: Board, tmp_path: Any) -> None:
+    main, log = tmp_path / "main_module.py", tmp_path / "log"
+    main.write_text(f"import os\nwith open({str(log)!r}, 'a') as f:\n    f.write('imported\\n')\n")
+    master = Master(board, preload=True)
+    for number in range(3):
+        preparation = {"preload": [], "sys_path": [str(tmp_path), *sys.path]}
+        master.started(number, preparation={**preparation, "preload": ["main_module"]})
+    master.close()
+    assert log.read_text() == "imported\n"
+
+
+@pytest.mark.parametrize("code", ["raise SystemExit(3)", "raise KeyboardInterrupt", "1 / 0"])
+def test_an_import_that_fails_does_not_end_it(board: Board, tmp_path: Any, code: str) -> None:
+    (tmp_path / "broken_module.py").write_text(code)
+    master = Master(board, preload=True)
+    preparation = {"preload": ["broken_module"], "sys_path": [str(tmp_path), *sys.path]}
+    assert master.started(1, preparation=preparation) > 0
+    master.close()
+
+
+def test_an_executable_that_is_not_there_is_named(
+    board: Board, capfd: pytest.CaptureFixture[str]
+) -> None:
+    master = Master(board)
+    master.started(1, method="spawn", executable="/no/such/python")
+    assert master.hear() == (zygote.EXITED, 1, 1)
+    master.close()
+    assert "No such file or directory: '/no/such/python'" in capfd.readouterr().err
+
+
+def test_more_descriptors_than_it_was_born_to_hold(board: Board) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    try:
+        master = Master(board)
+        first = master.started(1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    # The program raised its limit, as the error message says one can.
+    fds = [os.dup(1) for _ in range(400)]
+    second = master.started(2, fds=fds)
+    assert not gone(first)
+    assert not gone(second)
+    limits = [resource.prlimit(pid, resource.RLIMIT_NOFILE) for pid in (first, second)]
+    assert limits == [(256, hard), (soft, hard)], "a child has its program's limit of the moment"
+    for pid in (first, second):
+        os.kill(pid, signal.SIGKILL)
+    master.close()
+
+
+# What cannot be forced from outside: the zygote object itself, in this process
+
+
+@pytest.fixture
+def inside(board: Board) -> Iterator[tuple[zygote.Zygote, socket.socket]]:
+    ours, theirs = socketpair("a test")
+    ours.settimeout(PATIENCE)
+    watched = os.pidfd_open(os.getpid())
+    made = zygote.Zygote(theirs, board, watched, preload=False)
+    yield made, ours
+    for fd in (watched, made._deaths, made._deaths_in):
+        os.close(fd)
+    ours.close()
+    theirs.close()
+
+
+def test_a_refused_fork_is_told_and_leaks_nothing(
+    inside: tuple[zygote.Zygote, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse() -> int:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    made, ours = inside
+    before = len(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(os, "fork", refuse)
+    for number in (1, 2):
+        request = (zygote.START, number, tuple(_start()))
+        packet.send(ours, pickle.dumps(request), fds=[1, 2, 1, 2])
+        assert made._serve()
+        kind, who, text = packet.loads(packet.receive(ours))
+        assert (kind, who) == (zygote.FAILED, number)
+        assert text == "the system refused a new process: Resource temporarily unavailable"
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()
+
+
+def test_descriptors_that_nobody_took_are_closed_in_the_child(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reader, writer = os.pipe()
+    monkeypatch.setattr(child, "_descriptors", [writer])
+    start = _start(target=os.getpid)
+    monkeypatch.setattr(child, "_prepare_environment", lambda _data: None)
+    monkeypatch.setattr(child, "prepare_paths", lambda _data: None)
+    monkeypatch.setattr(child, "prepare_main", lambda _data: None)
+    child._load(start)
+    assert os.read(reader, 1) == b""
+    os.close(reader)
