@@ -50,6 +50,9 @@ def judge(budget: Budget, runs: Mapping[str, Run]) -> Verdict:
     if not run:
         return Verdict(budget, None, "—", "not measured")
     value = _value(budget, run)
+    floor = _floor(budget, run)
+    if value is None and floor and floor >= budget.bound:
+        return Verdict(budget, True, f"> {times(floor)}", "met")
     if value is None:
         why = run.failures.get(budget.case, {}).get(budget.contender)
         return Verdict(budget, None, "—", f"not measured: {why}" if why else "not measured")
@@ -70,6 +73,13 @@ def _value(budget: Budget, run: Run) -> float | None:
     else:
         found = ratio(values, run.series(budget.case, budget.against, budget.metric))
     return found.median if found else None
+
+
+def _floor(budget: Budget, run: Run) -> float | None:
+    """The least that a rival's time may have been of Fiber's, if the rival was stopped as too slow."""
+    after = run.unfinished.get(budget.case, {}).get(budget.contender)
+    against = summary(run.series(budget.case, budget.against, budget.metric))
+    return after / against.median if budget.against == "fiber" and after and against else None
 
 
 def _missed(value: float, budget: Budget) -> str:

@@ -131,17 +131,20 @@ def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool 
                 markersize=6,
                 **style,
             )
-        failed = [x for x, case in points if name in run.failures.get(case, {})]
-        if failed:
-            panel.plot(
-                failed,
-                [0.96] * len(failed),
-                transform=panel.get_xaxis_transform(),
-                linestyle="",
-                marker="$✗$",
-                color=contender.colour,
-                markersize=10,
-            )
+        for x, case in points:
+            if name in (failed := list(run.failures.get(case, {}))):
+                # Side by side along the top, as several may fail at the same point.
+                panel.annotate(
+                    "✗",
+                    (x, 0.96),
+                    xycoords=panel.get_xaxis_transform(),
+                    xytext=(-11 * failed.index(name), 0),
+                    textcoords="offset points",
+                    color=contender.colour,
+                    fontsize=12,
+                    horizontalalignment="center",
+                )
+    panel.margins(y=0.12)
     if log_x:
         panel.set_xscale("log")
     panel.set_yscale("log")

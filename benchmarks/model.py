@@ -5,6 +5,7 @@ A case is one thing to measure, a metric one number it gives, a run all that was
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -55,6 +56,7 @@ class Run:
     about: dict[str, Any]
     values: dict[str, dict[str, dict[str, Series]]] = field(default_factory=dict)
     failures: dict[str, dict[str, str]] = field(default_factory=dict)
+    unfinished: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def add(self, case: str, contender: str, turn: int, sample: Mapping[str, float]) -> None:
         """Note the sample of round `turn`, counted from 0."""
@@ -63,9 +65,11 @@ class Run:
             series.extend([None] * (turn + 1 - len(series)))
             series[turn] = value
 
-    def fail(self, case: str, contender: str, why: str) -> None:
-        """Note that a contender did not get through a case."""
+    def fail(self, case: str, contender: str, why: str, after: float | None = None) -> None:
+        """Note that a contender did not get through a case, or was not done `after` seconds."""
         self.failures.setdefault(case, {})[contender] = why
+        if after is not None:
+            self.unfinished.setdefault(case, {})[contender] = after
 
     def series(self, case: str, contender: str, metric: str) -> Series:
         """The values by round, shorter than the run where a contender took part in fewer rounds."""
@@ -73,9 +77,9 @@ class Run:
 
     def as_json(self) -> dict[str, Any]:
         """Plain data from which `from_json` makes the same run."""
-        return {"about": self.about, "values": self.values, "failures": self.failures}
+        return dataclasses.asdict(self)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Run:
         """The run that `as_json` described."""
-        return cls(dict(data["about"]), dict(data["values"]), dict(data["failures"]))
+        return cls(**data)

@@ -80,18 +80,18 @@ class Rounds:
         ):
             return
         where = f"{label}  {case.measure}: {case.name}  {contender.name}"
-        begin = time.monotonic()
+        run, begin = self._runs[case.measure], time.monotonic()
         try:
             sample = self._sample(case, contender)
         except Failed as failure:
             # Once is enough: it would only hold up the others again.
             self._finished.add(key)
-            self._runs[case.measure].fail(case.name, contender.name, str(failure))
+            run.fail(case.name, contender.name, str(failure), failure.after)
             self._say(f"{where}  failed: {failure}")
             return
         if time.monotonic() - begin > LONG:
             self._finished.add(key)
-        self._runs[case.measure].add(case.name, contender.name, turn, sample)
+        run.add(case.name, contender.name, turn, sample)
         self._say(f"{where}  " + "  ".join(f"{name} {value:.6g}" for name, value in sample.items()))
 
     def _sample(self, case: Case, contender: Contender) -> dict[str, float]:

@@ -23,7 +23,14 @@ _STRAGGLERS = 3.0
 
 
 class Failed(Exception):
-    """A contender did not get through a case; the text says why. Its session is of no more use."""
+    """A contender did not get through a case; the text says why. Its session is of no more use.
+
+    `after`: the seconds after which it was stopped, if it was merely too slow.
+    """
+
+    def __init__(self, why: str, after: float | None = None) -> None:
+        super().__init__(why)
+        self.after = after
 
 
 class Session:
@@ -115,7 +122,7 @@ class Session:
             if not data and (readable or self._process.poll() is not None):
                 raise Failed(self._died())
             if not data and time.monotonic() > end:
-                raise Failed(f"not finished after {limit:.0f} s")
+                raise Failed(f"not finished after {limit:.0f} s", after=limit)
         line, _, self._rest = self._rest.partition(b"\n")
         return line
 

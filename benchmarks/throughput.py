@@ -20,8 +20,7 @@ their own (Dask, ipyparallel, Ray, Spark) get a tenth of the no-op tasks, so tha
 in bearable time. The batches of arrays are 100 different ones of 1 MB, sent with chunksize 1.
 The long task stands in the middle of its batch, which is sent in default chunks: the time
 shows whether short tasks wait behind the long one, and whether the long one waited for its
-turn.
-Each batch but this one is the median of up to five in a row."""
+turn. Each other value of a round is the median of up to five batches in a row."""
 
 RATE = Metric("rate", "tasks a second", "1/s")
 TIME = Metric("time", "time of the batch", "s")

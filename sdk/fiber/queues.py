@@ -290,7 +290,7 @@ class _Backlog:
         while self._has_items():
             try:
                 while self._items:
-                    self._outbox.send(*self._items.popleft())
+                    self._outbox.post(*self._items.popleft())
             except BrokenPipeError:
                 self._items.clear()
             except OSError as error:

@@ -21,6 +21,7 @@ from typing import Any, ClassVar, cast
 
 from fiber._agent import child
 from fiber._wire import packet
+from fiber.errors import UnpicklableError
 
 __all__ = ["AbstractReducer", "ForkingPickler", "Spawning", "dump", "dumps", "register"]
 
@@ -75,12 +76,29 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
     mp_context.set_spawning_popen(cast("Any", attempt if same_host else RemoteSpawning(process)))
     try:
         payload = dumps(process, before_retry=attempt.reset)
+    except (TypeError, AttributeError, pickle.PicklingError) as error:
+        blame = _blame(process, error)
+        attempt.reset()
+        raise blame from error
     except BaseException:
         attempt.reset()
         raise
     finally:
         mp_context.set_spawning_popen(None)
     return payload, attempt.fds
+
+
+def _blame(process: Any, reason: Exception) -> UnpicklableError:
+    """The error that names what of a Process does not pickle."""
+    parts = {"the target": process._target}
+    parts |= {f"argument {index}": value for index, value in enumerate(process._args)}
+    parts |= {f"argument {name!r}": value for name, value in process._kwargs.items()}
+    for what, part in parts.items():
+        try:
+            dumps(part)
+        except Exception as error:
+            return UnpicklableError(f"{what} of process {process.name!r}", str(error))
+    return UnpicklableError(f"process {process.name!r}", str(reason))
 
 
 class RemoteSpawning:

@@ -146,6 +146,8 @@ class Oracle:
 
     def spared(self, child: Child, ref: Ref) -> None:
         """A task that a lost worker held is not charged."""
+        if child.agent.lost and self.accounts[ref.job].plan.retries:
+            return  # nobody knows how far it was
         if child.worker.running == ref:
             raise Violation(f"{ref} is not blamed for the end of {child.name}, which was in it")
 

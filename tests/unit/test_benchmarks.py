@@ -89,7 +89,7 @@ def test_order_rotates_and_visits_everyone() -> None:
 def test_a_run_survives_json() -> None:
     run = Run(dict(ABOUT))
     run.add("case", "fiber", 1, {"time": 2.0})
-    run.fail("case", "spark", "not finished after 20 s")
+    run.fail("case", "spark", "not finished after 20 s", after=20.0)
     again = Run.from_json(json.loads(json.dumps(run.as_json())))
     assert again == run
     assert again.series("case", "fiber", "time") == [None, 2.0]
@@ -138,6 +138,16 @@ def test_budget_of_what_was_not_measured() -> None:
     run.fail(budget.case, "fiber", "ended with exit status 1: no message")
     found = budgets.judge(budget, {"overhead": run})
     assert found.verdict == "not measured: ended with exit status 1: no message"
+
+
+def test_a_rival_that_was_too_slow_to_finish_keeps_a_budget_on_its_slowness() -> None:
+    budget = next(each for each in budgets.BUDGETS if each.contender == "spark")
+    run = overhead_run(2.0, 1.0)
+    run.fail(budget.case, "spark", "not finished after 90 s", after=90.0)
+    found = budgets.judge(budget, {"overhead": run})
+    assert (found.kept, found.measured) == (True, "> 45.0x")
+    run.fail(budget.case, "spark", "not finished after 20 s", after=20.0)
+    assert budgets.judge(budget, {"overhead": run}).kept is None
 
 
 def test_every_budget_is_on_a_case_that_is_measured() -> None:

@@ -50,6 +50,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(
         Exited,
         ids,
+        ids,
         numbers,
         any_text,
         st.lists(ids, max_size=3).map(tuple),
@@ -107,7 +108,7 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         (Said(1, b"", [b"12"]).encode()[:-1], "announces buffers of 2 bytes"),
         (bytes([PROTOCOL, 5]) + bytes(8) + b"\xff\xff\xff\xff", "announces 4294967295 buffers"),
         (Output(1, "x").encode() + b"\xff", "of kind output .* is malformed"),
-        (Exited(1, 0, "").encode()[:-1], "of kind exited .* is malformed"),
+        (Exited(1, 0, 0, "").encode()[:-1], "of kind exited .* is malformed"),
         (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b'["0", "", [], null, [], ""]', "number"),
         (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, 1, [], null, [], ""]', "text"),
         (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b"7", "of kind exited .* is malformed"),
@@ -157,8 +158,9 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
         (Said(3, memoryview(SECRET.encode())), "Said(child=3, payload=<14 bytes>, buffers=())"),
         (Output(3, SECRET), "Output(child=3, text=<14 characters>)"),
         (
-            Exited(3, -9, SECRET, (1, 2), (1, 0), (SECRET,), SECRET),
-            "Exited(child=3, exitcode=-9, reason=<14 characters>, unread=(1, 2), running=(1, 0), "
+            Exited(3, 2, -9, SECRET, (1, 2), (1, 0), (SECRET,), SECRET),
+            "Exited(child=3, delivered=2, exitcode=-9, reason=<14 characters>, "
+            "unread=(1, 2), running=(1, 0), "
             "log=<1 items>, host=<14 characters>)",
         ),
         (

@@ -16,7 +16,7 @@ import fiber
 from fiber import config, process
 from fiber._agent.port import ExitReport
 from fiber._runtime import popen, state
-from fiber.errors import StartError
+from fiber.errors import StartError, UnpicklableError
 from unit.agent_children import run_forever
 
 PATIENCE = 10
@@ -104,7 +104,7 @@ def test_a_lambda_and_a_closure_can_be_targets(pipe: tuple[Any, Any]) -> None:
     child.join()
 
 
-@pytest.mark.parametrize("target", [threading.Lock(), open(os.devnull).close])  # noqa: SIM115
+@pytest.mark.parametrize("target", [threading.Lock(), (item for item in ())])
 def test_what_does_not_pickle_is_refused_at_the_start_and_leaks_nothing(
     target: Any, pipe: tuple[Any, Any]
 ) -> None:
@@ -117,9 +117,26 @@ def test_what_does_not_pickle_is_refused_at_the_start_and_leaks_nothing(
     assert fiber.active_children() == []
 
 
-def test_an_unpicklable_target_is_named() -> None:
-    with pytest.raises(fiber.errors.UnpicklableError, match="argument 0 of Process 'named'"):
-        fiber.Process(target=print, args=(threading.Lock(),), name="named").start()
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        ({"target": threading.Lock().acquire}, "the target"),
+        ({"target": print, "args": (1, threading.Lock())}, "argument 1"),
+        ({"target": print, "kwargs": {"file": threading.Lock()}}, "argument 'file'"),
+    ],
+)
+def test_what_does_not_pickle_is_named(options: dict[str, Any], culprit: str) -> None:
+    with pytest.raises(UnpicklableError, match=f"{culprit} of process 'odd' cannot be pickled"):
+        fiber.Process(name="odd", **options).start()
+
+
+def test_an_error_of_the_objects_own_pickling_is_left_as_it_is() -> None:
+    class Odd:
+        def __reduce__(self) -> str:
+            raise ZeroDivisionError("in its own code")
+
+    with pytest.raises(ZeroDivisionError, match="in its own code"):
+        fiber.Process(target=print, args=(Odd(),)).start()
 
 
 def test_starts_and_ends_leave_no_descriptor() -> None:
@@ -205,7 +222,7 @@ def test_an_agent_that_does_not_answer_is_an_error_and_the_late_child_is_killed(
     silent: Port,
 ) -> None:
     before = open_files()
-    with pytest.raises(StartError, match=r"'slow' did not start.*'elsewhere'.*0\.05 s"):
+    with pytest.raises(StartError, match=r"process 'slow' did not start.*'elsewhere'.*0\.05 s"):
         fiber.Process(target=os.getpid, name="slow").start()
     assert silent.signals == [signal.SIGKILL]
     assert open_files() == before
@@ -231,7 +248,7 @@ def test_a_start_that_the_system_refuses_says_why(
         return Port()
 
     monkeypatch.setattr(runtime, "start", refuse)
-    with pytest.raises(StartError, match="'big' did not start: could not be started: no memory"):
+    with pytest.raises(StartError, match="process 'big' did not start: could not be started: no memory"):
         fiber.Process(target=os.getpid, name="big").start()
     assert fiber.active_children() == []
 

@@ -196,11 +196,10 @@ class LocalChild:
         fds, self._fds = self._fds, ()
         _close_all(fds)
 
-    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send a packet to the worker."""
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send a packet to the worker; False if it is gone."""
         outbox = self._outbox
-        if outbox is not None:
-            outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
+        return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
 
     def take_back(self) -> None:
         """Recall unread packets; answered on the loop."""

@@ -72,8 +72,11 @@ class ChildPort(Protocol):
     host: str
     pid: int | None
 
-    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send a packet to its task channel, ``seq`` (eight bytes) in front."""
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send a packet to its task channel, ``seq`` (eight bytes) in front.
+
+        False: the child is gone and never saw it, and no report names it among the unread.
+        """
 
     def take_back(self) -> None:
         """Recall the packets that it has not read; the observer hears which."""

@@ -101,6 +101,7 @@ class _Observed:
     def __init__(self, service: AgentService, loop: Loop, number: int) -> None:
         self._service = service
         self._number = number
+        self._delivered = 0
         self.capture = Capture(loop, self._wrote, service.busy)
 
     def start(self, agent: Agent, spec: ChildSpec) -> None:
@@ -114,6 +115,7 @@ class _Observed:
     def obey(self, message: messages.Deliver | messages.Signal | messages.TakeBack) -> None:
         """What the master wants of it."""
         if isinstance(message, messages.Deliver):
+            self._delivered += 1
             buffers = [memoryview(buffer) for buffer in message.buffers]
             self._child.deliver(message.seq, message.payload, buffers)
         elif isinstance(message, messages.Signal):
@@ -138,7 +140,8 @@ class _Observed:
     def exited(self, report: ExitReport) -> None:
         """Its last lines, then its end."""
         log = self.capture.finish()
-        self._service.send(messages.Exited(self._number, *report._replace(log=log)))
+        end = messages.Exited(self._number, self._delivered, *report._replace(log=log))
+        self._service.send(end)
         self._service.forget(self._number)
 
     def _wrote(self, text: str) -> None:

@@ -6,6 +6,7 @@ import itertools
 import pickle
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
@@ -16,6 +17,9 @@ from fiber._wire import messages, packet
 from fiber._wire.packet import BytesLike
 
 _SHUTDOWN_GRACE = 0.5
+
+_REMEMBERED = 1024
+"""Packets to one child whose sequence numbers are remembered; a worker has a few at a time."""
 
 
 class RemoteAgent:
@@ -88,7 +92,7 @@ class RemoteAgent:
             self._lost = reason
             children, self._children = self._children, {}
         for child in children.values():
-            child.observer.exited(
+            child.end(
                 ExitReport(-signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host)
             )
         self._on_lost(self)
@@ -135,10 +139,20 @@ class RemoteChild:
         self.pid: int | None = None
         self.observer = observer
         self._agent = agent
+        self._lock = threading.Lock()
+        self._delivered = 0
+        self._latest: deque[int] = deque(maxlen=_REMEMBERED)
+        self._gone = False
 
-    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send a packet to its task channel."""
-        self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send a packet to its task channel; False if its end is known."""
+        with self._lock:
+            if self._gone:
+                return False
+            self._delivered += 1
+            self._latest.append(seq)
+            self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
+            return True
 
     def take_back(self) -> None:
         """Recall unread packets."""
@@ -161,4 +175,11 @@ class RemoteChild:
         elif isinstance(message, messages.Output):
             output.write(f"{self.name}@{self.host}", message.text)
         elif isinstance(message, messages.Exited):
-            self.observer.exited(ExitReport(*message[1:]))
+            self.end(ExitReport(*message[2:]), self._delivered - message.delivered)
+
+    def end(self, report: ExitReport, crossed: int = 0) -> None:
+        """It is gone; the last ``crossed`` packets met the news of that on their way."""
+        with self._lock:
+            self._gone = True
+            missed = list(self._latest)[len(self._latest) - crossed :]
+        self.observer.exited(report._replace(unread=(*report.unread, *missed)))

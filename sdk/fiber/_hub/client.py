@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from fiber._hub import access, protocol
 from fiber._hub.access import Access
-from fiber._hub.local import QuietSocket
+from fiber._hub.local import QuietSocket, blocking
 from fiber._hub.protocol import HEAD, ONE, TWO, Op, Status
 from fiber._transport.unix import naming_the_limit, wait_readable
 from fiber._wire import packet
@@ -163,7 +163,7 @@ def _dial(home: Access) -> tuple[socket.socket, Sequence[bytes]]:
 
 def _connect(to: Access) -> socket.socket:
     with naming_the_limit("reaching the hub"):
-        sock = QuietSocket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        sock = blocking(QuietSocket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
     try:
         sock.connect(to.address)
     except OSError as error:

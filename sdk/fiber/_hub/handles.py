@@ -30,6 +30,9 @@ from fiber._wire.packet import BytesLike
 class SharedChannel(Channel, Protocol):
     """A channel that a queue can use: it never has to wait."""
 
+    def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message, waiting for room but not until it is read."""
+
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
 

@@ -28,7 +28,7 @@ from fiber._hub.session import Session
 from fiber._hub.streams import SocketStream, Stream
 from fiber._hub.tunnel import Send, Switch, Tunnels
 from fiber._transport.loop import Loop
-from fiber._transport.unix import naming_the_limit
+from fiber._transport.unix import naming_the_limit, socketpair
 
 _PEER = struct.Struct("iII")  # pid, uid, gid
 
@@ -69,8 +69,7 @@ class Hub:
 
     def dial(self) -> socket.socket:
         """A stream to this hub for its own process.  Any thread."""
-        with naming_the_limit("using a pipe or queue of another host"):
-            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours, theirs = socketpair("using a pipe or queue of another host")
         self._loop.call_soon(self._admit, theirs)
         return ours
 

@@ -6,11 +6,13 @@ import select
 import socket
 import time
 from collections.abc import Iterable, Sequence
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
-from fiber._transport.unix import UnixChannel, UnixCounter, naming_the_limit
+from fiber._transport.unix import UnixChannel, UnixCounter, socketpair
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
+
+_Socket = TypeVar("_Socket", bound=socket.socket)
 
 _DONTWAIT = int(socket.MSG_DONTWAIT)  # the enum member is slow to combine
 
@@ -55,6 +57,13 @@ class Impatient(socket.socket):
         self.detach()
 
 
+def blocking(sock: _Socket) -> _Socket:
+    """Free ``sock`` of the program's default timeout, which is for the user's own sockets."""
+    if sock.gettimeout() is not None:
+        sock.settimeout(None)
+    return sock
+
+
 class LocalChannel(UnixChannel):
     """A channel that can also be asked not to wait, whoever else uses the same end."""
 
@@ -67,22 +76,25 @@ class LocalChannel(UnixChannel):
     @classmethod
     def pair(cls) -> tuple[LocalChannel, LocalChannel]:
         """Two connected ends."""
-        with naming_the_limit("opening a pipe"):
-            one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        one, other = socketpair("opening a pipe")
         return cls.from_fd(one.detach()), cls.from_fd(other.detach())
 
     @classmethod
     def from_fd(cls, fd: int) -> LocalChannel:
         """Take over a descriptor."""
-        return cls(QuietSocket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd))
+        return cls(blocking(QuietSocket(fileno=fd)))
+
+    def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message, waiting for room but not, as ``send``, until a bulky one is read."""
+        packet.send(self._sock, payload, buffers, ballast=True)
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
         sock = self._impatient
         if sock is None:
-            sock = self._impatient = Impatient(fileno=self._sock.fileno())
+            sock = self._impatient = blocking(Impatient(fileno=self._sock.fileno()))
         try:
-            packet.send(sock, payload, buffers)
+            packet.send(sock, payload, buffers, ballast=True)
         except BlockingIOError:
             return False
         return True

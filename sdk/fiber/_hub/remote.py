@@ -105,6 +105,10 @@ class RemoteChannel(RemoteObject):
         if reply.status is Status.BROKEN:
             raise BrokenPipeError("the other end is closed")
 
+    def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """The same: a channel of another host takes a message when its hub has it."""
+        self.send(payload, buffers)
+
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Never: to find out takes as long as to send."""
         return False

@@ -135,7 +135,8 @@ class Exchange:
         assert link.port is not None
         try:
             message, buffers = encode(request, batch, link.known, plain)
-            link.port.deliver(batch.seq, message, buffers)
+            if not link.port.deliver(batch.seq, message, buffers):
+                return []  # it is gone: ``lost`` will find the batch unsent
         except Exception as error:
             # Whatever the user's pickler raises, or the system for want of memory or descriptors,
             # concerns the tasks of this batch only.

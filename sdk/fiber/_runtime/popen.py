@@ -9,6 +9,7 @@ from multiprocessing.process import BaseProcess
 
 from fiber._agent.port import ChildPort, ExitReport
 from fiber._runtime.state import runtime
+from fiber._transport.unix import naming_the_limit
 from fiber._wire.packet import Message
 from fiber.errors import StartError
 
@@ -24,28 +25,34 @@ class Popen:
         self.returncode: int | None = None
         self.report: ExitReport | None = None
         self.pid: int | None = None
-        self.sentinel = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._closed = True
+        self._port: ChildPort | None = None
         self._born = threading.Event()
         self._exited = threading.Event()
+        with naming_the_limit("starting a process"):
+            self.sentinel = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._closed = False
         try:
-            self._port: ChildPort = runtime().start(process, self, method=method)
-            self._wait_for_birth()
+            port = runtime().start(process, self, method=method)
+            if self.returncode is None:
+                self._port = port
+            self._wait_for_birth(port.host)
         except BaseException:
+            # Whoever asked does not know of it: it must not go on.
+            self.kill()
             self.close()
             raise
 
-    def _wait_for_birth(self) -> None:
+    def _wait_for_birth(self, host: str) -> None:
         timeout = runtime().config.start_timeout
         if not self._born.wait(timeout):
-            self.kill()
             raise StartError(
-                self._name,
-                f"its agent on host {self._port.host!r} did not start it within {timeout:g} s "
+                f"process {self._name!r}",
+                f"its agent on host {host!r} did not start it within {timeout:g} s "
                 "(start_timeout)",
             )
         if self.pid is None and self.report is not None:
-            raise StartError(self._name, self.report.reason)
+            raise StartError(f"process {self._name!r}", self.report.reason)
 
     # What the agent says, on the loop's thread
 
@@ -69,6 +76,8 @@ class Popen:
         self._born.set()
         if not self._closed:
             os.eventfd_write(self.sentinel, 1)
+        # Each held the other; the sentinel's descriptor goes when the last user of this lets go.
+        self._port = None
 
     # What Process asks
 
@@ -90,8 +99,9 @@ class Popen:
         self._signal(signal.SIGKILL)
 
     def _signal(self, signum: int) -> None:
-        if self.returncode is None:
-            self._port.signal(signum)
+        port = self._port
+        if port is not None:
+            port.signal(signum)
 
     def close(self) -> None:
         """Give the sentinel's descriptor back."""

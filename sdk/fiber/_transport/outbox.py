@@ -32,25 +32,26 @@ class Outbox:
 
     def send(
         self, payload: BytesLike, buffers: Sequence[memoryview] = (), fds: Sequence[int] = ()
-    ) -> None:
-        """Send now or as soon as there is room, in order.  A closed peer swallows it.
+    ) -> bool:
+        """Send now or as soon as there is room, in order; False if this outbox is closed.
 
-        Takes over ``fds``.
+        Takes over ``fds``.  A peer that is gone swallows it.
         """
         with self._lock:
+            if self._closed:
+                _close_all(fds)
+                return False
             try:
                 packet.check_buffers(buffers)
                 if not self._waiting and self._try(payload, buffers, fds):
-                    return
+                    return True
             except BaseException:
                 _close_all(fds)
                 raise
-            if self._closed:
-                _close_all(fds)
-                return
             self._waiting.append((payload, buffers, tuple(fds)))
             if len(self._waiting) == 1:
                 self._loop.call_soon(self._watch, self._flush)
+            return True
 
     def recall(self) -> list[BytesLike]:
         """Take back the payloads that never left."""
@@ -71,9 +72,6 @@ class Outbox:
         self._waiting.clear()
 
     def _try(self, payload: BytesLike, buffers: Sequence[memoryview], fds: Sequence[int]) -> bool:
-        if self._closed:
-            _close_all(fds)
-            return True
         try:
             packet.send(self._sock, payload, buffers, fds)
         except BlockingIOError:

@@ -117,9 +117,11 @@ class TakenBack(NamedTuple):
 
 
 class Exited(NamedTuple):
-    """Agent to master: the child is gone.  The fields after ``child`` are an ExitReport's."""
+    """Agent to master: the child is gone.  The fields after ``delivered`` are an ExitReport's."""
 
     child: int
+    delivered: int
+    """How many Deliver frames for it came in time; what was sent after those it never saw."""
     exitcode: int
     reason: str
     unread: tuple[int, ...] = ()
@@ -359,12 +361,15 @@ def _read_taken_back(view: memoryview) -> TakenBack:
 
 def _read_exited(view: memoryview) -> Exited:
     child = _NUMBER.unpack_from(view)[2]
-    exitcode, reason, unread, running, log, host = json.loads(_text(view[_NUMBER.size :]))
+    delivered, exitcode, reason, unread, running, log, host = json.loads(
+        _text(view[_NUMBER.size :])
+    )
     if running is not None:
         seq, index = running
         running = (_integer(seq), _integer(index))
     return Exited(
         child,
+        _integer(delivered),
         _integer(exitcode),
         _string(reason),
         tuple(map(_integer, unread)),

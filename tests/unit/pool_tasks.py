@@ -1,0 +1,334 @@
+"""What the tests of the pool have their workers run, and what they send there."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, NoReturn
+
+PATIENCE = 15.0
+
+
+def identity(value: Any) -> Any:
+    return value
+
+
+def square(x: int) -> int:
+    return x * x
+
+
+def add(x: int, y: int = 0) -> int:
+    return x + y
+
+
+def pid(_: object = None) -> int:
+    return os.getpid()
+
+
+def raise_value_error(value: object) -> NoReturn:
+    raise ValueError(value)
+
+
+def raise_if_odd(x: int) -> int:
+    if x % 2:
+        raise ValueError(x)
+    return x
+
+
+def stop_iteration(x: int) -> int:
+    if x == 3:
+        raise StopIteration
+    return x
+
+
+def sleep(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def nap_and_return(x: int) -> int:
+    time.sleep(0.0005)
+    return x
+
+
+# Meeting points between a task and its test: files, which any process sees
+
+
+def wait_for(path: Path) -> str:
+    """Until somebody makes the file."""
+    deadline = time.monotonic() + PATIENCE
+    while not path.exists():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{path} did not appear")
+        time.sleep(0.001)
+    return path.name
+
+
+def announce(path: Path) -> None:
+    path.with_suffix(f".{os.getpid()}").touch()
+
+
+def announced(path: Path) -> list[int]:
+    return [int(other.suffix[1:]) for other in path.parent.glob(path.name + ".*")]
+
+
+def wait_until_announced(path: Path, count: int = 1) -> list[int]:
+    deadline = time.monotonic() + PATIENCE
+    while len(pids := announced(path)) < count:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"{len(pids)} of {count} announced themselves at {path}")
+        time.sleep(0.001)
+    return pids
+
+
+def announce_and_wait(path: Path, gate: Path) -> str:
+    announce(path)
+    return wait_for(gate)
+
+
+def announce_and_sleep(path: Path) -> None:
+    announce(path)
+    time.sleep(600)
+
+
+def wait_if_first(task: tuple[int, Path]) -> int:
+    """Task 0 waits for what only somebody who has the other tasks' results can do."""
+    index, gate = task
+    if index == 0:
+        wait_for(gate)
+    return index
+
+
+def count(path: Path) -> int:
+    """One more line in the file: how often something ran."""
+    with path.open("a") as file:
+        file.write("x\n")
+    return len(path.read_text().splitlines())
+
+
+def runs(path: Path) -> int:
+    return len(path.read_text().splitlines()) if path.exists() else 0
+
+
+# Deaths
+
+
+def die(how: str) -> NoReturn:
+    if how == "exit":
+        os._exit(3)
+    if how == "sys.exit":
+        sys.exit(4)
+    if how == "segfault":
+        # No core file, which would take long to write.
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        os.kill(os.getpid(), signal.SIGSEGV)
+    os.kill(os.getpid(), signal.SIGKILL)
+    raise AssertionError("still alive")
+
+
+def die_if(task: tuple[int, int]) -> int:
+    index, victim = task
+    if index == victim:
+        os._exit(3)
+    return index
+
+
+def die_at_first(path: Path) -> str:
+    if count(path) == 1:
+        os._exit(3)
+    return "lived"
+
+
+def die_when_counted(path: Path, _: object = None) -> NoReturn:
+    count(path)
+    os._exit(3)
+
+
+def fail_until(path: Path, times: int) -> str:
+    if count(path) <= times:
+        raise ConnectionError(f"try {runs(path)}")
+    return "done"
+
+
+def counted_error(path: Path) -> NoReturn:
+    count(path)
+    raise KeyError("always")
+
+
+# Initializers
+
+state: dict[str, Any] = {}
+
+
+def remember(value: object) -> None:
+    state["value"] = value
+
+
+def recall(_: object = None) -> object:
+    return state["value"]
+
+
+def refuse() -> NoReturn:
+    raise RuntimeError("no such device")
+
+
+def refuse_counted(path: Path) -> NoReturn:
+    count(path)
+    raise RuntimeError("no such device")
+
+
+def vanish(path: Path) -> NoReturn:
+    count(path)
+    os._exit(9)
+
+
+def start_slowly(gate: Path) -> None:
+    wait_for(gate)
+
+
+# Objects that do not travel well
+
+
+class Unpicklable:
+    def __reduce__(self) -> NoReturn:
+        raise RuntimeError("cannot be pickled")
+
+    def __repr__(self) -> str:
+        return "<Unpicklable>"
+
+
+class Unreprable(Unpicklable):
+    def __repr__(self) -> str:
+        raise RuntimeError("cannot be shown")
+
+
+def _refuse_in_worker(parent: int) -> object:
+    if os.getpid() != parent:
+        raise RuntimeError("cannot be unpickled in a worker")
+    return identity
+
+
+class UnreadableInWorker:
+    """Pickles, and unpickles in the process that made it only."""
+
+    def __init__(self) -> None:
+        self.parent = os.getpid()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _refuse_in_worker, (self.parent,)
+
+    def __call__(self, value: object) -> object:
+        return value
+
+
+def _refuse_in_parent(child: int) -> object:
+    if os.getpid() != child:
+        raise RuntimeError("cannot be unpickled in the program")
+    return None
+
+
+class UnreadableResult:
+    """Pickles in a worker, and unpickles there only."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _refuse_in_parent, (os.getpid(),)
+
+
+class BadError(Exception):
+    """An exception that pickles but does not unpickle, as many do."""
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class HeldError(Exception):
+    """An exception that does not pickle."""
+
+    def __init__(self) -> None:
+        super().__init__("holds a lock")
+        self.lock = threading.Lock()
+
+
+class Exotic(BaseException):
+    """Not an Exception."""
+
+
+def raise_bad_error(_: object = None) -> NoReturn:
+    raise BadError("disk full", 28)
+
+
+def raise_held_error(_: object = None) -> NoReturn:
+    raise HeldError
+
+
+def raise_exotic(_: object = None) -> NoReturn:
+    raise Exotic("strange")
+
+
+def odd_results(x: int) -> object:
+    """Of five results one does not pickle and one does not unpickle in the program."""
+    if x % 5 == 2:
+        return Unpicklable()
+    if x % 5 == 3:
+        return UnreadableResult()
+    return x
+
+
+def unreprable_result(_: object = None) -> object:
+    return Unreprable()
+
+
+shared: list[int] = []
+
+
+def grow(x: int) -> list[int]:
+    """The same list each time, as an environment returns its one observation buffer."""
+    shared.append(x)
+    del shared[:-1]
+    return shared
+
+
+def fill(x: int) -> Any:
+    """The same array each time, large enough to travel beside the pickle."""
+    import numpy as np
+
+    if "array" not in state:
+        state["array"] = np.zeros(100_000)
+    state["array"][:] = x
+    return state["array"]
+
+
+class Point:
+    def __init__(self, x: int) -> None:
+        self.x = x
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Point) and pickle.dumps(self) == pickle.dumps(other)
+
+    def __hash__(self) -> int:
+        return hash(self.x)
+
+    def scaled(self, factor: int) -> Point:
+        return Point(self.x * factor)
+
+
+def pool_of_pools(n: int) -> list[int]:
+    import fiber
+
+    with fiber.Pool(2) as inner:
+        return inner.map(square, range(n))
+
+
+def current_name(_: object = None) -> tuple[str, bool]:
+    import multiprocessing
+
+    process = multiprocessing.current_process()
+    return process.name, process.daemon
