@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from collections import deque
 from collections.abc import Callable
@@ -48,8 +49,10 @@ class Capture:
         if not self._closed:
             self._closed = True
             self._loop.unregister(self._reader)
-            while self._read():
-                pass
+            # What was there when it died; something that it started may write on for ever.
+            left = fcntl.fcntl(self._reader, fcntl.F_GETPIPE_SZ)
+            while left > 0 and (size := self._read()):
+                left -= size
             self._pass_on(b"\n" if self._rest else b"")
             os.close(self._reader)
             self.started()
@@ -67,17 +70,17 @@ class Capture:
         if not self._closed:
             self._loop.register(self._reader, self._readable)
 
-    def _read(self) -> bool:
+    def _read(self) -> int:
         try:
             data = os.read(self._reader, _CHUNK)
         except BlockingIOError:
-            return False
+            return 0
         if data:
             self._pass_on(data)
         elif not self._closed:
             # Nobody holds it any more, though the child may still run: nothing will come.
             self._loop.unregister(self._reader)
-        return bool(data)
+        return len(data)
 
     def _pass_on(self, data: bytes) -> None:
         *lines, self._rest = (self._rest + data).split(b"\n")
