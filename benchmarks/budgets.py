@@ -76,7 +76,7 @@ def _value(budget: Budget, run: Run) -> float | None:
 
 
 def _floor(budget: Budget, run: Run) -> float | None:
-    """The least that a rival's time may have been of Fiber's, if the rival was stopped as too slow."""
+    """The least ratio to Fiber of a rival that was stopped because it was too slow."""
     after = run.unfinished.get(budget.case, {}).get(budget.contender)
     against = summary(run.series(budget.case, budget.against, budget.metric))
     return after / against.median if budget.against == "fiber" and after and against else None

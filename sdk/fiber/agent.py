@@ -3,7 +3,7 @@
 It takes everything from its environment, nothing from its command line:
 
 ``FIBER_AGENT_ADDRESS``      ``host:port`` of the master
-``FIBER_AGENT_CREDENTIALS``  directory with the agent's half of the credentials
+``FIBER_AGENT_CREDENTIALS``  the agent's half of the credentials, or the directory that holds it
 ``FIBER_AGENT_NAME``         what the master calls it
 ``FIBER_AGENT_PARENT``       optional: the pid of a process on this host to end with
 ``FIBER_START_TIMEOUT``      seconds to find the master, as for every Fiber process
@@ -25,6 +25,7 @@ from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
+from fiber.errors import AuthenticationError, ConfigError, FiberError
 
 _ADDRESS = "FIBER_AGENT_ADDRESS"
 _CREDENTIALS = "FIBER_AGENT_CREDENTIALS"
@@ -47,25 +48,32 @@ class Main:
 
     def run(self) -> int:
         """Serve until the end; the exit status."""
-        address, directory = _required(_ADDRESS), _required(_CREDENTIALS)
-        if not address or not directory:
+        try:
+            dialer = self._dial()
+        except (FiberError, AuthenticationError) as error:
+            self._complain(error)
             return 1
         signal.signal(signal.SIGTERM, self._on_sigterm)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._end_with_parent()
-        dialer = AgentDialer(
+        self._loop.run()
+        dialer.close()
+        self._agent.close()
+        return self._status
+
+    def _dial(self) -> AgentDialer:
+        return AgentDialer(
             self._loop,
-            address,
-            Credentials.from_directory(directory),
+            _required(_ADDRESS),
+            _read(_required(_CREDENTIALS)),
             Identity.of_this_process(self._name, pid=str(os.getpid())),
             on_link=self._joined,
             on_failed=self._failed,
             timeout=config.current().start_timeout,
         )
-        self._loop.run()
-        dialer.close()
-        self._agent.close()
-        return self._status
+
+    def _complain(self, what: object) -> None:
+        print(f"fiber agent {self._name}: {what}", file=sys.stderr, flush=True)
 
     def _joined(self, link: Link) -> None:
         self._service = AgentService(self._loop, link, self._agent, self._ended)
@@ -73,13 +81,13 @@ class Main:
         link.attach(self._service)
 
     def _failed(self, error: Exception) -> None:
-        print(f"fiber agent {self._name}: {error}", file=sys.stderr, flush=True)
+        self._complain(error)
         self._status = 1
         self._loop.stop()
 
     def _ended(self, reason: str) -> None:
         if reason.startswith("lost"):
-            print(f"fiber agent {self._name}: {reason}", file=sys.stderr, flush=True)
+            self._complain(reason)
             self._status = 1
         self._link.close("the agent ended", then=self._loop.stop)
 
@@ -107,13 +115,19 @@ class Main:
         os._exit(0)
 
 
+def _read(credentials: str) -> Credentials:
+    if os.path.isabs(credentials):
+        return Credentials.from_directory(credentials)
+    return Credentials.from_environment(credentials)
+
+
 def _required(variable: str) -> str:
-    value = os.environ.get(variable, "")
+    # The children, who run anybody's code, shall not have it.
+    value = os.environ.pop(variable, "")
     if not value:
-        print(
-            f"fiber agent: {variable} is not set. An agent is started by a Fiber backend or the "
-            "operator, which hand it the master's address and its credentials.",
-            file=sys.stderr,
+        raise ConfigError(
+            f"{variable} is not set. An agent is started by a Fiber backend, which hands it the "
+            "master's address and its credentials."
         )
     return value
 

@@ -535,9 +535,9 @@ def _positive(name: str, seconds: float | None) -> float | None:
 def _classes(
     wanted: type[BaseException] | Sequence[type[BaseException]],
 ) -> tuple[type[BaseException], ...]:
-    classes = (wanted,) if isinstance(wanted, type) else tuple(wanted)
+    classes: tuple[Any, ...] = (wanted,) if isinstance(wanted, type) else tuple(wanted)
     for cls in classes:
-        if not issubclass(cls, BaseException):
+        if not (isinstance(cls, type) and issubclass(cls, BaseException)):
             raise TypeError(f"retry_exceptions must be exception classes, not {cls!r}")
     return classes
 

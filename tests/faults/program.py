@@ -96,7 +96,9 @@ class Program:
 
     def family(self) -> list[census.Found]:
         """What it has started and is there still."""
-        return [found for found in census.started_by(self.pid, self._marker) if self._is_ours(found)]
+        return [
+            found for found in census.started_by(self.pid, self._marker) if self._is_ours(found)
+        ]
 
     def _is_ours(self, found: census.Found) -> bool:
         return found.pid != self.pid and found.state != "Z"

@@ -83,7 +83,7 @@ class Agent:
         """Start a worker."""
         child = Child(self, self.world.next_worker(), observer)
         self._children.append(child)
-        self.down.send(child.worker.be_born)
+        self.down.send(child.be_born)
         return child
 
     def cut(self, seconds: float) -> None:
@@ -131,26 +131,30 @@ class Agent:
 class Child:
     """One worker, as the master holds it (a ``ChildPort``) and as its agent does."""
 
-    pid: int | None = None
-
     def __init__(self, agent: Agent, number: int, observer: ChildObserver) -> None:
         self.name = f"worker {number}"
+        self.pid: int | None = None
         self.host = agent.host
         self.agent = agent
         self.worker = Worker(agent.world, number, self)
         self.inbox: deque[tuple[int, Any, Sequence[memoryview]]] = deque()
         self.gone = False
         """The master knows, or believes."""
+        self.was_heard = False
         self._observer = observer
         self._unread: dict[int, None] = {}
 
-    def deliver(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> None:
-        """Send a packet to it."""
+    def deliver(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send a packet to it; False if it is known to be gone."""
+        if self.gone:
+            return False
         self._unread[seq] = None
         self.agent.down.send(self._put, seq, payload, buffers)
+        return True
 
     def take_back(self) -> None:
         """Recall the packets that it has not read."""
+        self.agent.world.note("%s is asked for its unread batches", self.name)
         self.agent.down.send(self._recall)
 
     def signal(self, signum: int) -> None:
@@ -158,6 +162,11 @@ class Child:
         self.agent.down.send(self.worker.die, -signum)
 
     # At the agent
+
+    def be_born(self) -> None:
+        """Start it."""
+        self.agent.up.send(self._started)
+        self.worker.be_born()
 
     def _put(self, seq: int, payload: Any, buffers: Sequence[memoryview]) -> None:
         self.inbox.append((seq, payload, buffers))
@@ -191,16 +200,23 @@ class Child:
         report = ExitReport(-signal.SIGKILL, f"agent {self.host} lost", host=self.host)
         self._end(report)
 
+    def _started(self) -> None:
+        if not self.gone:
+            self._observer.started(self.worker.number)
+
     def _said(self, message: Any) -> None:
         if self.gone:
             self.agent.world.heard_late(self, message)
         else:
+            self.was_heard = True
+            self.agent.world.note("%s says %s", self.name, message)
             self._observer.said(self.agent.world.language.message(message))
 
     def _taken_back(self, seqs: list[int]) -> None:
         for seq in seqs:
             self._unread.pop(seq, None)
         if not self.gone:
+            self.agent.world.note("%s gives back %s", self.name, seqs)
             self._observer.taken_back(seqs)
 
     def _exited(self, exitcode: int, running: tuple[int, int] | None) -> None:
@@ -211,5 +227,7 @@ class Child:
 
     def _end(self, report: ExitReport) -> None:
         self.gone = True
-        self.agent.world.oracle.lost(self.worker)
+        world = self.agent.world
+        world.note("%s is gone: unread %s, in %s", self.name, report.unread, report.running)
+        world.oracle.lost(self.worker, was_heard=self.was_heard)
         self._observer.exited(report)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._engine.chunks import LIMIT
 from fiber._engine.ledger import PATIENCE, Batch, Job, Ledger, Loss, Receipt, Worker
@@ -12,117 +12,147 @@ from simulation.workers import Ref
 
 if TYPE_CHECKING:
     from simulation.agents import Child
-    from simulation.schedule import Act
     from simulation.world import World
 
 SLACK = 1e-3
 """Seconds after PATIENCE until which an idle worker must have asked for an unread batch."""
 
-Held = list[tuple[Job, int, int, int, Ref, int]]
+
+class Names(Protocol):
+    """What the objects of whoever drives the ledger stand for."""
+
+    def account(self, job: Job) -> Account | None:
+        """Whose job it is; None if it is that of many."""
+
+    def ref(self, job: Job, index: int, item: Any) -> Ref:
+        """Which task ``item``, the ``index``-th of ``job``, is."""
+
+    def child(self, worker: Worker) -> Child:
+        """Which process it is."""
 
 
 class Audit:
-    """Checks one ledger against what the oracle knows."""
+    """Checks each decision of one ledger, and what it keeps, against what the oracle knows."""
 
-    def __init__(self, world: World, ledger: Ledger) -> None:
+    def __init__(
+        self,
+        world: World,
+        ledger: Ledger,
+        names: Names,
+    ) -> None:
         self._world = world
-        self._oracle = world.oracle
         self._ledger = ledger
+        self._names = names
         self._watched: dict[Worker, float] = {}
-        self._pins: dict[tuple[Job, int], Worker] = {}
+        self._real = ledger.assign, ledger.receive, ledger.cancel, ledger.leave, ledger.lose
+        vars(ledger).update(
+            assign=self._assign,
+            receive=self._receive,
+            cancel=self._cancel,
+            leave=self._leave,
+            lose=self._lose,
+        )
 
     # Each decision
 
-    def before_assignment(self) -> None:
-        """The ledger is about to be asked what to give."""
-        self._pins = {
+    def _assign(self, now: float) -> Batch | None:
+        pins = {
             (job, span.start): worker
             for worker in self._ledger._pins
             for job, span in worker.pinned
         }
+        batch = self._real[0](now)
+        if batch is not None:
+            worker = batch.worker
+            assert batch.job is not None
+            self._world.note(
+                "%s gets batch %d, from task %d to before %d",
+                self._names.child(worker).name, batch.seq, batch.start, batch.stop,
+            )
+            self._check_tasks(batch, batch.job)
+            _require(worker in self._ledger.workers, "a worker that is gone is given a batch")
+            _require(not worker.leaving, "a worker that leaves is given a batch")
+            _require(not worker.key.leaving, "a worker that was told to stop is given a batch")
+            _require(worker.queue[-1] is batch, "a batch is not the last one of its worker")
+            pinned_to = pins.get((batch.job, batch.start))
+            _require(batch.pin is (pinned_to is not None), "a pinned task is not marked")
+            _require(pinned_to in (None, worker), "a task runs where it is not pinned to")
+        return batch
 
-    def assigned(self, batch: Batch) -> None:
-        """The ledger gives ``batch`` to its worker."""
-        worker = batch.worker
-        account: Account | None = batch.job and batch.job.owner
-        _require(account is not None and not account.cancelled, "a cancelled job is given out")
-        assert account is not None
-        _require(worker in self._ledger.workers, "a worker that is gone is given a batch")
-        _require(not worker.leaving, "a worker that leaves is given a batch")
-        _require(not worker.key.leaving, "a worker that was told to stop is given a batch")
-        _require(worker.queue[-1] is batch, "a batch is not the last one of its worker")
+    def _check_tasks(self, batch: Batch, job: Job) -> None:
         _require(1 <= len(batch.items) <= LIMIT, f"a batch has {len(batch.items)} tasks")
-        expected = [Ref(account.number, index) for index in range(batch.start, batch.stop)]
-        _require(list(batch.items) == expected, f"batch {batch.seq} carries other tasks")
-        if account.plan.everywhere:
-            pinned = self._pins.get((batch.job, batch.start)) is worker
-            _require(pinned and batch.pin, "a task runs where it is not pinned to")
-        if account.plan.alone or account.plan.everywhere or not account.plan.retries:
+        if job.alone or batch.pin or not job.retries:
             _require(len(batch.items) == 1, "tasks that travel alone share a batch")
             _require(batch.alone, "a task that travels alone is not marked")
+        account = self._names.account(job)
+        if account is not None:
+            _require(not account.cancelled, "a cancelled job is given out")
+            for index, item in enumerate(batch.items, batch.start):
+                self._check_name(job, account, index, item)
 
-    def received(self, receipt: Receipt, tasks: Sequence[tuple[Ref, Act]]) -> None:
-        """The ledger takes results."""
-        account: Account = receipt.job.owner
-        indexes = range(receipt.start, receipt.start + receipt.size)
-        expected = [Ref(account.number, index) for index in indexes]
-        _require([ref for ref, _ in tasks] == expected, "results are booked for other tasks")
-        _require([receipt.item(index) for index in indexes] == expected, "a receipt's items differ")
+    def _check_name(self, job: Job, account: Account, index: int, item: Any) -> None:
+        ref = self._names.ref(job, index, item)
+        _require(ref == (account.number, index), f"{ref} is taken for task {index}")
 
-    def dropped(self, receipt: Receipt | None) -> None:
-        """The ledger hears from a worker that was given up."""
-        _require(receipt is None, "a late result counts")
+    def _receive(self, *args: Any, **options: Any) -> Receipt | None:
+        receipt = self._real[1](*args, **options)
+        account = self._names.account(receipt.job) if receipt is not None else None
+        if receipt is not None and account is not None:
+            for index in range(receipt.start, receipt.start + receipt.size):
+                self._check_name(receipt.job, account, index, receipt.item(index))
+        return receipt
 
-    def cancel(self, job: Job) -> list[Worker]:
-        """Cancel ``job``."""
-        account: Account = job.owner
-        missing = account.everything & ~account.delivered
-        expected = {Ref(account.number, at) for at in range(account.fed) if missing >> at & 1}
+    def _cancel(self, job: Job) -> list[Worker]:
+        account = self._names.account(job)
         unfinished = self._ledger.unfinished(job)
-        _require(len(unfinished) == len(expected), "the unfinished tasks are miscounted")
-        _require(set(unfinished) == expected, "other tasks are said to be unfinished")
+        if account is not None:
+            missing = account.everything & ~account.delivered
+            _require(len(unfinished) == missing.bit_count(), "the unfinished tasks are miscounted")
         holders = {
             worker
             for worker in self._ledger.workers
             if any(batch.job is job for batch in list(worker.queue)[1:])
         }
-        told = self._ledger.cancel(job)
+        told = self._real[2](job)
         _require(set(told) == holders, "unread batches of a cancelled job are not recalled")
         return told
 
-    def leave(self, worker: Worker) -> bool:
-        """Ask ``worker`` to leave."""
+    def _leave(self, worker: Worker) -> bool:
         busy = bool(worker.queue or worker.pinned)
         leaving = worker.leaving
-        left = self._ledger.leave(worker)
+        left = self._real[3](worker)
         _require(left is not busy, "a busy worker leaves" if left else "an idle worker may not leave")
         _require(worker.leaving is (left or leaving), "a refusal to leave changes the worker")
         return left
 
-    def before_loss(self, worker: Worker) -> Held:
-        """What the user is still interested in of what ``worker`` holds."""
-        return [
-            (batch.job, batch.seq, index - batch.start, index, batch.items[index - batch.start],
-             batch.job.attempts.get(index, 0))
-            for batch in worker.queue if batch.job is not None
-            for index in range(batch.start + batch.received, batch.stop)
+    def _lose(
+        self, worker: Worker, unread: Iterable[int], running: tuple[int, int] | None
+    ) -> list[Loss]:
+        held = [
+            (batch.job, batch.seq, at, batch.start + at, batch.job.attempts.get(batch.start + at, 0),
+             batch.items[at])
+            for batch in worker.queue
+            if batch.job is not None
+            for at in range(batch.received, len(batch.items))
         ]
+        losses = self._real[4](worker, unread, running)
+        given_up = {(loss.job, loss.task): loss for loss in losses}
+        for job, seq, offset, index, attempts, item in held:
+            ref = self._names.ref(job, index, item)
+            loss = given_up.get((job, index))
+            now = loss.attempts if loss is not None else job.attempts.get(index, 0)
+            _require(attempts <= now <= attempts + 1, f"{ref} goes from {attempts} to {now}")
+            _require(loss is None or loss.item is item, "a loss names another task")
+            self._check_charge(self._names.child(worker), seq, offset, ref, now > attempts)
+            if loss is not None:
+                self._world.note("%s is given up", ref)
+        return losses
 
-    def after_loss(self, child: Child, held: Held, losses: Sequence[Loss]) -> None:
-        """``child`` was lost: who is charged for it?"""
-        given_up = {(loss.job, loss.task) for loss in losses}
-        for job, seq, offset, index, ref, attempts in held:
-            now = job.attempts.get(index, 0)
-            if (job, index) in given_up or now == attempts + 1:
-                self._oracle.blamed(child, seq, offset, ref)
-            else:
-                _require(now == attempts, f"the attempts of {ref} go from {attempts} to {now}")
-                self._oracle.spared(child, ref)
-
-    def named(self, loss: Loss) -> None:
-        """A task had its tries."""
-        account: Account = loss.job.owner
-        _require(loss.item == Ref(account.number, loss.task), "a loss names another task")
+    def _check_charge(self, child: Child, seq: int, offset: int, ref: Ref, charged: bool) -> None:
+        if charged:
+            self._world.oracle.blamed(child, seq, offset, ref)
+        else:
+            self._world.oracle.spared(child, ref)
 
     # The whole
 
@@ -144,33 +174,14 @@ class Audit:
         for job, span in (*pinned, *self._ledger._homeless):
             places.setdefault(job, []).append(("pinned", span.start, len(span.items)))
         for job, where in places.items():
-            self._check_places(job, where)
-        self._check_demand()
+            account = self._names.account(job)
+            if account is not None:
+                _check_places(job, account, where)
+        self._check_demand(places)
         self._check_idle()
 
-    def _check_places(self, job: Job, places: list[tuple[str, int, int]]) -> None:
-        account: Account = job.owner
-        if account.cancelled:
-            raise Violation(f"job {account.number} was cancelled, but the ledger keeps {places}")
-        seen = account.delivered
-        for place, start, size in places:
-            tasks = (1 << size) - 1 << start
-            if seen & tasks:
-                raise Violation(f"tasks of job {account.number} from {start} on are {place} and "
-                                "elsewhere")
-            seen |= tasks
-        if seen != account.everything:
-            raise Violation(f"tasks {account.everything & ~seen:b} of job {account.number} are "
-                            "nowhere")
-        done = account.delivered.bit_count()
-        _require(job.done == done, f"job {account.number} counts {job.done}, not {done}, as done")
-
-    def _check_demand(self) -> None:
-        wanted = sum(
-            (account.everything & ~account.delivered).bit_count()
-            for account in self._oracle.accounts
-            if not account.cancelled
-        )
+    def _check_demand(self, places: dict[Job, list[tuple[str, int, int]]]) -> None:
+        wanted = sum(size for where in places.values() for _, _, size in where)
         unwanted = sum(
             len(batch.items) - batch.received
             for batch in self._ledger.batches.values()
@@ -183,8 +194,9 @@ class Audit:
         held = 0
         for worker in self._ledger.workers:
             held += len(worker.queue)
-            _require(not worker.key.child.gone, f"{worker.key.child.name} is gone, but not lost")
-            _require(len(worker.queue) <= 2, f"{worker.key.child.name} has too many batches")
+            child = self._names.child(worker)
+            _require(not child.gone, f"{child.name} is gone, but not lost")
+            _require(len(worker.queue) <= 2, f"{child.name} has too many batches")
             for batch in worker.queue:
                 _require(self._ledger.batches.get(batch.seq) is batch, "an unknown batch is held")
                 _require(batch.worker is worker, "a batch is held by another worker")
@@ -209,7 +221,7 @@ class Audit:
         asked = 0
         late = []
         for worker in self._ledger.workers:
-            if len(worker.queue) == 2 and not worker.key.child.agent.up.is_cut:
+            if len(worker.queue) == 2 and not self._names.child(worker).agent.up.is_cut:
                 if worker.recalled:
                     asked += 1
                 elif now > max(worker.since, self._watched.setdefault(worker, now)) + PATIENCE + SLACK:
@@ -217,7 +229,7 @@ class Audit:
                 else:
                     self._world.loop.call_later(PATIENCE + 2 * SLACK, self._check_idle)
         if late and asked < len(idle):
-            raise Violation(f"{late[0].key.child.name} keeps an unread batch from an idle worker")
+            raise Violation(f"{self._names.child(late[0]).name} keeps an unread batch from an idle worker")
 
     def check_end(self) -> None:
         """Nothing happens any more."""
@@ -227,6 +239,22 @@ class Audit:
         _require(not any(job.closed for job in ledger.jobs), "a finished job is left over")
         _require(not any(worker.queue for worker in ledger.workers), "a worker is left busy")
         _require(ledger.starting == 0, f"{ledger.starting} workers never started")
+
+
+def _check_places(job: Job, account: Account, places: list[tuple[str, int, int]]) -> None:
+    """Each task is waiting, or in a batch, or done, and nowhere else."""
+    number = account.number
+    _require(not account.cancelled, f"job {number} was cancelled, but the ledger keeps {places}")
+    seen = account.delivered
+    for place, start, size in places:
+        tasks = (1 << size) - 1 << start
+        if seen & tasks:
+            raise Violation(f"tasks of job {number} from {start} on are {place} and elsewhere")
+        seen |= tasks
+    if seen != account.everything:
+        raise Violation(f"tasks {account.everything & ~seen:b} of job {number} are nowhere")
+    done = account.delivered.bit_count()
+    _require(job.done == done, f"job {number} counts {job.done}, not {done}, as done")
 
 
 def _require(condition: bool, otherwise: str) -> None:

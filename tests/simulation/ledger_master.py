@@ -12,16 +12,18 @@ from fiber._engine import ledger as engine
 from fiber._engine.ledger import Ledger
 from simulation.agents import Child
 from simulation.audit import Audit
-from simulation.oracle import Account
+from simulation.oracle import Account, Violation
 from simulation.schedule import Act, Job
-from simulation.workers import Ready, Ref, Results, Unreadable, Work
+from simulation.workers import Ready, Ref, Results, Unreadable, Work, Worker
 from simulation.world import World
 
 
 class Plain:
     """Everything is said as it is."""
 
-    def work(self, seq: int, payload: Any, buffers: Sequence[memoryview]) -> Work | None:
+    def work(
+        self, worker: Worker, seq: int, payload: Any, buffers: Sequence[memoryview]
+    ) -> Work | None:
         """``payload`` is it."""
         work: Work | None = payload
         return work
@@ -64,6 +66,25 @@ class Member:
         self.child.deliver(STOP, None)
 
 
+class Names:
+    """Tells the audit what the master's objects stand for."""
+
+    def account(self, job: engine.Job) -> Account:
+        """Whose job it is."""
+        account: Account = job.owner
+        return account
+
+    def ref(self, job: engine.Job, index: int, item: Any) -> Ref:
+        """Which task ``item`` is."""
+        ref: Ref = item
+        return ref
+
+    def child(self, worker: engine.Worker) -> Child:
+        """Which process it is."""
+        child: Child = worker.key.child
+        return child
+
+
 class LedgerMaster:
     """Gives work as one ledger says."""
 
@@ -73,7 +94,7 @@ class LedgerMaster:
         self.world = world
         self.ledger = ledger
         self.jobs: dict[int, engine.Job] = {}
-        self._audit = Audit(world, ledger)
+        self._audit = Audit(world, ledger, Names())
         self._rng = random.Random(f"{world.schedule.seed} master")
         self._members: dict[Child, Member] = {}
         self._terminated = False
@@ -154,7 +175,7 @@ class LedgerMaster:
         account.cancelled = True
         job = self.jobs.get(account.number)
         if job is not None:
-            for worker in self._audit.cancel(job):
+            for worker in self.ledger.cancel(job):
                 worker.key.child.take_back()
 
     def terminate(self) -> None:
@@ -168,7 +189,6 @@ class LedgerMaster:
 
     def heard(self, member: Member, said: Any) -> None:
         """A worker said something."""
-        self.world.note("%s says %s", member.child.name, said)
         if isinstance(said, Ready):
             self.ledger.starting -= 1
             member.worker = self.ledger.add(member, self._now, self.world.schedule.left)
@@ -183,9 +203,9 @@ class LedgerMaster:
     def heard_late(self, child: Child, said: Any) -> None:
         """A worker that was given up says something: it must count for nothing."""
         if isinstance(said, Results):
-            self._audit.dropped(self._receive(said))
+            _require_dropped(self._receive(said))
         elif isinstance(said, Unreadable):
-            self._audit.dropped(self.ledger.split(said.seq, self._now))
+            _require_dropped(self.ledger.split(said.seq, self._now))
         self._settle()
 
     def _receive(self, said: Results) -> engine.Receipt | None:
@@ -196,7 +216,9 @@ class LedgerMaster:
         receipt = self._receive(said)
         if receipt is None:
             return
-        self._audit.received(receipt, said.tasks)
+        indexes = range(receipt.start, receipt.start + receipt.size)
+        if [ref for ref, _ in said.tasks] != [receipt.item(index) for index in indexes]:
+            raise Violation("results are booked for other tasks")
         for at, (ref, act) in enumerate(said.tasks, receipt.start):
             if act is Act.RETRIED and self.ledger.retry(receipt, at):
                 self.world.oracle.tried_again(ref)
@@ -215,31 +237,23 @@ class LedgerMaster:
 
     def taken_back(self, member: Member, seqs: list[int]) -> None:
         """A worker did not read these."""
-        self.world.note("%s gives back %s", member.child.name, seqs)
         if member.worker is not None:
             self.ledger.put_back(member.worker, seqs, self._now)
         self._settle()
 
     def exited(self, member: Member, report: ExitReport) -> None:
         """A worker is gone."""
-        self.world.note(
-            "%s is gone: unread %s, in %s", member.child.name, report.unread, report.running
-        )
         del self._members[member.child]
         if member.worker is None:
             self.ledger.starting -= 1
         else:
-            self._lose(member, member.worker, report)
+            self._lose(member.worker, report)
         self._settle()
 
-    def _lose(self, member: Member, worker: engine.Worker, report: ExitReport) -> None:
-        held = self._audit.before_loss(worker)
+    def _lose(self, worker: engine.Worker, report: ExitReport) -> None:
         losses = self.ledger.lose(worker, report.unread, report.running)
-        self._audit.after_loss(member.child, held, losses)
         for loss in losses:
-            self.world.note("%s is given up", loss.item)
             self.world.oracle.died(loss.item, loss.attempts)
-            self._audit.named(loss)
         for job in {loss.job for loss in losses}:
             self._look(job)
 
@@ -262,7 +276,7 @@ class LedgerMaster:
 
     def _leave(self, member: Member) -> None:
         assert member.worker is not None
-        if self._audit.leave(member.worker):
+        if self.ledger.leave(member.worker):
             self.world.note("%s leaves", member.child.name)
             member.stop()
 
@@ -272,7 +286,6 @@ class LedgerMaster:
         self.world.count()
         self._assign()
         for worker in self.ledger.recall(self._now):
-            self.world.note("%s is asked for its unread batches", worker.key.child.name)
             worker.key.child.take_back()
         self._let_go()
         self._scale()
@@ -280,15 +293,9 @@ class LedgerMaster:
         self._audit.check()
 
     def _assign(self) -> None:
-        self._audit.before_assignment()
         while (batch := self.ledger.assign(self._now)) is not None:
-            self._audit.assigned(batch)
             member: Member = batch.worker.key
             account: Account = batch.job.owner
-            self.world.note(
-                "%s gets batch %d: %d:%d of job %d",
-                member.child.name, batch.seq, batch.start, batch.stop, account.number,
-            )
             work = Work(batch.seq, batch.items, batch.stride, account.plan.unit)
             member.child.deliver(batch.seq, work)
             if account.plan.timeout is not None:
@@ -337,6 +344,14 @@ class LedgerMaster:
         if self._recall_at == due:
             self._recall_at = None
 
+    def leave_process(self) -> None:
+        """It took nothing from the process."""
+
     def check_end(self) -> None:
         """Nothing may be left over."""
         self._audit.check_end()
+
+
+def _require_dropped(receipt: engine.Receipt | None) -> None:
+    if receipt is not None:
+        raise Violation("a late result counts")

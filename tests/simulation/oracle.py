@@ -49,6 +49,7 @@ class Oracle:
         self.accounts = [Account(number, plan) for number, plan in enumerate(schedule.jobs)]
         self._left = schedule.left
         self._lost: set[Worker] = set()
+        self.stillborn = 0
 
     # What truly happens
 
@@ -71,9 +72,10 @@ class Oracle:
         """How often a task was begun."""
         return len(self.accounts[ref.job].runs[ref.index])
 
-    def lost(self, worker: Worker) -> None:
-        """The master knows, or believes, that a worker is gone."""
+    def lost(self, worker: Worker, *, was_heard: bool) -> None:
+        """The master knows, or believes, that a worker is gone, of which it heard or not."""
         self._lost.add(worker)
+        self.stillborn += not was_heard
         if self._left is not None and worker.units > self._left:
             raise Violation(f"{worker.name} ran {worker.units} units, more than {self._left}")
 

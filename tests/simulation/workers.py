@@ -37,6 +37,8 @@ class Work(NamedTuple):
     tasks: Sequence[Ref]
     stride: int
     unit: int
+    apart: bool = False
+    """Each task is unpickled by itself."""
 
 
 class Results(NamedTuple):
@@ -55,6 +57,12 @@ class Unreadable(NamedTuple):
     seq: int
 
 
+class Unknown(NamedTuple):
+    """The worker has forgotten the function of batch ``seq``."""
+
+    seq: int
+
+
 class Ready(NamedTuple):
     """The worker can be given work."""
 
@@ -64,6 +72,9 @@ class Worker:
 
     def __init__(self, world: World, number: int, child: Child) -> None:
         self.name = child.name
+        self.number = number
+        self.functions: set[int] = set()
+        """Those that it remembers."""
         self.dead = False
         self.board: tuple[int, int] | None = None
         self.work: Work | None = None
@@ -148,16 +159,23 @@ class Worker:
             self._awake = True
             return
         seq, payload, buffers = self._child.read()
-        work = self._world.language.work(seq, payload, buffers)
+        work = self._world.language.work(self, seq, payload, buffers)
         if work is None:
             self._world.oracle.stopped(self, len(self._child.inbox))
             self.die(0)
-            return
+        elif isinstance(work, Unknown):
+            self._say(work)
+            self._wait()
+        else:
+            self._start(work)
+
+    def _start(self, work: Work) -> None:
         self.work = work
         if not self._reach("before it notes what it has read"):
             return
-        if any(self._world.task(ref).act is Act.UNREADABLE for ref in work.tasks):
-            self._say(Unreadable(seq))
+        acts = {self._world.task(ref).act for ref in work.tasks}
+        if Act.UNREADABLE in acts and not work.apart:
+            self._say(Unreadable(work.seq))
             self._wait()
         else:
             self._begin(work)
@@ -232,5 +250,5 @@ class Worker:
     def _say(self, message: Any) -> None:
         self._messages += 1
         self._child.say(message)
-        if self._messages in self._repeats and not isinstance(message, Ready):
+        if self._messages in self._repeats and not isinstance(message, Ready | Unknown):
             self._child.say(message)

@@ -23,7 +23,7 @@ from simulation.schedule import (
     Task,
     Terminate,
 )
-from simulation.workers import Ref, Work, Worker
+from simulation.workers import Ref, Unknown, Work, Worker
 
 CALLS = 50_000
 """More calls than any schedule needs: it goes round in circles."""
@@ -35,8 +35,10 @@ END = 1e6
 class Language(Protocol):
     """How the giver of work and its workers write down what they say."""
 
-    def work(self, seq: int, payload: Any, buffers: Sequence[memoryview]) -> Work | None:
-        """What a delivered packet says; None: stop."""
+    def work(
+        self, worker: Worker, seq: int, payload: Any, buffers: Sequence[memoryview]
+    ) -> Work | Unknown | None:
+        """What a delivered packet says, or what ``worker`` says to it; None: stop."""
 
     def message(self, said: Any) -> Any:
         """What a worker says, as its observer gets it."""
@@ -62,6 +64,9 @@ class Master(Protocol):
     def check_end(self) -> None:
         """Everything has happened: nothing may be left over."""
 
+    def leave_process(self) -> None:
+        """Undo what it did to the process."""
+
 
 class World:
     """Runs one schedule."""
@@ -77,7 +82,7 @@ class World:
         self.oracle = Oracle(schedule)
         self.agents = [Agent(self, number, plan) for number, plan in enumerate(schedule.agents)]
         self._trace = trace
-        self._workers: list[Worker | None] = []
+        self._workers: list[Worker] = []
         self._calls = 0
         self._faults: dict[int, list[Fault]] = {}
         for fault in schedule.faults:
@@ -88,12 +93,15 @@ class World:
 
     def run(self) -> None:
         """Let everything happen; Violation if a promise is broken."""
-        self._master.begin()
-        for fault in self.schedule.faults:
-            self._plan(fault)
-        self.loop.run_for(END)
-        self.oracle.check_end()
-        self._master.check_end()
+        try:
+            self._master.begin()
+            for fault in self.schedule.faults:
+                self._plan(fault)
+            self.loop.run_for(END)
+            self.oracle.check_end()
+            self._master.check_end()
+        finally:
+            self._master.leave_process()
 
     def note(self, text: str, *args: object) -> None:
         """Write it into the trace, if there is one."""

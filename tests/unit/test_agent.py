@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator
 from multiprocessing import spawn
 from typing import Any
 
-import census
 import pytest
 
+import census
 from fiber import reduction
 from fiber._agent import agent as agent_module
 from fiber._agent.agent import Agent, LocalChild

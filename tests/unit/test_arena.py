@@ -9,7 +9,15 @@ from collections.abc import Iterator
 import pytest
 
 from fiber._wire import arena
-from fiber._wire.arena import DATA_OFFSET, RETAINED_BLOCKS, RETAINED_LIMIT, Arena, Block, fill, release
+from fiber._wire.arena import (
+    DATA_OFFSET,
+    RETAINED_BLOCKS,
+    RETAINED_LIMIT,
+    Arena,
+    Block,
+    fill,
+    release,
+)
 
 
 @pytest.fixture
@@ -115,7 +123,8 @@ def test_a_block_without_memory_leaves_no_descriptor(monkeypatch: pytest.MonkeyP
         raise OSError("no memory")
 
     before = os.listdir("/proc/self/fd")
-    with monkeypatch.context() as short, pytest.raises(OSError, match="no memory"):
+    with monkeypatch.context() as short:
         short.setattr(arena.mmap, "mmap", refuse)
-        Block(1 << 16)
+        with pytest.raises(OSError, match="no memory"):
+            Block(1 << 16)
     assert os.listdir("/proc/self/fd") == before

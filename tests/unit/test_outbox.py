@@ -9,9 +9,9 @@ import sys
 import threading
 from collections.abc import Iterator
 
-import census
 import pytest
 
+import census
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
 from fiber._transport.unix import socketpair

@@ -18,17 +18,12 @@ from unit import pool_tasks as tasks
 PATIENCE = tasks.PATIENCE
 
 
-@pytest.fixture(scope="module")
-def shared_pool() -> Iterator[Pool]:
+@pytest.fixture
+def pool() -> Iterator[Pool]:
     pool = fiber.Pool(3)
     yield pool
     pool.close()
     pool.join()
-
-
-@pytest.fixture
-def pool(shared_pool: Pool) -> Pool:
-    return shared_pool
 
 
 # Every call gives what it gives in multiprocessing
@@ -247,9 +242,10 @@ def test_callbacks_come_in_order_and_before_the_result(pool: Pool) -> None:
     result = pool.apply_async(tasks.square, (3,), callback=seen.append)
     assert result.get(PATIENCE) == 9
     assert seen == [9]
-    for n in range(20):
-        last = pool.apply_async(tasks.identity, (n,), callback=seen.append)
-    last.wait(PATIENCE)
+    results = [pool.apply_async(tasks.identity, (n,), callback=seen.append) for n in range(20)]
+    for n, result in enumerate(results):
+        result.wait(PATIENCE)
+        assert n in seen
     pool.map_async(tasks.square, [2], callback=seen.extend).wait(PATIENCE)
     assert sorted(seen) == sorted([9, *range(20), 4])
 
@@ -511,7 +507,7 @@ def test_initializer_runs_in_each_worker() -> None:
         ({"retries": 1.5}, ValueError, "retries"),
         ({"task_timeout": 0}, ValueError, "task_timeout"),
         ({"idle_timeout": -1}, ValueError, "idle_timeout"),
-        ({"retry_exceptions": [1]}, TypeError, "retry_exceptions"),
+        ({"retry_exceptions": [1]}, TypeError, "retry_exceptions must be exception classes"),
         ({"retry_exceptions": int}, TypeError, "retry_exceptions"),
     ],
 )

@@ -9,9 +9,9 @@ import weakref
 from collections.abc import Iterator
 from typing import Any
 
-import census
 import pytest
 
+import census
 import fiber
 from fiber import config, process
 from fiber._agent.port import ExitReport
@@ -248,7 +248,9 @@ def test_a_start_that_the_system_refuses_says_why(
         return Port()
 
     monkeypatch.setattr(runtime, "start", refuse)
-    with pytest.raises(StartError, match="process 'big' did not start: could not be started: no memory"):
+    with pytest.raises(
+        StartError, match="process 'big' did not start: could not be started: no memory"
+    ):
         fiber.Process(target=os.getpid, name="big").start()
     assert fiber.active_children() == []
 

@@ -15,9 +15,9 @@ from collections.abc import Iterator
 from multiprocessing import spawn
 from typing import Any
 
-import census
 import pytest
 
+import census
 from fiber import reduction
 from fiber._agent import agent, child, zygote
 from fiber._agent.board import Board
@@ -150,7 +150,9 @@ def test_no_signal_of_the_terminal_ends_it(master: Master) -> None:
 
 
 def test_its_children_do_not_outlive_its_own_sudden_death(master: Master) -> None:
-    pids = [master.started(number, method=method) for number, method in enumerate(("fork", "spawn"))]
+    pids = [
+        master.started(number, method=method) for number, method in enumerate(("fork", "spawn"))
+    ]
     master.process.kill()
     assert census.wait_until(lambda: all(gone(pid) for pid in pids), PATIENCE)
 

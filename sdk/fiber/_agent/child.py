@@ -108,7 +108,7 @@ def _load(start: Start) -> Any:
 
 @contextlib.contextmanager
 def inheriting() -> Iterator[None]:
-    """While main is imported or a Process unpickled, starting one is an unguarded main's mistake."""
+    """While main is imported or a Process unpickled, no process may start: main is unguarded."""
     mp_process.current_process()._inheriting = True  # type: ignore[attr-defined]
     try:
         yield

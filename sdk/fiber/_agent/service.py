@@ -28,6 +28,7 @@ class AgentService:
         self._on_end = on_end
         self._children: dict[int, _Observed] = {}
         self._stopping = False
+        self._reason = ""
 
     def send(self, message: messages.Message) -> None:
         """Tell the master."""
@@ -76,13 +77,14 @@ class AgentService:
         """That one is gone."""
         del self._children[child]
         if self._stopping and not self._children:
-            self._loop.call_soon(self._on_end, "")
+            self._loop.call_soon(self._on_end, self._reason)
 
     def stop(self, reason: str, grace: float) -> None:
         """End the children, by force after ``grace`` seconds, and then the agent."""
         if self._stopping:
             return
         self._stopping = True
+        self._reason = reason
         if not self._children:
             self._on_end(reason)
             return

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 
 from fiber._agent.child import interpreter_arguments
@@ -30,7 +28,7 @@ _QUIT_TIMEOUT = 5.0
 
 
 class LoopbackBackend:
-    """Starts its agents at once and replaces the ones that end."""
+    """Starts its agents at once and replaces each at the moment it is lost."""
 
     name = "loopback"
     same_host = False
@@ -41,39 +39,28 @@ class LoopbackBackend:
         self._output = Output()
         self._lock = threading.Lock()
         self._failures: list[str] = []
-        self.closing = False
-        self._directory = tempfile.mkdtemp(prefix="fiber-", dir=config.runtime_directory)
+        self._closing = False
         credentials = make_credentials("loopback")
-        self._credentials = os.path.join(self._directory, "agent")
-        try:
-            credentials.agent_half().to_directory(self._credentials)
-            self._listener = MasterListener(
-                loop,
-                f"{config.listen_host}:{config.listen_port}",
-                credentials,
-                on_agent=self._joined,
-                on_refused=self._refused,
-                patience=Patience(
-                    config.heartbeat_interval, config.suspect_after, config.lost_after
-                ),
-            )
-        except BaseException:
-            shutil.rmtree(self._directory, ignore_errors=True)
-            raise
-        self._slots = [_Slot(self, number) for number in range(config.agents)]
+        self._credentials = credentials.agent_half().to_environment()
+        self._listener = MasterListener(
+            loop,
+            f"{config.listen_host}:{config.listen_port}",
+            credentials,
+            on_agent=self._joined,
+            on_refused=self._refused,
+            patience=Patience(config.heartbeat_interval, config.suspect_after, config.lost_after),
+        )
+        self._launched = 0
+        self._processes = [self._launch() for _ in range(config.agents)]
 
     def place(self) -> RemoteAgent:
         """The agent with the fewest children; StartError if none can take one more."""
         limit = self._config.processes_per_agent
         with self._lock:
             if len(self._failures) >= _ATTEMPTS:
-                raise StartError(
-                    "the loopback agents",
-                    "none of them joined",
-                    "\n".join(self._failures),
-                    _ATTEMPTS,
-                )
-            agents = [slot.agent for slot in self._slots]
+                reasons = "\n".join(self._failures)
+                raise StartError("the loopback agents", "none joined", reasons, _ATTEMPTS)
+            agents = [process.agent for process in self._processes]
         free = [agent for agent in agents if not limit or agent.children < limit]
         if not free:
             raise StartError(
@@ -85,43 +72,24 @@ class LoopbackBackend:
 
     def close(self) -> None:
         """End the agents and wait for them."""
-        self.closing = True
-        for slot in self._slots:
-            slot.agent.close()
-        for slot in self._slots:
-            slot.wait(_QUIT_TIMEOUT)
+        self._closing = True
+        for process in self._processes:
+            process.agent.close()
+        for process in self._processes:
+            process.wait(_QUIT_TIMEOUT)
         done = threading.Event()
         self._listener.close("the master ended", then=done.set)
         done.wait(_QUIT_TIMEOUT)
         self._output.close()
-        shutil.rmtree(self._directory, ignore_errors=True)
 
-    # On the loop's thread
+    def _launch(self) -> _AgentProcess:
+        # A name is never used again: what comes late from its last holder is not for the next.
+        name = f"loopback-{self._launched}"
+        self._launched += 1
+        agent = RemoteAgent(name, self._output, on_lost=self._lost)
+        return _AgentProcess(self._loop, agent, self._environment(name))
 
-    def _joined(self, link: Link) -> None:
-        for slot in self._slots:
-            if slot.agent.host == link.peer.name and not slot.agent.joined:
-                self._failures.clear()
-                slot.agent.join(link)
-                return
-        link.close(f"the master expects no agent named {link.peer.name}")
-
-    def _refused(self, reason: str) -> None:
-        self._output.write("fiber", f"refused an agent: {reason}")
-
-    def ended(self, slot: _Slot, reason: str) -> None:
-        """An agent's process ended."""
-        joined = slot.agent.joined
-        slot.agent.lose(reason)
-        if self.closing:
-            return
-        if not joined:
-            self._failures.append(f"{slot.agent.host}: {reason}")
-        if len(self._failures) < _ATTEMPTS:
-            slot.launch()
-
-    def environment(self, name: str) -> dict[str, str]:
-        """What an agent is told."""
+    def _environment(self, name: str) -> dict[str, str]:
         return {
             **os.environ,
             "FIBER_AGENT_ADDRESS": self._listener.address,
@@ -131,59 +99,64 @@ class LoopbackBackend:
             "FIBER_START_TIMEOUT": str(self._config.start_timeout),
         }
 
-    @property
-    def loop(self) -> Loop:
-        """The loop that watches them."""
-        return self._loop
+    # On the loop's thread
 
-    @property
-    def output(self) -> Output:
-        """Where their children's lines go."""
-        return self._output
+    def _joined(self, link: Link) -> None:
+        for process in self._processes:
+            if process.agent.host == link.peer.name and not process.agent.joined:
+                self._failures.clear()
+                process.agent.join(link)
+                return
+        link.close(f"the master expects no agent named {link.peer.name}")
+
+    def _refused(self, reason: str) -> None:
+        self._output.write("fiber", f"refused an agent: {reason}")
+
+    def _lost(self, agent: RemoteAgent, reason: str) -> None:
+        """Replace it before its children's ends make anybody ask for new ones."""
+        if self._closing:
+            return
+        with self._lock:
+            if not agent.joined:
+                self._failures.append(f"{agent.host}: {reason}")
+            for index, process in enumerate(self._processes):
+                if process.agent is agent:
+                    process.kill()
+                    if len(self._failures) < _ATTEMPTS:
+                        self._processes[index] = self._launch()
 
 
-class _Slot:
-    """A place for an agent: its process now, and the next one when that ends."""
+class _AgentProcess:
+    """The process of one agent."""
 
-    def __init__(self, backend: LoopbackBackend, number: int) -> None:
-        self._backend = backend
-        self._number = number
-        self._life = 0
-        self.launch()
-
-    def launch(self) -> None:
-        """Start an agent's process."""
-        self._life += 1
-        # A name is never used again: what comes late from the last holder is not for this one.
-        name = f"loopback-{self._number}" + (f"-{self._life}" if self._life > 1 else "")
-        self.agent = RemoteAgent(name, self._backend.output, on_lost=self._lost)
+    def __init__(self, loop: Loop, agent: RemoteAgent, environment: dict[str, str]) -> None:
+        self.agent = agent
+        self._loop = loop
         statement = "import runpy; runpy.run_module('fiber.agent', run_name='__main__')"
         self._process = subprocess.Popen(
             interpreter_arguments(sys.executable, statement),
-            env=self._backend.environment(name),
+            env=environment,
             stdin=subprocess.DEVNULL,
             process_group=0,
         )
         self._watched = os.pidfd_open(self._process.pid)
-        self._backend.loop.register(self._watched, self._ended)
+        loop.register(self._watched, self._ended)
+
+    def kill(self) -> None:
+        """It is out of reach, though it may run: nothing of it is wanted any more."""
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
 
     def wait(self, timeout: float) -> None:
-        """Wait for the process's end, by force after ``timeout`` seconds."""
+        """Wait for its end, by force after ``timeout`` seconds."""
         try:
             self._process.wait(timeout)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
 
-    def _lost(self, agent: RemoteAgent) -> None:
-        if self._backend.closing:
-            return
-        # Out of reach, though its process may run: nothing of it is wanted any more.
-        with contextlib.suppress(ProcessLookupError):
-            self._process.kill()
-
     def _ended(self) -> None:
-        self._backend.loop.unregister(self._watched)
+        self._loop.unregister(self._watched)
         os.close(self._watched)
         status = self._process.wait()
-        self._backend.ended(self, f"its process ended with status {status}")
+        self.agent.lose(f"its process ended with status {status}")

@@ -28,7 +28,9 @@ class RemoteAgent:
     It takes work before its link is there; what it cannot do it reports as exits.
     """
 
-    def __init__(self, host: str, output: Output, on_lost: Callable[[RemoteAgent], None]) -> None:
+    def __init__(
+        self, host: str, output: Output, on_lost: Callable[[RemoteAgent, str], None]
+    ) -> None:
         self.host = host
         self._output = output
         self._on_lost = on_lost
@@ -91,11 +93,11 @@ class RemoteAgent:
                 return
             self._lost = reason
             children, self._children = self._children, {}
+        self._on_lost(self, reason)
         for child in children.values():
             child.end(
                 ExitReport(-signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host)
             )
-        self._on_lost(self)
 
     # What comes over the link, on the loop's thread
 

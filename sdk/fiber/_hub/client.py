@@ -45,10 +45,13 @@ class Line:
         self._host = home.host
         self._number = 0
         self._unsettled: Op | None = None
+        self._end = "its hub is gone"
         self._sock, to_its_hub = _dial(home)
         try:
             for part in (*to_its_hub, protocol.hello(home.key), *greeting):
-                self._send(part)
+                packet.send(self._sock, part)
+        except BrokenPipeError:
+            pass  # the first request will find out why
         except BaseException:
             self._sock.close()
             raise
@@ -101,10 +104,11 @@ class Line:
         try:
             message = packet.receive(self._sock, descriptors=True)
         except (EOFError, ConnectionError) as error:
-            raise ConnectionClosed(self._peer, "its hub is gone") from error
+            raise ConnectionClosed(self._peer, self._end) from error
         try:
             if message.payload[0] == Status.GONE:
-                raise ConnectionClosed(self._peer, protocol.text(message.payload))
+                self._end = protocol.text(message.payload)
+                raise ConnectionClosed(self._peer, self._end)
             return Reply(message)
         finally:
             message.close_descriptors()

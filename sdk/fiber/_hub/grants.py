@@ -26,7 +26,7 @@ class Granted(NamedTuple):
 
 
 class GrantSet:
-    """Grants that last until they are released, or until this process ends.  Any thread.
+    """Grants that last until they are released, the set is forgotten or this process ends.
 
     For what may be unpickled any number of times: a process's start, a task that may run again.
     """
@@ -65,6 +65,9 @@ class GrantSet:
         for line in lines.values():
             line.close()  # a hub takes back what was granted on a stream when it ends
 
+    def __del__(self) -> None:
+        self.release()
+
     def _line(self, home: Access) -> Line:
         if home not in self._lines:
             self._lines[home] = Line(home)
@@ -81,6 +84,7 @@ class _SingleUse:
     def _forget(self) -> None:
         self._lock = threading.Lock()
         self._line: Line | None = None
+        self._line_to: Access | None = None
 
     def for_local(self, kind: Kind, fd: int) -> Granted:
         """A grant for an object of this host."""
@@ -103,8 +107,8 @@ class _SingleUse:
         return granted
 
     def _register(self, own: Access, kind: Kind, fd: int) -> Granted:
-        if self._line is None:
-            self._line = Line(own)
+        if self._line is None or self._line_to != own:
+            self._line, self._line_to = Line(own), own
         try:
             return _ask_local(self._line, own, kind, fd, reusable=False)
         except BaseException:

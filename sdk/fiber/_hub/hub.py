@@ -21,6 +21,7 @@ import weakref
 from fiber._hub import protocol
 from fiber._hub.access import Access
 from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter
+from fiber._hub.local import QuietSocket, blocking
 from fiber._hub.poller import Poller
 from fiber._hub.protocol import Kind
 from fiber._hub.registry import Registry
@@ -71,7 +72,7 @@ class Hub:
         """A stream to this hub for its own process.  Any thread."""
         ours, theirs = socketpair("using a pipe or queue of another host")
         self._loop.call_soon(self._admit, theirs)
-        return ours
+        return blocking(QuietSocket(fileno=ours.detach()))
 
     def link(self, host: str | None, send: Send, *, dialer: bool) -> Tunnels:
         """The hub of ``host`` can be reached by tunnels whose frames go out by ``send``.

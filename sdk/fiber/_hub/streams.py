@@ -158,7 +158,7 @@ class SocketStream:
             except (EOFError, ConnectionError):
                 self._close("")
                 return
-            except (OSError, struct.error, ValueError) as error:
+            except (OSError, struct.error, ValueError, IndexError) as error:
                 # No descriptor free for what it sent, or no packet of ours.
                 handler = self.handler
                 self.finish(str(error))

@@ -29,6 +29,7 @@ class Popen:
         self._port: ChildPort | None = None
         self._born = threading.Event()
         self._exited = threading.Event()
+        self._lock = threading.Lock()
         with naming_the_limit("starting a process"):
             self.sentinel = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._closed = False
@@ -71,11 +72,13 @@ class Popen:
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
         self.report = report
+        with self._lock:
+            if not self._closed:
+                os.eventfd_write(self.sentinel, 1)
+        # From here on its Process may be closed.
         self.returncode = report.exitcode
         self._exited.set()
         self._born.set()
-        if not self._closed:
-            os.eventfd_write(self.sentinel, 1)
         # Each held the other; the sentinel's descriptor goes when the last user of this lets go.
         self._port = None
 
@@ -105,9 +108,10 @@ class Popen:
 
     def close(self) -> None:
         """Give the sentinel's descriptor back."""
-        if not self._closed:
-            self._closed = True
-            os.close(self.sentinel)
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                os.close(self.sentinel)
 
     def __del__(self) -> None:
         self.close()

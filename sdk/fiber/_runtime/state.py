@@ -34,7 +34,11 @@ class Runtime:
         self.config = config.current()
         self.loop = Loop()
         self.host = child.host or "local"
-        self.backend: Backend = _make_backend(self)
+        try:
+            self.backend: Backend = _make_backend(self)
+        except BaseException:
+            self.loop.stop()
+            raise
         reduction.readers_are_remote(not self.backend.same_host)
         self.loop.start_thread("fiber-io")
 

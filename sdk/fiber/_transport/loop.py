@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-Callback = Callable[[], None]
+Callback = Callable[[], object]
 
 
 class Timer:
@@ -71,7 +71,7 @@ class Loop:
         """The loop's clock: monotonic seconds."""
         return time.monotonic()
 
-    def call_soon(self, callback: Callable[..., None], *args: Any) -> None:
+    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
         """Call it on the loop's thread, after what was asked before."""
         self._ready.append(_bound(callback, args))
         if threading.get_ident() != self._ident:
@@ -79,7 +79,7 @@ class Loop:
                 if not self._closed:
                     os.eventfd_write(self._wake, 1)
 
-    def interrupt(self, callback: Callable[..., None], *args: Any) -> None:
+    def interrupt(self, callback: Callable[..., object], *args: Any) -> None:
         """``call_soon`` for a signal handler, which may run on the loop's own thread while it
         waits.
         """
@@ -87,7 +87,7 @@ class Loop:
         if not self._closed:
             os.eventfd_write(self._wake, 1)
 
-    def call_later(self, seconds: float, callback: Callable[..., None], *args: Any) -> Timer:
+    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
         """Call it once, ``seconds`` from now, on the loop's thread."""
         timer = Timer(self.now() + seconds, _bound(callback, args))
         if self.on_thread():
@@ -133,6 +133,9 @@ class Loop:
     def stop(self) -> None:
         """End the loop after what it is doing; from another thread, wait until it has ended."""
         if self._closed:
+            return
+        if self._thread is None and self._ident is None:  # it never ran
+            self._close()
             return
         self.call_soon(self._stop)
         if self._thread is not None and not self.on_thread():
@@ -185,7 +188,7 @@ class Loop:
         self._writers.clear()
 
 
-def _bound(callback: Callable[..., None], args: tuple[Any, ...]) -> Callback:
+def _bound(callback: Callable[..., object], args: tuple[Any, ...]) -> Callback:
     return (lambda: callback(*args)) if args else callback
 
 

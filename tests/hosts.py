@@ -1,0 +1,97 @@
+"""Several hosts in one process: a hub each, linked as those of agents and master are."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Iterator
+
+from fiber._hub import access
+from fiber._hub.hub import Hub
+from fiber._hub.tunnel import Frame, Tunnels
+from fiber._transport.loop import Loop
+from fiber._wire import messages
+
+
+class Wire:
+    """One direction of a link: encodes frames, counts them, and can be stopped."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._loop = loop
+        self.to: Tunnels | None = None
+        self.held: deque[bytes] | None = None
+        self.frames = 0
+
+    def send(self, frame: Frame) -> None:
+        """On the loop's thread, as links are used."""
+        self.frames += 1
+        encoded = frame.encode()
+        if self.held is None:
+            self._loop.call_soon(self._deliver, encoded)
+        else:
+            self.held.append(encoded)
+
+    def hold(self) -> None:
+        """Deliver nothing until ``let_go``."""
+        self.held = deque()
+
+    def let_go(self) -> None:
+        """Deliver what was held."""
+        held, self.held = self.held or deque(), None
+        for encoded in held:
+            self._loop.call_soon(self._deliver, encoded)
+
+    def _deliver(self, encoded: bytes) -> None:
+        if self.to is not None:
+            self.to.on_frame(messages.decode(bytearray(encoded)))
+
+
+class Hosts:
+    """Hubs on one loop."""
+
+    def __init__(self) -> None:
+        self.loop = Loop()
+        self.loop.start_thread("hubs")
+        self._hubs: dict[str, Hub] = {}
+
+    def __getitem__(self, name: str) -> Hub:
+        if name not in self._hubs:
+            self._hubs[name] = Hub(self.loop, name)
+        return self._hubs[name]
+
+    def link(self, agent: str, master: str, *, only: bool = True) -> tuple[Wire, Wire]:
+        """Link an agent to its master; unless ``only``, everything foreign goes over this link."""
+        up, down = Wire(self.loop), Wire(self.loop)
+        down.to = self[agent].link(master if only else None, up.send, dialer=True)
+        up.to = self[master].link(agent, down.send, dialer=False)
+        return up, down
+
+    def on_loop(self, function: object, *args: object) -> None:
+        """Call on the loop's thread."""
+        self.loop.call_soon(function, *args)  # type: ignore[arg-type]
+
+    @contextlib.contextmanager
+    def at(self, name: str) -> Iterator[Hub]:
+        """In the block, this process is on that host, and the hub's own."""
+        before = access._hub, access._access
+        access._hub, access._access = self[name], None
+        try:
+            yield self[name]
+        finally:
+            access._hub, access._access = before
+
+    @contextlib.contextmanager
+    def child_at(self, name: str) -> Iterator[Hub]:
+        """In the block, this process is a child on that host, which reaches the hub by its door."""
+        before = access._hub, access._access
+        access._hub, access._access = None, self[name].access
+        try:
+            yield self[name]
+        finally:
+            access._hub, access._access = before
+
+    def close(self) -> None:
+        """End all."""
+        for hub in self._hubs.values():
+            self.loop.call_soon(hub.close)
+        self.loop.stop()

@@ -1,0 +1,443 @@
+"""The hub among processes of one host: who gets in, who gets what, and for how long."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import stat
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import fiber
+import pytest
+from census import wait_until
+from fiber._hub import access, grants, protocol
+from fiber._hub.access import Access, NoHub
+from fiber._hub.client import Line
+from fiber._hub.handles import collecting_grants
+from fiber._hub.protocol import TWO, Op
+from fiber._hub.registry import NoSuchObject
+from fiber._wire import packet
+from fiber.connection import Connection
+from fiber.errors import ConnectionClosed
+from hosts import Hosts
+
+PATIENCE = 15.0
+
+
+@pytest.fixture
+def hosts() -> Iterator[Hosts]:
+    hosts = Hosts()
+    yield hosts
+    hosts.close()
+
+
+def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
+    process = fiber.Process(target=target, args=args, daemon=True)
+    process.start()
+    return process
+
+
+def inode(connection: Connection) -> int:
+    return os.fstat(connection.fileno()).st_ino
+
+
+# Grants
+
+
+def test_a_handle_leads_to_the_very_same_pipe(hosts: Hosts) -> None:
+    with hosts.at("a"):
+        here, there = fiber.Pipe()
+        again = pickle.loads(pickle.dumps(there))
+        assert inode(again) == inode(there)
+        here.send("hello")
+        assert again.recv() == "hello"
+
+
+def test_a_handle_works_once(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        _, end = fiber.Pipe()
+        data = pickle.dumps(end)
+        assert len(hub.registry) == 1
+        pickle.loads(data)
+        assert len(hub.registry) == 0
+        with pytest.raises(NoSuchObject, match="used once already"):
+            pickle.loads(data)
+
+
+def test_collected_handles_work_until_released(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        _, end = fiber.Pipe()
+        with collecting_grants() as collected:
+            data = pickle.dumps([end, end])
+        assert collected
+        for _ in range(3):
+            assert len(pickle.loads(data)) == 2
+        collected.release()
+        collected.release()
+        assert not collected
+        assert len(hub.registry) == 0
+        with pytest.raises(NoSuchObject):
+            pickle.loads(data)
+
+
+def test_collected_grants_end_with_the_set(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        _, end = fiber.Pipe()
+        with collecting_grants() as collected:
+            pickle.dumps(end)
+        assert len(hub.registry) == 1
+        del collected
+        assert len(hub.registry) == 0
+
+
+def test_grants_collected_in_vain_are_released(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        _, end = fiber.Pipe()
+        with pytest.raises(ZeroDivisionError), collecting_grants() as collected:
+            pickle.dumps(end)
+            raise ZeroDivisionError
+        assert not collected
+        assert len(hub.registry) == 0
+
+
+def test_nothing_collected_is_nothing_to_release(hosts: Hosts) -> None:
+    with hosts.at("a"), collecting_grants() as collected:
+        pickle.dumps([1, 2, 3])
+    assert not collected
+
+
+def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        one, other = fiber.Pipe()
+        kept = pickle.dumps(one)
+        grants.begin_attempt()
+        with pytest.raises(Exception, match="pickle"):
+            pickle.dumps([other, threading.Lock()])
+        assert len(hub.registry) == 2
+        grants.undo_attempt()
+        assert len(hub.registry) == 1
+        pickle.loads(kept)
+
+
+def test_one_object_takes_one_descriptor_however_often_it_is_shared(hosts: Hosts) -> None:
+    with hosts.at("a") as hub, collecting_grants() as collected:
+        queue = fiber.Queue()
+        assert hub.access  # the door takes one of its own
+        before = len(os.listdir("/proc/self/fd"))
+        for _ in range(50):
+            pickle.dumps(queue)
+        assert len(hub.registry) == 3
+        assert len(os.listdir("/proc/self/fd")) == before + 3
+        collected.release()
+
+
+def test_the_other_end_sees_the_end_once_no_grant_is_left(hosts: Hosts) -> None:
+    with hosts.at("a"):
+        here, there = fiber.Pipe()
+        with collecting_grants() as collected:
+            pickle.dumps(there)
+        there.close()
+        assert not here.poll(0)
+        collected.release()
+        assert here.poll(PATIENCE)
+        with pytest.raises(EOFError):
+            here.recv()
+
+
+def test_everything_shared_travels(hosts: Hosts) -> None:
+    with hosts.at("a"):
+        queue, joinable, simple = fiber.Queue(7), fiber.JoinableQueue(), fiber.SimpleQueue()
+        event, semaphore, bounded = fiber.Event(), fiber.Semaphore(3), fiber.BoundedSemaphore(2)
+        things = [queue, joinable, simple, event, semaphore, bounded]
+        copies: list[Any] = pickle.loads(pickle.dumps(things))
+        for thing in (queue, joinable, simple):
+            thing.put(1)
+        event.set()
+        semaphore.acquire()
+        assert [copy.get() for copy in copies[:3]] == [1, 1, 1]
+        copies[1].task_done()
+        joinable.join()
+        assert copies[0]._maxsize == 7
+        assert copies[3].is_set()
+        assert copies[4].get_value() == 2
+        assert repr(copies[5]) == "<BoundedSemaphore(value=2, maxvalue=2)>"
+
+
+def test_without_a_hub_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_hub", "_access", "_starter"):
+        monkeypatch.setattr(access, name, None)
+    _, end = fiber.Pipe()
+    with pytest.raises(NoHub, match="Start a process or pool first"):
+        pickle.dumps(end)
+
+
+def test_a_program_without_a_hub_makes_one(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "_hub", None)
+    monkeypatch.setattr(access, "_access", None)
+    monkeypatch.setattr(access, "_starter", lambda: access.serve(hosts["a"]))
+    _, end = fiber.Pipe()
+    pickle.loads(pickle.dumps(end))
+
+
+# The door
+
+
+def test_the_door_is_private_and_goes_with_the_hub(hosts: Hosts) -> None:
+    hub = hosts["a"]
+    assert hub.directory is None
+    address = hub.access.address
+    assert hub.directory is not None
+    assert hub.access == hub.access
+    assert stat.S_IMODE(os.stat(hub.directory).st_mode) == 0o700
+    assert address.startswith(hub.directory)
+    hosts.on_loop(hub.close)
+    directory = hub.directory
+    assert wait_until(lambda: not os.path.exists(directory), PATIENCE)
+
+
+def test_a_path_that_is_too_long_says_what_to_set(tmp_path: Path, hosts: Hosts) -> None:
+    from fiber._hub.hub import Hub
+
+    deep = tmp_path / ("d" * 100)
+    deep.mkdir()
+    hub = Hub(hosts.loop, "a", str(deep))
+    with pytest.raises(OSError, match="FIBER_RUNTIME_DIRECTORY"):
+        _ = hub.access
+    assert list(deep.iterdir()) == []
+    hosts.on_loop(hub.close)
+
+
+def test_the_key_is_not_shown(hosts: Hosts) -> None:
+    own = hosts["a"].access
+    assert own.key.hex() not in repr(own)
+    assert repr(own.key) not in repr(own)
+
+
+class Bomb:
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize(
+    "greeting",
+    [
+        b"\0",
+        b"nonsense",
+        b"\1\xff",
+        b"\2" + bytes(20),
+        packet.PLAIN + protocol.hello(bytes(32)),
+        packet.PLAIN + protocol.hello(bytes(32))[:-1],
+        packet.PLAIN + TWO.pack(Op.FETCH, 1, 1, 2),
+    ],
+)
+def test_a_stranger_is_shown_out(hosts: Hosts, greeting: bytes) -> None:
+    hub = hosts["a"]
+    with hosts.at("a"):
+        _, end = fiber.Pipe()
+        pickle.dumps(end)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
+        stranger.settimeout(PATIENCE)
+        stranger.connect(hub.access.address)
+        stranger.send(greeting)
+        try:
+            packet.send(stranger, TWO.pack(Op.FETCH, 1, 1, 2))
+        except OSError:
+            pass  # it was shown out already
+        said = []
+        try:
+            while part := stranger.recv(4096):
+                said.append(part)
+        except ConnectionResetError:
+            pass
+        assert all(part[1] == protocol.Status.GONE for part in said)
+    assert len(hub.registry) == 1
+
+
+def test_nothing_of_a_stranger_is_unpickled(hosts: Hosts, tmp_path: Path) -> None:
+    hub = hosts["a"]
+    mark = tmp_path / "unpickled"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
+        stranger.connect(hub.access.address)
+        packet.send(stranger, pickle.dumps(Bomb(mark)))
+        assert stranger.recv(4096)[1] == protocol.Status.GONE
+    assert not mark.exists()
+
+
+def test_a_wrong_key_is_refused_with_a_reason(hosts: Hosts) -> None:
+    own = hosts["a"].access
+    with hosts.child_at("a"):
+        line = Line(Access("a", own.address, bytes(32)))
+        with pytest.raises(ConnectionClosed, match="another program"):
+            line.ask(Op.FETCH, 1, 2, form=TWO)
+        line.close()
+
+
+def test_another_version_is_refused_by_name(hosts: Hosts) -> None:
+    own = hosts["a"].access
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
+        other.connect(own.address)
+        packet.send(other, protocol.HELLO.pack(Op.HELLO, 0, protocol.VERSION + 1, own.key))
+        assert b"install the same fiberpool" in other.recv(4096)
+
+
+def test_a_hub_that_is_gone_is_named(hosts: Hosts) -> None:
+    with hosts.child_at("a") as hub:
+        _, end = fiber.Pipe()
+        data = pickle.dumps(end)
+        hosts.on_loop(hub.close)
+        assert hub.directory is not None
+        directory = hub.directory
+        assert wait_until(lambda: not os.path.exists(directory), PATIENCE)
+        with pytest.raises(ConnectionClosed, match="host 'a'"):
+            pickle.loads(data)
+
+
+def test_a_hub_without_descriptors_lets_callers_wait(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub = hosts["a"]
+    own = hub.access
+    real, refusals = hub._door, []
+
+    class Exhausted:
+        def accept(self) -> Any:
+            refusals.append(1)
+            if len(refusals) <= 2:
+                raise OSError(24, "Too many open files")
+            assert real is not None
+            return real.accept()
+
+        def fileno(self) -> int:
+            assert real is not None
+            return real.fileno()
+
+        def close(self) -> None:
+            assert real is not None
+            real.close()
+
+    monkeypatch.setattr(hub, "_door", Exhausted())
+    with hosts.child_at("a"):
+        _, end = fiber.Pipe()
+        pickle.loads(pickle.dumps(end))
+    assert len(refusals) >= 3
+    assert own == hub.access
+
+
+# Children
+
+
+def in_a_child(own: Access, commands: Connection) -> None:
+    """Lends and borrows as told, in a process that reaches the hub by its door."""
+    access.install(own)
+    for command in iter(commands.recv, None):
+        if command == "lend":
+            here, there = fiber.Pipe()
+            commands.send_bytes(pickle.dumps(there))
+            there.close()
+            here.send("from the child")
+        elif command == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        else:
+            borrowed = pickle.loads(command)
+            borrowed.send(borrowed.recv() * 2)
+            borrowed.close()
+
+
+@pytest.fixture
+def child(hosts: Hosts) -> Iterator[Connection]:
+    ours, theirs = fiber.Pipe()
+    process = start(in_a_child, hosts["a"].access, theirs)
+    theirs.close()
+    yield ours
+    ours.close()
+    process.kill()
+    process.join()
+
+
+def test_a_child_borrows(hosts: Hosts, child: Connection) -> None:
+    with hosts.at("a") as hub:
+        here, there = fiber.Pipe()
+        child.send(pickle.dumps(there))
+        there.close()
+        here.send("ab")
+        assert here.recv() == "abab"
+        with pytest.raises(EOFError):
+            here.recv()
+        assert len(hub.registry) == 0
+
+
+def test_a_child_lends_and_what_it_lent_outlives_it(hosts: Hosts, child: Connection) -> None:
+    with hosts.at("a"):
+        child.send("lend")
+        data = child.recv_bytes()
+        child.send("die")
+        with pytest.raises(EOFError):
+            child.recv()
+        borrowed = pickle.loads(data)
+        assert borrowed.recv() == "from the child"
+        with pytest.raises(EOFError):
+            borrowed.recv()
+
+
+def test_children_lend_to_each_other_without_the_hubs_process_in_between(
+    hosts: Hosts, child: Connection
+) -> None:
+    with hosts.child_at("a"):
+        child.send("lend")
+        borrowed = pickle.loads(child.recv_bytes())
+        assert borrowed.recv() == "from the child"
+
+
+def collect_and_die(own: Access, results: Connection) -> None:
+    access.install(own)
+    here, there = fiber.Pipe()
+    with collecting_grants() as collected:
+        results.send_bytes(pickle.dumps(there))
+    results.recv()
+    assert collected
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_what_a_dead_process_had_collected_is_released(hosts: Hosts) -> None:
+    hub = hosts["a"]
+    ours, theirs = fiber.Pipe()
+    process = start(collect_and_die, hub.access, theirs)
+    theirs.close()
+    data = ours.recv_bytes()
+    with hosts.at("a"):
+        pickle.loads(data)
+        pickle.loads(data)
+        assert len(hub.registry) == 1
+        ours.send("die")
+        process.join(PATIENCE)
+        assert wait_until(lambda: len(hub.registry) == 0, PATIENCE)
+    ours.close()
+
+
+def test_a_child_takes_back_what_it_collected(hosts: Hosts) -> None:
+    with hosts.child_at("a") as hub:
+        _, end = fiber.Pipe()
+        with collecting_grants() as collected:
+            data = pickle.dumps(end)
+        pickle.loads(data)
+        assert len(hub.registry) == 1
+        collected.release()
+        assert wait_until(lambda: len(hub.registry) == 0, PATIENCE)
+
+
+def test_a_child_takes_back_what_it_could_not_pickle(hosts: Hosts) -> None:
+    with hosts.child_at("a") as hub:
+        _, end = fiber.Pipe()
+        grants.begin_attempt()
+        with pytest.raises(Exception, match="pickle"):
+            pickle.dumps([end, threading.Lock()])
+        grants.undo_attempt()
+        assert wait_until(lambda: len(hub.registry) == 0, PATIENCE)

@@ -1,0 +1,177 @@
+"""How objects become bytes: by reference, by value, with descriptors that never leak."""
+
+from __future__ import annotations
+
+import multiprocessing
+import multiprocessing.reduction
+import os
+import pickle
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from fiber import reduction
+from fiber._agent import child
+from fiber._transport.unix import socketpair
+from fiber._wire import packet
+from fiber.connection import Pipe
+from fiber.process import Process
+
+
+class Point:
+    def __init__(self, x: int) -> None:
+        self.x = x
+
+    @classmethod
+    def origin(cls) -> Point:
+        return cls(0)
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[Any, Any]]:
+    ends = Pipe()
+    yield ends
+    for end in ends:
+        end.close()
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_what_can_be_imported_goes_by_reference() -> None:
+    data = reduction.dumps(Point.origin)
+    assert b"cloudpickle" not in data
+    assert pickle.loads(data)().x == 0
+
+
+@pytest.mark.parametrize("make", [lambda: lambda: 42, lambda: type("Local", (), {"f": 42})])
+def test_what_cannot_goes_by_value(make: Any) -> None:
+    thing = pickle.loads(reduction.dumps(make()))
+    assert (thing() if type(thing) is not type else thing.f) == 42
+
+
+def test_the_error_is_about_the_object_not_about_the_second_try() -> None:
+    with pytest.raises(TypeError, match=r"cannot pickle '_thread\.lock' object"):
+        reduction.dumps([threading.Lock()])
+
+
+def test_reducers_registered_with_multiprocessing_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Odd:
+        def __reduce__(self) -> Any:
+            raise TypeError("never this way")
+
+    extra = multiprocessing.reduction.ForkingPickler._extra_reducers  # type: ignore[attr-defined]
+    monkeypatch.setitem(extra, Odd, lambda _odd: (int, (7,)))
+    assert pickle.loads(reduction.dumps(Odd())) == 7
+    closure = Odd()
+    assert pickle.loads(reduction.dumps(lambda: closure))() == 7
+
+
+def test_encode_puts_large_buffers_beside_the_pickle() -> None:
+    numpy = pytest.importorskip("numpy")
+    array = numpy.arange(100_000)
+    payload, buffers = reduction.encode({"array": array})
+    assert len(payload) < 1000
+    assert sum(buffer.nbytes for buffer in buffers) == array.nbytes
+    message = packet.Message(memoryview(payload), buffers, [])
+    assert (packet.loads(message)["array"] == array).all()
+
+
+def test_encode_falls_back_to_cloudpickle() -> None:
+    value = 41
+    payload, buffers = reduction.encode(lambda: value + 1)
+    assert packet.loads(packet.Message(memoryview(payload), buffers, []))() == 42
+
+
+# Descriptors that travel with a start
+
+
+def test_descriptors_of_a_process_are_duplicated_and_owned_by_the_caller(
+    pipe: tuple[Any, Any],
+) -> None:
+    before = open_files()
+    _, fds = reduction.dump_process(Process(target=print, args=pipe), same_host=True)
+    assert len(fds) == 2
+    assert open_files() == before + 2
+    for fd in fds:
+        os.close(fd)
+
+
+def test_a_second_try_does_not_keep_the_descriptors_of_the_first(pipe: tuple[Any, Any]) -> None:
+    before = open_files()
+    one, other = pipe
+    # The connection is reached first, then plain pickle fails at the lambda.
+    process = Process(target=print, args=(one, other, lambda: None))
+    payload, fds = reduction.dump_process(process, same_host=True)
+    assert len(fds) == 2
+    assert open_files() == before + 2
+    assert payload
+    for fd in fds:
+        os.close(fd)
+
+
+def test_a_failed_start_keeps_none(pipe: tuple[Any, Any]) -> None:
+    before = open_files()
+    with pytest.raises(TypeError):
+        reduction.dump_process(
+            Process(target=print, args=(*pipe, threading.Lock())), same_host=True
+        )
+    assert open_files() == before
+    assert reduction.spawning() is None
+
+
+def test_a_start_within_a_start_does_not_mix_them_up(pipe: tuple[Any, Any]) -> None:
+    threads_fds: list[int] = []
+
+    class Nested:
+        def __reduce__(self) -> Any:
+            def other_thread() -> None:
+                process = Process(target=print, args=(pipe[0],))
+                threads_fds.extend(reduction.dump_process(process, same_host=True)[1])
+
+            thread = threading.Thread(target=other_thread)
+            thread.start()
+            thread.join()
+            return int, (1,)
+
+    _, fds = reduction.dump_process(Process(target=print, args=(Nested(), pipe[1])), same_host=True)
+    assert (len(fds), len(threads_fds)) == (1, 1)
+    for fd in (*fds, *threads_fds):
+        os.close(fd)
+
+
+def test_a_descriptor_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    fd = os.dup(1)
+    monkeypatch.setattr(child, "_descriptors", [fd])
+    handle = reduction.InheritedDescriptor(0)
+    assert handle.detach() == fd
+    with pytest.raises(RuntimeError, match="descriptor 0 of the start message was taken twice"):
+        handle.detach()
+    os.close(fd)
+
+
+def test_a_socket_goes_along_on_the_same_host_only() -> None:
+    ours, theirs = socket.socketpair()
+    process = Process(target=print, args=(ours,))
+    _, fds = reduction.dump_process(process, same_host=True)
+    assert len(fds) == 1
+    os.close(fds[0])
+    with pytest.raises(RuntimeError, match="cannot go to a process on another host"):
+        reduction.dump_process(process, same_host=False)
+    ours.close()
+    theirs.close()
+
+
+def test_a_connection_cannot_be_pickled_by_just_anyone_without_a_trace() -> None:
+    one, other = socketpair("a test")
+    for sock in (one, other):
+        sock.close()
+    closed, open_end = Pipe()
+    closed.close()
+    with pytest.raises(OSError, match="handle is closed"):
+        pickle.dumps(closed)
+    open_end.close()
