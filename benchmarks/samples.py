@@ -56,8 +56,9 @@ def in_words(value: float, unit: str) -> str:
 
 
 def times(value: float) -> str:
-    """A ratio in words: "0.65x", "21.3x"; finer around one, as the budgets are."""
-    digits = 3 if 0.9 <= value < 1.1 else 2 if value < 10 else 1 if value < 100 else 0
+    """A ratio in words: "0.65x", "21.3x"; finer near one, as the budgets are."""
+    fine = value < 0.1 or 0.9 <= value < 1.1
+    digits = 3 if fine else 2 if value < 10 else 1 if value < 100 else 0
     return f"{value:,.{digits}f}x"
 
 

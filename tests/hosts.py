@@ -6,7 +6,7 @@ import contextlib
 from collections import deque
 from collections.abc import Iterator
 
-from fiber._hub import access
+from fiber._hub import access, grants
 from fiber._hub.hub import Hub
 from fiber._hub.tunnel import Frame, Tunnels
 from fiber._transport.loop import Loop
@@ -89,6 +89,7 @@ class Hosts:
             yield self[name]
         finally:
             access._hub, access._access = before
+            grants._single_use._forget()
 
     def close(self) -> None:
         """End all."""

@@ -20,6 +20,7 @@ import sys
 from fiber import config
 from fiber._agent.agent import Agent
 from fiber._agent.service import AgentService
+from fiber._hub.hub import Hub
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
@@ -42,7 +43,8 @@ class Main:
     def __init__(self) -> None:
         self._name = os.environ.get(_NAME) or f"agent-{os.getpid()}"
         self._loop = Loop()
-        self._agent = Agent(self._loop, self._name)
+        self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
+        self._agent = Agent(self._loop, self._name, self._hub)
         self._service: AgentService | None = None
         self._status = 0
 
@@ -59,6 +61,7 @@ class Main:
         self._loop.run()
         dialer.close()
         self._agent.close()
+        self._hub.close()
         return self._status
 
     def _dial(self) -> AgentDialer:
@@ -76,7 +79,7 @@ class Main:
         print(f"fiber agent {self._name}: {what}", file=sys.stderr, flush=True)
 
     def _joined(self, link: Link) -> None:
-        self._service = AgentService(self._loop, link, self._agent, self._ended)
+        self._service = AgentService(self._loop, link, self._agent, self._hub, self._ended)
         self._link = link
         link.attach(self._service)
 

@@ -390,7 +390,7 @@ class Pool:
     @property
     def _pool(self) -> list[Any]:
         """The processes of its workers."""
-        return [link.process for link in self._dispatcher.links()]
+        return list(self._dispatcher.processes())
 
     def _repopulate_pool(self) -> None:
         """Nothing: workers are replaced as they go."""

@@ -104,6 +104,8 @@ def _blame(process: Any, reason: Exception) -> UnpicklableError:
 class RemoteSpawning:
     """Marks a start on another host: multiprocessing's checks pass, no descriptor can go along."""
 
+    other_host = True
+
     def __init__(self, process: Any) -> None:
         self.process = process
 

@@ -44,7 +44,10 @@ def launch_on(
 @pytest.fixture(scope="module", params=BACKENDS)
 def backend(request: pytest.FixtureRequest) -> Iterator[str]:
     """The runtime of this very process, on each backend in turn."""
-    with running(backend=request.param):
+    with running(backend=request.param, agents=2) as runtime:
+        if request.param == "loopback":
+            # The thread that writes what agents tell lives as long as the runtime.
+            runtime.backend._output.write("test", "begins")
         yield request.param
 
 

@@ -54,7 +54,13 @@ class Program:
         with self._stderr.open("wb") as stderr:
             self.process = subprocess.Popen(
                 [sys.executable, str(self.script), *arguments],
-                **{"stdout": subprocess.PIPE, "stderr": stderr, "env": environ, **options},
+                **{
+                    "stdout": subprocess.PIPE,
+                    "stderr": stderr,
+                    "env": environ,
+                    "cwd": self.folder,
+                    **options,
+                },
             )
 
     @property
@@ -65,6 +71,11 @@ class Program:
     def stderr(self) -> str:
         """What it, and all that it started, has written to stderr so far."""
         return self._stderr.read_text(errors="replace")
+
+    @property
+    def answer(self) -> str:
+        """What it wrote to the file ``answer`` in its working directory."""
+        return (self.folder / "answer").read_text()
 
     def line(self, seconds: float = PATIENCE) -> str:
         """The next line of its stdout."""

@@ -66,3 +66,21 @@ def close_every_descriptor(connection: Any) -> None:
     connection.send("closing")
     os.closerange(3, 1 << 16)
     sys.exit(5)
+
+
+def send_for_ever(connection: Any, size: int) -> NoReturn:
+    message = bytes(size)
+    while True:
+        connection.send_bytes(message)
+
+
+def ignore_sigterm(connection: Any) -> NoReturn:
+    signal.signal(signal.SIGTERM, lambda *_: connection.send("not me"))
+    connection.send("ready")
+    block()
+
+
+def exit_on_sigterm(connection: Any) -> NoReturn:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(42))
+    connection.send("ready")
+    block()

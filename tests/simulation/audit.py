@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._engine.chunks import LIMIT
@@ -44,14 +45,16 @@ class Audit:
         self._ledger = ledger
         self._names = names
         self._watched: dict[Worker, float] = {}
-        self._real = ledger.assign, ledger.receive, ledger.cancel, ledger.leave, ledger.lose
-        vars(ledger).update(
-            assign=self._assign,
-            receive=self._receive,
-            cancel=self._cancel,
-            leave=self._leave,
-            lose=self._lose,
-        )
+        watched = {
+            "assign": self._assign,
+            "receive": self._receive,
+            "retry": self._retry,
+            "cancel": self._cancel,
+            "leave": self._leave,
+            "lose": self._lose,
+        }
+        self._real = SimpleNamespace(**{name: getattr(ledger, name) for name in watched})
+        vars(ledger).update(watched)
 
     # Each decision
 
@@ -61,7 +64,7 @@ class Audit:
             for worker in self._ledger._pins
             for job, span in worker.pinned
         }
-        batch = self._real[0](now)
+        batch: Batch | None = self._real.assign(now)
         if batch is not None:
             worker = batch.worker
             assert batch.job is not None
@@ -95,12 +98,19 @@ class Audit:
         _require(ref == (account.number, index), f"{ref} is taken for task {index}")
 
     def _receive(self, *args: Any, **options: Any) -> Receipt | None:
-        receipt = self._real[1](*args, **options)
+        receipt: Receipt | None = self._real.receive(*args, **options)
         account = self._names.account(receipt.job) if receipt is not None else None
         if receipt is not None and account is not None:
             for index in range(receipt.start, receipt.start + receipt.size):
                 self._check_name(receipt.job, account, index, receipt.item(index))
         return receipt
+
+    def _retry(self, receipt: Receipt, index: int) -> bool:
+        again: bool = self._real.retry(receipt, index)
+        if again:
+            ref = self._names.ref(receipt.job, index, receipt.item(index))
+            self._world.oracle.tried_again(ref)
+        return again
 
     def _cancel(self, job: Job) -> list[Worker]:
         account = self._names.account(job)
@@ -113,14 +123,14 @@ class Audit:
             for worker in self._ledger.workers
             if any(batch.job is job for batch in list(worker.queue)[1:])
         }
-        told = self._real[2](job)
+        told: list[Worker] = self._real.cancel(job)
         _require(set(told) == holders, "unread batches of a cancelled job are not recalled")
         return told
 
     def _leave(self, worker: Worker) -> bool:
         busy = bool(worker.queue or worker.pinned)
         leaving = worker.leaving
-        left = self._real[3](worker)
+        left: bool = self._real.leave(worker)
         _require(left is not busy, "a busy worker leaves" if left else "an idle worker may not leave")
         _require(worker.leaving is (left or leaving), "a refusal to leave changes the worker")
         return left
@@ -135,7 +145,7 @@ class Audit:
             if batch.job is not None
             for at in range(batch.received, len(batch.items))
         ]
-        losses = self._real[4](worker, unread, running)
+        losses: list[Loss] = self._real.lose(worker, unread, running)
         given_up = {(loss.job, loss.task): loss for loss in losses}
         for job, seq, offset, index, attempts, item in held:
             ref = self._names.ref(job, index, item)

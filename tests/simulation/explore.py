@@ -8,6 +8,8 @@ import re
 import traceback
 from collections.abc import Callable, Iterable
 
+from typing import NamedTuple
+
 from simulation.oracle import Violation
 from simulation.schedule import Schedule, draw, simpler
 from simulation.world import Master, World
@@ -15,7 +17,15 @@ from simulation.world import Master, World
 ATTEMPTS = 600
 """Runs spent on making a schedule smaller."""
 
-MakeMaster = Callable[[World], Master]
+
+
+class Suite(NamedTuple):
+    """Something to drive through schedules."""
+
+    make: Callable[[World], Master]
+    adapt: Callable[[Schedule], Schedule] = lambda schedule: schedule
+    """Makes a schedule possible for it."""
+
 
 
 class Failure(Exception):
@@ -43,45 +53,45 @@ class Failure(Exception):
         )
 
 
-def run(schedule: Schedule, make: MakeMaster, trace: list[str] | None = None) -> Exception | None:
+def run(schedule: Schedule, suite: Suite, trace: list[str] | None = None) -> Exception | None:
     """What goes wrong in one run."""
     try:
-        World(schedule, make, trace).run()
+        World(suite.adapt(schedule), suite.make, trace).run()
     except Exception as error:  # also what the code under test raises by mistake
         return error
     return None
 
 
-def examine(seed: int, make: MakeMaster, again: str) -> None:
+def examine(seed: int, suite: Suite, again: str) -> None:
     """Run the schedule of ``seed``; Failure if it breaks a promise."""
     schedule = draw(seed)
-    if run(schedule, make) is None:
+    if run(schedule, suite) is None:
         return
-    schedule = shrink(schedule, make)
+    schedule = shrink(schedule, suite)
     trace: list[str] = []
-    error = run(schedule, make, trace)
+    error = run(schedule, suite, trace)
     assert error is not None
     raise Failure(schedule, error, trace, again)
 
 
-def first_failure(seeds: Iterable[int], make: MakeMaster) -> tuple[int, Exception] | None:
+def first_failure(seeds: Iterable[int], suite: Suite) -> tuple[int, Exception] | None:
     """The first seed that breaks a promise, and how."""
     for seed in seeds:
-        error = run(draw(seed), make)
+        error = run(draw(seed), suite)
         if error is not None:
             return seed, error
     return None
 
 
-def shrink(schedule: Schedule, make: MakeMaster) -> Schedule:
+def shrink(schedule: Schedule, suite: Suite) -> Schedule:
     """The smallest schedule found that fails in the same way."""
-    kind = _kind(run(schedule, make))
+    kind = _kind(run(schedule, suite))
     budget = itertools.count()
     while True:
         for smaller in simpler(schedule):
             if next(budget) == ATTEMPTS:
                 return schedule
-            if _kind(run(smaller, make)) == kind:
+            if _kind(run(smaller, suite)) == kind:
                 schedule = smaller
                 break
         else:
@@ -90,7 +100,7 @@ def shrink(schedule: Schedule, make: MakeMaster) -> Schedule:
 
 def _kind(error: Exception | None) -> tuple[type | None, str]:
     """What makes two failures the same: all but the numbers."""
-    return type(error) if error else None, re.sub(r"\d+", "", str(error))
+    return type(error) if error else None, re.sub(r"\d+(, \d+)*", "", str(error))
 
 
 def describe(schedule: Schedule) -> list[str]:

@@ -220,9 +220,7 @@ class LedgerMaster:
         if [ref for ref, _ in said.tasks] != [receipt.item(index) for index in indexes]:
             raise Violation("results are booked for other tasks")
         for at, (ref, act) in enumerate(said.tasks, receipt.start):
-            if act is Act.RETRIED and self.ledger.retry(receipt, at):
-                self.world.oracle.tried_again(ref)
-            else:
+            if act is not Act.RETRIED or not self.ledger.retry(receipt, at):
                 self._deliver(receipt.job, ref, act)
 
     def _deliver(self, job: engine.Job, ref: Ref, outcome: Act | str) -> None:

@@ -28,6 +28,8 @@ class Account:
         self.fed = 0
         self.closed = False
         self.cancelled = False
+        self.refused = False
+        """The pool was closed before all of it was asked for."""
         self.finished = False
         self.delivered = 0
         """A bit for each task of which the user has heard."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 
 from fiber._engine.ledger import Ledger
-from simulation.explore import MakeMaster, examine
+from simulation.dispatcher_master import DispatcherMaster, for_pool
+from simulation.explore import Suite, examine
 from simulation.ledger_master import LedgerMaster
 from simulation.world import World
 
@@ -21,7 +22,10 @@ def with_ledger(world: World) -> LedgerMaster:
     return LedgerMaster(world, Ledger())
 
 
-SUITES: dict[str, MakeMaster] = {"ledger": with_ledger}
+SUITES = {
+    "ledger": Suite(with_ledger),
+    "dispatcher": Suite(DispatcherMaster, for_pool),
+}
 
 
 def again(suite: str, seed: int) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
-from simulation.explore import Failure, MakeMaster, examine, first_failure, run
+from simulation.explore import Failure, Suite, examine, first_failure, run
 from simulation.ledger_master import LedgerMaster
 from simulation.schedule import draw
 from simulation.suites import SUITES, again, with_ledger
@@ -151,8 +151,8 @@ BROKEN = [
 ]
 
 
-def with_broken(ledger: type[Ledger]) -> MakeMaster:
-    return lambda world: LedgerMaster(world, ledger())
+def with_broken(ledger: type[Ledger]) -> Suite:
+    return Suite(lambda world: LedgerMaster(world, ledger()))
 
 
 @pytest.mark.parametrize("ledger", BROKEN)
@@ -162,11 +162,11 @@ def test_a_broken_ledger_is_found_out(ledger: type[Ledger]) -> None:
 
 @contextmanager
 def failing(ledger: type[Ledger]) -> Iterator[pytest.ExceptionInfo[Failure]]:
-    make = with_broken(ledger)
-    found = first_failure(SEEDS, make)
+    suite = with_broken(ledger)
+    found = first_failure(SEEDS, suite)
     assert found is not None
     with pytest.raises(Failure) as caught:
-        examine(found[0], make, again("ledger", found[0]))
+        examine(found[0], suite, again("ledger", found[0]))
     yield caught
 
 

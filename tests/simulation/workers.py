@@ -75,6 +75,7 @@ class Worker:
         self.number = number
         self.functions: set[int] = set()
         """Those that it remembers."""
+        self.born = False
         self.dead = False
         self.board: tuple[int, int] | None = None
         self.work: Work | None = None
@@ -101,6 +102,7 @@ class Worker:
 
     def be_born(self) -> None:
         """Start up."""
+        self.born = True
         self._later(self._rng.random() * 2e-3, self._initialize)
 
     def _initialize(self) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 from fiber._agent.port import ChildObserver
@@ -30,6 +31,27 @@ CALLS = 50_000
 
 END = 1e6
 """Simulated seconds after which nothing can be left to happen."""
+
+
+class Loop(SimulatedLoop):
+    """The simulated loop; what other threads do happens on its thread, but does not know it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._off = 0
+
+    def on_thread(self) -> bool:
+        """Whether whoever asks may take this for the loop's thread."""
+        return not self._off
+
+    @contextmanager
+    def off_thread(self) -> Iterator[None]:
+        """What happens within happens on another thread."""
+        self._off += 1
+        try:
+            yield
+        finally:
+            self._off -= 1
 
 
 class Language(Protocol):
@@ -78,11 +100,11 @@ class World:
         trace: list[str] | None = None,
     ) -> None:
         self.schedule = schedule
-        self.loop = SimulatedLoop()
+        self.loop = Loop()
         self.oracle = Oracle(schedule)
         self.agents = [Agent(self, number, plan) for number, plan in enumerate(schedule.agents)]
         self._trace = trace
-        self._workers: list[Worker] = []
+        self.workers: list[Worker] = []
         self._calls = 0
         self._faults: dict[int, list[Fault]] = {}
         for fault in schedule.faults:
@@ -117,13 +139,13 @@ class World:
     def start(self, agent: Agent, observer: ChildObserver) -> Child:
         """Start a worker on ``agent``."""
         child = agent.start(observer)
-        self._workers.append(child.worker)
+        self.workers.append(child.worker)
         self.note("%s is started on %s", child.name, agent.host)
         return child
 
     def next_worker(self) -> int:
         """The number of the next worker."""
-        return len(self._workers)
+        return len(self.workers)
 
     def faults_of(self, worker: int) -> list[Fault]:
         """What happens to a worker as it goes on."""
@@ -154,5 +176,5 @@ class World:
             later(fault.at, self._master.terminate)
 
     def _on_worker(self, number: int, act: Callable[[Worker], None]) -> None:
-        if number < len(self._workers):
-            act(self._workers[number])
+        if number < len(self.workers):
+            act(self.workers[number])

@@ -455,6 +455,7 @@ def lost_soul(hosts: Hosts, far: Far) -> Iterator[Callable[..., Any]]:
         ours.close()
         process.kill()
         process.join()
+        process.close()
 
 
 def test_a_far_receiver_killed_while_waiting_takes_nothing(

@@ -11,6 +11,7 @@ thread.
 from __future__ import annotations
 
 import errno
+import fcntl
 import itertools
 import os
 import pickle
@@ -28,6 +29,8 @@ from fiber._agent import zygote
 from fiber._agent.board import Board
 from fiber._agent.child import interpreter_arguments
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._hub.access import Access
+from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
 from fiber._transport.unix import naming_the_limit, socketpair
@@ -41,8 +44,9 @@ _QUIT_TIMEOUT = 10.0
 class Agent:
     """Runs the children of this host; an ``AgentPort``."""
 
-    def __init__(self, loop: Loop, host: str) -> None:
+    def __init__(self, loop: Loop, host: str, hub: Hub | None = None) -> None:
         self.host = host
+        self._hub = hub
         self._loop = loop
         self._lock = threading.Lock()
         self._ids = itertools.count(1)
@@ -77,9 +81,17 @@ class Agent:
             link.quit()
         self._loop.call_soon(self._board.close)
 
+    def access(self) -> Access | None:
+        """What our children are told of this host's hub."""
+        return self._hub.access if self._hub is not None else None
+
     def _zygote(self, *, preload: bool = True) -> _ZygoteLink:
         if not self._zygotes or not preload:
-            self._zygotes.append(_ZygoteLink(self, self._loop, self._board.fd, preload=preload))
+            link = _ZygoteLink(self, self._loop, self._board.fd, preload=preload)
+            self._zygotes.append(link)
+            access = self.access()
+            if access is not None:
+                link.send(zygote.INHERIT, os.path.dirname(access.address))
         return self._zygotes[-1]
 
     # What zygotes say, on the loop's thread
@@ -290,6 +302,7 @@ class _ZygoteLink:
             spec.executable,
             captured=spec.stdio is not None,
             open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
+            hub=self._agent.access(),
         )
         self._outbox.send(pickle.dumps((zygote.START, child.id, tuple(start)), protocol=5), fds=fds)
 
@@ -326,18 +339,34 @@ class _ZygoteLink:
 
 
 def _launch(control: int, board: int, *, preload: bool) -> subprocess.Popen[bytes]:
-    statement = (
-        f"from fiber._agent.zygote import main; main({control}, {board}, {os.getpid()}, {preload})"
-    )
-    return subprocess.Popen(
-        interpreter_arguments(sys.executable, statement),
-        pass_fds=(control, board),
-        stdin=subprocess.DEVNULL,
-        # Ctrl-C in the terminal is for the program's own group.  A session of its own would make
-        # the kernel's scheduler share the processors between program and children by half
-        # (sched_autogroup), however many children there are.
-        process_group=0,
-    )
+    # A program that closed its standard streams may have their numbers under ours; the zygote and
+    # its children must not.
+    fds = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 3) for fd in (control, board)]
+    arguments = f"{fds[0]}, {fds[1]}, {os.getpid()}, {preload}"
+    try:
+        return subprocess.Popen(
+            interpreter_arguments(
+                sys.executable, f"from fiber._agent.zygote import main; main({arguments})"
+            ),
+            pass_fds=fds,
+            stdin=subprocess.DEVNULL,
+            stdout=_null_if_closed(1),
+            stderr=_null_if_closed(2),
+            # Ctrl-C in the terminal is for the program's own group.  A session of its own would
+            # make the kernel's scheduler share the processors between program and children by half
+            # (sched_autogroup), however many children there are.
+            process_group=0,
+        )
+    finally:
+        _close_all(fds)
+
+
+def _null_if_closed(fd: int) -> int | None:
+    try:
+        os.fstat(fd)
+    except OSError:
+        return subprocess.DEVNULL
+    return None
 
 
 def describe(exitcode: int) -> str:

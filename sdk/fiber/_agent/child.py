@@ -18,6 +18,7 @@ from multiprocessing import util
 from typing import TYPE_CHECKING, Any, cast
 
 from fiber._agent.board import Board
+from fiber._hub import access
 from fiber._transport.unix import UnixChannel
 
 if TYPE_CHECKING:
@@ -94,6 +95,8 @@ def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
 
 def _load(start: Start) -> Any:
     data: dict[str, Any] = pickle.loads(start.preparation)
+    if start.hub is not None:
+        access.install(start.hub)
     prepare_paths(data)
     _prepare_environment(data)
     with inheriting():

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from fiber._agent.agent import Agent
 from fiber._agent.capture import Capture
 from fiber._agent.port import ChildSpec, ExitReport
+from fiber._hub.hub import Hub
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
 from fiber._transport.session import Frame
@@ -21,8 +22,12 @@ _BACKLOG = 4 << 20
 class AgentService:
     """Serves one master until the link ends; a ``LinkObserver``.  On the loop's thread."""
 
-    def __init__(self, loop: Loop, link: Link, agent: Agent, on_end: Callable[[str], None]) -> None:
+    def __init__(
+        self, loop: Loop, link: Link, agent: Agent, hub: Hub, on_end: Callable[[str], None]
+    ) -> None:
         self._loop = loop
+        self._hub = hub
+        self._tunnels = hub.link(None, self.send, dialer=True)
         self._link = link
         self._agent = agent
         self._on_end = on_end
@@ -47,6 +52,8 @@ class AgentService:
             self._start(message)
         elif isinstance(message, messages.Shutdown):
             self.stop("the master ended", message.grace)
+        elif isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
+            self._tunnels.on_frame(message)
         elif isinstance(message, messages.Deliver | messages.Signal | messages.TakeBack):
             child = self._children.get(message.child)
             if child is not None:  # otherwise its end and this crossed
@@ -60,6 +67,7 @@ class AgentService:
 
     def on_lost(self, reason: str) -> None:
         """The master is gone for good."""
+        self._hub.unlink(None, reason)
         self.stop(f"lost the master: {reason}", 0)
 
     # Children

@@ -6,7 +6,8 @@ sends them signals (a pid that only we can reap cannot be someone else's).  It e
 it, when its agent's process does.
 
 Packets from the agent: ``(START, child, start, descriptor count)``, ``(SIGNAL, child, signum)``,
-``(DESCRIPTORS,)`` (more descriptors for the START that follows), ``(QUIT,)``.
+``(DESCRIPTORS,)`` (more descriptors for the START that follows), ``(QUIT,)``, ``(INHERIT,
+directory)``: to be removed should the agent's process die before it can do so itself.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
 ``(UNFIT, child, reason)``: this zygote's imports made forking unsafe, start that child elsewhere.
 """
@@ -20,6 +21,7 @@ import os
 import pickle
 import resource
 import select
+import shutil
 import signal
 import socket
 import sys
@@ -31,9 +33,10 @@ from typing import Any, NamedTuple, NoReturn
 
 from fiber._agent import child as child_module
 from fiber._agent.board import Board
+from fiber._hub.access import Access
 from fiber._wire import packet
 
-START, SIGNAL, DESCRIPTORS, QUIT = range(4)
+START, SIGNAL, DESCRIPTORS, INHERIT, QUIT = range(5)
 STARTED, FAILED, EXITED, UNFIT = range(4)
 
 _HELD = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -56,6 +59,8 @@ class Start(NamedTuple):
     """Whether its output goes to its agent, which wants it line by line."""
     open_files: tuple[int, int]
     """Its limits of descriptors, soft and hard: those of its agent's process."""
+    hub: Access | None
+    """Where it finds the hub of its host."""
 
 
 class Zygote:
@@ -73,6 +78,7 @@ class Zygote:
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
         self._descriptors: list[int] = []
+        self._heirlooms: list[str] = []
         self._deaths, self._deaths_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self._poller = select.poll()
         for fd in (control.fileno(), self._deaths, agent):
@@ -81,17 +87,18 @@ class Zygote:
     def run(self) -> None:
         """Serve until told to quit or the agent's process is gone; then kill what is left."""
         self._listen_to_signals()
-        grace = 0.0
         while True:
             ready = {fd for fd, _ in self._poller.poll()}
             if self._deaths in ready:
                 self._reap()
             if self._agent in ready:
-                grace = GRACE
-                break
+                self._end(GRACE)
+                for directory in self._heirlooms:
+                    shutil.rmtree(directory, ignore_errors=True)
+                return
             if self._control.fileno() in ready and not self._serve():
-                break
-        self._end(grace)
+                self._end(0)
+                return
 
     def _listen_to_signals(self) -> None:
         # Ctrl-C in a terminal is the master's alone.  SIGTERM to us would orphan the children.
@@ -114,6 +121,8 @@ class Zygote:
             self._start(request[1], Start(*request[2]), fds)
         elif request[0] == SIGNAL:
             self._signal(request[1], request[2])
+        elif request[0] == INHERIT:
+            self._heirlooms.append(request[1])
         return bool(request[0] != QUIT)
 
     def _start(self, child: int, start: Start, fds: list[int]) -> None:

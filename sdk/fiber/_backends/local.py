@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fiber._agent.agent import Agent
+from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
 
 
@@ -12,8 +13,8 @@ class LocalBackend:
     name = "local"
     same_host = True
 
-    def __init__(self, loop: Loop, host: str) -> None:
-        self._agent = Agent(loop, host)
+    def __init__(self, loop: Loop, hub: Hub) -> None:
+        self._agent = Agent(loop, hub.host, hub)
 
     def place(self) -> Agent:
         """The one agent."""

@@ -14,6 +14,7 @@ import threading
 from fiber._agent.child import interpreter_arguments
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
+from fiber._hub.hub import Hub
 from fiber._transport.credentials import make_credentials
 from fiber._transport.link import Link, Patience
 from fiber._transport.listener import MasterListener
@@ -33,8 +34,9 @@ class LoopbackBackend:
     name = "loopback"
     same_host = False
 
-    def __init__(self, loop: Loop, config: Config) -> None:
+    def __init__(self, loop: Loop, hub: Hub, config: Config) -> None:
         self._loop = loop
+        self._hub = hub
         self._config = config
         self._output = Output()
         self._lock = threading.Lock()
@@ -86,7 +88,7 @@ class LoopbackBackend:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{self._launched}"
         self._launched += 1
-        agent = RemoteAgent(name, self._output, on_lost=self._lost)
+        agent = RemoteAgent(name, self._hub, self._output, on_lost=self._lost)
         return _AgentProcess(self._loop, agent, self._environment(name))
 
     def _environment(self, name: str) -> dict[str, str]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
+from fiber._hub.hub import Hub
 from fiber._transport.link import Link
 from fiber._transport.session import Frame
 from fiber._wire import messages, packet
@@ -29,9 +30,11 @@ class RemoteAgent:
     """
 
     def __init__(
-        self, host: str, output: Output, on_lost: Callable[[RemoteAgent, str], None]
+        self, host: str, hub: Hub, output: Output, on_lost: Callable[[RemoteAgent, str], None]
     ) -> None:
         self.host = host
+        self._hub = hub
+        self._tunnels = hub.link(host, self.send, dialer=False)
         self._output = output
         self._on_lost = on_lost
         self._lock = threading.Lock()
@@ -93,6 +96,7 @@ class RemoteAgent:
                 return
             self._lost = reason
             children, self._children = self._children, {}
+        self._hub.unlink(self.host, reason)
         self._on_lost(self, reason)
         for child in children.values():
             child.end(
@@ -104,6 +108,9 @@ class RemoteAgent:
     def on_frame(self, frame: Frame) -> None:
         """What the agent tells of its children."""
         message = messages.decode(frame)
+        if isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
+            self._tunnels.on_frame(message)
+            return
         if isinstance(message, messages.Problem):
             self._output.write(self.host, message.text)
             return

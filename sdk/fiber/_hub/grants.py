@@ -28,12 +28,14 @@ class Granted(NamedTuple):
 class GrantSet:
     """Grants that last until they are released, the set is forgotten or this process ends.
 
-    For what may be unpickled any number of times: a process's start, a task that may run again.
+    ``reusable``: for what may be unpickled any number of times, as a task that may run again.
+    Otherwise each also ends with its first use, as what is given to a new process.
     """
 
-    __slots__ = ("_direct", "_lines")
+    __slots__ = ("_direct", "_lines", "_reusable")
 
-    def __init__(self) -> None:
+    def __init__(self, *, reusable: bool = True) -> None:
+        self._reusable = reusable
         self._direct: list[tuple[Registry, int]] = []
         self._lines: dict[Access, Line] = {}
 
@@ -45,15 +47,15 @@ class GrantSet:
         """A grant for an object of this host."""
         hub = access.own_hub()
         if hub is not None:
-            number, grant = hub.registry.register(kind, fd, reusable=True)
+            number, grant = hub.registry.register(kind, fd, reusable=self._reusable)
             self._direct.append((hub.registry, grant))
             return Granted(hub.access, number, grant)
         own = access.current()
-        return _ask_local(self._line(own), own, kind, fd, reusable=True)
+        return _ask_local(self._line(own), own, kind, fd, reusable=self._reusable)
 
     def for_remote(self, end: RemoteObject) -> Granted:
         """A grant for an object of another host."""
-        reply = self._line(end.home).ask(Op.GRANT, end.number, True, form=TWO)
+        reply = self._line(end.home).ask(Op.GRANT, end.number, self._reusable, form=TWO)
         return Granted(end.home, *reply.values)
 
     def release(self) -> None:
@@ -152,12 +154,12 @@ def current() -> GrantSet | _SingleUse:
 
 
 @contextlib.contextmanager
-def collecting_grants() -> Iterator[GrantSet]:
+def collecting_grants(*, reusable: bool = True) -> Iterator[GrantSet]:
     """Handles pickled on this thread within the block work until the yielded set is released.
 
-    If the block raises, it is released.
+    If the block raises, it is released.  Not ``reusable``: each works once.
     """
-    grants = GrantSet()
+    grants = GrantSet(reusable=reusable)
     before, _attempt.collecting = _attempt.collecting, grants
     try:
         yield grants

@@ -54,6 +54,7 @@ class Hub:
         self._door: socket.socket | None = None
         self._access: Access | None = None
         self.directory: str | None = None
+        self._closed = False
 
     @property
     def access(self) -> Access:
@@ -95,6 +96,9 @@ class Hub:
 
     def close(self) -> None:
         """End all streams, let go of all objects, leave no file.  On the loop, or after its end."""
+        if self._closed:
+            return
+        self._closed = True
         for session in list(self._sessions):
             session.close("the program that keeps it has ended")
         for stream in list(self._streams):

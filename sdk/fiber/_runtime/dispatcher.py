@@ -13,7 +13,7 @@ from fiber._runtime.exchange import Exchange, Terms
 from fiber._runtime.outcome import Failure
 from fiber._runtime.reader import Reader
 from fiber._runtime.requests import Call, Function, Request, Sink, name_of
-from fiber._runtime.workers import Link
+from fiber._runtime.workers import PoolProcess
 from fiber._wire import work
 
 __all__ = ["Dispatcher", "Terms"]
@@ -260,8 +260,8 @@ class Dispatcher(Exchange):
             self._give_up(error)
             for link in links:
                 link.terminate()
-        if links:
-            self._loop.call_later(KILL_AFTER, _kill, links)
+            if links:
+                self._kill_timer = self._loop.call_later(KILL_AFTER, _kill, links)
         self._wind_down()
 
     def join(self) -> None:
@@ -273,10 +273,10 @@ class Dispatcher(Exchange):
         self.pump.join()
         self.callbacks.join()
 
-    def links(self) -> list[Link]:
-        """The workers that are there."""
+    def processes(self) -> list[PoolProcess]:
+        """The processes of the workers that are there."""
         with self._lock:
-            return list(self.crew.links)
+            return [link.process for link in self.crew.links if link.process is not None]
 
 
 def _kill(links: list[Any]) -> None:

@@ -75,6 +75,7 @@ class Exchange:
         self._deadlines: dict[int, Timer] = {}
         self._recall_timer: Timer | None = None
         self._idle_timer: Timer | None = None
+        self._kill_timer: Timer | None = None
         self._closing = False
         self._terminated = False
         self.crew = Crew(
@@ -326,7 +327,7 @@ class Exchange:
             name = request.task_name(receipt.start, receipt.item(receipt.start))
             error = TimeoutError(
                 f"{name} took longer than its timeout of {request.timeout:g} s; "
-                f"its worker {link.process.name!r} was killed"  # type: ignore[union-attr]
+                f"its worker {link.name!r} was killed"
             )
             self._put(receipt, [Failure(error)], ends)
         link.kill()
@@ -383,7 +384,7 @@ class Exchange:
         request: Request = loss.job.owner
         error = WorkerDied(
             task=request.task_name(loss.task, loss.item),
-            worker=link.process.name if link.process is not None else "",
+            worker=link.name,
             host=report.host,
             pid=link.pid,
             exitcode=report.exitcode,
@@ -506,8 +507,13 @@ class Exchange:
                     if link.worker is None or self._ledger.leave(link.worker):
                         link.leaving = True
                         leaving.append(link)
-            if not self.crew.links and not self.crew.hiring:
-                self.pump.stop()
-                self.callbacks.stop()
-                self.ended.set()
+            over = not self.crew.links and not self.crew.hiring
+            if over:
+                for timer in (self._recall_timer, self._idle_timer, self._kill_timer):
+                    if timer is not None:
+                        timer.cancel()
         dismiss(leaving)
+        if over:
+            self.pump.stop()
+            self.callbacks.stop()
+            self.ended.set()

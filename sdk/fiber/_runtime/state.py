@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from fiber import config, reduction
 from fiber._agent import child
-from fiber._agent.port import AgentPort, ChildObserver, ChildPort, ChildSpec
+from fiber._agent.port import AgentPort, ChildObserver, ChildPort, ChildSpec, ExitReport
+from fiber._hub import access
+from fiber._hub.grants import GrantSet, collecting_grants
+from fiber._hub.hub import Hub
 from fiber._runtime import methods
 from fiber._transport.loop import Loop
 
@@ -33,14 +36,16 @@ class Runtime:
     def __init__(self) -> None:
         self.config = config.current()
         self.loop = Loop()
-        self.host = child.host or "local"
+        self.hub = Hub(self.loop, child.host or "local", self.config.runtime_directory)
         try:
             self.backend: Backend = _make_backend(self)
         except BaseException:
+            self.hub.close()
             self.loop.stop()
             raise
         reduction.readers_are_remote(not self.backend.same_host)
         self.loop.start_thread("fiber-io")
+        access.serve(self.hub)
 
     def start(
         self,
@@ -57,7 +62,10 @@ class Runtime:
         """
         agent = self.backend.place()
         same_host = self.backend.same_host
-        payload, fds = reduction.dump_process(process, same_host=same_host)
+        with collecting_grants(reusable=False) as grants:
+            payload, fds = reduction.dump_process(process, same_host=same_host)
+        if grants:
+            observer = _Releasing(observer, grants)
         spec = ChildSpec(
             name=process.name,
             method=method,
@@ -93,16 +101,34 @@ class Runtime:
         """End every child, agent and thread.  Not on the loop's thread."""
         self.backend.close()
         self.loop.stop()
+        access.serve(None)
+        self.hub.close()
+
+
+class _Releasing:
+    """Passes on what is heard of a child and, when it is gone, takes back what it never used."""
+
+    def __init__(self, observer: ChildObserver, grants: GrantSet) -> None:
+        self.started = observer.started
+        self.said = observer.said
+        self.taken_back = observer.taken_back
+        self._observer = observer
+        self._grants = grants
+
+    def exited(self, report: ExitReport) -> None:
+        """It is gone."""
+        self._grants.release()
+        self._observer.exited(report)
 
 
 def _make_backend(runtime: Runtime) -> Backend:
     if runtime.config.backend == "loopback":
         from fiber._backends.loopback import LoopbackBackend
 
-        return LoopbackBackend(runtime.loop, runtime.config)
+        return LoopbackBackend(runtime.loop, runtime.hub, runtime.config)
     from fiber._backends.local import LocalBackend
 
-    return LocalBackend(runtime.loop, runtime.host)
+    return LocalBackend(runtime.loop, runtime.hub)
 
 
 def _modules_of(process: Any) -> list[str]:
@@ -148,4 +174,5 @@ def _forget() -> None:
 
 
 os.register_at_fork(after_in_child=_forget)
+access.start_with(runtime)
 config.guard(lambda: _runtime is not None)

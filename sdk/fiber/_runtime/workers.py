@@ -16,10 +16,10 @@ from typing import Any, Protocol
 from fiber._agent import worker
 from fiber._agent.port import ChildPort, ExitReport
 from fiber._engine.ledger import Worker
+from fiber._runtime.methods import zygote_method
 from fiber._runtime.state import runtime
 from fiber._wire import work
 from fiber._wire.packet import Message
-from fiber._runtime.methods import zygote_method
 from fiber.errors import StartError
 from fiber.process import Process
 
@@ -45,6 +45,7 @@ class Link:
 
     def __init__(self, supervisor: Supervisor) -> None:
         self.process: PoolProcess | None = None
+        """Once it is started."""
         self.port: ChildPort | None = None
         self.worker: Worker | None = None
         """Its entry in the ledger, once it is ready."""
@@ -60,9 +61,13 @@ class Link:
         self._exited = threading.Event()
         self._sentinel: int | None = None
 
+    @property
+    def name(self) -> str:
+        """The worker's name."""
+        return self.port.name if self.port is not None else "?"
+
     def launch(self, process: PoolProcess, method: str) -> None:
         """Start the process; returns before it exists."""
-        self.process = process
         self.port = runtime().start(process, self, tasks=True, method=method)
 
     # What the agent says, on the loop's thread
@@ -207,6 +212,7 @@ class Crew:
             self.links[link] = None
         try:
             process.start()
+            link.process = process
         except BaseException:
             with self._lock:
                 self.links.pop(link, None)
@@ -246,10 +252,8 @@ class Crew:
         self.failures += 1
         if self.failures >= TRIES and not self.ready():
             reason = "its initializer raised" if link.complaint else report.reason
-            assert link.process is not None
-            name = link.process.name
             self.error = StartError(
-                f"pool worker {name!r}", reason, link.complaint or "\n".join(report.log), TRIES
+                f"pool worker {link.name!r}", reason, link.complaint or "\n".join(report.log), TRIES
             )
 
     def hesitant(self) -> bool:

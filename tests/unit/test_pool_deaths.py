@@ -1,0 +1,242 @@
+"""Workers that die, tasks that take too long, workers that cannot start."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import fiber
+from fiber.errors import StartError, WorkerDied
+from fiber.pool import Pool
+from unit import pool_tasks as tasks
+
+PATIENCE = tasks.PATIENCE
+
+
+@pytest.fixture
+def pool() -> Iterator[Pool]:
+    pool = fiber.Pool(2, retries=3)
+    yield pool
+    assert pool.map(tasks.square, range(10)) == [x * x for x in range(10)]
+    assert len(pool._pool) == 2
+    pool.close()
+    pool.join()
+
+
+@pytest.mark.parametrize(
+    ("how", "exitcode", "reason"),
+    [
+        ("exit", 3, "exit status 3"),
+        ("sys.exit", 4, "exit status 4"),
+        ("kill", -signal.SIGKILL, "SIGKILL"),
+        ("segfault", -signal.SIGSEGV, "SIGSEGV"),
+    ],
+)
+def test_a_task_that_kills_its_worker_fails_with_the_reason(
+    pool: Pool, how: str, exitcode: int, reason: str
+) -> None:
+    with pytest.raises(WorkerDied, match=reason) as caught:
+        pool.apply(tasks.die, (how,))
+    error = caught.value
+    assert "die" in error.task
+    assert "PoolWorker-" in error.worker
+    assert (error.exitcode, error.attempts) == (exitcode, 4)
+    assert error.pid is not None
+
+
+def test_a_task_runs_again_when_its_worker_died(pool: Pool, tmp_path: Path) -> None:
+    assert pool.apply(tasks.die_at_first, (tmp_path / "a",)) == "lived"
+    assert pool.map(tasks.die_at_first, [tmp_path / "b"], 1) == ["lived"]
+
+
+def test_a_worker_killed_from_outside_costs_nothing(pool: Pool, tmp_path: Path) -> None:
+    path, gate = tmp_path / "here", tmp_path / "gate"
+    result = pool.apply_async(tasks.announce_and_wait, (path, gate))
+    (victim,) = tasks.wait_until_announced(path)
+    os.kill(victim, signal.SIGKILL)
+    tasks.wait_until_announced(path, 2)
+    gate.touch()
+    assert result.get(PATIENCE) == "gate"
+
+
+@pytest.mark.parametrize("chunksize", [None, 1, 10])
+def test_only_the_culprit_fails(pool: Pool, chunksize: int | None) -> None:
+    pool.map(tasks.die_if, [(n, -1) for n in range(3000)], chunksize)  # batches become large
+    pairs = [(n, 250) for n in range(500)]
+    iterator = pool.imap(tasks.die_if, pairs, chunksize or 1)
+    assert [next(iterator) for _ in range(250)] == list(range(250))
+    with pytest.raises(WorkerDied, match="task 250 of die_if"):
+        next(iterator)
+    assert list(iterator) == list(range(251, 500))
+    with pytest.raises(WorkerDied, match="task 250 of die_if") as caught:
+        pool.map(tasks.die_if, pairs, chunksize)
+    assert caught.value.attempts == 4
+
+
+@pytest.mark.parametrize("retries", [0, 1])
+def test_a_task_has_as_many_tries_as_were_asked_for(tmp_path: Path, retries: int) -> None:
+    with fiber.Pool(2, retries=retries) as pool:
+        with pytest.raises(WorkerDied) as caught:
+            pool.apply(tasks.die_when_counted, (tmp_path / "runs",))
+        assert tasks.runs(tmp_path / "runs") == caught.value.attempts == retries + 1
+        # With tasks around it that are worth sending together.
+        pairs = [(n, 250) for n in range(500)]
+        with pytest.raises(WorkerDied, match="task 250"):
+            pool.map(tasks.die_if, pairs)
+    pool.join()
+
+
+def test_without_retries_no_task_runs_twice(tmp_path: Path) -> None:
+    paths = [tmp_path / str(n) for n in range(100)]
+    with fiber.Pool(2, retries=0) as pool:
+        pool.map(tasks.square, range(1000))
+        result = pool.map_async(tasks.count, [*paths, tmp_path / "x"])
+        for victim in [process.pid for process in pool._pool]:
+            os.kill(victim, signal.SIGKILL)
+        result.wait(PATIENCE)
+        assert result.ready()
+    pool.join()
+    assert all(tasks.runs(path) <= 1 for path in paths)
+
+
+def test_all_workers_killed_again_and_again(pool: Pool) -> None:
+    # Three times: a task that is hit each time still has one try.
+    result = pool.map_async(tasks.nap_and_return, range(2000), 1)
+    for _ in range(3):
+        for process in pool._pool:
+            process.kill()
+        time.sleep(0.01)  # let some work be done in between
+    assert result.get(PATIENCE) == list(range(2000))
+
+
+def test_broadcast_reaches_the_replacement_of_a_worker(pool: Pool, tmp_path: Path) -> None:
+    assert sorted(pool.broadcast(tasks.die_at_first, tmp_path / "a")) == ["lived", "lived"]
+    with pytest.raises(WorkerDied):
+        pool.broadcast(tasks.die, "exit")
+
+
+def test_results_around_a_death_are_kept(pool: Pool) -> None:
+    iterator = pool.imap_unordered(tasks.die_if, [(n, 99) for n in range(100)])
+    found = []
+    while True:
+        try:
+            found.append(next(iterator))
+        except WorkerDied:
+            break
+    assert sorted([*found, *iterator]) == list(range(99))
+
+
+# Time
+
+
+@pytest.mark.parametrize("call", ["apply", "map", "starmap", "imap"])
+def test_a_task_over_its_timeout_is_killed(pool: Pool, tmp_path: Path, call: str) -> None:
+    path = tmp_path / "here"
+    inputs = {"apply": (path,), "map": [path], "starmap": [(path,)], "imap": [path]}
+
+    def run() -> None:
+        found = getattr(pool, call)(tasks.announce_and_sleep, inputs[call], timeout=0.3)
+        next(found)
+
+    with pytest.raises(fiber.TimeoutError, match=r"announce_and_sleep.* 0\.3 s"):
+        run()
+    assert len(tasks.announced(path)) == 1, "it ran again"
+
+
+def test_other_tasks_of_the_call_have_their_own_time(pool: Pool) -> None:
+    found = pool.imap(tasks.sleep, [0.001, 600, 0.002, 0.003], timeout=0.3)
+    assert next(found) == 0.001
+    with pytest.raises(fiber.TimeoutError):
+        next(found)
+    assert [next(found), next(found)] == [0.002, 0.003]
+
+
+def test_waiting_is_not_counted_as_running(pool: Pool) -> None:
+    assert pool.map(tasks.sleep, [0.15] * 6, timeout=0.4) == [0.15] * 6
+
+
+def test_a_timeout_for_all_tasks(tmp_path: Path) -> None:
+    with fiber.Pool(1, task_timeout=0.2) as pool:
+        with pytest.raises(fiber.TimeoutError):
+            pool.apply(tasks.sleep, (600,))
+        assert pool.map(tasks.square, range(5)) == [0, 1, 4, 9, 16]
+        assert pool.apply(tasks.sleep, (0.25,), timeout=PATIENCE) == 0.25
+    pool.join()
+
+
+# Birth
+
+
+def test_an_initializer_that_raises_is_told_and_not_tried_for_ever(tmp_path: Path) -> None:
+    path = tmp_path / "runs"
+    pool = fiber.Pool(2, tasks.refuse_counted, (path,))
+    with pytest.raises(StartError, match="no such device") as caught:
+        pool.map(tasks.square, range(10))
+    assert "refuse_counted" in str(caught.value)
+    with pytest.raises(StartError):
+        pool.apply(tasks.square, (1,))
+    with pytest.raises(StartError):
+        pool.imap(tasks.square, iter(range(3)))
+    pool.close()
+    pool.join()
+    assert tasks.runs(path) <= 5
+
+
+def test_outstanding_calls_hear_of_it() -> None:
+    pool = fiber.Pool(2, tasks.start_slowly, (Path("/nowhere"),))
+    results = [pool.apply_async(tasks.square, (n,)) for n in range(3)]
+    iterator = pool.imap(tasks.square, iter(range(10)))
+    deadline = time.monotonic() + PATIENCE
+    while not results[0].ready():
+        assert time.monotonic() < deadline, "workers are replaced for ever"
+        for process in pool._pool:
+            process.kill()
+        time.sleep(0.001)
+    for result in results:
+        with pytest.raises(StartError, match="SIGKILL"):
+            result.get(PATIENCE)
+    with pytest.raises(StartError):
+        iterator.next(PATIENCE)
+    pool.terminate()
+    pool.join()
+
+
+def test_workers_that_die_at_birth_are_not_tried_for_ever(tmp_path: Path) -> None:
+    path = tmp_path / "runs"
+    pool = fiber.Pool(1, tasks.vanish, (path,))
+    with pytest.raises(StartError, match="exit status 9"):
+        pool.apply(tasks.square, (1,))
+    pool.terminate()
+    pool.join()
+    assert tasks.runs(path) == 3
+
+
+def test_an_initializer_that_does_not_pickle() -> None:
+    with pytest.raises((RuntimeError, TypeError), match="cannot be pickled"):
+        fiber.Pool(2, tasks.remember, (tasks.Unpicklable(),))
+
+
+# Lifetime
+
+
+@pytest.mark.parametrize("chunksize", [None, 1, 5])
+def test_maxtasksperchild(chunksize: int | None) -> None:
+    with fiber.Pool(2, maxtasksperchild=2) as pool:
+        pids = pool.map(tasks.pid, range(20), chunksize)
+    pool.join()
+    chunk = chunksize or 3
+    per_worker = [pids.count(pid) for pid in set(pids)]
+    assert max(per_worker) <= 2 * chunk
+    assert len(per_worker) >= 20 // (2 * chunk)
+
+
+def test_maxtasksperchild_counts_calls() -> None:
+    with fiber.Pool(1, maxtasksperchild=1) as pool:
+        results = [pool.apply_async(tasks.pid) for _ in range(6)]
+        assert len({result.get(PATIENCE) for result in results}) == 6
+    pool.join()

@@ -1,0 +1,231 @@
+"""What does not pickle or unpickle: an error where it belongs, never a hang, nothing else lost."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from multiprocessing.pool import MaybeEncodingError, RemoteTraceback  # type: ignore[attr-defined]
+from typing import Any
+
+import pytest
+
+import fiber
+from fiber.pool import Pool
+from unit import pool_tasks as tasks
+
+PATIENCE = tasks.PATIENCE
+
+
+@pytest.fixture
+def pool() -> Iterator[Pool]:
+    pool = fiber.Pool(2)
+    yield pool
+    assert pool.apply_async(tasks.square, (3,)).get(PATIENCE) == 9, "the pool does not go on"
+    pool.close()
+    pool.join()
+
+
+def gather(iterator: Iterator[Any]) -> list[Any]:
+    """All results, errors in their places."""
+    found: list[Any] = []
+    while True:
+        try:
+            found.append(next(iterator))
+        except StopIteration:
+            return found
+        except Exception as error:
+            found.append(error)
+
+
+# Tasks that raise
+
+
+def test_an_exception_comes_with_its_remote_traceback(pool: Pool) -> None:
+    with pytest.raises(ValueError, match="5") as caught:
+        pool.apply(tasks.raise_value_error, (5,))
+    cause = caught.value.__cause__
+    assert isinstance(cause, RemoteTraceback)
+    assert "raise ValueError(value)" in str(cause)
+
+
+@pytest.mark.parametrize("chunksize", [None, 1, 4])
+def test_errors_stay_with_their_tasks(pool: Pool, chunksize: int | None) -> None:
+    pool.map(tasks.identity, range(100))
+    found = gather(pool.imap(tasks.raise_if_odd, range(40), chunksize or 1))
+    for index, value in enumerate(found):
+        assert value == index if index % 2 == 0 else value.args == (index,)
+    with pytest.raises(ValueError, match=r"\d"):
+        pool.map(tasks.raise_if_odd, range(40), chunksize)
+
+
+def test_an_exception_that_does_not_unpickle_says_what_it_was(pool: Pool) -> None:
+    with pytest.raises(MaybeEncodingError) as caught:
+        pool.apply(tasks.raise_bad_error)
+    text = str(caught.value)
+    assert "BadError" in text
+    assert "disk full" in text
+    assert 'raise BadError("disk full", 28)' in str(caught.value.__cause__)
+
+
+def test_an_exception_that_does_not_pickle_says_what_it_was(pool: Pool) -> None:
+    with pytest.raises(MaybeEncodingError, match="holds a lock") as caught:
+        pool.map(tasks.raise_held_error, range(3))
+    assert "raise HeldError" in str(caught.value.__cause__)
+
+
+def test_what_is_not_an_exception_reaches_the_caller(pool: Pool) -> None:
+    with pytest.raises(tasks.Exotic, match="strange"):
+        pool.apply(tasks.raise_exotic)
+
+
+# Results
+
+
+@pytest.mark.parametrize("chunksize", [1, 10])
+def test_results_that_do_not_travel_are_errors_of_their_tasks_only(
+    pool: Pool, chunksize: int
+) -> None:
+    found = gather(pool.imap(tasks.odd_results, range(30), chunksize))
+    for index, value in enumerate(found):
+        if index % 5 in (2, 3):
+            assert isinstance(value, MaybeEncodingError)
+        else:
+            assert value == index
+    assert "<Unpicklable>" in str(found[2])
+    assert "cannot be pickled" in str(found[2])
+    assert "cannot be unpickled in the program" in str(found[3])
+
+
+@pytest.mark.parametrize("chunksize", [None, 1, 10])
+def test_a_map_with_such_a_result_raises(pool: Pool, chunksize: int | None) -> None:
+    with pytest.raises(MaybeEncodingError):
+        pool.map(tasks.odd_results, [0, 1, 2], chunksize)
+    result = pool.map_async(tasks.odd_results, [0, 1, 3], chunksize)
+    result.wait(PATIENCE)
+    assert not result.successful()
+    with pytest.raises(MaybeEncodingError):
+        result.get()
+
+
+def test_a_result_that_cannot_even_be_shown(pool: Pool) -> None:
+    with pytest.raises(MaybeEncodingError, match="Unreprable object"):
+        pool.apply(tasks.unreprable_result)
+
+
+def test_callbacks_hear_of_results_that_do_not_travel(pool: Pool) -> None:
+    heard: list[Any] = []
+    for x in (2, 3):
+        result = pool.apply_async(tasks.odd_results, (x,), error_callback=heard.append)
+        result.wait(PATIENCE)
+    assert [type(error) for error in heard] == [MaybeEncodingError] * 2
+
+
+# Arguments
+
+
+@pytest.mark.parametrize("chunksize", [None, 1, 10])
+def test_an_argument_that_does_not_pickle(pool: Pool, chunksize: int | None) -> None:
+    with pytest.raises(RuntimeError, match="cannot be pickled"):
+        pool.map(tasks.identity, [1, tasks.Unpicklable(), 3], chunksize)
+    with pytest.raises(RuntimeError, match="cannot be pickled"):
+        pool.apply(tasks.identity, (tasks.Unpicklable(),))
+
+
+@pytest.mark.parametrize("source", [list, iter])
+def test_of_many_tasks_only_those_whose_arguments_do_not_pickle_fail(
+    pool: Pool, source: Any
+) -> None:
+    pool.map(tasks.identity, range(1000))  # batches become large
+    bad = {3, 200, 201, 499}
+    items = [tasks.Unpicklable() if n in bad else n for n in range(500)]
+    found = gather(pool.imap(tasks.identity, source(items)))
+    assert {n for n, value in enumerate(found) if isinstance(value, RuntimeError)} == bad
+    assert all(value == n for n, value in enumerate(found) if n not in bad)
+
+
+@pytest.mark.parametrize("chunksize", [1, 7])
+def test_of_many_tasks_only_those_whose_arguments_do_not_unpickle_fail(
+    pool: Pool, chunksize: int
+) -> None:
+    pool.map(tasks.identity, range(1000))
+    bad = {3, 200, 201, 499}
+    items = [tasks.UnreadableInWorker() if n in bad else n for n in range(500)]
+    found = gather(pool.imap(tasks.identity, items, chunksize))
+    assert {n for n, value in enumerate(found) if isinstance(value, RuntimeError)} == bad
+    assert all(value == n for n, value in enumerate(found) if n not in bad)
+    assert "cannot be unpickled in a worker" in str(found[3])
+
+
+def test_a_call_whose_arguments_do_not_unpickle(pool: Pool) -> None:
+    results = [
+        pool.apply_async(tasks.identity, (tasks.UnreadableInWorker() if n == 5 else n,))
+        for n in range(10)
+    ]
+    for n, result in enumerate(results):
+        if n == 5:
+            with pytest.raises(RuntimeError, match="in a worker"):
+                result.get(PATIENCE)
+        else:
+            assert result.get(PATIENCE) == n
+
+
+# Functions
+
+
+@pytest.mark.parametrize("call", ["map", "starmap", "imap", "apply", "broadcast"])
+def test_a_function_that_does_not_pickle(pool: Pool, call: str) -> None:
+    with pytest.raises((RuntimeError, pickle.PicklingError), match="cannot be pickled"):
+        run(pool, call, tasks.Unpicklable().__repr__)
+
+
+@pytest.mark.parametrize("call", ["map", "starmap", "imap", "apply", "broadcast"])
+def test_a_function_that_does_not_unpickle(pool: Pool, call: str) -> None:
+    with pytest.raises(RuntimeError, match="cannot be unpickled in a worker"):
+        run(pool, call, tasks.UnreadableInWorker())
+
+
+def run(pool: Pool, call: str, function: Any) -> Any:
+    if call == "apply":
+        return pool.apply(function, (1,))
+    if call == "broadcast":
+        return pool.broadcast(function)
+    if call == "starmap":
+        return pool.starmap(function, [(1,)] * 20)
+    if call == "imap":
+        return list(pool.imap(function, iter(range(20))))
+    return pool.map(function, range(20))
+
+
+# Retries of tasks that raise
+
+
+def test_retry_exceptions(tmp_path: Any) -> None:
+    with fiber.Pool(2, retry_exceptions=ConnectionError) as pool:
+        assert pool.apply(tasks.fail_until, (tmp_path / "a", 3)) == "done"
+        assert tasks.runs(tmp_path / "a") == 4
+        with pytest.raises(ConnectionError, match="try 4"):
+            pool.apply(tasks.fail_until, (tmp_path / "b", 4))
+        with pytest.raises(KeyError, match="always"):
+            pool.map(tasks.counted_error, [tmp_path / "c"])
+        assert tasks.runs(tmp_path / "c") == 1
+        paths = [(tmp_path / f"d{n}", n % 3) for n in range(30)]
+        assert pool.starmap(tasks.fail_until, paths) == ["done"] * 30
+        assert list(pool.imap(tasks.raise_if_odd, [2, 4])) == [2, 4]
+    pool.join()
+
+
+def test_error_handling_retries_any_exception_within_bounds(tmp_path: Any) -> None:
+    with fiber.Pool(1, error_handling=True, retries=2) as pool:
+        with pytest.raises(KeyError, match="always"):
+            pool.map(tasks.counted_error, [tmp_path / "c"])
+        assert tasks.runs(tmp_path / "c") == 3
+        assert pool.map(tasks.square, range(5)) == [0, 1, 4, 9, 16]
+    pool.join()
+
+
+def test_without_retries_nothing_runs_twice(tmp_path: Any) -> None:
+    with fiber.Pool(1, error_handling=True, retries=0) as pool:
+        with pytest.raises(KeyError, match="always"):
+            pool.apply(tasks.counted_error, (tmp_path / "c",))
+        assert tasks.runs(tmp_path / "c") == 1
+    pool.join()
