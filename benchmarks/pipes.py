@@ -61,7 +61,7 @@ def cases(size: float) -> list[Case]:
             name=name,
             group=group,
             needs="pipes",
-            params={**params, "count": max(5, round(count * size)), "seconds": 3.0 * size},
+            params={**params, "count": max(5, round(count * size)), "seconds": 2.0 * size},
             metrics=(metric,),
             fresh=True,
         )

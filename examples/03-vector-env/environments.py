@@ -54,9 +54,9 @@ def parse(description: str, arguments: Sequence[str] | None = None) -> argparse.
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("--envs", type=int, default=8, help="how many environments")
-    parser.add_argument("--steps", type=int, default=300, help="steps of each environment")
+    parser.add_argument("--steps", type=int, default=100, help="steps of each environment")
     parser.add_argument(
-        "--ms", type=float, default=2.0, help="milliseconds of a slow simulator's step"
+        "--ms", type=float, default=10.0, help="milliseconds of a slow simulator's step"
     )
     options = parser.parse_args(arguments)
     if options.envs < 1 or options.steps < 1 or options.ms < 0:

@@ -84,3 +84,20 @@ def exit_on_sigterm(connection: Any) -> NoReturn:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(42))
     connection.send("ready")
     block()
+
+
+def spin() -> NoReturn:
+    """Hold the interpreter."""
+    while True:
+        pass
+
+
+def shrug_off_signals() -> NoReturn:
+    for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(signum, signal.SIG_IGN)
+    block()
+
+
+def get_for_ever(queue: Any) -> NoReturn:
+    while True:
+        queue.get()

@@ -20,7 +20,7 @@ from fiber.errors import StartError, TimeoutError, WorkerDied
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation
-from simulation.schedule import Act, Schedule
+from simulation.schedule import Act, Job, Schedule, Task
 from simulation.staged import Actor, Stage, StagedDispatcher, StagedProcess, WatchedLock
 from simulation.workers import Ready, Ref, Results, Unknown, Unreadable, Work, Worker
 from simulation.world import END, World
@@ -319,6 +319,7 @@ class DispatcherMaster:
             self._dispatcher.read(request, self._slowly(actor, account, broken))
         except BrokenInput as error:
             self.world.note("the input of job %d is broken", account.number)
+            account.refused = True
             if tells:
                 account.closed = True
                 self._dispatcher.finish(request, error)
@@ -383,7 +384,7 @@ class DispatcherMaster:
         self.world.loop.run_for(END)
         if not self._dispatcher.ended.is_set():
             raise Violation("the pool does not end")
-        if self._dispatcher.links() or self._ledger.demand() or self._dispatcher._deadlines:
+        if self._dispatcher.crew.links or self._ledger.demand() or self._dispatcher._deadlines:
             raise Violation("the pool leaves something behind")
         for worker in self.world.workers:
             if worker.born and not worker.dead:
@@ -413,5 +414,11 @@ def _terms(schedule: Schedule) -> Terms:
 def for_pool(schedule: Schedule) -> Schedule:
     """What the user of a pool can ask for: retries, for one, are the pool's."""
     retries = schedule.jobs[0].retries
-    jobs = (replace(job, retries=retries, alone=job.timeout is not None) for job in schedule.jobs)
-    return replace(schedule, jobs=tuple(jobs))
+    return replace(schedule, jobs=tuple(_for_pool(job, retries) for job in schedule.jobs))
+
+
+def _for_pool(job: Job, retries: int) -> Job:
+    if job.everywhere:  # a broadcast has no timeout
+        tasks = tuple(task for task in job.tasks if task.act is not Act.ENDLESS)
+        job = replace(job, tasks=tasks or (Task(1e-3),), timeout=None)
+    return replace(job, retries=retries, alone=job.timeout is not None)

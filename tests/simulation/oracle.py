@@ -29,7 +29,7 @@ class Account:
         self.closed = False
         self.cancelled = False
         self.refused = False
-        """The pool was closed before all of it was asked for."""
+        """Not all of it could be asked for."""
         self.finished = False
         self.delivered = 0
         """A bit for each task of which the user has heard."""

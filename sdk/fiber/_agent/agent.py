@@ -10,7 +10,6 @@ thread.
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import itertools
 import os
@@ -29,6 +28,7 @@ from fiber._agent import zygote
 from fiber._agent.board import Board
 from fiber._agent.child import interpreter_arguments
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._hub import access
 from fiber._hub.access import Access
 from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
@@ -83,15 +83,14 @@ class Agent:
 
     def access(self) -> Access | None:
         """What our children are told of this host's hub."""
-        return self._hub.access if self._hub is not None else None
+        return self._hub.access if self._hub is not None else access.told()
 
     def _zygote(self, *, preload: bool = True) -> _ZygoteLink:
         if not self._zygotes or not preload:
             link = _ZygoteLink(self, self._loop, self._board.fd, preload=preload)
             self._zygotes.append(link)
-            access = self.access()
-            if access is not None:
-                link.send(zygote.INHERIT, os.path.dirname(access.address))
+            if self._hub is not None:
+                link.send(zygote.INHERIT, os.path.dirname(self._hub.access.address))
         return self._zygotes[-1]
 
     # What zygotes say, on the loop's thread
@@ -196,8 +195,9 @@ class LocalChild:
         fds: list[int] = []
         try:
             with naming_the_limit("starting a process"):
-                fds += map(_dup_or_null, self.spec.stdio or (1, 2))
-                fds += map(os.dup, [*ours, *self._fds])
+                if self.spec.stdio is None:
+                    fds += map(_dup_or_null, (1, 2))
+                fds += map(os.dup, [*(self.spec.stdio or ()), *ours, *self._fds])
         except BaseException:
             _close_all(fds)
             raise
@@ -362,11 +362,7 @@ def _launch(control: int, board: int, *, preload: bool) -> subprocess.Popen[byte
 
 
 def _null_if_closed(fd: int) -> int | None:
-    try:
-        os.fstat(fd)
-    except OSError:
-        return subprocess.DEVNULL
-    return None
+    return None if _is_standard_stream(fd) else subprocess.DEVNULL
 
 
 def describe(exitcode: int) -> str:
@@ -380,13 +376,16 @@ def describe(exitcode: int) -> str:
 
 
 def _dup_or_null(fd: int) -> int:
+    return os.dup(fd) if _is_standard_stream(fd) else os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+
+
+def _is_standard_stream(fd: int) -> bool:
+    # Python makes no descriptor inheritable by itself: one that is not has taken the number of a
+    # stream that the program closed.
     try:
-        return os.dup(fd)
-    except OSError as error:
-        if error.errno != errno.EBADF:
-            raise
-        # The program closed its stdout or stderr.
-        return os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+        return os.get_inheritable(fd)
+    except OSError:
+        return False
 
 
 def _close_all(fds: Sequence[int]) -> None:

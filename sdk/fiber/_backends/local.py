@@ -13,8 +13,8 @@ class LocalBackend:
     name = "local"
     same_host = True
 
-    def __init__(self, loop: Loop, hub: Hub) -> None:
-        self._agent = Agent(loop, hub.host, hub)
+    def __init__(self, loop: Loop, host: str, hub: Hub | None) -> None:
+        self._agent = Agent(loop, host, hub)
 
     def place(self) -> Agent:
         """The one agent."""

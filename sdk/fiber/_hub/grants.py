@@ -11,7 +11,7 @@ from typing import NamedTuple
 from fiber._hub import access
 from fiber._hub.access import Access
 from fiber._hub.client import Line
-from fiber._hub.protocol import ONE, TWO, Kind, Op
+from fiber._hub.protocol import ONE, TWO, Kind, Op, Terms
 from fiber._hub.registry import Registry
 from fiber._hub.remote import RemoteObject
 from fiber.errors import ConnectionClosed
@@ -32,10 +32,10 @@ class GrantSet:
     Otherwise each also ends with its first use, as what is given to a new process.
     """
 
-    __slots__ = ("_direct", "_lines", "_reusable")
+    __slots__ = ("_direct", "_lines", "_terms")
 
     def __init__(self, *, reusable: bool = True) -> None:
-        self._reusable = reusable
+        self._terms = Terms.BOUND | (Terms.REUSABLE if reusable else 0)
         self._direct: list[tuple[Registry, int]] = []
         self._lines: dict[Access, Line] = {}
 
@@ -47,15 +47,16 @@ class GrantSet:
         """A grant for an object of this host."""
         hub = access.own_hub()
         if hub is not None:
-            number, grant = hub.registry.register(kind, fd, reusable=self._reusable)
+            reusable = bool(self._terms & Terms.REUSABLE)
+            number, grant = hub.registry.register(kind, fd, reusable=reusable)
             self._direct.append((hub.registry, grant))
             return Granted(hub.access, number, grant)
         own = access.current()
-        return _ask_local(self._line(own), own, kind, fd, reusable=self._reusable)
+        return _ask_local(self._line(own), own, kind, fd, self._terms)
 
     def for_remote(self, end: RemoteObject) -> Granted:
         """A grant for an object of another host."""
-        reply = self._line(end.home).ask(Op.GRANT, end.number, self._reusable, form=TWO)
+        reply = self._line(end.home).ask(Op.GRANT, end.number, self._terms, form=TWO)
         return Granted(end.home, *reply.values)
 
     def release(self) -> None:
@@ -103,7 +104,7 @@ class _SingleUse:
     def for_remote(self, end: RemoteObject) -> Granted:
         """A grant for an object of another host."""
         with end.line() as line:
-            reply = line.ask(Op.GRANT, end.number, False, form=TWO)
+            reply = line.ask(Op.GRANT, end.number, Terms(0), form=TWO)
         granted = Granted(end.home, *reply.values)
         _attempt.undo.append(lambda: _release_remote(end, granted.grant))
         return granted
@@ -112,7 +113,7 @@ class _SingleUse:
         if self._line is None or self._line_to != own:
             self._line, self._line_to = Line(own), own
         try:
-            return _ask_local(self._line, own, kind, fd, reusable=False)
+            return _ask_local(self._line, own, kind, fd, Terms(0))
         except BaseException:
             # Whatever it was, Ctrl-C or the hub's refusal, the next one begins anew.
             self._line.close()
@@ -125,8 +126,8 @@ class _SingleUse:
                 self._line.say(Op.RELEASE, grant, form=ONE)
 
 
-def _ask_local(line: Line, own: Access, kind: Kind, fd: int, *, reusable: bool) -> Granted:
-    reply = line.ask(Op.REGISTER, kind, reusable, form=TWO, fds=[fd])
+def _ask_local(line: Line, own: Access, kind: Kind, fd: int, terms: Terms) -> Granted:
+    reply = line.ask(Op.REGISTER, kind, terms, form=TWO, fds=[fd])
     return Granted(own, *reply.values)
 
 

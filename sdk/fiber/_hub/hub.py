@@ -172,7 +172,7 @@ class Hub:
         return HostedCounter(self._poller, fd)
 
     def _discard(self, hosted: Hosted) -> None:
-        if self._loop.on_thread():
+        if self._closed or self._loop.on_thread():
             hosted.close()
         else:
             self._loop.call_soon(hosted.close)

@@ -14,7 +14,7 @@ Layout (little endian): request kind:u8, number:u32, and its own fields; reply t
 from __future__ import annotations
 
 import struct
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 
 VERSION = 1
 KEY_BYTES = 32
@@ -27,15 +27,22 @@ class Kind(IntEnum):
     COUNTER = 2
 
 
+class Terms(IntFlag):
+    """How long a grant lasts."""
+
+    REUSABLE = 1  # beyond its first use
+    BOUND = 2  # no longer than the stream on which it was asked for
+
+
 class Op(IntEnum):
     """Requests."""
 
     HELLO = 1  # version, key
     CONNECT = 2  # host
-    REGISTER = 3  # kind, reusable; a descriptor beside it -> object, grant
+    REGISTER = 3  # kind, terms; a descriptor beside it -> object, grant
     FETCH = 4  # object, grant -> a descriptor beside the reply
     ATTACH = 5  # object, grant
-    GRANT = 6  # object, reusable -> object, grant
+    GRANT = 6  # object, terms -> object, grant
     RELEASE = 7  # grant; silent
     CANCEL = 8  # answers the request of this number NO, if it is still waiting; otherwise silent
     SYNC = 9  # withdraws what is waiting -> nothing

@@ -45,7 +45,8 @@ class Registry:
         self._numbers = itertools.count(1)
         self._entries: dict[int, Entry] = {}
         self._by_identity: dict[tuple[int, int], Entry] = {}
-        self._reusable: dict[int, Entry] = {}
+        self._grants: dict[int, Entry] = {}
+        self._reusable: set[int] = set()
 
     def register(self, kind: Kind, fd: int, *, reusable: bool) -> tuple[int, int]:
         """Host what ``fd`` refers to, which stays the caller's; its number and a grant."""
@@ -93,12 +94,9 @@ class Registry:
     def release(self, grant: int) -> None:
         """Nobody will use the grant any more."""
         with self._lock:
-            entry = self._reusable.pop(grant, None)
-            if entry is None:
-                entry = next((e for e in self._entries.values() if grant in e.grants), None)
+            entry = self._grants.get(grant)
             if entry is not None:
-                entry.grants.discard(grant)
-                self._drop_if_unused(entry)
+                self._end(entry, grant)
 
     def close(self) -> None:
         """Let go of everything."""
@@ -107,6 +105,7 @@ class Registry:
                 self._discard(entry.hosted)
             self._entries.clear()
             self._by_identity.clear()
+            self._grants.clear()
             self._reusable.clear()
 
     def __len__(self) -> int:
@@ -124,14 +123,20 @@ class Registry:
     def _grant(self, entry: Entry, reusable: bool) -> int:
         grant = next(self._numbers)
         entry.grants.add(grant)
+        self._grants[grant] = entry
         if reusable:
-            self._reusable[grant] = entry
+            self._reusable.add(grant)
         return grant
 
     def _use(self, entry: Entry, grant: int) -> None:
-        if grant not in self._reusable:
-            entry.grants.discard(grant)
-            self._drop_if_unused(entry)
+        if grant and grant not in self._reusable:
+            self._end(entry, grant)
+
+    def _end(self, entry: Entry, grant: int) -> None:
+        del self._grants[grant]
+        self._reusable.discard(grant)
+        entry.grants.discard(grant)
+        self._drop_if_unused(entry)
 
     def _drop_if_unused(self, entry: Entry) -> None:
         if not entry.attached and not entry.grants and entry.number in self._entries:

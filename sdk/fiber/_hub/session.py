@@ -9,7 +9,7 @@ from typing import Protocol
 
 from fiber._hub import protocol
 from fiber._hub.hosted import HostedChannel, HostedCounter
-from fiber._hub.protocol import HEAD, ONE, TWO, Kind, Op, Status
+from fiber._hub.protocol import HEAD, ONE, TWO, Kind, Op, Status, Terms
 from fiber._hub.registry import Entry, NoSuchObject, Registry
 from fiber._hub.streams import Deaf, Stream
 from fiber._wire.packet import Message
@@ -62,7 +62,7 @@ class Session:
         self._home = home
         self._admitted = False
         self._entry: Entry | None = None
-        self._own_grants: set[int] = set()
+        self._bound: set[int] = set()
         stream.handler = self
 
     def on_message(self, message: Message) -> None:
@@ -103,9 +103,9 @@ class Session:
             if isinstance(entry.hosted, HostedChannel):
                 entry.hosted.forget(self)
             self._home.registry.detach(entry)
-        for grant in self._own_grants:
+        for grant in self._bound:
             self._home.registry.release(grant)
-        self._own_grants.clear()
+        self._bound.clear()
         self._home.ended(self)
 
     def _cancel(self) -> Request | None:
@@ -151,20 +151,21 @@ class Session:
 
     def register(self, message: Message) -> None:
         """Host a descriptor."""
-        _, number, kind, reusable = TWO.unpack(message.payload)
+        _, number, kind, terms = TWO.unpack(message.payload)
         (fd,) = message.fds
-        entry, grant = self._home.registry.register(Kind(kind), fd, reusable=bool(reusable))
-        self._granted(number, entry, grant, reusable)
+        reusable = bool(terms & Terms.REUSABLE)
+        entry, grant = self._home.registry.register(Kind(kind), fd, reusable=reusable)
+        self._granted(number, entry, grant, terms)
 
     def grant(self, message: Message) -> None:
         """Give a grant for an object that the sender uses."""
-        _, number, entry, reusable = TWO.unpack(message.payload)
-        grant = self._home.registry.grant(entry, reusable=bool(reusable))
-        self._granted(number, entry, grant, reusable)
+        _, number, entry, terms = TWO.unpack(message.payload)
+        grant = self._home.registry.grant(entry, reusable=bool(terms & Terms.REUSABLE))
+        self._granted(number, entry, grant, terms)
 
-    def _granted(self, number: int, entry: int, grant: int, reusable: int) -> None:
-        if reusable:
-            self._own_grants.add(grant)
+    def _granted(self, number: int, entry: int, grant: int, terms: int) -> None:
+        if terms & Terms.BOUND:
+            self._bound.add(grant)
         self.stream.send(TWO.pack(Status.OK, number, entry, grant))
 
     def release(self, message: Message) -> None:

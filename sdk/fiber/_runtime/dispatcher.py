@@ -177,6 +177,7 @@ class Dispatcher(Exchange):
             self._check_finished(request.job, ends)
         self._send(batches)
         self._end(ends)
+        self._wind_down()
 
     def cancel(self, request: Request) -> None:
         """Nobody wants the rest of it any more; what runs is left to end."""

@@ -153,7 +153,9 @@ class Exchange:
         with self._lock:
             self._unsent.discard(batch.seq)
             self._ledger.put_back(batch.worker, (batch.seq,), monotonic())
-            return self._assign()
+            batches = self._assign()
+        self._wind_down()
+        return batches
 
     def _unsendable(self, batch: Batch, error: BaseException) -> list[Batch]:
         ends: list[Sink] = []
@@ -164,6 +166,7 @@ class Exchange:
                 self._put(receipt, [Failure(error)], ends)
             batches = self._assign()
         self._end(ends)
+        self._wind_down()
         return batches
 
     # Taking: on the loop's thread
@@ -186,6 +189,8 @@ class Exchange:
             self.recalled(link, [words[1]])
         elif kind == work.BROKEN:
             self._broken(words[1], words[2])
+        if self._closing:
+            self._wind_down()
 
     def _answered(
         self,
@@ -254,8 +259,6 @@ class Exchange:
         """Tell sinks that they have it all."""
         for sink in ends:
             sink.end()
-        if self._closing and ends:
-            self._wind_down()
 
     def _unread(self, seq: int, error: bytes) -> None:
         """A worker could not unpickle a batch."""
@@ -280,7 +283,6 @@ class Exchange:
                 self._ledger.put_back(batch.worker, (seq,), monotonic())
             batches = self._assign()
         self._send_from_loop(batches)
-        self._wind_down()
 
     def recalled(self, link: Link, seqs: list[int]) -> None:
         """A worker will never see these batches."""
@@ -296,6 +298,8 @@ class Exchange:
             self._ledger.put_back(link.worker, seqs, monotonic())
             batches = self._assign()
         self._send_from_loop(batches)
+        if self._closing:
+            self._wind_down()
 
     def _recall(self, now: float) -> None:
         """Ask busy workers for what they have not begun, if others are idle.  Lock held."""
@@ -332,6 +336,7 @@ class Exchange:
             self._put(receipt, [Failure(error)], ends)
         link.kill()
         self._end(ends)
+        self._wind_down()
 
     def _cancel_deadline(self, seq: int) -> None:
         timer = self._deadlines.pop(seq, None)
@@ -499,9 +504,9 @@ class Exchange:
     def _wind_down(self) -> None:
         """Let the workers go once the pool is closed and has nothing left to do."""
         leaving: list[Link] = []
+        if not self._closing:
+            return
         with self._lock:
-            if not self._closing:
-                return
             if not self._ledger.jobs:
                 for link in self.crew.staying():
                     if link.worker is None or self._ledger.leave(link.worker):

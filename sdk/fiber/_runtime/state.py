@@ -36,16 +36,28 @@ class Runtime:
     def __init__(self) -> None:
         self.config = config.current()
         self.loop = Loop()
-        self.hub = Hub(self.loop, child.host or "local", self.config.runtime_directory)
+        self.host = child.host or "local"
+        self.hub = self._make_hub()
         try:
             self.backend: Backend = _make_backend(self)
         except BaseException:
-            self.hub.close()
+            self._close_hub()
             self.loop.stop()
             raise
         reduction.readers_are_remote(not self.backend.same_host)
         self.loop.start_thread("fiber-io")
         access.serve(self.hub)
+
+    def _make_hub(self) -> Hub | None:
+        # One hub a host: a process that Fiber started uses the one that its agent has.
+        if access.told() is not None:
+            return None
+        return Hub(self.loop, self.host, self.config.runtime_directory)
+
+    def _close_hub(self) -> None:
+        access.serve(None)
+        if self.hub is not None:
+            self.hub.close()
 
     def start(
         self,
@@ -101,8 +113,7 @@ class Runtime:
         """End every child, agent and thread.  Not on the loop's thread."""
         self.backend.close()
         self.loop.stop()
-        access.serve(None)
-        self.hub.close()
+        self._close_hub()
 
 
 class _Releasing:
@@ -122,13 +133,13 @@ class _Releasing:
 
 
 def _make_backend(runtime: Runtime) -> Backend:
-    if runtime.config.backend == "loopback":
+    if runtime.config.backend == "loopback" and runtime.hub is not None:
         from fiber._backends.loopback import LoopbackBackend
 
         return LoopbackBackend(runtime.loop, runtime.hub, runtime.config)
     from fiber._backends.local import LocalBackend
 
-    return LocalBackend(runtime.loop, runtime.hub)
+    return LocalBackend(runtime.loop, runtime.host, runtime.hub)
 
 
 def _modules_of(process: Any) -> list[str]:

@@ -1,0 +1,191 @@
+"""The program is killed, however: within two seconds nothing of it is left."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from faults.program import GONE, Program, alive, stop_and_wait, wait_for
+
+IDLE_AND_BUSY = """
+    import fiber, time
+    from faults import targets
+    if __name__ == "__main__":
+        fiber.set_start_method("{method}")
+        children = [fiber.Process(target=targets.block) for _ in range(2)]
+        children.append(fiber.Process(target=targets.spin, daemon=True))
+        children.append(fiber.Process(target=targets.shrug_off_signals))
+        for child in children:
+            child.start()
+        print("ready", flush=True)
+        children[0].join()
+"""
+
+
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+@pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSEGV, signal.SIGTERM])
+def test_killed_it_leaves_nothing(
+    launch_on: Callable[..., Program], method: str, signum: signal.Signals
+) -> None:
+    program = launch_on(IDLE_AND_BUSY.format(method=method))
+    assert program.line() == "ready"
+    assert len(program.family()) >= 5
+    program.signal(signum)
+    assert program.wait() == -signum
+    assert program.left() == []
+
+
+NESTED = """
+    import fiber, os, sys
+    from faults import targets
+    def nest(depth):
+        if depth:
+            child = fiber.Process(target=nest, args=(depth - 1,))
+            child.start()
+            print(child.pid, flush=True)
+            child.join()
+        else:
+            print("deepest", flush=True)
+            targets.block()
+    if __name__ == "__main__":
+        nest(4)
+"""
+
+
+def nested(launch: Callable[..., Program], **options: Any) -> tuple[Program, list[int]]:
+    program = launch(NESTED, **options)
+    lines = [program.line() for _ in range(5)]
+    return program, [int(line) for line in lines if line != "deepest"]
+
+
+def test_killed_it_takes_all_generations_with_it(launch: Callable[..., Program]) -> None:
+    program, _ = nested(launch)
+    program.kill()
+    assert program.left() == []
+
+
+def test_a_nested_parent_that_is_killed_takes_its_descendants_and_only_them(
+    launch: Callable[..., Program],
+) -> None:
+    program, pids = nested(launch)
+    parent, middle, *below = pids
+    os.kill(middle, signal.SIGKILL)
+    wait_for(lambda: not any(map(alive, below)), GONE)
+    # Each generation above ends by itself: its child did.
+    program.rest()
+    assert program.wait() == 0
+    assert not alive(parent)
+    assert program.left() == []
+
+
+def test_killed_while_its_children_are_stopped_it_leaves_none(
+    launch_on: Callable[..., Program],
+) -> None:
+    program = launch_on(IDLE_AND_BUSY.format(method="forkserver"))
+    assert program.line() == "ready"
+    for found in program.family():
+        if "zygote" not in found.command and "fiber.agent" not in found.command:
+            stop_and_wait(found.pid)
+    program.kill()
+    assert program.left() == []
+
+
+AT_A_STAGE = """
+    import fiber, os, signal, threading, time
+    from faults import targets
+    if __name__ == "__main__":
+        threading.Timer({delay}, os.kill, (os.getpid(), signal.SIGKILL)).start()
+        while True:
+            fiber.Process(target=targets.block).start()
+"""
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.1, 0.2, 0.4])
+def test_killed_while_it_starts_processes_it_leaves_none(
+    launch_on: Callable[..., Program], delay: float
+) -> None:
+    program = launch_on(AT_A_STAGE.format(delay=delay))
+    assert program.wait() == -signal.SIGKILL
+    assert program.left() == []
+
+
+POOL_AND_QUEUE = """
+    import fiber, time
+    from faults import targets
+    if __name__ == "__main__":
+        queue = fiber.Queue()
+        queue.put(bytes(1 << 20))
+        pool = fiber.Pool(2)
+        results = pool.map_async(time.sleep, [60] * 10)
+        child = fiber.Process(target=targets.get_for_ever, args=(queue,))
+        child.start()
+        print("ready", flush=True)
+        results.get()
+"""
+
+
+def test_killed_with_pool_queue_and_pipes_it_leaves_nothing(
+    launch_on: Callable[..., Program],
+) -> None:
+    program = launch_on(POOL_AND_QUEUE)
+    assert program.line() == "ready"
+    program.kill()
+    assert program.left() == []
+
+
+ONE_CHILD = """
+    import fiber
+    from faults import targets
+    if __name__ == "__main__":
+        fiber.Process(target=targets.block).start()
+        print("ready", flush=True)
+        targets.block()
+"""
+
+
+def test_orphans_of_a_killed_program_are_not_left_to_a_killed_zygote(
+    launch_on: Callable[..., Program],
+) -> None:
+    program = launch_on(ONE_CHILD)
+    assert program.line() == "ready"
+    zygotes = [found.pid for found in program.family() if "zygote" in found.command]
+    assert zygotes
+    for pid in zygotes:
+        os.kill(pid, signal.SIGKILL)
+    program.kill()
+    assert program.left() == []
+
+
+ENDS = """
+    import fiber, os, sys
+    from faults import targets
+    if __name__ == "__main__":
+        child = fiber.Process(target=targets.block, daemon=True)
+        child.start()
+        print("ready", flush=True)
+        {end}
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [
+        ("pass", 0),
+        ("sys.exit(3)", 3),
+        ("1 / 0", 1),
+        ("os._exit(4)", 4),
+        ("os.abort()", -signal.SIGABRT),
+        ("os.execv('/bin/true', ['true'])", 0),
+    ],
+)
+def test_however_it_ends_itself_its_daemons_end_too(
+    launch_on: Callable[..., Program], end: str, status: int
+) -> None:
+    program = launch_on(ENDS.format(end=end))
+    assert program.line() == "ready"
+    assert program.wait() == status
+    assert program.left() == []
