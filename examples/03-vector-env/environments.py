@@ -14,16 +14,18 @@ MakeEnv = Callable[[], gym.Env[Any, Any]]
 
 
 class Simulator(gym.Wrapper[Any, Any, Any, Any]):
-    """Keeps a core busy for so many milliseconds more in each step, as a real simulator would."""
+    """Makes a step take so many milliseconds of a core, as that of a real simulator does."""
 
     def __init__(self, env: gym.Env[Any, Any], milliseconds: float) -> None:
         super().__init__(env)
         self._seconds = milliseconds / 1000
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        end = time.perf_counter() + self._seconds
+        # The time of this thread on a core, not the clock on the wall: two environments that
+        # share a core must not count the same moment twice.
+        end = time.thread_time() + self._seconds
         result = self.env.step(action)
-        while time.perf_counter() < end:
+        while time.thread_time() < end:
             pass
         return result
 

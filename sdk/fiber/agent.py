@@ -6,6 +6,7 @@ It takes everything from its environment, nothing from its command line:
 ``FIBER_AGENT_CREDENTIALS``  the agent's half of the credentials, or the directory that holds it
 ``FIBER_AGENT_NAME``         what the master calls it
 ``FIBER_AGENT_PARENT``       optional: the pid of a process on this host to end with
+``FIBER_AGENT_INHERITS``     optional: a directory of that process, to be removed if it is killed
 ``FIBER_START_TIMEOUT``      seconds to find the master, as for every Fiber process
 
 Exit status 0: the master ended it.  1: it could not join, or lost the master; stderr says why.
@@ -14,6 +15,7 @@ Exit status 0: the master ended it.  1: it could not join, or lost the master; s
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
 
@@ -32,6 +34,7 @@ _ADDRESS = "FIBER_AGENT_ADDRESS"
 _CREDENTIALS = "FIBER_AGENT_CREDENTIALS"
 _NAME = "FIBER_AGENT_NAME"
 _PARENT = "FIBER_AGENT_PARENT"
+_INHERITS = "FIBER_AGENT_INHERITS"
 
 _DRAIN_GRACE = 10.0
 """Seconds that children have to end when this process is told to (SIGTERM)."""
@@ -115,6 +118,9 @@ class Main:
 
     def _parent_died(self) -> None:
         # At once and by force: nobody is left to tell or to wait for.
+        directory = os.environ.get(_INHERITS)
+        if directory:
+            shutil.rmtree(directory, ignore_errors=True)
         os._exit(0)
 
 

@@ -9,6 +9,8 @@ import sys
 import threading
 from typing import Any, NoReturn
 
+import fiber
+
 
 def nothing() -> None:
     pass
@@ -101,3 +103,26 @@ def shrug_off_signals() -> NoReturn:
 def get_for_ever(queue: Any) -> NoReturn:
     while True:
         queue.get()
+
+
+def send_and_die(connection: Any, count: int) -> None:
+    for number in range(count):
+        connection.send(number)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def read_one_and_block(connection: Any) -> NoReturn:
+    connection.send(("read", connection.recv()))
+    block()
+
+
+def read_all_and_report(connection: Any, count: int) -> None:
+    connection.send(("read", [connection.recv() for _ in range(count)]))
+
+
+def make_and_send_a_pipe(connection: Any) -> NoReturn:
+    ours, theirs = fiber.Pipe()
+    connection.send(theirs)
+    theirs.close()
+    ours.send("through the inner pipe")
+    block()

@@ -95,20 +95,27 @@ class Agent:
         self._cut_number += 1
         self.world.loop.call_later(LOST_AFTER, self._lose, self._cut_number)
         if seconds == schedule.FOREVER:
-            self._kill_all()
+            self.kill_all()
         else:
             self.world.loop.call_later(seconds, self._mend)
 
-    def forget(self, child: Child) -> None:
-        """The master knows that it is gone."""
-        self._children.remove(child)
+    @property
+    def is_cut(self) -> bool:
+        """Whether nothing gets through."""
+        return self.up.is_cut
+
+    def ended(self, child: Child) -> None:
+        """The master knows that ``child`` is gone, or believes so."""
+        if not self.lost:
+            self._children.remove(child)
+        self.world.oracle.lost(child.worker, was_heard=child.was_heard, reported=not self.lost)
 
     def _lose(self, cut_number: int) -> None:
         if not self.up.is_cut or cut_number != self._cut_number:
             return
         self.world.note("%s is given up", self.host)
         self.lost = True
-        for child in list(self._children):
+        for child in self._children:
             child.give_up()
 
     def _mend(self) -> None:
@@ -117,13 +124,14 @@ class Agent:
             # The session has ended: the agent ends its workers, and what was on its way to them is
             # gone.  Their last words come late.
             self.down.forget()
-            self._kill_all()
+            self.kill_all()
             self._children.clear()
         self.lost = False
         self.down.mend()
         self.up.mend()
 
-    def _kill_all(self) -> None:
+    def kill_all(self) -> None:
+        """All workers die."""
         for child in self._children:
             child.worker.die(-signal.SIGKILL)
 
@@ -221,7 +229,6 @@ class Child:
 
     def _exited(self, exitcode: int, running: tuple[int, int] | None) -> None:
         if not self.gone:
-            self.agent.forget(self)
             unread = tuple(self._unread)
             self._end(ExitReport(exitcode, f"exit {exitcode}", unread, running, host=self.host))
 
@@ -229,5 +236,5 @@ class Child:
         self.gone = True
         world = self.agent.world
         world.note("%s is gone: unread %s, in %s", self.name, report.unread, report.running)
-        world.oracle.lost(self.worker, was_heard=self.was_heard)
+        self.agent.ended(self)
         self._observer.exited(report)

@@ -231,7 +231,7 @@ class Audit:
         asked = 0
         late = []
         for worker in self._ledger.workers:
-            if len(worker.queue) == 2 and not self._names.child(worker).agent.up.is_cut:
+            if len(worker.queue) == 2 and not self._names.child(worker).agent.is_cut:
                 if worker.recalled:
                     asked += 1
                 elif now > max(worker.since, self._watched.setdefault(worker, now)) + PATIENCE + SLACK:

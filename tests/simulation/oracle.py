@@ -74,10 +74,13 @@ class Oracle:
         """How often a task was begun."""
         return len(self.accounts[ref.job].runs[ref.index])
 
-    def lost(self, worker: Worker, *, was_heard: bool) -> None:
-        """The master knows, or believes, that a worker is gone, of which it heard or not."""
+    def lost(self, worker: Worker, *, was_heard: bool, reported: bool) -> None:
+        """The master knows, or believes, that a worker is gone.
+
+        ``was_heard``: it was ready before.  ``reported``: its agent says so.
+        """
         self._lost.add(worker)
-        self.stillborn += not was_heard
+        self.stillborn += reported and not was_heard
         if self._left is not None and worker.units > self._left:
             raise Violation(f"{worker.name} ran {worker.units} units, more than {self._left}")
 

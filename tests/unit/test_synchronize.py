@@ -8,8 +8,9 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-import fiber
 import pytest
+
+import fiber
 from fiber import synchronize
 from fiber._hub.absent import NotInFiber
 

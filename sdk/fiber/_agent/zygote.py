@@ -91,13 +91,17 @@ class Zygote:
             ready = {fd for fd, _ in self._poller.poll()}
             if self._deaths in ready:
                 self._reap()
+            try:
+                if self._control.fileno() in ready and not self._serve():
+                    self._end(0)
+                    return
+            except (EOFError, ConnectionError):
+                # A dying process closes its descriptors a moment before it counts as dead.
+                ready.add(self._agent)
             if self._agent in ready:
                 self._end(GRACE)
                 for directory in self._heirlooms:
                     shutil.rmtree(directory, ignore_errors=True)
-                return
-            if self._control.fileno() in ready and not self._serve():
-                self._end(0)
                 return
 
     def _listen_to_signals(self) -> None:
@@ -108,10 +112,7 @@ class Zygote:
         signal.set_wakeup_fd(self._deaths_in, warn_on_full_buffer=False)
 
     def _serve(self) -> bool:
-        try:
-            message = packet.receive(self._control, descriptors=True)
-        except (EOFError, ConnectionError):
-            return False
+        message = packet.receive(self._control, descriptors=True)
         fds, message.fds = message.fds, []
         request: tuple[Any, ...] = packet.loads(message)
         if request[0] == DESCRIPTORS:

@@ -207,7 +207,7 @@ class Tunnels:
             return
         try:
             stream.on_data(memoryview(frame.payload), [memoryview(b) for b in frame.buffers])
-        except (struct.error, ValueError, IndexError) as error:
+        except (struct.error, ValueError, IndexError, OverflowError, MemoryError) as error:
             # Not what the other side's tunnel writes.
             self._send(TunnelClose(frame.tunnel, "malformed data in a tunnel"))
             stream.on_close(f"malformed data in a tunnel: {error}")

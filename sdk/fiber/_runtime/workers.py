@@ -251,7 +251,7 @@ class Crew:
             return
         self.failures += 1
         if self.failures >= TRIES and not self.ready():
-            reason = "its initializer raised" if link.complaint else report.reason
+            reason = "it raised an error" if link.complaint else report.reason
             self.error = StartError(
                 f"pool worker {link.name!r}", reason, link.complaint or "\n".join(report.log), TRIES
             )
