@@ -18,6 +18,7 @@ import os
 import shutil
 import signal
 import sys
+from typing import NoReturn
 
 from fiber import config
 from fiber._agent.agent import Agent
@@ -113,10 +114,10 @@ class Main:
         try:
             watched = os.pidfd_open(int(parent))
         except ProcessLookupError:
-            sys.exit(0)
+            self._parent_died()
         self._loop.register(watched, self._parent_died)
 
-    def _parent_died(self) -> None:
+    def _parent_died(self) -> NoReturn:
         # At once and by force: nobody is left to tell or to wait for.
         directory = os.environ.get(_INHERITS)
         if directory:

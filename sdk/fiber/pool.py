@@ -131,7 +131,12 @@ class Pool:
         timeout: float | None = None,
     ) -> Any:
         """Call ``func(*args, **kwds)`` in a worker and return its result."""
-        return self.apply_async(func, args, kwds, timeout=timeout).get()
+        self._check_running()
+        result = AsyncResult(self)
+        worker = self._dispatcher.call(result, func, args, kwds, self._limit(timeout))
+        while worker is not None and not result.ready() and worker.attend():
+            pass
+        return result.get()
 
     def apply_async(
         self,

@@ -2,8 +2,8 @@
 
 ::
 
-    put ── slots.take() ── pickle ─┬─ room in the channel ──────────► channel ──► get ── slots.add()
-                                   └─ no room: backlog ─► feeder ───►
+    put ── a slot ── pickle ─┬─ room in the channel ─────────► channel ──► get ── the slot is free
+                             └─ no room: backlog ─► feeder ──►
 
 There is no lock between processes: an item is one message, which the kernel gives to exactly one
 reader.  A process that dies while it waits takes nothing; one that dies later takes its own item.
@@ -28,7 +28,7 @@ from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
 from fiber.connection import Connection
-from fiber.synchronize import RECHECK, SEM_VALUE_MAX
+from fiber.synchronize import RECHECK
 
 __all__ = ["Empty", "Full", "JoinableQueue", "Queue", "SimpleQueue"]
 
@@ -37,18 +37,17 @@ class Queue:
     """A first-in first-out queue for any number of processes and threads."""
 
     def __init__(self, maxsize: int = 0, *, ctx: Any = None) -> None:
-        self._maxsize = maxsize if maxsize > 0 else SEM_VALUE_MAX
+        self._slots: _Slots | _Tally = _Slots(maxsize) if maxsize > 0 else _Tally()
         self._inbox, self._outbox = LocalChannel.pair()
-        self._slots: SharedCounter = LocalCounter.create(self._maxsize)
         self._open()
 
     def __getstate__(self) -> tuple[Any, ...]:
         if self._closed:
             raise ValueError(f"Queue {self!r} is closed")
-        return self._maxsize, self._inbox, self._outbox, self._slots
+        return self._slots, self._inbox, self._outbox
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self._maxsize, self._inbox, self._outbox, self._slots = state
+        self._slots, self._inbox, self._outbox = state
         self._open()
 
     def _open(self) -> None:
@@ -74,20 +73,16 @@ class Queue:
         try:
             payload, buffers = reduction.encode(obj)
         except Exception as error:
-            self._slots.add(1)
+            self._slots.give_back()
             self._on_queue_feeder_error(error, obj)
         except BaseException:
-            self._slots.add(1)
+            self._slots.give_back()
             raise
         else:
             self._send(payload, buffers)
 
     def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
-        try:
-            self._backlog.put(payload, buffers)
-        except OSError:
-            self._slots.add(1)
-            raise
+        self._backlog.put(payload, buffers)
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """The next item; Empty if there is none, nor within ``timeout`` seconds."""
@@ -96,7 +91,7 @@ class Queue:
         if not block:
             timeout = 0
         message = self._inbox.recv() if timeout is None else self._receive_within(timeout)
-        self._slots.add(1)
+        self._slots.free()
         return packet.loads(message)
 
     def _receive_within(self, timeout: float) -> Message:
@@ -117,7 +112,7 @@ class Queue:
 
     def qsize(self) -> int:
         """How many items were put and not yet gotten."""
-        return self._maxsize - self._slots.value()
+        return self._slots.used(self._backlog.waiting)
 
     def empty(self) -> bool:
         """Whether ``get`` would wait."""
@@ -125,7 +120,7 @@ class Queue:
 
     def full(self) -> bool:
         """Whether ``put`` would wait."""
-        return not self._slots.wait(0)
+        return self._slots.full()
 
     def close(self) -> None:
         """This process puts and gets no more.  What it has put still gets sent."""
@@ -224,6 +219,78 @@ class SimpleQueue:
         return types.GenericAlias(cls, item)
 
 
+class _Slots:
+    """The places of a queue with a maximum size: a count of those that are free."""
+
+    def __init__(self, maximum: int) -> None:
+        self._maximum = maximum
+        self._free: SharedCounter = LocalCounter.create(maximum)
+
+    def take(self, timeout: float | None) -> bool:
+        """Take a place for an item; False if none gets free in time."""
+        return self._free.take(timeout)
+
+    def give_back(self) -> None:
+        """The item is not sent after all."""
+        self._free.add(1)
+
+    def sending(self) -> None:
+        """The item leaves this process."""
+
+    def not_sent(self) -> None:
+        """It did not, but will."""
+
+    def free(self) -> None:
+        """An item was received."""
+        self._free.add(1)
+
+    def used(self, waiting: int) -> int:
+        """How many items there are; so many of them wait in this process."""
+        return self._maximum - self._free.value()
+
+    def full(self) -> bool:
+        """Whether there is no place."""
+        return not self._free.wait(0)
+
+
+class _Tally:
+    """The places of a queue without a maximum: only items that have left their process count.
+
+    Its operations while a feeder runs are none: a system call lets go of the interpreter, and two
+    threads that take it from each other at every item are several times slower than one.
+    """
+
+    def __init__(self) -> None:
+        self._sent: SharedCounter = LocalCounter.create()
+
+    def take(self, timeout: float | None) -> bool:
+        """There is always a place."""
+        return True
+
+    def give_back(self) -> None:
+        """The item is not sent after all."""
+
+    def sending(self) -> None:
+        """The item leaves this process.  Before it does: its receiver takes off the count."""
+        self._sent.add(1)
+
+    def not_sent(self) -> None:
+        """It did not, but will."""
+        self._sent.take(0)
+
+    def free(self) -> None:
+        """An item was received."""
+        self._sent.take(0)
+
+    def used(self, waiting: int) -> int:
+        """How many items there are; so many of them wait in this process."""
+        return self._sent.value() + waiting
+
+    def full(self) -> bool:
+        """Never."""
+        return False
+
+
 class _Backlog:
     """What did not fit into the channel when it was put, and the thread that sends it on.
 
@@ -248,13 +315,30 @@ class _Backlog:
     def put(self, payload: bytes, buffers: list[memoryview]) -> None:
         """Send a message now if it is its turn and there is room, otherwise later."""
         with self._changed:
-            if self._idle and self._outbox.try_send(payload, buffers):
+            if self._idle and self._send_now(payload, buffers):
                 return
             # The arrays behind the buffers are their owner's to change once ``put`` has returned.
             self._items.append((payload, [memoryview(bytearray(view)) for view in buffers]))
             if self._idle:
                 self._idle = False
                 self._wake_feeder()
+
+    @property
+    def waiting(self) -> int:
+        """How many messages wait."""
+        return len(self._items)
+
+    def _send_now(self, payload: bytes, buffers: list[memoryview]) -> bool:
+        self._slots.sending()
+        try:
+            if self._outbox.try_send(payload, buffers):
+                return True
+        except OSError:
+            self._slots.not_sent()
+            self._slots.give_back()
+            raise
+        self._slots.not_sent()
+        return False
 
     def close(self) -> None:
         """Take no more; let go of the channel once everything is sent."""
@@ -290,7 +374,9 @@ class _Backlog:
         while self._has_items():
             try:
                 while self._items:
-                    self._outbox.post(*self._items.popleft())
+                    item = self._items.popleft()
+                    self._slots.sending()
+                    self._outbox.post(*item)
             except BrokenPipeError:
                 self._items.clear()
             except OSError as error:
@@ -309,11 +395,12 @@ class _Backlog:
             return True
 
     def _failed(self, error: OSError) -> None:
+        self._slots.not_sent()
+        self._slots.give_back()
         if util.is_exiting():
             util.info("error in queue thread: %s", error)
-            return
-        self._slots.add(1)
-        self._on_error(error, None)
+        else:
+            self._on_error(error, None)
 
 
 def _join(thread: weakref.ref[threading.Thread]) -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from typing import Any, NoReturn
 
 import fiber
@@ -126,3 +127,8 @@ def make_and_send_a_pipe(connection: Any) -> NoReturn:
     theirs.close()
     ours.send("through the inner pipe")
     block()
+
+
+def slow_square(number: int) -> int:
+    time.sleep(0.01)
+    return number * number

@@ -11,7 +11,6 @@ import pytest
 
 from faults.program import Program
 
-
 UNCAUGHT = """
     import fiber, sys
     from faults import targets

@@ -1,7 +1,7 @@
 """Simulated hosts: the lines to them, the kernel's part of a worker's channel, and exit reports.
 
-A ``Child`` is a ``ChildPort`` that keeps what ``ExitReport`` promises: ``unread`` names every packet
-that was delivered and that the worker never read, wherever it was when the worker died.
+A ``Child`` is a ``ChildPort`` that keeps what ``ExitReport`` promises: ``unread`` names every
+packet that was delivered and that the worker never read, wherever it was when the worker died.
 """
 
 from __future__ import annotations

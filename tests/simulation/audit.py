@@ -45,6 +45,7 @@ class Audit:
         self._ledger = ledger
         self._names = names
         self._watched: dict[Worker, float] = {}
+        self._passed: dict[Job, int] = {}
         watched = {
             "assign": self._assign,
             "receive": self._receive,
@@ -64,13 +65,17 @@ class Audit:
             for worker in self._ledger._pins
             for job, span in worker.pinned
         }
+        somebody_idle = bool(self._ledger.idle())
         batch: Batch | None = self._real.assign(now)
         if batch is not None:
             worker = batch.worker
             assert batch.job is not None
             self._world.note(
                 "%s gets batch %d, from task %d to before %d",
-                self._names.child(worker).name, batch.seq, batch.start, batch.stop,
+                self._names.child(worker).name,
+                batch.seq,
+                batch.start,
+                batch.stop,
             )
             self._check_tasks(batch, batch.job)
             _require(worker in self._ledger.workers, "a worker that is gone is given a batch")
@@ -80,7 +85,15 @@ class Audit:
             pinned_to = pins.get((batch.job, batch.start))
             _require(batch.pin is (pinned_to is not None), "a pinned task is not marked")
             _require(pinned_to in (None, worker), "a task runs where it is not pinned to")
+            self._check_turns(batch.job, somebody_idle and not batch.pin)
         return batch
+
+    def _check_turns(self, job: Job, was_idle: bool) -> None:
+        """A worker went to ``job``.  If idle it may run anything: others must get their turns."""
+        waiting = [other for other in self._ledger.jobs if other.waiting and other is not job]
+        self._passed = {other: self._passed.get(other, 0) + was_idle for other in waiting}
+        most = max(self._passed.values(), default=0)
+        _require(most <= len(self._ledger.jobs), "a job waits while others get all the workers")
 
     def _check_tasks(self, batch: Batch, job: Job) -> None:
         _require(1 <= len(batch.items) <= LIMIT, f"a batch has {len(batch.items)} tasks")
@@ -131,7 +144,9 @@ class Audit:
         busy = bool(worker.queue or worker.pinned)
         leaving = worker.leaving
         left: bool = self._real.leave(worker)
-        _require(left is not busy, "a busy worker leaves" if left else "an idle worker may not leave")
+        _require(
+            left is not busy, "a busy worker leaves" if left else "an idle worker may not leave"
+        )
         _require(worker.leaving is (left or leaving), "a refusal to leave changes the worker")
         return left
 
@@ -139,8 +154,14 @@ class Audit:
         self, worker: Worker, unread: Iterable[int], running: tuple[int, int] | None
     ) -> list[Loss]:
         held = [
-            (batch.job, batch.seq, at, batch.start + at, batch.job.attempts.get(batch.start + at, 0),
-             batch.items[at])
+            (
+                batch.job,
+                batch.seq,
+                at,
+                batch.start + at,
+                batch.job.attempts.get(batch.start + at, 0),
+                batch.items[at],
+            )
             for batch in worker.queue
             if batch.job is not None
             for at in range(batch.received, len(batch.items))
@@ -192,13 +213,15 @@ class Audit:
 
     def _check_demand(self, places: dict[Job, list[tuple[str, int, int]]]) -> None:
         wanted = sum(size for where in places.values() for _, _, size in where)
+        # Whoever runs a task that was cancelled is not there for others.
         unwanted = sum(
             len(batch.items) - batch.received
             for batch in self._ledger.batches.values()
             if batch.job is None
         )
         demand = self._ledger.demand()
-        _require(demand == wanted + unwanted, f"the demand is {demand}, not {wanted}+{unwanted}")
+        fits = wanted <= demand <= wanted + unwanted
+        _require(fits, f"the demand is {demand} for {wanted} tasks and {unwanted} cancelled ones")
 
     def _check_workers(self) -> None:
         held = 0
@@ -234,12 +257,17 @@ class Audit:
             if len(worker.queue) == 2 and not self._names.child(worker).agent.is_cut:
                 if worker.recalled:
                     asked += 1
-                elif now > max(worker.since, self._watched.setdefault(worker, now)) + PATIENCE + SLACK:
+                elif (
+                    now
+                    > max(worker.since, self._watched.setdefault(worker, now)) + PATIENCE + SLACK
+                ):
                     late.append(worker)
                 else:
                     self._world.loop.call_later(PATIENCE + 2 * SLACK, self._check_idle)
         if late and asked < len(idle):
-            raise Violation(f"{self._names.child(late[0]).name} keeps an unread batch from an idle worker")
+            raise Violation(
+                f"{self._names.child(late[0]).name} keeps an unread batch from an idle worker"
+            )
 
     def check_end(self) -> None:
         """Nothing happens any more."""

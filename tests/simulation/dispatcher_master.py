@@ -10,6 +10,7 @@ from multiprocessing import process as mp_process
 from types import SimpleNamespace
 from typing import Any
 
+from fiber._backends.remote import RemoteChild
 from fiber._engine import ledger as engine
 from fiber._runtime.dispatcher import Terms
 from fiber._runtime.outcome import Encoded, Failure
@@ -23,7 +24,7 @@ from simulation.oracle import Account, Violation
 from simulation.schedule import Act, Job, Schedule, Task
 from simulation.staged import Actor, Stage, StagedDispatcher, StagedProcess, WatchedLock
 from simulation.workers import Ready, Ref, Results, Unknown, Unreadable, Work, Worker
-from simulation.world import END, World
+from simulation.world import World
 
 
 class Again(Exception):
@@ -48,7 +49,7 @@ def perform_other(job: int, index: int) -> int:
 
 
 def _value(ref: Ref) -> int:
-    return ref.job * 1000 + ref.index
+    return ref.job * 1000 + ref.task
 
 
 class Wire:
@@ -128,7 +129,7 @@ class Outcomes:
     def _put(self, ref: Ref, outcome: Any) -> None:
         error = outcome.error if type(outcome) is Failure else None
         if isinstance(error, BrokenInput):
-            if self.request is None or ref.index != self.request.job.fed:
+            if self.request is None or ref.task != self.request.job.fed:
                 raise Violation(f"the error of the input takes the place of {ref}")
         elif isinstance(error, WorkerDied):
             self._oracle.died(ref, error.attempts)
@@ -186,20 +187,24 @@ class Names:
 
     def child(self, worker: engine.Worker) -> Child:
         """Which process it is."""
-        child: Child = worker.key.port
+        port = worker.key.port
+        if isinstance(port, RemoteChild):
+            seen: Any = port.observer
+            return seen  # type: ignore[no-any-return]
+        child: Child = port
         return child
 
 
 class DispatcherMaster:
     """Plays the pool's user."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, dispatcher: type[StagedDispatcher] = StagedDispatcher) -> None:
         self.world = world
         self.stage = Stage(world)
         self.stage.enter()
         self._rng = random.Random(f"{world.schedule.seed} user")
         schedule = world.schedule
-        self._dispatcher = StagedDispatcher(self.stage, _terms(schedule))
+        self._dispatcher = dispatcher(self.stage, _terms(schedule))
         self._ledger = self._dispatcher._ledger
         self.language = Wire(self._ledger.batches, schedule.seed)
         self._audit = Audit(world, self._ledger, Names())
@@ -371,6 +376,15 @@ class DispatcherMaster:
             if batch.pin:
                 self.language.pinned[batch.seq] = batch.start
         self._audit.check()
+        self._check_size()
+
+    def _check_size(self) -> None:
+        crew = self._dispatcher.crew
+        if self._dispatcher._closing or crew.error or crew.degraded() or crew.hesitant():
+            return
+        waiting = sum(len(job.waiting) for job in self._ledger.jobs)
+        if waiting and not crew.starting() and len(crew.links) < crew.maximum:
+            raise Violation(f"{waiting} tasks wait, but the pool does not grow")
 
     def check_end(self) -> None:
         """All is quiet: then the pool closes, and nothing stays behind."""
@@ -381,7 +395,7 @@ class DispatcherMaster:
                 raise Violation(f"only {account.fed} tasks of job {account.number} were fed")
         if not self._dispatcher._closing:
             self.drain()
-        self.world.loop.run_for(END)
+        self.world.run_out()
         if not self._dispatcher.ended.is_set():
             raise Violation("the pool does not end")
         if self._dispatcher.crew.links or self._ledger.demand() or self._dispatcher._deadlines:
@@ -389,6 +403,12 @@ class DispatcherMaster:
         for worker in self.world.workers:
             if worker.born and not worker.dead:
                 raise Violation(f"{worker.name} outlives the pool")
+
+    def done(self) -> bool:
+        """Every job is over, and the pool too if it was closed."""
+        accounts = self.world.oracle.accounts
+        over = all(account.finished or account.cancelled for account in accounts)
+        return over and self._dispatcher.ended.is_set() is self._dispatcher._closing
 
     def leave_process(self) -> None:
         """Leave no trace in this process."""

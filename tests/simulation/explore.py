@@ -7,16 +7,14 @@ import itertools
 import re
 import traceback
 from collections.abc import Callable, Iterable
-
 from typing import NamedTuple
 
-from simulation.oracle import Violation
+from simulation.agents import Agent
 from simulation.schedule import Schedule, draw, simpler
 from simulation.world import Master, World
 
 ATTEMPTS = 600
 """Runs spent on making a schedule smaller."""
-
 
 
 class Suite(NamedTuple):
@@ -25,7 +23,10 @@ class Suite(NamedTuple):
     make: Callable[[World], Master]
     adapt: Callable[[Schedule], Schedule] = lambda schedule: schedule
     """Makes a schedule possible for it."""
-
+    remote: type[Agent] = Agent
+    """How hosts are simulated that are not the master's own."""
+    share: float = 1.0
+    """The part of all seeds that it runs: it may be slow."""
 
 
 class Failure(Exception):
@@ -42,7 +43,8 @@ class Failure(Exception):
         where = "".join(traceback.format_exception(self.error)[-2:])
         return "\n".join(
             (
-                f"seed {self.schedule.seed} breaks a promise; run it again with\n\n    {self.again}\n",
+                f"seed {self.schedule.seed} breaks a promise; run it again with",
+                f"\n    {self.again}\n",
                 "made smaller:",
                 *(f"    {line}" for line in describe(self.schedule)),
                 "what happens:",
@@ -56,7 +58,7 @@ class Failure(Exception):
 def run(schedule: Schedule, suite: Suite, trace: list[str] | None = None) -> Exception | None:
     """What goes wrong in one run."""
     try:
-        World(suite.adapt(schedule), suite.make, trace).run()
+        World(suite.adapt(schedule), suite.make, trace, suite.remote).run()
     except Exception as error:  # also what the code under test raises by mistake
         return error
     return None
@@ -121,6 +123,3 @@ def _unusual(job: object) -> str:
         if getattr(job, field.name) != field.default
     ]
     return f"Job({', '.join(fields)})"
-
-
-__all__ = ["Failure", "Violation", "describe", "examine", "first_failure", "run", "shrink"]

@@ -9,11 +9,12 @@ from typing import Any
 
 from fiber._agent.port import ExitReport
 from fiber._engine import ledger as engine
+from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Ledger
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation
-from simulation.schedule import Act, Job
+from simulation.schedule import Act
 from simulation.workers import Ready, Ref, Results, Unreadable, Work, Worker
 from simulation.world import World
 
@@ -98,7 +99,7 @@ class LedgerMaster:
         self._rng = random.Random(f"{world.schedule.seed} master")
         self._members: dict[Child, Member] = {}
         self._terminated = False
-        self._pace = engine.Pace()
+        self._pace = Pace()
         self._recall_at: float | None = None
         self._idle_since: dict[engine.Worker, float] = {}
 
@@ -130,7 +131,7 @@ class LedgerMaster:
         job = self.ledger.open(
             account, pace=pace, retries=plan.retries, unit=plan.unit, alone=plan.alone
         )
-        self._pace = engine.Pace(job.pace)
+        self._pace = Pace(job.pace)
         self.jobs[account.number] = job
         if plan.cancelled_at is not None:
             self._later(max(0.0, plan.cancelled_at - self._now), self._cancel, account)
@@ -261,8 +262,9 @@ class LedgerMaster:
         receipt = self.ledger.expire(batch.seq)
         if receipt is not None:
             self._deliver(receipt.job, receipt.item(receipt.start), "too late")
-        batch.worker.key.leaving = True
-        batch.worker.key.child.signal(signal.SIGKILL)
+        member: Member = batch.worker.key
+        member.leaving = True
+        member.child.signal(signal.SIGKILL)
 
     def drain(self) -> None:
         """Ask some worker to leave."""
@@ -293,6 +295,7 @@ class LedgerMaster:
     def _assign(self) -> None:
         while (batch := self.ledger.assign(self._now)) is not None:
             member: Member = batch.worker.key
+            assert batch.job is not None
             account: Account = batch.job.owner
             work = Work(batch.seq, batch.items, batch.stride, account.plan.unit)
             member.child.deliver(batch.seq, work)
@@ -300,16 +303,17 @@ class LedgerMaster:
                 self._later(account.plan.timeout, self._expire, batch)
 
     def _let_go(self) -> None:
-        for member in self._members.values():
-            if member.worker is not None and member.worker.spent and not member.leaving:
-                member.stop()
+        for worker in self.ledger.spent():
+            worker.key.stop()
 
     def _scale(self) -> None:
         staying = sum(not member.leaving for member in self._members.values())
         schedule = self.world.schedule
-        wanted = min(schedule.max_workers, self.ledger.demand())
+        wanted = max(schedule.min_workers, min(schedule.max_workers, self.ledger.demand()))
+        newcomers = len(self.ledger.homeless()) - self.ledger.starting
         if not self._terminated:
-            for _ in range(max(wanted, schedule.min_workers) - staying):
+            missing = max(wanted - staying, min(newcomers, schedule.max_workers - staying))
+            for _ in range(missing):
                 self._start()
         if schedule.linger is not None and staying > schedule.min_workers:
             for worker in self.ledger.idle():
@@ -341,6 +345,10 @@ class LedgerMaster:
     def _recall(self, due: float) -> None:
         if self._recall_at == due:
             self._recall_at = None
+
+    def done(self) -> bool:
+        """The loop runs out of things to do."""
+        return True
 
     def leave_process(self) -> None:
         """It took nothing from the process."""

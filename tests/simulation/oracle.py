@@ -58,9 +58,9 @@ class Oracle:
     def begins(self, ref: Ref, worker: Worker) -> None:
         """``worker`` begins a task: the first time, or because an earlier run came to nothing."""
         account = self.accounts[ref.job]
-        runs = account.runs[ref.index]
+        runs = account.runs[ref.task]
         living = sum(earlier not in self._lost for earlier in runs)
-        if living > account.forgiven[ref.index]:
+        if living > account.forgiven[ref.task]:
             raise Violation(f"{ref} runs again, though {runs[-1].name} was not lost")
         if runs and not account.plan.retries:
             raise Violation(f"{ref} runs again, though it has no retries")
@@ -72,7 +72,7 @@ class Oracle:
 
     def runs(self, ref: Ref) -> int:
         """How often a task was begun."""
-        return len(self.accounts[ref.job].runs[ref.index])
+        return len(self.accounts[ref.job].runs[ref.task])
 
     def lost(self, worker: Worker, *, was_heard: bool, reported: bool) -> None:
         """The master knows, or believes, that a worker is gone.
@@ -98,7 +98,7 @@ class Oracle:
     def delivered(self, ref: Ref, outcome: Act | str) -> None:
         """The user sees how a task ended."""
         account = self.accounts[ref.job]
-        bit = 1 << ref.index
+        bit = 1 << ref.task
         if account.delivered & bit:
             raise Violation(f"{ref} is delivered twice")
         if account.cancelled:
@@ -106,7 +106,7 @@ class Oracle:
         if account.finished:
             raise Violation(f"{ref} is delivered after its job was finished")
         account.delivered |= bit
-        if isinstance(outcome, Act) and not account.runs[ref.index]:
+        if isinstance(outcome, Act) and not account.runs[ref.task]:
             raise Violation(f"{ref} has a result, but never ran")
         if outcome is Act.RETRIED and self._tries(account, ref) < account.plan.retries:
             raise Violation(f"{ref} fails, though it could have been tried again")
@@ -123,12 +123,12 @@ class Oracle:
     def tried_again(self, ref: Ref) -> None:
         """A task is tried again after an error."""
         account = self.accounts[ref.job]
-        account.forgiven[ref.index] += 1
+        account.forgiven[ref.task] += 1
         if self._tries(account, ref) > account.plan.retries:
             raise Violation(f"{ref} is tried again more than {account.plan.retries} times")
 
     def _tries(self, account: Account, ref: Ref) -> int:
-        return account.forgiven[ref.index] + account.charges[ref.index]
+        return account.forgiven[ref.task] + account.charges[ref.task]
 
     def closed(self, number: int) -> None:
         """The user has no more tasks for a job."""
@@ -149,7 +149,7 @@ class Oracle:
         """A task is charged for the end of the worker that held it."""
         if not child.agent.lost and not self._is_suspect(child.worker, seq, offset):
             raise Violation(f"{ref} is blamed for the end of {child.name}, which was not in it")
-        self.accounts[ref.job].charges[ref.index] += 1
+        self.accounts[ref.job].charges[ref.task] += 1
 
     def spared(self, child: Child, ref: Ref) -> None:
         """A task that a lost worker held is not charged."""

@@ -1,7 +1,7 @@
 """Runs simulated schedules outside of the tests.
 
-    python tests/simulation/run.py ledger 1234             one seed: what is planned, what happens
-    python tests/simulation/run.py ledger 10000 60000      many: stops at the first that fails
+python tests/simulation/run.py ledger 1234             one seed: what is planned, what happens
+python tests/simulation/run.py ledger 10000 60000      many: stops at the first that fails
 """
 
 from __future__ import annotations

@@ -232,7 +232,7 @@ class _Draw:
             alone=timeout is not None or rng.random() < 0.1,
             timeout=timeout,
             everywhere=everywhere,
-            cancelled_at=cancelled_at if rng.random() < 0.2 else None,
+            cancelled_at=cancelled_at if rng.random() < (0.4 if everywhere else 0.2) else None,
         )
 
     def faults(self, workers: int, remote: int) -> Iterator[Fault]:
@@ -282,10 +282,15 @@ def simpler(schedule: Schedule) -> Iterator[Schedule]:
 def _plainer(schedule: Schedule) -> Iterator[Schedule]:
     """The same with one special condition less."""
     for at, job in enumerate(schedule.jobs):
-        plain = {"cancelled_at": None, "bite": 1000, "unit": 1, "at": 0.0, "everywhere": False}
-        for name, value in plain.items():
-            if getattr(job, name) != value:
-                yield replace(schedule, jobs=_with(schedule.jobs, at, replace(job, **{name: value})))
+        for plain in (
+            replace(job, cancelled_at=None),
+            replace(job, bite=1000),
+            replace(job, unit=1),
+            replace(job, at=0.0),
+            replace(job, everywhere=False),
+        ):
+            if plain != job:
+                yield replace(schedule, jobs=_with(schedule.jobs, at, plain))
     if schedule.left is not None:
         yield replace(schedule, left=None)
     if schedule.linger is not None:

@@ -11,21 +11,25 @@ import random
 import threading
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
+from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from unittest import mock
 
+from fiber._agent import service
+from fiber._backends.remote import RemoteChild
 from fiber._engine.ledger import Batch
 from fiber._runtime import exchange, workers
 from fiber._runtime.dispatcher import Dispatcher, Terms
 from fiber.process import Process
 from simulation.agents import Child
+from simulation.remote_hosts import NoCapture, RemoteHost
 
 if TYPE_CHECKING:
     from simulation.world import World
 
-MOMENT = 1e-4
-"""Seconds until another thread gets its turn, at most."""
+MOMENTS = 1e-5, 1e-4, 3e-3
+"""Seconds until another thread gets its turn, at most: on an idle machine, on a busy one."""
 
 
 class StagedProcess(Process):
@@ -42,28 +46,40 @@ class Stage:
         self.config = SimpleNamespace(start_timeout=1.0)
         self.rng = random.Random(f"{world.schedule.seed} stage")
         self._world = world
+        self._started = 0
+        self._longest = self.rng.choice(MOMENTS)
         self._stack = ExitStack()
 
     def enter(self) -> None:
         """Take the places."""
         enter = self._stack.enter_context
-        enter(mock.patch.object(exchange, "runtime", lambda: self))
-        enter(mock.patch.object(workers, "runtime", lambda: self))
+        enter(mock.patch.object(exchange, "runtime", return_value=self))
+        enter(mock.patch.object(workers, "runtime", return_value=self))
         enter(mock.patch.object(exchange, "monotonic", self.loop.now))
-        enter(mock.patch.object(exchange, "Pump", lambda name: StagedPump(self)))
+        enter(mock.patch.object(exchange, "Pump", partial(StagedPump, self)))
+        enter(mock.patch.object(service, "Capture", NoCapture))
 
     def leave(self) -> None:
         """Give them back."""
         self._stack.close()
 
-    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> Child:
+    def start(
+        self, process: Any, observer: Any, *, tasks: bool, method: str
+    ) -> Child | RemoteChild:
         """Start a worker on some agent."""
-        agents = [agent for agent in self._world.agents if not agent.lost]
-        return self._world.start(self.rng.choice(agents), observer)
+        self._started += 1
+        agent = self.rng.choice([agent for agent in self._world.agents if not agent.lost])
+        if isinstance(agent, RemoteHost):
+            return agent.start_for_master(f"start {self._started}", observer)
+        return self._world.start(agent, observer)
 
     def soon(self, callback: Callable[..., object], *args: Any) -> None:
         """Call it when another thread gets its turn."""
-        self.loop.call_later(self.rng.random() * MOMENT, self._off_loop, callback, args)
+        self.loop.call_later(self.moment(), self._off_loop, callback, args)
+
+    def moment(self) -> float:
+        """Seconds until another thread gets its turn."""
+        return self.rng.random() * self._longest
 
     def _off_loop(self, callback: Callable[..., object], args: tuple[Any, ...]) -> None:
         with self.loop.off_thread():
@@ -73,7 +89,7 @@ class Stage:
 class StagedPump:
     """A ``Pump`` without a thread."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: Stage, name: str) -> None:
         self._stage = stage
         self._todo: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
         self.stopped = False
@@ -180,7 +196,7 @@ class Actor:
         self._open = True
         if self._waits:
             self._waits = False
-            self._stage.loop.call_later(self._stage.rng.random() * MOMENT, self.resume)
+            self._stage.loop.call_later(self._stage.moment(), self.resume)
 
     def _pause(self) -> None:
         self._back.release()

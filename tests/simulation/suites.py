@@ -1,4 +1,4 @@
-"""What can be driven through the schedules, by name."""
+"""What is driven through the schedules, by name."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from fiber._engine.ledger import Ledger
 from simulation.dispatcher_master import DispatcherMaster, for_pool
 from simulation.explore import Suite, examine
 from simulation.ledger_master import LedgerMaster
+from simulation.remote_hosts import RemoteHost
 from simulation.world import World
 
-SCHEDULES = int(os.environ.get("SIMULATION_SCHEDULES", "4000"))
-"""Seeds that each suite runs in a test session."""
+SCHEDULES = int(os.environ.get("SIMULATION_SCHEDULES", "3000"))
+"""Seeds for the ledger in one test session; the slower suites run a part of them."""
 
 PARTS = 10
-"""Tests over which they are spread."""
+"""Tests over which a suite is spread."""
 
 
 def with_ledger(world: World) -> LedgerMaster:
@@ -24,8 +25,11 @@ def with_ledger(world: World) -> LedgerMaster:
 
 SUITES = {
     "ledger": Suite(with_ledger),
-    "dispatcher": Suite(DispatcherMaster, for_pool),
+    "dispatcher": Suite(DispatcherMaster, adapt=for_pool, share=0.6),
+    "remote": Suite(DispatcherMaster, adapt=for_pool, share=0.25, remote=RemoteHost),
 }
+"""``remote`` is the dispatcher again, with everything between it and the far workers real but the
+connection."""
 
 
 def again(suite: str, seed: int) -> str:
@@ -35,5 +39,5 @@ def again(suite: str, seed: int) -> str:
 
 def examine_part(suite: str, part: int) -> None:
     """Run every PARTS-th schedule."""
-    for seed in range(part, SCHEDULES, PARTS):
+    for seed in range(part, int(SCHEDULES * SUITES[suite].share), PARTS):
         examine(seed, SUITES[suite], again(suite, seed))

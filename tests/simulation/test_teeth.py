@@ -1,4 +1,4 @@
-"""The simulation finds what it is there to find: each of these ledgers breaks one promise."""
+"""The simulation finds what it is there to find: whatever is named here breaks one promise."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 
-from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
+from fiber._engine.ledger import Batch, Job, Ledger, Loss, Receipt, Worker
+from fiber._runtime.workers import Link
+from simulation.dispatcher_master import DispatcherMaster
 from simulation.explore import Failure, Suite, examine, first_failure, run
 from simulation.ledger_master import LedgerMaster
 from simulation.schedule import draw
-from simulation.suites import SUITES, again, with_ledger
-from simulation.world import World
+from simulation.staged import StagedDispatcher
+from simulation.suites import SUITES, again
 
 SEEDS = range(300)
 """Among these each fault must show."""
@@ -129,6 +131,51 @@ class NeverFinishes(Ledger):
         return False
 
 
+class ForgetsWhatIsUnsent(StagedDispatcher):
+    """Takes what was assigned, but not sent, for something that its worker may have run."""
+
+    def _assign(self) -> list[Batch]:
+        batches = super()._assign()
+        self._unsent.clear()
+        return batches
+
+
+class ReplacesNobody(StagedDispatcher):
+    def _replace(self) -> None:
+        """Nothing."""
+
+
+class HearsNothingBack(StagedDispatcher):
+    def recalled(self, link: Link, seqs: list[int]) -> None:
+        """Nothing."""
+
+
+class ForgetsDeadlines(StagedDispatcher):
+    def _expired(self, seq: int) -> None:
+        """Nothing."""
+
+
+class TellsTwice(StagedDispatcher):
+    def _put(self, receipt: Receipt, *args: Any, **options: Any) -> None:
+        super()._put(receipt, *args, **options)
+        super()._put(receipt, *args, **options)
+
+
+class TellsOthers(StagedDispatcher):
+    def _put(self, receipt: Receipt, results: list[Any], *args: Any, **options: Any) -> None:
+        super()._put(receipt, results[::-1], *args, **options)
+
+
+class NeverLetsGo(StagedDispatcher):
+    def _wind_down(self) -> None:
+        """Nothing."""
+
+
+class GrowsTooLate(StagedDispatcher):
+    def _grow(self) -> None:
+        """Nothing."""
+
+
 BROKEN = [
     ForgetsLostBatches,
     KeepsLostBatches,
@@ -148,16 +195,26 @@ BROKEN = [
     IgnoresMaxTasks,
     PinsToAnyone,
     NeverFinishes,
+    ForgetsWhatIsUnsent,
+    ReplacesNobody,
+    HearsNothingBack,
+    ForgetsDeadlines,
+    TellsTwice,
+    TellsOthers,
+    NeverLetsGo,
+    GrowsTooLate,
 ]
 
 
-def with_broken(ledger: type[Ledger]) -> Suite:
-    return Suite(lambda world: LedgerMaster(world, ledger()))
+def with_broken(broken: type[Ledger | StagedDispatcher]) -> Suite:
+    if issubclass(broken, Ledger):
+        return Suite(lambda world: LedgerMaster(world, broken()))
+    return SUITES["dispatcher"]._replace(make=lambda world: DispatcherMaster(world, broken))
 
 
-@pytest.mark.parametrize("ledger", BROKEN)
-def test_a_broken_ledger_is_found_out(ledger: type[Ledger]) -> None:
-    assert first_failure(SEEDS, with_broken(ledger)) is not None
+@pytest.mark.parametrize("broken", BROKEN)
+def test_what_is_broken_is_found_out(broken: type[Ledger | StagedDispatcher]) -> None:
+    assert first_failure(SEEDS, with_broken(broken)) is not None
 
 
 @contextmanager
@@ -191,22 +248,55 @@ def test_a_seed_runs_exactly_the_same_again(suite: str) -> None:
         assert first == second
 
 
-class Tally(list[str]):
-    """A trace that counts what kinds of things happen."""
+TELLING = {
+    "ledger": (
+        "crashes while it starts",
+        "crashes before it reads",
+        "crashes before it notes what it has read",
+        "crashes in a task",
+        "crashes after a task",
+        "crashes before it sends",
+        "crashes after it sent",
+        "is stopped for",
+        "is cut off",
+        "host 1 is given up",
+        "Ref(job=0, task=0) is given up",
+        "is back",
+        "is late: Results",
+        "Unreadable",
+        "kept=1",
+        "gives back [",
+        "is cancelled",
+        "leaves",
+        "in None",
+    ),
+    "dispatcher": (
+        "a map",
+        "a call",
+        "a stream",
+        "a broadcast",
+        "Unknown(",
+        "is aborted",
+        "is refused",
+        "the pool is closed",
+        "the pool is terminated",
+        "the input of job 0 is broken",
+    ),
+    "remote": (
+        "host 1 is back",
+        "host 1 is given up",
+        "the master hears that",
+        "gives back [",
+    ),
+}
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.kinds: Counter[str] = Counter()
 
-
-def test_everything_happens() -> None:
+@pytest.mark.parametrize("suite", TELLING)
+def test_everything_happens(suite: str) -> None:
     kinds: Counter[str] = Counter()
     for seed in SEEDS:
         trace: list[str] = []
-        World(draw(seed), with_ledger, trace).run()
-        kinds.update(word for line in trace for word in TELLING if word in line)
-    rare = [word for word in TELLING if kinds[word] < 5]
-    assert not rare, kinds
-
-
-TELLING = ()
+        run(draw(seed), SUITES[suite], trace)
+        text = "\n".join(trace)
+        kinds.update(word for word in TELLING[suite] if word in text)
+    assert not [word for word in TELLING[suite] if kinds[word] < 2], kinds

@@ -1,8 +1,8 @@
 """A simulated pool worker: reads a message, runs its tasks, answers; dies where it is told to.
 
-It keeps the rules of ``fiber._agent.worker``: one message at a time, a note on the board before each
-stride of tasks, results in order and in one or more pieces, and, of a batch that runs for too long,
-everything given back that has not begun.
+It keeps the rules of ``fiber._agent.worker``: one message at a time, a note on the board before
+each stride of tasks, results in order and in one or more pieces, and, of a batch that runs for too
+long, everything given back that has not begun.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Ref(NamedTuple):
     """Names a task: the number of its job in the schedule, and its index in that."""
 
     job: int
-    index: int
+    task: int
 
 
 class Work(NamedTuple):

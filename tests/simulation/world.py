@@ -8,8 +8,10 @@ from typing import Any, Protocol
 
 from fiber._agent.port import ChildObserver
 from fiber._transport.memory import SimulatedLoop
+from simulation import schedule
 from simulation.agents import Agent, Child
 from simulation.oracle import Oracle, Violation
+from simulation.remote_hosts import RemoteHost
 from simulation.schedule import (
     Crash,
     Cut,
@@ -25,6 +27,9 @@ from simulation.schedule import (
     Terminate,
 )
 from simulation.workers import Ref, Unknown, Work, Worker
+
+PATIENCE = 300
+"""Simulated seconds after which what did not happen over links never will."""
 
 CALLS = 50_000
 """More calls than any schedule needs: it goes round in circles."""
@@ -69,7 +74,9 @@ class Language(Protocol):
 class Master(Protocol):
     """Whoever gives the workers work."""
 
-    language: Language
+    @property
+    def language(self) -> Language:
+        """How it speaks with its workers."""
 
     def begin(self) -> None:
         """Set the schedule's jobs and workers going."""
@@ -86,6 +93,9 @@ class Master(Protocol):
     def check_end(self) -> None:
         """Everything has happened: nothing may be left over."""
 
+    def done(self) -> bool:
+        """Whether nothing is left to happen but heartbeats."""
+
     def leave_process(self) -> None:
         """Undo what it did to the process."""
 
@@ -95,23 +105,27 @@ class World:
 
     def __init__(
         self,
-        schedule: Schedule,
+        plans: Schedule,
         make_master: Callable[[World], Master],
         trace: list[str] | None = None,
+        make_remote: Callable[[World, int, schedule.Agent], Agent] = Agent,
     ) -> None:
-        self.schedule = schedule
+        self.schedule = plans
         self.loop = Loop()
-        self.oracle = Oracle(schedule)
-        self.agents = [Agent(self, number, plan) for number, plan in enumerate(schedule.agents)]
+        self.oracle = Oracle(plans)
         self._trace = trace
         self.workers: list[Worker] = []
         self._calls = 0
         self._faults: dict[int, list[Fault]] = {}
-        for fault in schedule.faults:
+        for fault in plans.faults:
             if isinstance(fault, Crash | StillBirth | Slow | Repeat):
                 self._faults.setdefault(fault.worker, []).append(fault)
         self._master = make_master(self)
         self.language = self._master.language
+        self.agents = [
+            (make_remote if plan.delay else Agent)(self, number, plan)
+            for number, plan in enumerate(plans.agents)
+        ]
 
     def run(self) -> None:
         """Let everything happen; Violation if a promise is broken."""
@@ -119,11 +133,21 @@ class World:
             self._master.begin()
             for fault in self.schedule.faults:
                 self._plan(fault)
-            self.loop.run_for(END)
+            self.run_out()
             self.oracle.check_end()
             self._master.check_end()
         finally:
             self._master.leave_process()
+
+    def run_out(self) -> None:
+        """Let everything happen."""
+        if not any(isinstance(agent, RemoteHost) for agent in self.agents):
+            self.loop.run_for(END)
+            return
+        # Links have heartbeats to the end of time.
+        end = self.loop.now() + PATIENCE
+        while not self._master.done() and self.loop.now() < end:
+            self.loop.run_for(5)
 
     def note(self, text: str, *args: object) -> None:
         """Write it into the trace, if there is one."""
@@ -154,7 +178,7 @@ class World:
     def task(self, ref: Ref) -> Task:
         """What a task does."""
         job = self.schedule.jobs[ref.job]
-        return job.tasks[0 if job.everywhere else ref.index]
+        return job.tasks[0 if job.everywhere else ref.task]
 
     def heard_late(self, child: Child, said: Any) -> None:
         """A worker that was given up says something."""

@@ -5,6 +5,7 @@ Host ``a`` has the objects; this process is on host ``b``.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import pickle
 import select
@@ -22,6 +23,7 @@ import fiber
 from census import wait_until
 from fiber._hub import access
 from fiber._hub.access import Access
+from fiber._hub.client import Unreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.remote import RemoteChannel, RemoteCounter
@@ -255,7 +257,7 @@ def test_a_handle_used_twice_says_so(hosts: Hosts, far: Far) -> None:
     pickle.loads(data).close()
     assert wait_until(lambda: len(hosts["a"].registry) == 0, PATIENCE)
     late = pickle.loads(data)
-    with pytest.raises(ConnectionClosed, match="used once already"):
+    with pytest.raises(Unreachable, match="used once already"):
         late.poll()
     with pytest.raises(BrokenPipeError, match="used once already"):
         late.send(1)
@@ -504,7 +506,7 @@ def test_a_lost_link_ends_every_wait_with_its_reason(hosts: Hosts, far: Far) -> 
     def fails(wait_for_it: Callable[..., Any], *args: Any) -> None:
         try:
             wait_for_it(*args)
-        except ConnectionClosed as error:
+        except Unreachable as error:
             errors.append(str(error))
 
     remote.poll(0)
@@ -533,7 +535,7 @@ def test_a_host_that_nobody_knows_is_named(hosts: Hosts) -> None:
         data = pickle.dumps(there)
     with hosts.at("b"):
         remote = pickle.loads(data)
-        with pytest.raises(ConnectionClosed, match="'elsewhere' cannot be reached"):
+        with pytest.raises(Unreachable, match="'elsewhere' cannot be reached"):
             remote.poll()
         remote.close()
     here.close()
@@ -610,3 +612,30 @@ def test_an_interrupted_acquire_takes_nothing(far: Far, wires: tuple[Wire, Wire]
     down.let_go()
     assert remote.acquire(timeout=PATIENCE)
     assert semaphore.get_value() == 0
+
+
+def send_from_a_fork(remote: Connection) -> None:
+    remote.send("from the fork")
+    assert remote.recv() == "to the fork"
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+def test_a_process_forked_by_multiprocessing_has_streams_of_its_own(
+    hosts: Hosts, wires: tuple[Wire, Wire]
+) -> None:
+    here, there = fiber.Pipe()
+    with hosts.at("a"):
+        data = pickle.dumps(there)
+    with hosts.child_at("b"):
+        remote = pickle.loads(data)
+        assert not remote.poll()
+        context = multiprocessing.get_context("fork")
+        process = context.Process(target=send_from_a_fork, args=(remote,))
+        process.start()
+        assert here.recv() == "from the fork"
+        here.send("to the fork")
+        process.join(PATIENCE)
+        assert process.exitcode == 0
+        here.send("to the parent")
+        assert remote.recv() == "to the parent"
+        remote.close()

@@ -167,6 +167,15 @@ def test_tasks_that_travel_alone_go_to_idle_workers_only(options: dict[str, Any]
     assert all(len(worker.queue) == 1 for worker in workers)
 
 
+def test_an_expired_task_of_a_cancelled_job_takes_its_worker_with_it() -> None:
+    ledger, (worker,) = ledger_with(1)
+    job = job_of(ledger, range(1), alone=True)
+    (batch,) = assign_all(ledger)
+    ledger.cancel(job)
+    assert ledger.expire(batch.seq) is None
+    assert worker.leaving
+
+
 def test_pinned_tasks_run_on_their_worker() -> None:
     ledger, workers = ledger_with(3)
     job = ledger.open()
@@ -226,10 +235,34 @@ def test_a_worker_is_given_no_more_than_it_may_do() -> None:
     job_of(ledger, range(10), pace=known(1e-6))
     (batch,) = assign_all(ledger)
     assert len(batch.items) == 3
-    assert not worker.spent
+    assert ledger.spent() == []
     answer(ledger, batch)
-    assert worker.spent
+    assert ledger.spent() == [worker]
+    assert ledger.spent() == [], "told twice"
     assert not assign_all(ledger)
+
+
+def test_pinned_tasks_of_a_worker_that_is_spent_are_for_another() -> None:
+    ledger, (worker,) = ledger_with(1, left=1)
+    job_of(ledger, range(1))
+    (batch,) = assign_all(ledger)
+    job = ledger.open()
+    ledger.pin(job, worker, "x")
+    answer(ledger, batch)
+    assert ledger.spent() == [worker]
+    assert ledger.homeless() == [job]
+    ledger.add("next", 0.0)
+    assert assign_all(ledger)[0].items == ["x"]
+
+
+def test_units_of_cancelled_batches_may_be_given_again() -> None:
+    ledger, (worker,) = ledger_with(1, left=2)
+    job = job_of(ledger, range(10))
+    first, second = assign_all(ledger)
+    ledger.cancel(job)
+    ledger.put_back(worker, [first.seq, second.seq], 0.0)
+    assert worker.left == 2
+    assert ledger.spent() == []
 
 
 def test_a_chunk_counts_as_one() -> None:
@@ -339,6 +372,31 @@ def test_idle_workers_ask_for_what_others_have_not_begun() -> None:
     ledger.put_back(other, [other.queue[1].seq], PATIENCE)
     (stolen,) = assign_all(ledger)
     assert stolen.worker is one
+
+
+def test_who_does_not_answer_does_not_keep_others_from_being_asked() -> None:
+    ledger, (one, other, third) = ledger_with(3)
+    job_of(ledger, range(6))
+    for batch in assign_all(ledger):
+        if batch.worker is one:
+            answer(ledger, batch)
+    assert len(ledger.recall(PATIENCE)) == 1
+    assert len(ledger.recall(PATIENCE)) == 1
+    assert other.recalled
+    assert third.recalled
+    assert ledger.next_recall() is None
+
+
+def test_the_time_to_ask_is_the_time_that_was_said() -> None:
+    ledger, (one, other) = ledger_with(2)
+    job_of(ledger, range(4))
+    for batch in assign_all(ledger):
+        if batch.worker is one:
+            answer(ledger, batch)
+    other.since = 17.26  # 17.26 + PATIENCE - 17.26 < PATIENCE
+    due = ledger.next_recall()
+    assert due is not None
+    assert ledger.recall(due) == [other]
 
 
 def test_nothing_is_asked_for_while_something_waits() -> None:

@@ -160,10 +160,11 @@ def test_an_address_that_is_not_ours_is_named() -> None:
         pass
 
 
-def test_it_leaves_no_file_while_it_runs_nor_after(tmp_path: Any) -> None:
+def test_it_leaves_no_file(tmp_path: Any) -> None:
     with running(runtime_directory=str(tmp_path)):
         stop(start())
-        assert list(tmp_path.iterdir()) == []
+        assert "key" not in " ".join(path.name for path in tmp_path.rglob("*"))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_runtime_can_be_shut_down_and_made_again() -> None:

@@ -357,6 +357,7 @@ def in_a_fork(queue: Any) -> None:
     queue.join_thread()
 
 
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 def test_a_process_forked_by_multiprocessing_shares_the_queue() -> None:
     queue: Any = fiber.Queue()
     for _ in range(MORE_THAN_FITS):  # a feeder thread runs, which the fork does not inherit

@@ -84,6 +84,7 @@ def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.
         executable=options.pop("executable", None),
         captured=False,
         open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
+        hub=None,
     )
 
 

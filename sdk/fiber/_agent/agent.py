@@ -33,11 +33,14 @@ from fiber._hub.access import Access
 from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
-from fiber._transport.unix import naming_the_limit, socketpair
+from fiber._transport.unix import naming_the_limit, socketpair, wait_readable
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike
 
 _SEQ = struct.Struct("<Q")
+_ATTENTION = 5e-3
+"""Seconds that a caller waits for a worker itself before it leaves the answer to the loop."""
+
 _QUIT_TIMEOUT = 10.0
 
 
@@ -171,7 +174,7 @@ class LocalChild:
         self._ours: socket.socket | None = None
         self._theirs: socket.socket | None = None
         self._outbox: Outbox | None = None
-        self._lock = threading.Lock()
+        self._hearing = threading.Lock()
         try:
             if spec.tasks:
                 self._open_channel(agent)
@@ -213,6 +216,23 @@ class LocalChild:
         outbox = self._outbox
         return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
 
+    def attend(self) -> bool:
+        """Wait for its answer in place of the loop."""
+        ours = self._ours
+        if ours is None or self._loop.on_thread() or not self._hearing.acquire(blocking=False):
+            return False
+        try:
+            fd = ours.fileno()
+            if fd < 0:
+                return False
+            self._loop.pause(fd)
+            try:
+                return wait_readable(fd, _ATTENTION) and self._hear()
+            finally:
+                self._loop.resume(fd)
+        finally:
+            self._hearing.release()
+
     def take_back(self) -> None:
         """Recall unread packets; answered on the loop."""
         self._loop.call_soon(self._answer_take_back)
@@ -227,12 +247,12 @@ class LocalChild:
         self.release_descriptors()
         if self._ours is None or self._theirs is None or self._outbox is None:
             return ()
-        while self._hear():
-            pass
-        unread = self._recall()
-        self._loop.unregister(self._ours.fileno())
-        self._outbox.close()
-        with self._lock:
+        with self._hearing:
+            while self._hear():
+                pass
+            unread = self._recall()
+            self._loop.unregister(self._ours.fileno())
+            self._outbox.close()
             self._ours.close()
             self._theirs.close()
         return tuple(unread)
@@ -242,7 +262,12 @@ class LocalChild:
             self.observer.taken_back(self._recall())
 
     def _receive(self) -> None:
-        self._hear()
+        # Whoever attends to it already hears it, in order.
+        if self._hearing.acquire(blocking=False):
+            try:
+                self._hear()
+            finally:
+                self._hearing.release()
 
     def _hear(self) -> bool:
         assert self._ours is not None

@@ -18,9 +18,13 @@ class Board:
     def __init__(self, fd: int | None = None) -> None:
         self.fd = os.memfd_create("fiber-progress", os.MFD_CLOEXEC) if fd is None else fd
         size = _SLOTS * _SLOT * 8
-        if fd is None:
-            os.ftruncate(self.fd, size)
-        self._memory = mmap.mmap(self.fd, size)
+        try:
+            if fd is None:
+                os.ftruncate(self.fd, size)
+            self._memory = mmap.mmap(self.fd, size)
+        except BaseException:
+            os.close(self.fd)
+            raise
         self._words = memoryview(self._memory).cast("Q")
         self._free: list[int] = []
         self._next = 0

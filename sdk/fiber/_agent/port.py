@@ -78,6 +78,13 @@ class ChildPort(Protocol):
         False: the child is gone and never saw it, and no report names it among the unread.
         """
 
+    def attend(self) -> bool:
+        """Wait for its answer on the calling thread, for some milliseconds.
+
+        True: something came and the observer was told, on this thread.  Where the answer is near
+        this saves waking the loop, and the loop waking the caller.
+        """
+
     def take_back(self) -> None:
         """Recall the packets that it has not read; the observer hears which."""
 

@@ -163,6 +163,10 @@ class RemoteChild:
             self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
             return True
 
+    def attend(self) -> bool:
+        """Its answer is never near."""
+        return False
+
     def take_back(self) -> None:
         """Recall unread packets."""
         self._agent.send(messages.TakeBack(self.number))

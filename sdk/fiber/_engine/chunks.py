@@ -23,11 +23,14 @@ GROWTH = 8
 RESUMED = 64
 """What a function that ran before is trusted with at first, counted as a measured message."""
 
-LIMIT = 1 << 14
+LIMIT = 1 << 12
 """Tasks in one message, however short they are."""
 
 SLOW = 50e-3
 """Tasks of this many seconds do not queue behind another: the gap between two cannot be seen."""
+
+SHORTEST = 1e-9
+"""Seconds that a task takes at least; clocks are not better than that."""
 
 STRIDE_SECONDS = 200e-6
 STRIDE_LIMIT = 1024
@@ -48,7 +51,7 @@ class Pace:
         if not tasks:
             return
         # One very long task must not make the next thousand travel alone for long.
-        each = min(seconds / tasks, 4 * SLOW)
+        each = min(max(seconds / tasks, SHORTEST), 4 * SLOW)
         self.seconds = each if self.seconds is None else (self.seconds + each) / 2
         self.largest = max(self.largest, tasks)
 
@@ -58,15 +61,19 @@ class Pace:
         About ``target`` seconds of work, but no more than half of a worker's fair share of what
         waits, so that all end together.
         """
-        seconds = self.seconds
-        size = 1
-        if seconds is not None and seconds <= target:
-            seconds = seconds or 1e-9
-            wanted = min(int(target / seconds), GROWTH * self.largest, LIMIT)
-            share = waiting // (2 * workers)
-            size = wanted if wanted <= share else min(wanted, max(share, int(FLOOR / seconds)))
+        size = self.message_size(target)
+        share = waiting // (2 * workers)
+        if size > share and self.seconds is not None:
+            size = min(size, max(share, int(FLOOR / self.seconds)))
         units = size // unit or 1
         return min(units * unit, waiting)
+
+    def message_size(self, target: float = TARGET) -> int:
+        """Tasks that one message carries where there are plenty."""
+        seconds = self.seconds
+        if seconds is None or seconds > target:
+            return 1
+        return min(int(target / seconds), GROWTH * self.largest, LIMIT)
 
     def depth(self) -> int:
         """Messages in flight for each worker: the one that runs and, if tasks are fast, another."""
@@ -80,7 +87,7 @@ class Pace:
         """
         if self.seconds is None:
             return 1
-        return min(max(int(STRIDE_SECONDS / max(self.seconds, 1e-9)), 1), STRIDE_LIMIT)
+        return min(max(int(STRIDE_SECONDS / self.seconds), 1), STRIDE_LIMIT)
 
 
 def default_chunksize(tasks: int, workers: int) -> int:

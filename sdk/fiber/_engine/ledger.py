@@ -25,7 +25,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from fiber._engine.chunks import PROMPT, TARGET, Pace
+from fiber._engine.chunks import Pace
 from fiber._engine.roster import PATIENCE, Roster
 from fiber._engine.spans import Span, Waiting
 from fiber._engine.tasks import Batch, Job, Loss, Receipt, Worker
@@ -157,9 +157,28 @@ class Ledger:
         """Give ``worker`` nothing more.  False, and nothing changed, if it is busy."""
         if worker.queue or worker.pinned:
             return False
-        worker.leaving = True
-        self._roster.sort(worker)
+        self._fence(worker)
+        self._roster.spent.pop(worker, None)
         return True
+
+    def spent(self) -> list[Worker]:
+        """Workers that did all that they may do, each once; they are given nothing more."""
+        spent, self._roster.spent = list(self._roster.spent), {}
+        for worker in spent:
+            self._fence(worker)
+        return spent
+
+    def _fence(self, worker: Worker) -> None:
+        """It is about to go: what only it was to run is for one that comes after it."""
+        worker.leaving = True
+        self._homeless += worker.pinned
+        worker.pinned.clear()
+        self._pins.pop(worker, None)
+        self._roster.sort(worker)
+
+    def homeless(self) -> list[Job]:
+        """The jobs of tasks that only a new worker may run, as often as there are such tasks."""
+        return [job for job, _ in self._homeless]
 
     def idle(self) -> list[Worker]:
         """Workers with nothing to do, the one that has been so for longest first."""
@@ -172,7 +191,8 @@ class Ledger:
     def demand(self) -> int:
         """Tasks that wait or run: as many workers could be used."""
         waiting = sum(len(job.waiting) for job in self._turns)
-        running = sum(len(batch.items) - batch.received for batch in self.batches.values())
+        wanted = (batch for batch in self.batches.values() if batch.job is not None)
+        running = sum(len(batch.items) - batch.received for batch in wanted)
         pinned = sum(len(worker.pinned) for worker in self._pins)
         return waiting + running + pinned + len(self._homeless)
 
@@ -221,8 +241,7 @@ class Ledger:
 
     def _cut(self, job: Job, worker: Worker, now: float) -> Batch:
         workers = len(self.workers) + self.starting
-        target = PROMPT if job.exact else TARGET
-        size = job.pace.batch_size(len(job.waiting), workers, job.unit, target)
+        size = job.pace.batch_size(len(job.waiting), workers, job.unit, job.target)
         if worker.left is not None:
             size = min(size, worker.left * job.unit)
         return self._send(job, worker, job.waiting.take(size), now)
@@ -337,15 +356,17 @@ class Ledger:
         return None
 
     def expire(self, seq: int) -> Receipt | None:
-        """The task of batch ``seq``, sent alone, ran out of time: it is done.
+        """The task of batch ``seq``, sent alone, ran out of time: it is done, if it counts.
 
         Its worker, which still runs it, is given nothing more.
         """
         batch = self.batches.get(seq)
-        if batch is None or batch.job is None:
+        if batch is None:
             return None
+        self._fence(batch.worker)
         job, batch.job = batch.job, None
-        batch.worker.leaving = True
+        if job is None:
+            return None
         job.done += 1
         self._finish(job)
         return Receipt(job, batch.start, 1, batch)
@@ -373,8 +394,6 @@ class Ledger:
         tasks that had their tries; they are done by that.
         """
         self.workers.discard(worker)
-        self._pins.pop(worker, None)
-        self._homeless += worker.pinned
         guilty = _in_progress(worker, set(unread), running)
         losses: list[Loss] = []
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):
@@ -382,10 +401,9 @@ class Ledger:
             if batch.job is not None:
                 suspects = batch.suspects(running) if batch is guilty else range(0)
                 losses += self._lose_batch(batch.job, batch.rest(), suspects)
-        worker.leaving = True
         worker.queue.clear()
-        worker.pinned.clear()
-        self._roster.sort(worker)
+        self._fence(worker)
+        self._roster.spent.pop(worker, None)
         return losses[::-1]
 
     def _lose_batch(self, job: Job, rest: Span, suspects: range) -> list[Loss]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 
 from fiber._engine.tasks import Worker
 
@@ -17,6 +18,7 @@ class Roster:
         self.idle: dict[Worker, None] = {}
         self.single: dict[Worker, None] = {}
         self.deep: dict[Worker, None] = {}
+        self.spent: dict[Worker, None] = {}
 
     def sort(self, worker: Worker) -> None:
         """Put ``worker`` where one that holds as much as it does belongs."""
@@ -28,6 +30,8 @@ class Roster:
         elif worker not in self.deep:
             self.deep[worker] = None
         if worker.leaving or worker.left == 0:
+            if not queue and not worker.leaving:
+                self.spent[worker] = None
             return
         if not queue:
             self.idle[worker] = None
@@ -44,16 +48,16 @@ class Roster:
 
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for what they have not read, one for each idle one; marks them."""
-        victims = []
-        for worker in itertools.islice(self.deep, len(self.idle)):
-            if now - worker.since >= PATIENCE and not worker.recalled:
-                worker.recalled = True
-                victims.append(worker)
+        victims = [worker for worker in self._candidates() if now >= worker.since + PATIENCE]
+        for worker in victims:
+            worker.recalled = True
         return victims
 
     def next_recall(self) -> float | None:
         """When ``recall`` could next return something, if nothing else happens."""
         if not self.idle or not self.deep:
             return None
-        candidates = itertools.islice(self.deep, len(self.idle))
-        return min((w.since + PATIENCE for w in candidates if not w.recalled), default=None)
+        return min((worker.since + PATIENCE for worker in self._candidates()), default=None)
+
+    def _candidates(self) -> Iterator[Worker]:
+        return itertools.islice((w for w in self.deep if not w.recalled), len(self.idle))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, NamedTuple
 
-from fiber._engine.chunks import Pace
+from fiber._engine.chunks import PROMPT, TARGET, Pace
 from fiber._engine.spans import Span, Waiting
 
 
@@ -44,6 +44,11 @@ class Job:
         self.listed = False  # whether it is in the ledger's round of turns
 
     @property
+    def target(self) -> float:
+        """Seconds of work that a message of it should carry."""
+        return PROMPT if self.exact else TARGET
+
+    @property
     def finished(self) -> bool:
         """No task will come any more, and all that came are done."""
         return self.closed and self.done == self.fed
@@ -56,7 +61,18 @@ class Batch:
     is the number of tasks between two notes of the worker's progress.
     """
 
-    __slots__ = ("alone", "items", "job", "pin", "received", "seq", "start", "stride", "worker")
+    __slots__ = (
+        "alone",
+        "items",
+        "job",
+        "pin",
+        "received",
+        "seq",
+        "start",
+        "stride",
+        "unit",
+        "worker",
+    )
 
     def __init__(self, seq: int, job: Job, worker: Worker, span: Span) -> None:
         self.seq = seq
@@ -67,6 +83,7 @@ class Batch:
         self.alone = span.alone
         self.pin = span.pin
         self.stride = 1 if job.exact else job.pace.stride()
+        self.unit = job.unit
         self.received = 0
 
     @property
@@ -77,7 +94,7 @@ class Batch:
     @property
     def units(self) -> int:
         """What this batch counts for maxtasksperchild."""
-        return -(-len(self.items) // self.job.unit) if self.job else 0
+        return -(-len(self.items) // self.unit)
 
     def rest(self) -> Span:
         """The tasks without a result."""
@@ -109,11 +126,6 @@ class Worker:
         self.since = 0.0  # when it began what it does now
         self.recalled = False
         self.leaving = False
-
-    @property
-    def spent(self) -> bool:
-        """It did all that it may do, and can go."""
-        return self.left == 0 and not self.queue
 
 
 class Receipt(NamedTuple):

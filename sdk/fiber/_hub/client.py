@@ -20,6 +20,15 @@ from fiber.errors import ConnectionClosed
 _FORMS = {form.size: form for form in (HEAD, ONE, TWO)}
 
 
+class Unreachable(ConnectionClosed):
+    """An object of some hub that cannot be used any more, or never could; says why."""
+
+    def __init__(self, host: str, reason: str) -> None:
+        EOFError.__init__(self, f"what is kept on host {host!r} cannot be used: {reason}")
+        self.peer = f"host {host!r}"
+        self.reason = reason
+
+
 class Reply:
     """What a hub answered."""
 
@@ -71,7 +80,7 @@ class Line:
         try:
             self._send(form.pack(operation, number, *values), buffers, fds)
             reply = self._reply(number, timeout)
-        except ConnectionClosed:
+        except Unreachable:
             raise
         except BaseException:
             # Ctrl-C, or what another signal's handler raised.  What nobody waits for any more
@@ -100,15 +109,15 @@ class Line:
         self._send(form.pack(operation, self._next(), *values))
 
     def receive(self) -> Reply:
-        """What comes next, asked for or not; ConnectionClosed with the hub's reason at the end."""
+        """What comes next, asked for or not; Unreachable with the hub's reason at the end."""
         try:
             message = packet.receive(self._sock, descriptors=True)
         except (EOFError, ConnectionError) as error:
-            raise ConnectionClosed(self._peer, self._end) from error
+            raise Unreachable(self._host, self._end) from error
         try:
             if message.payload[0] == Status.GONE:
                 self._end = protocol.text(message.payload)
-                raise ConnectionClosed(self._peer, self._end)
+                raise Unreachable(self._host, self._end)
             return Reply(message)
         finally:
             message.close_descriptors()
@@ -149,10 +158,6 @@ class Line:
             while True:  # what the hub said before it closed says why, in the end
                 self.receive()
 
-    @property
-    def _peer(self) -> str:
-        return f"the hub of host {self._host!r}"
-
 
 def _dial(home: Access) -> tuple[socket.socket, Sequence[bytes]]:
     """A socket towards ``home``, and what to say before greeting it."""
@@ -172,7 +177,6 @@ def _connect(to: Access) -> socket.socket:
         sock.connect(to.address)
     except OSError as error:
         sock.close()
-        raise ConnectionClosed(
-            f"the hub of host {to.host!r}", f"nobody serves {to.address}: its program has ended"
-        ) from error
+        reason = f"nobody serves {to.address}, so its program has ended"
+        raise Unreachable(to.host, reason) from error
     return sock

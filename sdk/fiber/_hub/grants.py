@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 from fiber._hub import access
 from fiber._hub.access import Access
-from fiber._hub.client import Line
+from fiber._hub.client import Line, Unreachable
 from fiber._hub.protocol import ONE, TWO, Kind, Op, Terms
 from fiber._hub.registry import Registry
 from fiber._hub.remote import RemoteObject
-from fiber.errors import ConnectionClosed
 
 
 class Granted(NamedTuple):
@@ -180,5 +179,5 @@ def undo_attempt() -> None:
     """It did not work out: what was granted meanwhile, nobody will ever use."""
     undo, _attempt.undo = _attempt.undo, []
     for step in undo:
-        with contextlib.suppress(OSError, ConnectionClosed):  # the hub is gone, and all with it
+        with contextlib.suppress(OSError, Unreachable):  # the hub is gone, and all with it
             step()

@@ -18,9 +18,10 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from fiber._hub import access, grants
 from fiber._hub.access import Access
-from fiber._hub.client import Line
+from fiber._hub.client import Line, Unreachable
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.protocol import TWO, Kind, Op
+from fiber._hub.registry import NoSuchObject
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
 from fiber._transport.base import Channel, Counter
 from fiber._transport.unix import UnixChannel, UnixCounter
@@ -66,7 +67,10 @@ class HubHandle(NamedTuple):
         """On the hub's host: a descriptor."""
         hub = access.own_hub()
         if hub is not None and hub.key == self.home.key:
-            return hub.registry.fetch(self.number, self.grant)
+            try:
+                return hub.registry.fetch(self.number, self.grant)
+            except NoSuchObject as error:
+                raise Unreachable(hub.host, str(error)) from None
         line = Line(self.home)
         try:
             reply = line.ask(Op.FETCH, self.number, self.grant, form=TWO)

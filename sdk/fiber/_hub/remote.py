@@ -13,11 +13,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from fiber._hub.access import Access
-from fiber._hub.client import Line, Reply
+from fiber._hub.client import Line, Reply, Unreachable
 from fiber._hub.protocol import ONE, TWO, Op, Status
 from fiber._transport.unix import wait_readable
 from fiber._wire.packet import BytesLike, Message
-from fiber.errors import ConnectionClosed
 
 
 class RemoteObject:
@@ -100,7 +99,7 @@ class RemoteChannel(RemoteObject):
         try:
             with self.line() as line:
                 reply = line.ask(Op.SEND, buffers=[memoryview(payload), *buffers])
-        except ConnectionClosed as error:
+        except Unreachable as error:
             raise BrokenPipeError(str(error)) from error
         if reply.status is Status.BROKEN:
             raise BrokenPipeError("the other end is closed")

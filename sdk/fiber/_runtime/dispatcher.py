@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import signal
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from fiber import reduction
+from fiber._agent.port import ChildPort
 from fiber._engine.chunks import Pace
-from fiber._runtime.exchange import Exchange, Terms
+from fiber._runtime.exchange import Exchange, Plan, Terms
 from fiber._runtime.outcome import Failure
 from fiber._runtime.reader import Reader
 from fiber._runtime.requests import Call, Function, Request, Sink, name_of
@@ -39,17 +40,14 @@ class Dispatcher(Exchange):
 
     def start(self) -> None:
         """Start the first workers; raises what stands in the way of one."""
-        self.crew.hiring = self.crew.minimum
-        try:
-            for _ in range(self.crew.minimum):
-                self.crew.hire()
-        except BaseException:
-            with self._lock:
-                self.crew.hiring = 0
-            self.terminate(RuntimeError("the pool could not be started"))
-            raise
         with self._lock:
-            self._count()
+            self.crew.order(self.crew.minimum)
+        try:
+            while self.crew.hire() is not None:
+                pass
+        except BaseException as error:
+            self.terminate(error)
+            raise
 
     # Requests
 
@@ -60,11 +58,11 @@ class Dispatcher(Exchange):
         args: Iterable[Any],
         kwargs: Mapping[str, Any],
         timeout: float | None = None,
-    ) -> None:
-        """One call of a function."""
+    ) -> ChildPort | None:
+        """One call of a function.  Returns the worker that has it, if it has it already."""
         call = _make_call(sink, function, args, kwargs)
         if call is None:
-            return
+            return None
         with self._lock:
             self._check()
             request = self._calls
@@ -73,11 +71,14 @@ class Dispatcher(Exchange):
             self._ledger.feed(request.job, [call])
             if request is not self._calls:
                 self._ledger.close(request.job)
-            batches = self._assign()
-            if call.buffers and not any(call in batch.items for batch in batches):
+            plan = self._step()
+            if call.buffers and not any(call in batch.items for batch in plan.batches):
                 call.detach()
-            self._grow()
-        self._send(batches)
+        self._follow(plan)
+        if len(plan.batches) != 1:
+            return None
+        port: ChildPort | None = plan.batches[0].worker.key.port
+        return port
 
     def broadcast(self, sink: Sink, function: Callable[..., Any], args: Sequence[Any]) -> None:
         """The same call on every worker, present or starting; ``sink`` gets one outcome of each."""
@@ -89,11 +90,11 @@ class Dispatcher(Exchange):
             request = self._open(work.CALLS, sink=sink)
             for link in self.crew.staying():
                 self._ledger.pin(request.job, link.worker, call)
-            for _ in range(self.crew.hiring):
+            for _ in range(self.crew.ordered):
                 self._ledger.pin(request.job, None, call)
-            self._ledger.close(request.job)
-            batches = self._assign()
-        self._send(batches)
+            finished = self._ledger.close(request.job)
+            plan = self._step()
+        self._follow(plan, [sink] if finished else [])
 
     def function(self, function: Callable[..., Any]) -> Function:
         """``function``, pickled; one that pickles as an earlier one did is the same."""
@@ -128,11 +129,8 @@ class Dispatcher(Exchange):
             )
             self._ledger.feed(request.job, items)
             finished = self._ledger.close(request.job)
-            batches = self._assign()
-            self._grow()
-        self._send(batches)
-        if finished:
-            sink.end()
+            plan = self._step()
+        self._follow(plan, [sink] if finished else [])
         return request
 
     def stream(
@@ -170,14 +168,13 @@ class Dispatcher(Exchange):
         with self._lock:
             if request.job not in self._ledger.jobs:
                 return  # aborted or cancelled meanwhile
-            batches = self._assign()  # empties the inbox
+            request.reader.absorb(self._ledger)  # type: ignore[union-attr]
             if error is not None and request.sink is not None:
                 request.sink.put(request.job.fed, [Failure(error)], True)
             self._ledger.close(request.job)
             self._check_finished(request.job, ends)
-        self._send(batches)
-        self._end(ends)
-        self._wind_down()
+            plan = self._step()
+        self._follow(plan, ends)
 
     def cancel(self, request: Request) -> None:
         """Nobody wants the rest of it any more; what runs is left to end."""
@@ -185,12 +182,8 @@ class Dispatcher(Exchange):
             self._stop_reader(request)
             for worker in self._ledger.cancel(request.job):
                 worker.key.port.take_back()
-            batches = self._assign()
-        if self._loop.on_thread():
-            self._send_from_loop(batches)
-        else:
-            self._send(batches)
-        self._wind_down()
+            plan = self._step()
+        self._act(plan)
 
     def post(self, action: Callable[..., None], *args: Any) -> None:
         """Have something done on the loop's thread: for finalizers, which may hold any lock."""
@@ -203,9 +196,13 @@ class Dispatcher(Exchange):
     def _feed_hungry(self) -> None:
         if self.hungry:
             with self._lock:
-                batches = self._assign()
-                self._grow()
-            self._send(batches)
+                plan = self._step()
+            self._follow(plan)
+
+    def _follow(self, plan: Plan, ends: Iterable[Sink] = ()) -> None:
+        """Do what was decided, on a caller's thread, which may run the user's code."""
+        self._send(plan.batches)
+        self._tell(plan, ends)
 
     def _open(
         self,
@@ -238,11 +235,6 @@ class Dispatcher(Exchange):
         if self._closing:
             raise ValueError("Pool not running")
 
-    def _grow(self) -> None:
-        """Start more workers if there is more work than those that are there can do.  Lock held."""
-        if len(self.crew.links) + self.crew.hiring < self.crew.maximum:
-            self._replace()
-
     # The end
 
     def close(self) -> None:
@@ -250,7 +242,8 @@ class Dispatcher(Exchange):
         with self._lock:
             self._closing = True
             self._ledger.close(self._calls.job)
-        self._wind_down()
+            plan = self._step()
+        self._follow(plan)
 
     def terminate(self, error: BaseException) -> None:
         """End the workers now; ``error`` is what those hear who wait for a result."""
@@ -262,8 +255,9 @@ class Dispatcher(Exchange):
             for link in links:
                 link.terminate()
             if links:
-                self._kill_timer = self._loop.call_later(KILL_AFTER, _kill, links)
-        self._wind_down()
+                self._later("kill", KILL_AFTER, partial(_kill, links))
+            plan = self._step()
+        self._act(plan)
 
     def join(self) -> None:
         """Wait until all workers and threads are gone; after ``close`` or ``terminate``."""
@@ -282,7 +276,7 @@ class Dispatcher(Exchange):
 
 def _kill(links: list[Any]) -> None:
     for link in links:
-        link.signal(signal.SIGKILL)
+        link.kill()
 
 
 def _make_call(

@@ -2,20 +2,24 @@
 
 ::
 
-    caller's thread            loop's thread                     worker
-    assign ─────┐                                                  │
+    caller's thread              loop's thread                   worker
+    step ───────┐                                                  │
                 ├────────── send ────────────────────────────────► │ run
     pump ───────┘                                                  │
-                       receive ◄── heard ◄──────────────────────── │ answer
-                          │
-                          └─► sink.put, sink.end ──► results, iterators, callbacks
+        step ◄── receive ◄── heard ◄────────────────────────────── │ answer
+                    │
+                    └─► sink.put, sink.end ──► results, iterators, callbacks
 
-Who touches what: the ledger, the crew, ``_unsent``, ``_readers`` and the flags are guarded by
-``_lock``.  Work is assigned under it by whichever thread found that there is some, and sent after
-it is released.  ``heard``, ``recalled``, ``lost`` and ``_expired`` run on the loop's thread, which
-must not run any of the user's code: a batch whose pickling could goes to the pump, values whose
-unpickling could stay ``Encoded``.  A batch in ``_unsent`` is assigned but not sent: nobody can have
-run it.
+Whatever happens, to a worker or to a request, is handled in the same way: under ``_lock`` the
+ledger and the crew take it in, ``_step`` decides what follows, and after the lock is released
+``_act`` does it.  So no event can forget to send what became free, to replace or dismiss a worker,
+or to end a pool that has nothing left to do.
+
+Who touches what: the ledger, the crew, ``_unsent``, ``_readers``, timers and flags are guarded by
+``_lock``.  ``heard`` runs on the loop's thread or on that of a caller who attends to a worker,
+``recalled``, ``lost`` and timers on the loop's thread.  None of them may run any of the user's
+code: a batch whose pickling could goes to the pump, values whose unpickling could stay ``Encoded``.
+A batch in ``_unsent`` is assigned but not sent: nobody can have run it.
 """
 
 from __future__ import annotations
@@ -29,19 +33,17 @@ from typing import Any, NamedTuple
 
 from fiber._agent.port import ExitReport
 from fiber._engine.ledger import Batch, Job, Ledger, Loss, Receipt
+from fiber._runtime.crew import Crew
 from fiber._runtime.outcome import Encoded, Failure, outcomes
 from fiber._runtime.pump import Pump
 from fiber._runtime.reader import Reader
 from fiber._runtime.requests import Request, Sink, encode, is_plain
 from fiber._runtime.state import runtime
-from fiber._runtime.workers import Crew, Link, dismiss
+from fiber._runtime.workers import Link, dismiss
 from fiber._transport.loop import Timer
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import TimeoutError, WorkerDied
-
-HESITATION = 1.0
-"""Seconds before a worker is replaced when many die without having done anything."""
 
 
 class Terms(NamedTuple):
@@ -58,6 +60,14 @@ class Terms(NamedTuple):
     idle_timeout: float = 60.0
 
 
+class Plan(NamedTuple):
+    """What follows from an event: batches to send, workers to dismiss, the pool's end."""
+
+    batches: list[Batch]
+    leaving: list[Link]
+    over: bool
+
+
 class Exchange:
     """The part of a dispatcher that talks to workers."""
 
@@ -66,31 +76,53 @@ class Exchange:
         self.pump = Pump("fiber-pool")
         self.callbacks = Pump("fiber-pool-callbacks")
         self.ended = threading.Event()
+        self.hungry = False
+        """Whether a task that is read now could be sent, or hire a worker, at once."""
         self._loop = runtime().loop
         self._lock = threading.Lock()
         self._ledger = Ledger()
         self._unsent: set[int] = set()
         self._readers: list[Reader] = []
-        self.hungry = False
         self._deadlines: dict[int, Timer] = {}
-        self._recall_timer: Timer | None = None
-        self._idle_timer: Timer | None = None
-        self._kill_timer: Timer | None = None
+        self._timers: dict[str, Timer] = {}
         self._closing = False
         self._terminated = False
-        self.crew = Crew(
-            self,
-            self._lock,
-            terms.context,
-            (terms.initializer, terms.initargs, terms.retryable),
-            terms.minimum,
-            terms.maximum,
-        )
+        arguments = (terms.initializer, terms.initargs, terms.retryable)
+        self.crew = Crew(self, self._lock, terms.context, arguments, terms.minimum, terms.maximum)
 
-    # Giving
+    # What follows
+
+    def _step(self) -> Plan:
+        """Decide what follows from what happened.  Lock held; ``_act`` does it."""
+        crew = self.crew
+        self._ledger.starting = crew.starting
+        batches = self._assign()
+        leaving = [worker.key for worker in self._ledger.spent()]
+        for link in leaving:
+            crew.let_go(link)
+        if crew.size < crew.maximum:
+            self._order()
+        over = False
+        if self._closing:
+            leaving += self._nobody_needed()
+            over = self._is_over()
+        return Plan(batches, leaving, over)
+
+    def _act(self, plan: Plan, ends: Iterable[Sink] = ()) -> None:
+        """Do what was decided, on any thread."""
+        self._send_safely(plan.batches)
+        self._tell(plan, ends)
+
+    def _tell(self, plan: Plan, ends: Iterable[Sink] = ()) -> None:
+        """Tell everyone but the workers that get work."""
+        for sink in ends:
+            sink.end()
+        if plan.leaving:
+            dismiss(plan.leaving)
+        if plan.over:
+            self._end()
 
     def _assign(self) -> list[Batch]:
-        """Decide what can be sent now; whoever calls sends it.  Lock held."""
         now = monotonic()
         ledger = self._ledger
         batches: list[Batch] = []
@@ -100,7 +132,9 @@ class Exchange:
             while (batch := ledger.assign(now)) is not None:
                 self._unsent.add(batch.seq)
                 batches.append(batch)
-            self.hungry = ledger.hungry()
+            # A reader looks whether somebody is hungry after it put something in: so say it, and
+            # then look whether something was put in.
+            self.hungry = ledger.hungry() or self.crew.size < self.crew.maximum
             if not (self.hungry and any(reader.inbox for reader in self._readers)):
                 break
         for reader in self._readers:
@@ -108,18 +142,44 @@ class Exchange:
         self._recall(now)
         return batches
 
+    def _recall(self, now: float) -> None:
+        """Ask busy workers for what they have not begun, if others are idle."""
+        for worker in self._ledger.recall(now):
+            worker.key.port.take_back()
+        due = self._ledger.next_recall()
+        if due is not None:
+            self._later("recall", due - now, self._reconsider)
+
+    def _later(self, name: str, seconds: float, action: Callable[[], None]) -> None:
+        """Do something once the time comes, unless that is intended already.  Lock held."""
+        if name not in self._timers:
+            self._timers[name] = self._loop.call_later(max(seconds, 0.0), self._due, name, action)
+
+    def _due(self, name: str, action: Callable[[], None]) -> None:
+        with self._lock:
+            self._timers.pop(name, None)
+        action()
+
+    def _reconsider(self) -> None:
+        """Time has passed."""
+        with self._lock:
+            plan = self._step()
+        self._act(plan)
+
+    # Giving
+
     def _send(self, batches: Iterable[Batch]) -> None:
         """Send batches, on a thread that may run the user's code."""
         todo = deque(batches)
         while todo:
             todo.extend(self._send_one(todo.popleft(), plain=False))
 
-    def _send_from_loop(self, batches: Iterable[Batch]) -> None:
-        """Send batches from the loop's thread, or have the pump send those that it must not."""
+    def _send_safely(self, batches: Iterable[Batch]) -> None:
+        """Send batches, on any thread: the pump does it where the user's code could run."""
         for batch in batches:
             job = batch.job
             if job is None or job.owner.kind == work.CALLS or is_plain(batch.items):
-                self._send_from_loop(self._send_one(batch, plain=True))
+                self._send_safely(self._send_one(batch, plain=True))
             else:
                 self.pump.post(self._send, (batch,))
 
@@ -153,23 +213,20 @@ class Exchange:
         with self._lock:
             self._unsent.discard(batch.seq)
             self._ledger.put_back(batch.worker, (batch.seq,), monotonic())
-            batches = self._assign()
-        self._wind_down()
-        return batches
+            plan = self._step()
+        self._tell(plan)
+        return plan.batches
 
     def _unsendable(self, batch: Batch, error: BaseException) -> list[Batch]:
         ends: list[Sink] = []
         with self._lock:
             self._unsent.discard(batch.seq)
-            receipt = self._ledger.split(batch.seq, monotonic())
-            if receipt is not None:
-                self._put(receipt, [Failure(error)], ends)
-            batches = self._assign()
-        self._end(ends)
-        self._wind_down()
-        return batches
+            self._split(batch.seq, Failure(error), ends)
+            plan = self._step()
+        self._tell(plan, ends)
+        return plan.batches
 
-    # Taking: on the loop's thread
+    # Taking
 
     def heard(self, link: Link, message: Message) -> None:
         """A packet from a worker."""
@@ -178,26 +235,17 @@ class Exchange:
         message.release()
         kind = words[0]
         if type(kind) is int:
-            self._answered(link, words, buffers)
+            self._answered(words, buffers)
         elif kind == work.READY:
             self._ready(link)
         elif kind == work.BIRTH:
             link.complaint = words[1]
-        elif kind == work.UNREADABLE:
-            self._unread(words[1], words[2])
         elif kind == work.UNKNOWN:
             self.recalled(link, [words[1]])
-        elif kind == work.BROKEN:
-            self._broken(words[1], words[2])
-        if self._closing:
-            self._wind_down()
+        else:
+            self._unreadable(kind, words[1], Encoded(work.ERROR, words[2], ()))
 
-    def _answered(
-        self,
-        link: Link,
-        words: tuple[Any, ...],
-        buffers: list[memoryview],
-    ) -> None:
+    def _answered(self, words: tuple[Any, ...], buffers: list[memoryview]) -> None:
         seq, offset, kept, seconds, values, odd = words
         results = outcomes(values, odd, buffers) if odd else values
         ends: list[Sink] = []
@@ -213,11 +261,8 @@ class Exchange:
                     self._put(receipt, results, ends, mixed=bool(odd))
             if self._deadlines:
                 self._cancel_deadline(seq)
-            spent = self._spent(link)
-            batches = self._assign()
-        self._send_from_loop(batches)
-        self._end(ends)
-        dismiss(spent)
+            plan = self._step()
+        self._act(plan, ends)
 
     def _put(
         self, receipt: Receipt, results: list[Any], ends: list[Sink], *, mixed: bool = True
@@ -255,34 +300,25 @@ class Exchange:
         if request.sink is not None and request.sink not in ends:
             ends.append(request.sink)
 
-    def _end(self, ends: list[Sink]) -> None:
-        """Tell sinks that they have it all."""
-        for sink in ends:
-            sink.end()
-
-    def _unread(self, seq: int, error: bytes) -> None:
-        """A worker could not unpickle a batch."""
+    def _unreadable(self, kind: str, seq: int, error: Encoded) -> None:
+        """A worker cannot unpickle a batch, or its function: then no task of its job can run."""
         ends: list[Sink] = []
         with self._lock:
-            receipt = self._ledger.split(seq, monotonic())
-            if receipt is not None:
-                self._put(receipt, [Encoded(work.ERROR, error, ())], ends)
-            batches = self._assign()
-        self._send_from_loop(batches)
-        self._end(ends)
-
-    def _broken(self, seq: int, error: bytes) -> None:
-        """A worker could not unpickle a function: no task of its job can run."""
-        failure = Encoded(work.ERROR, error, ()).decode()
-        with self._lock:
             batch = self._ledger.batches.get(seq)
-            job = batch.job if batch is not None else None
-            if job is not None:
-                self._abort(job, failure.error)
-            if batch is not None:
+            if kind == work.UNREADABLE:
+                self._split(seq, error, ends)
+            elif batch is not None:
+                if batch.job is not None:
+                    self._abort(batch.job, error.decode().error)
                 self._ledger.put_back(batch.worker, (seq,), monotonic())
-            batches = self._assign()
-        self._send_from_loop(batches)
+            plan = self._step()
+        self._act(plan, ends)
+
+    def _split(self, seq: int, failure: Any, ends: list[Sink]) -> None:
+        """Send the tasks of a batch one by one; of a single one, that is its outcome."""
+        receipt = self._ledger.split(seq, monotonic())
+        if receipt is not None:
+            self._put(receipt, [failure], ends)
 
     def recalled(self, link: Link, seqs: list[int]) -> None:
         """A worker will never see these batches."""
@@ -296,24 +332,8 @@ class Exchange:
                     if function is not None:
                         link.known.pop(function.id, None)
             self._ledger.put_back(link.worker, seqs, monotonic())
-            batches = self._assign()
-        self._send_from_loop(batches)
-        if self._closing:
-            self._wind_down()
-
-    def _recall(self, now: float) -> None:
-        """Ask busy workers for what they have not begun, if others are idle.  Lock held."""
-        for worker in self._ledger.recall(now):
-            worker.key.port.take_back()
-        due = self._ledger.next_recall()
-        if due is not None and self._recall_timer is None:
-            self._recall_timer = self._loop.call_later(max(due - now, 0.0), self._look_again)
-
-    def _look_again(self) -> None:
-        with self._lock:
-            self._recall_timer = None
-            batches = self._assign()
-        self._send_from_loop(batches)
+            plan = self._step()
+        self._act(plan)
 
     # Deadlines
 
@@ -321,29 +341,30 @@ class Exchange:
         """A task had its time."""
         ends: list[Sink] = []
         with self._lock:
-            timer = self._deadlines.pop(seq, None)
-            receipt = self._ledger.expire(seq) if timer is not None else None
-            if receipt is None:
+            batch = self._ledger.batches.get(seq)
+            if self._deadlines.pop(seq, None) is None or batch is None:
                 return
-            request: Request = receipt.job.owner
-            link: Link = receipt.batch.worker.key
-            link.leaving = True
-            name = request.task_name(receipt.start, receipt.item(receipt.start))
-            error = TimeoutError(
-                f"{name} took longer than its timeout of {request.timeout:g} s; "
-                f"its worker {link.name!r} was killed"
-            )
-            self._put(receipt, [Failure(error)], ends)
+            link: Link = batch.worker.key
+            receipt = self._ledger.expire(seq)
+            if receipt is not None:
+                request: Request = receipt.job.owner
+                name = request.task_name(receipt.start, receipt.item(receipt.start))
+                error = TimeoutError(
+                    f"{name} took longer than its timeout of {request.timeout:g} s; "
+                    f"its worker {link.name!r} was killed"
+                )
+                self._put(receipt, [Failure(error)], ends)
+            self.crew.let_go(link)
+            plan = self._step()
         link.kill()
-        self._end(ends)
-        self._wind_down()
+        self._act(plan, ends)
 
     def _cancel_deadline(self, seq: int) -> None:
         timer = self._deadlines.pop(seq, None)
         if timer is not None:
             timer.cancel()
 
-    # Workers' lives
+    # Workers come and go
 
     def _ready(self, link: Link) -> None:
         """A worker is initialized."""
@@ -354,11 +375,11 @@ class Exchange:
             if link.leaving:
                 return
             link.worker = self._ledger.add(link, monotonic(), self.terms.maxtasks)
-            self.crew.failures = 0
-            self._count()
-            self._watch_idle()
-            batches = self._assign()
-        self._send_from_loop(batches)
+            self.crew.ready()
+            if self.crew.size > self.crew.minimum:
+                self._later("idle", self.terms.idle_timeout, self._thin_out)
+            plan = self._step()
+        self._act(plan)
 
     def lost(self, link: Link, report: ExitReport) -> None:
         """A worker is gone, with or without having been told to."""
@@ -373,17 +394,9 @@ class Exchange:
                     self._cancel_deadline(seq)
                 for loss in self._ledger.lose(link.worker, unread, report.running):
                     self._put_loss(loss, link, report, ends)
-            self._count()
-            if self.crew.error is not None:
-                self._give_up(self.crew.error)
-            elif self.crew.hesitant():
-                self._loop.call_later(HESITATION, self._replace_late)
-            else:
-                self._replace()
-            batches = self._assign()
-        self._send_from_loop(batches)
-        self._end(ends)
-        self._wind_down()
+            self._check_crew()
+            plan = self._step()
+        self._act(plan, ends)
 
     def _put_loss(self, loss: Loss, link: Link, report: ExitReport, ends: list[Sink]) -> None:
         request: Request = loss.job.owner
@@ -397,83 +410,88 @@ class Exchange:
             log=report.log,
             attempts=loss.attempts,
         )
-        sink = request.sink if request.sink is not None else loss.item.sink
-        sink.put(loss.task if request.sink is not None else 0, [Failure(error)], True)
-        if request.sink is None:
-            ends.append(sink)
+        if request.sink is not None:
+            request.sink.put(loss.task, [Failure(error)], True)
+        else:
+            loss.item.sink.put(0, [Failure(error)], True)
+            ends.append(loss.item.sink)
         self._check_finished(loss.job, ends)
 
-    def _spent(self, link: Link) -> list[Link]:
-        """The worker, if it did all that it may do.  Lock held; the caller dismisses it."""
-        worker = link.worker
-        if worker is None or not worker.spent or link.leaving:
-            return []
-        self._ledger.leave(worker)
-        link.leaving = True
-        return [link]
+    def _check_crew(self) -> None:
+        """If workers do not start, fail what depends on it.  Lock held."""
+        crew = self.crew
+        if self._terminated or crew.trouble is None:
+            return
+        if crew.error is not None:
+            self._give_up(crew.error)
+        else:
+            for job in set(self._ledger.homeless()):
+                self._abort(job, crew.trouble)
 
-    def _replace(self) -> None:
-        """See that there are as many workers as there should be.  Lock held."""
+    def _order(self) -> None:
+        """Order workers that are missing.  Lock held."""
+        count = self._missing()
+        if not count:
+            return
+        pause = self.crew.pause()
+        if pause:
+            self._later("hire", pause, self._try_again)
+        else:
+            self._hire_soon(count)
+
+    def _missing(self) -> int:
         if self._terminated or self.crew.error is not None:
-            return
-        demand = self._ledger.demand()
-        if self._closing and not demand and not self._ledger.jobs:
-            return
-        # Degraded: those that are there go on, until there is a reason to try again.
-        count = 0 if self.crew.degraded() else self.crew.missing(demand)
-        if count:
-            self.crew.hiring += count
-            self._count()
-            self.pump.post(self._hire, count)
+            return 0
+        if self._closing and not self._ledger.jobs:
+            return 0
+        return self.crew.missing(self._ledger.demand(), len(self._ledger.homeless()))
 
-    def _replace_late(self) -> None:
+    def _try_again(self) -> None:
+        """The pause after failures is over: one more try."""
         with self._lock:
-            self._replace()
+            if self._missing():
+                self._hire_soon(1)
 
-    def _hire(self, count: int) -> None:
-        """Start workers; not on the loop's thread, which agents may need for it."""
-        for _ in range(count):
-            link = None
+    def _hire_soon(self, count: int) -> None:
+        self.crew.order(count)
+        # Not on the loop's thread, which agents may need for it.
+        self.pump.post(self._hire)
+
+    def _hire(self) -> None:
+        """Start the workers that are ordered."""
+        while self.crew.ordered:
             try:
                 link = self.crew.hire()
             except Exception as error:
-                # Want of descriptors or memory: with some workers the pool goes on.
+                # Want of descriptors or memory, mostly.
                 with self._lock:
                     self.crew.refused(error)
-                    if self.crew.error is not None:
-                        self._give_up(self.crew.error)
-            with self._lock:
-                self._count()
-            if link is not None and self._terminated:
-                link.kill()
-        self._wind_down()
-
-    def _count(self) -> None:
-        """Tell the ledger how many workers are on their way.  Lock held."""
-        self._ledger.starting = self.crew.starting()
-
-    # Leaving
-
-    def _watch_idle(self) -> None:
-        """See to it that those who are not needed leave after a while.  Lock held."""
-        if self._idle_timer is None and len(self.crew.staying()) > self.crew.minimum:
-            self._idle_timer = self._loop.call_later(self.terms.idle_timeout, self._thin_out)
+                    self._check_crew()
+            else:
+                if link is not None and self._terminated:
+                    link.kill()
+        self._reconsider()
 
     def _thin_out(self) -> None:
         """Let go workers above the minimum that have had nothing to do for a while."""
-        long_ago = monotonic() - 0.9 * self.terms.idle_timeout
+        timeout = self.terms.idle_timeout
         with self._lock:
-            self._idle_timer = None
-            spare = len(self.crew.staying()) - self.crew.minimum
-            idle = [worker for worker in self._ledger.idle() if worker.since <= long_ago]
+            now = monotonic()
             leaving: list[Link] = []
-            for worker in idle[: max(spare, 0)]:
+            for worker in self._ledger.idle():
                 # The ledger has the last word: one that was given work since stays.
-                if self._ledger.leave(worker):
-                    worker.key.leaving = True
+                if (
+                    self.crew.size > self.crew.minimum
+                    and now - worker.since >= 0.9 * timeout
+                    and self._ledger.leave(worker)
+                ):
+                    self.crew.let_go(worker.key)
                     leaving.append(worker.key)
-            self._watch_idle()
+            if self.crew.size > self.crew.minimum:
+                self._later("idle", timeout, self._thin_out)
+            plan = self._step()
         dismiss(leaving)
+        self._act(plan)
 
     # Ending
 
@@ -495,30 +513,40 @@ class Exchange:
 
     def _give_up(self, error: BaseException) -> None:
         """Fail all that is not done, and end the workers.  Lock held."""
+        for reader in list(self._readers):
+            reader.absorb(self._ledger)
         for job in list(self._ledger.jobs):
             self._abort(job, error)
+        self.crew.cancel()
         for link in self.crew.staying():
-            link.leaving = True
+            self.crew.let_go(link)
             link.terminate()
 
-    def _wind_down(self) -> None:
-        """Let the workers go once the pool is closed and has nothing left to do."""
+    def _nobody_needed(self) -> list[Link]:
+        """Workers to let go since the pool is closed and has nothing left for them.  Lock held."""
         leaving: list[Link] = []
-        if not self._closing:
-            return
+        if not self._ledger.jobs and self.crew.size:
+            for link in self.crew.staying():
+                if link.worker is None or self._ledger.leave(link.worker):
+                    self.crew.let_go(link)
+                    leaving.append(link)
+        return leaving
+
+    def _is_over(self) -> bool:
+        """Whether a closed pool has ended.  Lock held."""
+        if self.crew.links or self.crew.ordered:
+            return False
+        return not self._ledger.jobs or self._terminated or self.crew.error is not None
+
+    def _end(self) -> None:
+        """Nobody is left."""
         with self._lock:
-            if not self._ledger.jobs:
-                for link in self.crew.staying():
-                    if link.worker is None or self._ledger.leave(link.worker):
-                        link.leaving = True
-                        leaving.append(link)
-            over = not self.crew.links and not self.crew.hiring
-            if over:
-                for timer in (self._recall_timer, self._idle_timer, self._kill_timer):
-                    if timer is not None:
-                        timer.cancel()
-        dismiss(leaving)
-        if over:
-            self.pump.stop()
-            self.callbacks.stop()
+            if self.ended.is_set():
+                return
             self.ended.set()
+            timers = [*self._timers.values(), *self._deadlines.values()]
+            self._timers.clear()
+        for timer in timers:
+            timer.cancel()
+        self.pump.stop()
+        self.callbacks.stop()

@@ -14,10 +14,9 @@ from collections.abc import Callable, Iterable
 from itertools import islice
 from typing import Any
 
-from fiber._engine.chunks import TARGET
 from fiber._engine.ledger import Job, Ledger
 
-AHEAD = 4
+AHEAD = 3
 """Messages worth of tasks that are read ahead for each worker."""
 
 
@@ -76,8 +75,7 @@ class Reader:
 
     def make_room(self, workers: int) -> None:
         """Let the reader go on if little is left.  Lock held."""
-        pace = self._job.pace.seconds
-        message = max(1, int(TARGET / max(pace, 1e-7))) if pace is not None else 1
+        message = self._job.pace.message_size(self._job.target)
         self._bound = AHEAD * max(workers, 1) * max(message, self._job.unit)
         self._release_if_room()
 

@@ -23,6 +23,7 @@ from fiber._hub.grants import GrantSet, collecting_grants
 from fiber._hub.hub import Hub
 from fiber._runtime import methods
 from fiber._transport.loop import Loop
+from fiber._transport.unix import naming_the_limit
 
 if TYPE_CHECKING:
     from fiber._backends.base import Backend
@@ -37,8 +38,9 @@ class Runtime:
         self.config = config.current()
         self.loop = Loop()
         self.host = child.host or "local"
-        self.hub = self._make_hub()
+        self.hub: Hub | None = None
         try:
+            self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
         except BaseException:
             self._close_hub()
@@ -164,7 +166,8 @@ def runtime() -> Runtime:
     if _runtime is None:
         with _lock:
             if _runtime is None:
-                _runtime = Runtime()
+                with naming_the_limit("starting Fiber"):
+                    _runtime = Runtime()
                 util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
     return _runtime
 

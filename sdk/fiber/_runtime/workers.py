@@ -1,8 +1,4 @@
-"""The workers of a pool: started, watched, replaced, let go.
-
-Everything here but ``Link``'s own state is guarded by the pool's lock; methods that say so are
-called with it held, the others without.
-"""
+"""One worker of a pool, as the pool sees it."""
 
 from __future__ import annotations
 
@@ -13,18 +9,13 @@ from collections.abc import Iterable
 from multiprocessing import process as mp_process
 from typing import Any, Protocol
 
-from fiber._agent import worker
 from fiber._agent.port import ChildPort, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._runtime.methods import zygote_method
 from fiber._runtime.state import runtime
 from fiber._wire import work
 from fiber._wire.packet import Message
-from fiber.errors import StartError
 from fiber.process import Process
-
-TRIES = 3
-"""Workers that may fail to start, one after the other, before the pool gives up."""
 
 
 class Supervisor(Protocol):
@@ -54,6 +45,7 @@ class Link:
         self.complaint = ""
         """What its initializer, or its birth, failed with."""
         self.leaving = False
+        """It was told to go, or will be at once."""
         self.returncode: int | None = None
         self._supervisor = supervisor
         self._pid: int | None = None
@@ -160,7 +152,7 @@ class PoolProcess(Process):
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_link": None}
 
-    def _Popen(self) -> Link:  # type: ignore[override]
+    def _Popen(self) -> Link:
         assert self._link is not None
         self._link.launch(self, zygote_method(self._start_method))
         return self._link
@@ -173,104 +165,8 @@ class PoolProcess(Process):
         return self._link.sentinel
 
 
-class Crew:
-    """Who works for a pool: between ``minimum`` and ``maximum`` processes.
-
-    ``failures`` counts workers that were gone before they were ready, since the last that was,
-    ``idle_deaths`` those that died with nothing to do since one last did something; ``error`` is
-    set once there is no point in trying again.
-    """
-
-    def __init__(
-        self,
-        supervisor: Supervisor,
-        lock: threading.Lock,
-        context: Any,
-        target_args: tuple[Any, ...],
-        minimum: int,
-        maximum: int,
-    ) -> None:
-        self.links: dict[Link, None] = {}
-        self.hiring = 0
-        """Workers that someone is about to hire."""
-        self.minimum = minimum
-        self.maximum = maximum
-        self.failures = 0
-        self.idle_deaths = 0
-        self.error: StartError | None = None
-        self._supervisor = supervisor
-        self._lock = lock
-        self._context = context
-        self._args = target_args
-
-    def hire(self) -> Link:
-        """Start one of those in ``hiring``; the supervisor hears when it is ready, or gone."""
-        link = Link(self._supervisor)
-        process = PoolProcess(link, self._context, target=worker.run, args=self._args)
-        with self._lock:
-            self.hiring -= 1
-            self.links[link] = None
-        try:
-            process.start()
-            link.process = process
-        except BaseException:
-            with self._lock:
-                self.links.pop(link, None)
-            raise
-        return link
-
-    def missing(self, demand: int) -> int:
-        """Workers to hire for ``demand`` tasks.  Lock held."""
-        wanted = min(max(demand, self.minimum), self.maximum)
-        return max(0, wanted - len(self.staying()) - self.hiring)
-
-    def staying(self) -> list[Link]:
-        """Workers that were not told to go.  Lock held."""
-        return [link for link in self.links if not link.leaving]
-
-    def starting(self) -> int:
-        """Workers that are not ready yet.  Lock held."""
-        return self.hiring + sum(link.worker is None for link in self.staying())
-
-    def ready(self) -> int:
-        """Workers that are.  Lock held."""
-        return sum(link.worker is not None for link in self.staying())
-
-    def degraded(self) -> bool:
-        """Whether new workers do not start while others work on.  Lock held."""
-        return self.failures >= TRIES and self.ready() > 0
-
-    def gone(self, link: Link, report: ExitReport) -> None:
-        """Take in that a worker is gone.  Lock held."""
-        self.links.pop(link, None)
-        if link.leaving:
-            return
-        if link.worker is not None:
-            # One that dies with nothing to do, again and again, is not worth a process each time.
-            self.idle_deaths += not link.worker.queue
-            return
-        self.failures += 1
-        if self.failures >= TRIES and not self.ready():
-            reason = "it raised an error" if link.complaint else report.reason
-            self.error = StartError(
-                f"pool worker {link.name!r}", reason, link.complaint or "\n".join(report.log), TRIES
-            )
-
-    def hesitant(self) -> bool:
-        """Whether new workers should wait a little."""
-        return self.idle_deaths > self.maximum + TRIES
-
-    def refused(self, error: BaseException) -> None:
-        """Take in that a worker could not even be asked for.  Lock held."""
-        self.failures = TRIES
-        if not self.links:
-            self.error = StartError("a pool worker", str(error))
-            self.error.__cause__ = error
-
-
 def dismiss(links: Iterable[Link]) -> None:
-    """Tell workers to end once they have read this."""
+    """Tell workers that are leaving to end once they have read this."""
     for link in links:
-        link.leaving = True
         if link.port is not None:
             link.port.deliver(0, work.STOP_MESSAGE)

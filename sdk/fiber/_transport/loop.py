@@ -107,6 +107,18 @@ class Loop:
         if self._readers.pop(fd, None) is not None and not self._closed:
             self._epoll.unregister(fd)
 
+    def pause(self, fd: int) -> None:
+        """Let another thread read the registered ``fd`` without waking this one, until resumed."""
+        self._epoll.modify(fd, 0)
+
+    def resume(self, fd: int) -> None:
+        """Watch ``fd`` again."""
+        if fd in self._readers:
+            self._epoll.modify(fd, self._interest(fd))
+
+    def _interest(self, fd: int) -> int:
+        return select.EPOLLIN | (select.EPOLLOUT if fd in self._writers else 0)
+
     def want_write(self, fd: int, callback: Callback | None) -> None:
         """Also call back when the registered ``fd`` is writable; None ends it."""
         if callback is None:
@@ -114,7 +126,7 @@ class Loop:
         else:
             self._writers[fd] = callback
         if fd in self._readers:
-            self._epoll.modify(fd, select.EPOLLIN | (select.EPOLLOUT if callback else 0))
+            self._epoll.modify(fd, self._interest(fd))
 
     def run(self) -> None:
         """Call back until stopped."""

@@ -14,18 +14,14 @@ from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import TooManyOpenFiles
 
-LOOKS = 20
-"""Looks at an empty socket before sleeping: about as long as the wake-up that they may save."""
-
-LOOKS_ON_TRIAL = 50
-SLEEPS_BETWEEN_TRIALS = 32
-
 
 @contextlib.contextmanager
 def naming_the_limit(doing: str) -> Iterator[None]:
     """Turn "no more descriptors" into the error that says the limit and what to set."""
     try:
         yield
+    except TooManyOpenFiles:
+        raise
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
             raise TooManyOpenFiles(doing) from error
@@ -47,19 +43,12 @@ def _block(sock: socket.socket) -> None:
 
 
 class UnixChannel:
-    """A ``SOCK_SEQPACKET`` socket whose messages are packets.
+    """A ``SOCK_SEQPACKET`` socket whose messages are packets."""
 
-    A receiver looks at the empty socket for some microseconds before it sleeps, which saves a
-    wake-up where answers come at once.  Where they do not, it sleeps at once and tries anew after
-    some messages.
-    """
-
-    __slots__ = ("_looks", "_sleeps", "_sock")
+    __slots__ = ("_sock",)
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
-        self._looks = LOOKS
-        self._sleeps = 0
 
     @classmethod
     def pair(cls) -> tuple[UnixChannel, UnixChannel]:
@@ -88,18 +77,7 @@ class UnixChannel:
 
     def recv(self) -> Message:
         """The next message, EOFError at the end."""
-        sock = self._sock
-        for look in range(self._looks):
-            try:
-                message = packet.receive(sock, wait=False)
-            except BlockingIOError:
-                continue
-            if look:  # it came while we looked; one that was there before proves nothing
-                self._looks = LOOKS
-            return message
-        self._sleeps += 1
-        self._looks = LOOKS_ON_TRIAL if self._sleeps % SLEEPS_BETWEEN_TRIALS == 0 else 0
-        return packet.receive(sock)
+        return packet.receive(self._sock)
 
     def try_recv(self) -> Message | None:
         """The next message if one is there."""

@@ -1,0 +1,130 @@
+"""Agents that do not fit: wrong credentials, wrong versions, nonsense in their environment."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from faults.program import Program
+from fiber._transport import handshake
+from fiber._transport.credentials import make_credentials
+from fiber._wire import messages
+
+AGENT = """
+    import runpy, sys
+    {before}
+    sys.argv = ["agent"]
+    runpy.run_module("fiber.agent", run_name="__main__")
+"""
+
+MASTER = """
+    import fiber, sys
+    from fiber._transport.credentials import make_credentials
+    from fiber._transport.listener import MasterListener
+    from fiber._transport.loop import Loop
+    from fiber._transport.credentials import MasterCredentials
+    import pickle
+    credentials = pickle.load(open(sys.argv[1], "rb"))
+    loop = Loop()
+    listener = MasterListener(
+        loop, "127.0.0.1:0", credentials,
+        on_agent=lambda link: print("joined", link.peer.name, flush=True),
+        on_refused=lambda reason: print("refused", reason, flush=True),
+    )
+    print(listener.address, flush=True)
+    loop.run()
+"""
+
+
+@pytest.fixture
+def master(launch: Callable[..., Program], tmp_path: Path) -> Callable[..., Program]:
+    """Starts an agent beside a master that expects it; ``before`` runs in it first."""
+    credentials = make_credentials("test")
+    path = tmp_path / "credentials"
+    path.write_bytes(pickle.dumps(credentials))
+
+    def agent(before: str = "", **env: str) -> tuple[Program, Program]:
+        listening = launch(MASTER, str(path))
+        told = {
+            "FIBER_AGENT_ADDRESS": listening.line(),
+            "FIBER_AGENT_CREDENTIALS": credentials.agent_half().to_environment(),
+            "FIBER_AGENT_NAME": "newcomer",
+            "FIBER_AGENT_PARENT": str(os.getpid()),
+            "FIBER_START_TIMEOUT": "10",
+        }
+        return listening, launch(AGENT.format(before=before), env={**told, **env})
+
+    return agent
+
+
+def test_an_agent_that_fits_is_taken(master: Callable[..., tuple[Program, Program]]) -> None:
+    listening, agent = master()
+    assert listening.line() == "joined newcomer"
+    listening.kill()
+    agent.kill()
+
+
+def test_wrong_credentials(master: Callable[..., tuple[Program, Program]]) -> None:
+    other = make_credentials("test").agent_half().to_environment()
+    before = time.monotonic()
+    _, agent = master(FIBER_AGENT_CREDENTIALS=other)
+    assert agent.wait() == 1
+    assert time.monotonic() - before < 8, "it does not try for the whole timeout"
+    assert "do not trust each other" in agent.stderr
+    assert "Traceback" not in agent.stderr
+
+
+@pytest.mark.parametrize(
+    ("before", "ours", "theirs"),
+    [
+        (
+            "import platform; platform.python_version = lambda: '2.7.18'",
+            handshake.Identity.of_this_process("x").python,
+            "2.7.18",
+        ),
+        (
+            "import fiber._transport.handshake as h; h.PROTOCOL = 999",
+            str(messages.PROTOCOL),
+            "999",
+        ),
+    ],
+    ids=["Python", "protocol"],
+)
+def test_wrong_version_of(
+    master: Callable[..., tuple[Program, Program]], before: str, ours: str, theirs: str
+) -> None:
+    listening, agent = master(before)
+    refusal = listening.line()
+    assert refusal.startswith("refused")
+    assert ours in refusal
+    assert theirs in refusal
+    assert agent.wait() == 1
+    assert ours in agent.stderr
+    assert theirs in agent.stderr
+    assert "Traceback" not in agent.stderr
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"FIBER_AGENT_ADDRESS": ""}, "FIBER_AGENT_ADDRESS is not set"),
+        ({"FIBER_AGENT_CREDENTIALS": ""}, "FIBER_AGENT_CREDENTIALS is not set"),
+        ({"FIBER_AGENT_CREDENTIALS": "garbage"}, "credentials in the environment"),
+        ({"FIBER_AGENT_CREDENTIALS": "/no/such/folder"}, "/no/such/folder"),
+        ({"FIBER_AGENT_ADDRESS": "nonsense"}, "nonsense"),
+        ({"FIBER_AGENT_ADDRESS": "127.0.0.1:1", "FIBER_START_TIMEOUT": "0.5"}, "127.0.0.1:1"),
+    ],
+    ids=["no address", "no credentials", "garbage", "no folder", "bad address", "nobody there"],
+)
+def test_an_agent_that_is_told_nonsense(
+    master: Callable[..., tuple[Program, Program]], told: dict[str, str], words: str
+) -> None:
+    _, agent = master(**told)
+    assert agent.wait() == 1
+    assert words in agent.stderr
+    assert "Traceback" not in agent.stderr

@@ -1,0 +1,137 @@
+"""What a person can get wrong is answered at once, with what is wrong and what to do."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+import fiber
+from faults.program import Program
+
+UNGUARDED_PROCESS = """
+    import fiber, sys
+    from faults import targets
+    print("main is imported", file=sys.stderr)
+    fiber.set_start_method("{method}", force=True)
+    child = fiber.Process(target=targets.nothing)
+    child.start()
+    child.join()
+    print(child.exitcode, flush=True)
+"""
+
+UNGUARDED_POOL = """
+    import fiber, sys
+    print("main is imported", file=sys.stderr)
+    pool = fiber.Pool(4)
+    pool.map(abs, range(10))
+"""
+
+UNGUARDED_QUEUE_THEN_PROCESS = """
+    import fiber, sys
+    from faults import targets
+    print("main is imported", file=sys.stderr)
+    queue = fiber.Queue()
+    child = fiber.Process(target=targets.get_for_ever, args=(queue,))
+    child.start()
+    child.join()
+    print(child.exitcode, flush=True)
+"""
+
+
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+@pytest.mark.parametrize("script", [UNGUARDED_PROCESS, UNGUARDED_QUEUE_THEN_PROCESS])
+def test_an_unguarded_main_is_told_so_and_starts_no_avalanche(
+    launch: Callable[..., Program], script: str, method: str
+) -> None:
+    program = launch(script.replace("{method}", method))
+    assert program.rest() == "1\n"
+    assert program.wait() == 0
+    assert 'if __name__ == "__main__"' in program.stderr
+    assert program.stderr.count("main is imported") <= 3  # itself, its zygote, the child
+    assert program.left() == []
+
+
+def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
+    launch: Callable[..., Program],
+) -> None:
+    program = launch(UNGUARDED_POOL)
+    assert program.wait() == 1
+    assert 'if __name__ == "__main__"' in program.stderr
+    assert "StartError" in program.stderr
+    assert program.stderr.count("main is imported") <= 20
+    assert program.left() == []
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: fiber.Pool(0), ValueError, "processes"),
+        (lambda: fiber.Pool(-1), ValueError, "processes"),
+        (lambda: fiber.Pool(2.5), (TypeError, ValueError), "processes"),
+        (lambda: fiber.Pool("4"), (TypeError, ValueError), "processes"),
+        (lambda: fiber.Pool(2, initializer=1), TypeError, "initializer"),
+        (lambda: fiber.Pool(2, maxtasksperchild=0), ValueError, "maxtasksperchild"),
+        (lambda: fiber.Pool(2, retries=-1), ValueError, "retries"),
+        (lambda: fiber.Pool(2, task_timeout=0), ValueError, "task_timeout"),
+        (lambda: fiber.Pool(2, prcesses=3), TypeError, "prcesses"),
+        (lambda: fiber.Pool(min_workers=3, max_workers=2), ValueError, "max_workers"),
+        (lambda: fiber.Pool(2, max_workers=4), (TypeError, ValueError), "processes"),
+        (lambda: fiber.Process(group=1), AssertionError, "group"),
+        (lambda: fiber.Semaphore(-1), ValueError, "value"),
+        (lambda: fiber.get_context("typo"), ValueError, "typo"),
+        (lambda: fiber.set_start_method("typo", force=True), ValueError, "typo"),
+        (lambda: fiber.init(bakend="local"), fiber.ConfigError, "'bakend'.*'backend'"),
+        (lambda: fiber.init(backend="typo"), fiber.ConfigError, "'typo'.*'local'"),
+        (lambda: fiber.Lock, AttributeError, "Lock"),
+    ],
+)
+def test_bad_arguments_are_named(make: Callable[[], Any], error: Any, words: str) -> None:
+    with pytest.raises(error, match=words):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "words"),
+    [
+        ("FIBER_BACKEND", "typo", "'typo' for 'backend'"),
+        ("FIBER_BAKEND", "local", "FIBER_BAKEND"),
+        ("FIBER_AGENTS", "0", "'0' for 'agents'"),
+        ("FIBER_LOST_AFTER", "never", "'never' for 'lost_after'"),
+        ("FIBER_LISTEN_PORT", "80000", "'80000' for 'listen_port'"),
+        ("FIBER_RUNTIME_DIRECTORY", "/no/such", "'/no/such' for 'runtime_directory'"),
+    ],
+)
+def test_bad_environment_is_named_at_the_first_use(
+    launch: Callable[..., Program], variable: str, value: str, words: str
+) -> None:
+    script = "import fiber\nprint('imported', flush=True)\nfiber.Process(target=print).start()\n"
+    program = launch(script, env={variable: value})
+    assert program.rest() == "imported\n"
+    assert program.wait() == 1
+    assert words in program.stderr
+    assert program.left() == []
+
+
+def test_a_port_in_use(launch: Callable[..., Program]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        env = {"FIBER_BACKEND": "loopback", "FIBER_LISTEN_PORT": port}
+        program = launch("import fiber\nfiber.Process(target=print).start()\n", env=env)
+        assert program.wait() == 1
+        assert f"127.0.0.1:{port}" in program.stderr
+        assert "port 0 takes a free one" in program.stderr
+        assert program.left() == []
+
+
+def test_targets_that_exist_here_only_are_explained(launch: Callable[..., Program]) -> None:
+    script = """
+        import fiber, threading
+        if __name__ == "__main__":
+            fiber.Process(target=print, args=(threading.Lock(),), name="mine").start()
+    """
+    program = launch(script)
+    assert program.wait() == 1
+    assert "argument 0 of process 'mine' cannot be pickled" in program.stderr

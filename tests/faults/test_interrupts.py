@@ -1,0 +1,166 @@
+"""Ctrl-C in each blocking call: KeyboardInterrupt at once, and nothing is left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+
+import pytest
+
+from faults.program import GONE, Program, wait_for
+
+SCRIPT = """
+    import fiber, sys, time
+    from faults import targets
+    from fiber import connection
+    if __name__ == "__main__":
+        ours, theirs = fiber.Pipe()
+        queue = fiber.Queue()
+        full = fiber.Queue(1)
+        full.put(1)
+        done = fiber.Event()
+        semaphore = fiber.Semaphore(0)
+        joinable = fiber.JoinableQueue()
+        joinable.put(1)
+        child = fiber.Process(target=targets.block)
+        child.start()
+        {prepare}
+        print("ready", flush=True)
+        try:
+            {call}
+        except KeyboardInterrupt:
+            print("interrupted", flush=True)
+            child.kill()
+            {clean}
+        else:
+            print("returned", flush=True)
+"""
+
+CALLS = [
+    "child.join()",
+    "child.join(60)",
+    "ours.recv()",
+    "ours.poll(60)",
+    "ours.send_bytes(bytes(1 << 24)); ours.send_bytes(bytes(1 << 24))",
+    "connection.wait([ours, child.sentinel])",
+    "queue.get()",
+    "queue.get(timeout=60)",
+    "full.put(2)",
+    "done.wait()",
+    "semaphore.acquire()",
+    "joinable.join()",
+    "time.sleep(60)",
+]
+
+
+def interrupt(program: Program, *, group: bool = False) -> float:
+    """Ctrl-C once it blocks; the seconds until it said that it was interrupted."""
+    assert program.line() == "ready"
+    wait_for(lambda: _sleeps(program.pid))
+    before = time.monotonic()
+    if group:
+        os.killpg(program.pid, signal.SIGINT)
+    else:
+        program.signal(signal.SIGINT)
+    assert program.line() == "interrupted"
+    return time.monotonic() - before
+
+
+def _sleeps(pid: int) -> bool:
+    with open(f"/proc/{pid}/stat") as file:
+        return file.read().rpartition(") ")[2][0] == "S"
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_each_blocking_call(launch: Callable[..., Program], call: str) -> None:
+    program = launch(SCRIPT.format(prepare="pass", call=call, clean="joinable.task_done()"))
+    assert interrupt(program) < 2
+    assert program.finish() == ""
+
+
+POOL_CALLS = [
+    "pool.map(time.sleep, [60] * 10)",
+    "pool.apply(time.sleep, (60,))",
+    "pool.map_async(time.sleep, [60] * 10).get()",
+    "pool.map_async(time.sleep, [60] * 10).wait()",
+    "list(pool.imap(time.sleep, [60] * 10))",
+    "list(pool.imap_unordered(time.sleep, [60] * 10))",
+    "pool.starmap(time.sleep, [(60,)] * 10_000, chunksize=1)",
+    "pool.apply_async(time.sleep, (60,)); pool.close(); pool.join()",
+]
+
+
+@pytest.mark.parametrize("call", POOL_CALLS)
+def test_each_blocking_call_of_a_pool(launch: Callable[..., Program], call: str) -> None:
+    script = SCRIPT.format(prepare="pool = fiber.Pool(2)", call=call, clean="pool.terminate()")
+    program = launch(script)
+    assert interrupt(program) < 2
+    assert program.finish() == ""
+    assert "Traceback" not in program.stderr, "only the master saw it"
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+@pytest.mark.parametrize("call", ["pool.map(time.sleep, [60] * 10)", "child.join()", "queue.get()"])
+def test_in_a_terminal_it_reaches_the_program_alone(
+    launch: Callable[..., Program], backend: str, call: str
+) -> None:
+    script = SCRIPT.format(
+        prepare="pool = fiber.Pool(2)", call=call, clean="pool.terminate(); pool.join()"
+    )
+    program = launch(script, env={"FIBER_BACKEND": backend}, process_group=0)
+    assert interrupt(program, group=True) < 2
+    assert program.finish() == ""
+    assert "Traceback" not in program.stderr
+    assert "KeyboardInterrupt" not in program.stderr
+
+
+UNCAUGHT = """
+    import fiber, time
+    if __name__ == "__main__":
+        pool = fiber.Pool(2)
+        print("ready", flush=True)
+        pool.map(time.sleep, [60] * 100)
+"""
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+def test_uncaught_it_ends_the_program_and_all_of_it(
+    launch: Callable[..., Program], backend: str
+) -> None:
+    program = launch(UNCAUGHT, env={"FIBER_BACKEND": backend}, process_group=0)
+    assert program.line() == "ready"
+    wait_for(lambda: _sleeps(program.pid))
+    before = time.monotonic()
+    os.killpg(program.pid, signal.SIGINT)
+    assert program.wait() == -signal.SIGINT
+    assert time.monotonic() - before < 2 * GONE
+    assert program.left() == []
+    assert program.stderr.count("KeyboardInterrupt") == 1
+
+
+IMPATIENT = """
+    import fiber, time
+    from faults import targets
+    if __name__ == "__main__":
+        pool = fiber.Pool(2)
+        children = [fiber.Process(target=targets.shrug_off_signals) for _ in range(2)]
+        for child in children:
+            child.start()
+        print("ready", flush=True)
+        pool.map(time.sleep, [60] * 100)
+"""
+
+
+def test_an_impatient_user_presses_it_again_and_again(launch: Callable[..., Program]) -> None:
+    program = launch(IMPATIENT, process_group=0)
+    assert program.line() == "ready"
+    wait_for(lambda: _sleeps(program.pid))
+
+    def ended() -> bool:
+        os.killpg(program.pid, signal.SIGINT)
+        return program.process.poll() is not None
+
+    wait_for(ended)
+    assert program.left() == []

@@ -1,0 +1,125 @@
+"""The network between master and agents: short cuts cost nothing, long ones only time."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+import fiber
+from faults import targets
+from faults.conftest import running
+from faults.program import PATIENCE, alive, wait_for
+from faults.proxy import Proxy
+from fiber._backends.loopback import LoopbackBackend
+
+LOST_AFTER = 2.0
+
+
+class Wire:
+    """A loopback runtime whose agents reach it through a proxy."""
+
+    def __init__(self, proxy: Proxy, backend: LoopbackBackend) -> None:
+        self.proxy = proxy
+        self.backend = backend
+
+    def agents(self) -> list[str]:
+        return [process.agent.host for process in self.backend._processes]
+
+    def start(self, target: Any = targets.block, *args: Any) -> Any:
+        child = fiber.Process(target=target, args=args)
+        child.start()
+        return child
+
+
+@pytest.fixture
+def wire(monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
+    original = LoopbackBackend._environment
+    proxies: list[Proxy] = []
+
+    def through_the_proxy(backend: LoopbackBackend, name: str) -> dict[str, str]:
+        environment = original(backend, name)
+        if not proxies:
+            proxies.append(Proxy(environment["FIBER_AGENT_ADDRESS"]).__enter__())
+        return {**environment, "FIBER_AGENT_ADDRESS": proxies[0].address}
+
+    monkeypatch.setattr(LoopbackBackend, "_environment", through_the_proxy)
+    settings = {"heartbeat_interval": 0.2, "suspect_after": 0.7, "lost_after": LOST_AFTER}
+    try:
+        with running(backend="loopback", agents=1, **settings) as runtime:
+            assert isinstance(runtime.backend, LoopbackBackend)
+            yield Wire(proxies[0], runtime.backend)
+    finally:
+        for proxy in proxies:
+            proxy.__exit__(None, None, None)
+
+
+@pytest.mark.parametrize("way", ["silence", "sever"])
+def test_a_short_cut_loses_nothing(wire: Wire, way: str) -> None:
+    ours, theirs = fiber.Pipe()
+    child = wire.start(targets.echo, theirs)
+    theirs.close()
+    ours.send(0)
+    assert ours.recv() == 0
+    for number in range(1, 51):
+        ours.send(number)
+        if number == 25:
+            getattr(wire.proxy, way)()
+    time.sleep(LOST_AFTER / 4)  # the length of the cut, which is what is tested
+    wire.proxy.heal()
+    assert [ours.recv() for _ in range(50)] == list(range(1, 51))
+    assert child.is_alive()
+    assert wire.agents() == ["loopback-0"]
+    ours.close()
+    child.join(PATIENCE)
+    assert child.exitcode == 0
+
+
+@pytest.mark.parametrize("way", ["silence", "sever"])
+def test_a_long_cut_is_told_ends_its_processes_and_brings_a_new_agent(wire: Wire, way: str) -> None:
+    ours, theirs = fiber.Pipe()
+    child = wire.start(targets.report_and_block, theirs)
+    theirs.close()
+    pid = ours.recv()
+    before = time.monotonic()
+    getattr(wire.proxy, way)()
+    child.join(PATIENCE)
+    assert LOST_AFTER * 0.5 < time.monotonic() - before < LOST_AFTER + 4
+    assert child.exitcode == -signal.SIGKILL
+    assert "loopback-0" in child._popen.report.reason
+    with pytest.raises(EOFError):
+        ours.recv()
+    ours.close()
+    wait_for(lambda: not alive(pid))
+    assert wire.agents() == ["loopback-1"]
+    wire.proxy.heal()
+    again = wire.start(targets.nothing)
+    again.join(PATIENCE)
+    assert again.exitcode == 0
+
+
+def test_many_short_cuts_in_the_middle_of_work(wire: Wire) -> None:
+    with fiber.Pool(2) as pool:
+        results = pool.imap_unordered(targets.slow_square, range(60), chunksize=1)
+        seen = []
+        for number, result in enumerate(results):
+            seen.append(result)
+            if number % 15 == 0:
+                wire.proxy.sever()
+                wire.proxy.heal()
+    assert sorted(seen) == [n * n for n in range(60)]
+    assert wire.agents() == ["loopback-0"]
+    assert wire.proxy.connections >= 4
+
+
+def test_a_pool_survives_a_long_cut(wire: Wire) -> None:
+    with fiber.Pool(2) as pool:
+        result = pool.map_async(targets.slow_square, range(40), chunksize=1)
+        wait_for(lambda: result._number_left < 36 if hasattr(result, "_number_left") else True)
+        wire.proxy.silence()
+        wait_for(lambda: wire.agents() == ["loopback-1"])
+        wire.proxy.heal()
+        assert result.get(PATIENCE) == [n * n for n in range(40)]

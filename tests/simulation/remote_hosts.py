@@ -1,0 +1,180 @@
+"""Hosts behind the real remote path: ports, service, links and sessions, over simulated wires.
+
+Only what is outside of the agent's Python is simulated: the connection, which delays, loses and
+breaks off, and the workers.
+"""
+
+from __future__ import annotations
+
+import random
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+from unittest import mock
+
+from fiber._agent import service
+from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._transport.memory import Cable
+from fiber._wire.packet import Message
+from simulation import schedule
+from simulation.agents import SAME_HOST, Agent, Child
+from simulation.workers import Worker
+
+if TYPE_CHECKING:
+    from simulation.world import World
+
+
+class RemoteHost(Agent):
+    """A host with an agent of its own.  Once lost, it joins again under another name."""
+
+    def __init__(self, world: World, number: int, plan: schedule.Agent) -> None:
+        super().__init__(world, number, SAME_HOST)
+        self._plan = plan
+        self._rng = random.Random(f"{world.schedule.seed} cable {number}")
+        self._seen: dict[str, Seen] = {}
+        self._generation = 0
+        self.is_gone = False
+        self._join()
+
+    def _join(self) -> None:
+        self._generation += 1
+        self._seen = {}
+        self.lost = False
+        name = f"{self.host}.{self._generation}"
+        loop: Any = self.world.loop
+        delay = self._plan.delay, self._plan.delay + self._plan.jitter
+        self._cable = Cable(
+            loop,
+            seed=self._rng.getrandbits(32),
+            delay=delay,
+            drop=self._rng.choice((0.0, 0.0, 0.05)),
+        )
+        nothing: Any = mock.MagicMock()
+        self._remote = RemoteAgent(name, nothing, nothing, self._lose_remote)
+        here: Any = LocalPort(self)
+        self._service = service.AgentService(loop, self._cable.agent, here, nothing, nothing)
+        self._cable.agent.attach(self._service)
+        self._remote.join(self._cable.master)
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether nothing gets through."""
+        return self._cable.is_cut
+
+    def start_for_master(self, name: str, observer: ChildObserver) -> RemoteChild:
+        """Start a worker as the master does."""
+        seen = self._seen[name] = Seen(self, name, observer)
+        spec = ChildSpec(name, "fork", b"", b"", tasks=True)
+        return self._remote.start(spec, seen)
+
+    def seen(self, name: str) -> Seen:
+        """What the master knows of a worker."""
+        return self._seen[name]
+
+    def cut(self, seconds: float) -> None:
+        """Let nothing through for a while."""
+        if self.is_cut:
+            return
+        self.world.note("%s is cut off for %g s", self.host, seconds)
+        self._cable.cut()
+        if seconds == schedule.FOREVER:
+            self.is_gone = True
+            self.kill_all()
+        else:
+            self.world.loop.call_later(seconds, self._mend_cable)
+
+    def _mend_cable(self) -> None:
+        self.world.note("%s is back", self.host)
+        self._cable.mend()
+        if self.lost and not self.is_gone:
+            self._join()
+
+    def _lose_remote(self, agent: RemoteAgent, reason: str) -> None:
+        self.world.note("%s is given up: %s", self.host, reason)
+        self.lost = True
+        if not self.is_cut and not self.is_gone:
+            # What it started is ended by its own side; the backend starts an agent anew.
+            self.world.loop.call_later(0.0, self._join)
+
+    def ended(self, child: Child) -> None:
+        """Its agent knows; the master does not yet."""
+        self._children.remove(child)
+
+    def close(self) -> None:
+        """Let the link go."""
+        self._cable.master.close(linger=0)
+        self._cable.agent.close(linger=0)
+
+
+class LocalPort:
+    """The agent's own process; in place of ``fiber._agent.agent.Agent``."""
+
+    def __init__(self, host: RemoteHost) -> None:
+        self.host = host.host
+        self._host = host
+
+    def start(self, spec: ChildSpec, observer: ChildObserver) -> Child:
+        """Start a worker here."""
+        if self._host.is_gone:
+            raise RuntimeError("nobody is there")
+        child = self._host.world.start(self._host, observer)
+        self._host.seen(spec.name).child = child
+        return child
+
+
+class Seen:
+    """A remote worker from the master's side: what the oracle wants to know, and an observer."""
+
+    def __init__(self, agent: RemoteHost, name: str, observer: ChildObserver) -> None:
+        self.agent = agent
+        self.name = name
+        self.child: Child | None = None
+        self.gone = False
+        self._observer = observer
+        self._was_heard = False
+
+    @property
+    def worker(self) -> Worker:
+        """The process."""
+        assert self.child is not None
+        return self.child.worker
+
+    def started(self, pid: int) -> None:
+        """It exists."""
+        self._observer.started(pid)
+
+    def said(self, message: Message) -> None:
+        """It said something."""
+        self._was_heard = True
+        self._observer.said(message)
+
+    def taken_back(self, seqs: list[int]) -> None:
+        """It did not read these."""
+        self._observer.taken_back(seqs)
+
+    def exited(self, report: ExitReport) -> None:
+        """It is gone."""
+        self.gone = True
+        reported = not self.agent.lost
+        world = self.agent.world
+        world.note("the master hears that %s is gone: unread %s", self.name, report.unread)
+        if self.child is not None:
+            was_heard = self._was_heard
+            world.oracle.lost(self.child.worker, was_heard=was_heard, reported=reported)
+        self._observer.exited(report)
+
+
+class NoCapture(SimpleNamespace):
+    """In place of the pipe that reads a child's output."""
+
+    stdio = (1, 2)
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__()
+
+    def started(self) -> None:
+        """It has its own descriptors."""
+
+    def finish(self) -> tuple[str, ...]:
+        """It wrote nothing."""
+        return ()

@@ -1,0 +1,116 @@
+"""Liveness: silence is judged by what was truly heard, and no frame is lost by a judgement."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+import pytest
+
+from fiber._transport.link import Patience
+from fiber._transport.memory import Cable, SimulatedLoop
+from fiber._transport.session import Frame
+from fiber._transport.session_link import SessionLink
+
+PATIENCE = Patience()
+SEEDS = 200
+INSTANT = 1e-6
+TICK = PATIENCE.heartbeat / 3 + 0.05
+"""Seconds after which silence that is too long has been noticed."""
+
+
+class Judge:
+    """Hears what one end of a link tells, and knows when that end truly heard of the other."""
+
+    def __init__(self, loop: SimulatedLoop, link: SessionLink) -> None:
+        self.frames: list[bytes] = []
+        self.suspect = False
+        self.lost: str | None = None
+        self.longest = 0.0
+        """Seconds of silence, at most."""
+        self._loop = loop
+        self._heard_at = loop.now()
+        for name in ("datagram", "connected"):
+            setattr(link, name, self._noting(getattr(link, name)))
+        link.attach(self)
+
+    def _noting(self, happens: Callable[..., None]) -> Callable[..., None]:
+        def noted(*args: object) -> None:
+            self.longest = max(self.longest, self.silence)
+            self._heard_at = self._loop.now()
+            happens(*args)
+
+        return noted
+
+    @property
+    def silence(self) -> float:
+        """Seconds since this end heard of the other."""
+        return self._loop.now() - self._heard_at
+
+    def on_frame(self, frame: Frame) -> None:
+        assert self.lost is None
+        self.frames.append(bytes(frame))
+
+    def on_suspect(self) -> None:
+        assert self.lost is None
+        assert not self.suspect
+        assert 0 <= self.silence - PATIENCE.suspect_after + INSTANT <= TICK
+        self.suspect = True
+
+    def on_trusted(self) -> None:
+        assert self.lost is None
+        assert self.suspect
+        assert self.silence == 0
+        self.suspect = False
+
+    def on_lost(self, reason: str) -> None:
+        assert self.lost is None
+        self.lost = reason
+        self.longest = max(self.longest, self.silence)
+        if "nothing was heard" in reason:
+            assert self.suspect
+            assert 0 <= self.silence - PATIENCE.lost_after + INSTANT <= TICK
+
+
+def run(seed: int) -> tuple[list[Judge], list[list[bytes]]]:
+    """Traffic both ways over a connection that is cut, breaks off and drops; then a good one."""
+    loop, rng = SimulatedLoop(), random.Random(seed)
+    delay = rng.choice((1e-4, 1e-2, 0.3))
+    cable = Cable(loop, seed=seed, delay=(0, delay), drop=rng.choice((0, 0, 0.2)))
+    links = cable.agent, cable.master
+    judges = [Judge(loop, link) for link in links]
+    sent: list[list[bytes]] = [[], []]
+    for number in range(40):
+        side = rng.randrange(2)
+        sent[1 - side].append(b"%d" % number)
+        links[side].send(b"%d" % number)
+        loop.run_for(rng.choice((0.0, 0.01, 1.0, 5.0)))
+        fault = rng.random()
+        if fault < 0.1:
+            cable.cut()
+            loop.run_for(rng.choice((0.5, 5.0, 10.0, 14.0, 17.0)))
+            cable.mend()
+        elif fault < 0.2:
+            cable.break_off()
+    cable.drop = 0
+    loop.run_for(120)
+    return judges, sent
+
+
+@pytest.mark.parametrize("seed", range(SEEDS))
+def test_silence_is_judged_right(seed: int) -> None:
+    judges, sent = run(seed)
+    for judge, frames in zip(judges, sent, strict=True):
+        assert judge.frames == frames[: len(judge.frames)]
+    lost = [judge.lost is not None for judge in judges]
+    if any(lost):
+        assert all(lost), "one end waits for an other that has given up"
+        assert max(judge.longest for judge in judges) + TICK >= PATIENCE.lost_after
+    else:
+        assert [judge.frames for judge in judges] == sent
+        assert not any(judge.suspect for judge in judges)
+
+
+def test_both_happens_and_it_is_not_always_the_same() -> None:
+    ends = [judges[0].lost is not None for judges, _ in map(run, range(SEEDS // 4))]
+    assert 5 < sum(ends) < len(ends) - 5

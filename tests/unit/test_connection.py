@@ -1,0 +1,356 @@
+"""Connections: multiprocessing's semantics, whoever holds the ends, and however they end."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import threading
+from array import array
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import wait
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fiber
+from census import wait_until
+from fiber.connection import Connection, Pipe
+from fiber.errors import ConnectionClosed
+
+PATIENCE = 15.0
+
+
+def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
+    process = fiber.Process(target=target, args=args, daemon=True)
+    process.start()
+    return process
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[Connection, Connection]]:
+    one, other = Pipe()
+    with one, other:
+        yield one, other
+
+
+# Objects and bytes
+
+
+def test_both_ends_send_and_receive() -> None:
+    one, other = Pipe()
+    one.send([1, "two"])
+    other.send(None)
+    assert other.recv() == [1, "two"]
+    assert one.recv() is None
+
+
+def test_a_simplex_pipe_has_a_direction() -> None:
+    reader, writer = Pipe(duplex=False)
+    assert (reader.readable, reader.writable) == (True, False)
+    assert (writer.readable, writer.writable) == (False, True)
+    writer.send(1)
+    assert reader.recv() == 1
+    with pytest.raises(OSError, match="connection is read-only"):
+        reader.send(1)
+    with pytest.raises(OSError, match="connection is read-only"):
+        reader.send_bytes(b"x")
+    for receive in (writer.recv, writer.recv_bytes, writer.poll):
+        with pytest.raises(OSError, match="connection is write-only"):
+            receive()
+
+
+def test_what_has_no_pickle_is_an_error_and_nothing_is_sent() -> None:
+    one, other = Pipe()
+    with pytest.raises(TypeError, match="pickle"):
+        one.send(threading.Lock())
+    assert not other.poll()
+
+
+def test_functions_without_a_name_travel_by_value() -> None:
+    one, other = Pipe()
+    one.send(lambda x: x + 1)
+    assert other.recv()(1) == 2
+
+
+@pytest.mark.parametrize(
+    ("window", "expected"),
+    [
+        ((), b"0123456789"),
+        ((3,), b"3456789"),
+        ((3, 4), b"3456"),
+        ((10,), b""),
+        ((0, 0), b""),
+    ],
+)
+def test_a_window_of_bytes(window: tuple[int, ...], expected: bytes) -> None:
+    one, other = Pipe()
+    one.send_bytes(b"0123456789", *window)
+    assert other.recv_bytes() == expected
+
+
+@pytest.mark.parametrize("window", [(-1,), (11,), (0, -1), (3, 8)])
+def test_a_window_outside_is_refused(window: tuple[int, ...]) -> None:
+    one, _other = Pipe()
+    with pytest.raises(ValueError):
+        one.send_bytes(b"0123456789", *window)
+
+
+def test_anything_with_a_buffer_is_bytes() -> None:
+    one, other = Pipe()
+    for thing in (bytearray(b"abcd"), memoryview(b"abcd"), array("i", [1, 2]), np.ones((2, 3))):
+        one.send_bytes(thing)  # type: ignore[arg-type]
+        assert other.recv_bytes() == bytes(memoryview(thing).cast("B"))
+
+
+def test_too_long_a_message_closes_the_connection() -> None:
+    one, other = Pipe()
+    one.send_bytes(b"12345")
+    assert other.recv_bytes(5) == b"12345"
+    one.send_bytes(b"123456")
+    with pytest.raises(OSError, match="bad message length"):
+        other.recv_bytes(5)
+    assert other.closed
+    with pytest.raises(ValueError, match="negative"):
+        one.recv_bytes(-1)
+
+
+def test_receiving_into_a_buffer(
+    pipe: tuple[Connection, Connection],
+) -> None:
+    one, other = pipe
+    numbers = array("i", range(10))
+    one.send_bytes(array("i", [7, 8, 9]))  # type: ignore[arg-type]
+    assert other.recv_bytes_into(numbers, 4) == 12
+    assert numbers.tolist() == [0, 7, 8, 9, 4, 5, 6, 7, 8, 9]
+    one.send_bytes(b"longer than fits")
+    with pytest.raises(fiber.BufferTooShort) as caught:
+        other.recv_bytes_into(bytearray(4))
+    assert caught.value.args == (b"longer than fits",)
+    with pytest.raises(ValueError, match="negative offset"):
+        other.recv_bytes_into(bytearray(4), -1)
+    with pytest.raises(ValueError, match="offset too large"):
+        other.recv_bytes_into(bytearray(4), 5)
+
+
+def test_an_object_can_be_received_as_bytes_and_bytes_as_an_object() -> None:
+    one, other = Pipe()
+    for item in ({"a": 1}, np.arange(5), np.arange(100_000)):
+        sender = threading.Thread(target=one.send, args=(item,))
+        sender.start()
+        assert np.array_equal(pickle.loads(other.recv_bytes()), item)
+        sender.join()
+        sender = threading.Thread(target=one.send_bytes, args=(pickle.dumps(item),))
+        sender.start()
+        assert np.array_equal(other.recv(), item)
+        sender.join()
+
+
+def test_a_message_of_a_hundred_megabytes() -> None:
+    one, other = Pipe()
+    item = np.arange(100_000_000 // 8)
+    sender = threading.Thread(target=one.send, args=(item,))
+    sender.start()
+    assert np.array_equal(other.recv(), item)
+    sender.join()
+
+
+def test_a_bulky_message_waits_for_its_reader() -> None:
+    one, other = Pipe()
+    sent = threading.Event()
+
+    def send() -> None:
+        one.send_bytes(bytes(2_000_000))
+        sent.set()
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    assert other.poll(PATIENCE)
+    assert not sent.wait(0.05)
+    assert len(other.recv_bytes()) == 2_000_000
+    assert sent.wait(PATIENCE)
+    sender.join()
+
+
+def test_a_thousand_pipes() -> None:
+    pipes = [Pipe() for _ in range(200)]
+    for number, (one, _) in enumerate(pipes):
+        one.send(number)
+    assert len(wait([other for _, other in pipes], PATIENCE)) == 200
+    assert [other.recv() for _, other in pipes] == list(range(200))
+
+
+# The end
+
+
+def test_closing_tells_the_other_end_after_the_last_message(
+    pipe: tuple[Connection, Connection],
+) -> None:
+    one, other = pipe
+    one.send("last")
+    one.close()
+    assert other.poll()
+    assert other.recv() == "last"
+    assert other.poll()
+    with pytest.raises(ConnectionClosed) as caught:
+        other.recv()
+    assert isinstance(caught.value, EOFError)
+    with pytest.raises(BrokenPipeError):
+        other.send(1)
+
+
+def test_a_closed_end_refuses_everything() -> None:
+    one, _other = Pipe()
+    with one:
+        pass
+    one.close()
+    assert one.closed
+    uses: list[Callable[[], Any]] = [
+        lambda: one.send(1),
+        lambda: one.send_bytes(b""),
+        one.recv,
+        one.recv_bytes,
+        one.poll,
+        one.fileno,
+        lambda: pickle.dumps(one),
+    ]
+    for use in uses:
+        with pytest.raises(OSError, match="handle is closed"):
+            use()
+
+
+def test_a_forgotten_end_is_closed() -> None:
+    one, other = Pipe()
+    del one
+    with pytest.raises(EOFError):
+        other.recv()
+
+
+def hold(connection: Connection, ready: Any) -> None:
+    ready.set()
+    connection.recv()
+
+
+def test_the_end_comes_only_when_the_last_holder_has_gone() -> None:
+    one, other = Pipe()
+    ready = [fiber.Event(), fiber.Event()]
+    processes = [start(hold, other, event) for event in ready]
+    other.close()
+    assert all(event.wait(PATIENCE) for event in ready)
+    processes[0].kill()
+    processes[0].join(PATIENCE)
+    assert not one.poll(0.05)
+    processes[1].kill()
+    with pytest.raises(EOFError):
+        one.recv()
+    processes[1].join(PATIENCE)
+
+
+def test_the_end_says_how_the_other_process_died() -> None:
+    one, other = Pipe()
+    ready = fiber.Event()
+    process = start(hold, other, ready)
+    other.close()
+    assert ready.wait(PATIENCE)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    with pytest.raises(ConnectionClosed, match=f"{process.name}.*SIGKILL"):
+        one.recv()
+    process.join(PATIENCE)
+
+
+# Waiting
+
+
+def test_poll_waits_as_long_as_told() -> None:
+    one, other = Pipe()
+    assert not other.poll(0.01)
+    assert not other.poll(-1)
+    timer = threading.Timer(0.01, one.send, ["later"])
+    timer.start()
+    assert other.poll(None)
+    assert other.recv() == "later"
+    timer.join()
+
+
+def test_wait_mixes_connections_and_sentinels() -> None:
+    one, other = Pipe()
+    ready = fiber.Event()
+    process = start(hold, other, ready)
+    assert ready.wait(PATIENCE)
+    assert wait([one, process.sentinel], 0) == []
+    process.kill()
+    assert wait([one, process.sentinel], PATIENCE) == [process.sentinel]
+    other.close()
+    assert set(wait([one, process.sentinel], PATIENCE)) == {one, process.sentinel}
+    process.join(PATIENCE)
+
+
+# Travelling
+
+
+def use(carrier: Connection) -> None:
+    borrowed = carrier.recv()
+    borrowed.send(borrowed.recv() + 1)
+    borrowed.close()
+    carrier.recv()
+
+
+def test_connections_travel_through_connections() -> None:
+    here, there = Pipe()
+    one, other = Pipe()
+    process = start(use, there)
+    here.send(other)
+    other.close()
+    one.send(1)
+    assert one.recv() == 2
+    with pytest.raises(EOFError):
+        one.recv()
+    here.send("done")
+    process.join(PATIENCE)
+    assert process.exitcode == 0
+
+
+def give_away(carrier: Connection) -> None:
+    one, other = Pipe()
+    carrier.send(other)
+    other.close()
+    one.send("from a process that has ended")
+    carrier.recv()
+
+
+def test_an_end_outlives_the_process_that_made_it() -> None:
+    here, there = Pipe()
+    process = start(give_away, there)
+    there.close()
+    end = here.recv()
+    here.send("end")
+    process.join(PATIENCE)
+    assert end.recv() == "from a process that has ended"
+    with pytest.raises(EOFError):
+        end.recv()
+
+
+def open_descriptors(pid: int) -> int:
+    return len(os.listdir(f"/proc/{pid}/fd"))
+
+
+def test_sending_connections_leaves_no_descriptor_behind() -> None:
+    here, there = Pipe()
+    process = start(use, there)
+    one, other = Pipe()
+    here.send(other)
+    one.send(1)
+    assert one.recv() == 2
+    before = open_descriptors(os.getpid())
+    for _ in range(10):
+        end, far_end = Pipe()
+        queue: Any = fiber.Queue()
+        queue.put(far_end)
+        queue.get().send(1)
+        assert end.recv() == 1
+        del end, far_end, queue
+    assert wait_until(lambda: open_descriptors(os.getpid()) == before, PATIENCE)
+    here.send("done")
+    process.join(PATIENCE)
