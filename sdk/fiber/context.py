@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["BaseContext", "DefaultContext", "ForkProcess", "ForkServerProcess", "SpawnProcess"]
 
+
 class ForkProcess(Process):
     """A process forked from the zygote."""
 

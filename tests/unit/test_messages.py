@@ -109,7 +109,10 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         (bytes([PROTOCOL, 5]) + bytes(8) + b"\xff\xff\xff\xff", "announces 4294967295 buffers"),
         (Output(1, "x").encode() + b"\xff", "of kind output .* is malformed"),
         (Exited(1, 0, 0, "").encode()[:-1], "of kind exited .* is malformed"),
-        (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, "0", "", [], null, [], ""]', "number"),
+        (
+            TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, "0", "", [], null, [], ""]',
+            "number",
+        ),
         (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, 0, 1, [], null, [], ""]', "text"),
         (TakeBack(1).encode()[:1] + b"\x08" + bytes(8) + b"7", "of kind exited .* is malformed"),
     ],

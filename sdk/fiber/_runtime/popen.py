@@ -49,8 +49,7 @@ class Popen:
         if not self._born.wait(timeout):
             raise StartError(
                 f"process {self._name!r}",
-                f"its agent on host {host!r} did not start it within {timeout:g} s "
-                "(start_timeout)",
+                f"its agent on host {host!r} did not start it within {timeout:g} s (start_timeout)",
             )
         if self.pid is None and self.report is not None:
             raise StartError(f"process {self._name!r}", self.report.reason)
