@@ -19,6 +19,10 @@ SLACK = 1e-3
 """Seconds after PATIENCE until which an idle worker must have asked for an unread batch."""
 
 
+PASSES = 3
+"""Batches for each job and worker that others may get while a job waits for its turn."""
+
+
 class Names(Protocol):
     """What the objects of whoever drives the ledger stand for."""
 
@@ -45,7 +49,7 @@ class Audit:
         self._ledger = ledger
         self._names = names
         self._watched: dict[Worker, float] = {}
-        self._passed: dict[Job, int] = {}
+        self._patience: dict[Job, int] = {}
         watched = {
             "assign": self._assign,
             "receive": self._receive,
@@ -65,7 +69,6 @@ class Audit:
             for worker in self._ledger._pins
             for job, span in worker.pinned
         }
-        somebody_idle = bool(self._ledger.idle())
         batch: Batch | None = self._real.assign(now)
         if batch is not None:
             worker = batch.worker
@@ -85,15 +88,17 @@ class Audit:
             pinned_to = pins.get((batch.job, batch.start))
             _require(batch.pin is (pinned_to is not None), "a pinned task is not marked")
             _require(pinned_to in (None, worker), "a task runs where it is not pinned to")
-            self._check_turns(batch.job, somebody_idle and not batch.pin)
+            if not batch.pin:
+                self._check_turns(batch.job)
         return batch
 
-    def _check_turns(self, job: Job, was_idle: bool) -> None:
-        """A worker went to ``job``.  If idle it may run anything: others must get their turns."""
+    def _check_turns(self, job: Job) -> None:
+        """``job`` is given a worker: others that wait must get their turns."""
         waiting = [other for other in self._ledger.jobs if other.waiting and other is not job]
-        self._passed = {other: self._passed.get(other, 0) + was_idle for other in waiting}
-        most = max(self._passed.values(), default=0)
-        _require(most <= len(self._ledger.jobs), "a job waits while others get all the workers")
+        fair = PASSES * (len(self._ledger.jobs) + len(self._ledger.workers))
+        self._patience = {other: self._patience.get(other, fair) - 1 for other in waiting}
+        least = min(self._patience.values(), default=0)
+        _require(least >= 0, "a job waits while others get all the workers")
 
     def _check_tasks(self, batch: Batch, job: Job) -> None:
         _require(1 <= len(batch.items) <= LIMIT, f"a batch has {len(batch.items)} tasks")
@@ -126,11 +131,9 @@ class Audit:
         return again
 
     def _cancel(self, job: Job) -> list[Worker]:
-        account = self._names.account(job)
-        unfinished = self._ledger.unfinished(job)
-        if account is not None:
-            missing = account.everything & ~account.delivered
-            _require(len(unfinished) == missing.bit_count(), "the unfinished tasks are miscounted")
+        missing = job.fed - job.done
+        unfinished = len(self._ledger.unfinished(job))
+        _require(unfinished == missing, f"{unfinished} tasks are unfinished, not {missing}")
         holders = {
             worker
             for worker in self._ledger.workers

@@ -380,10 +380,10 @@ class DispatcherMaster:
 
     def _check_size(self) -> None:
         crew = self._dispatcher.crew
-        if self._dispatcher._closing or crew.error or crew.degraded() or crew.hesitant():
+        if self._dispatcher._closing or crew.error or crew.pause():
             return
         waiting = sum(len(job.waiting) for job in self._ledger.jobs)
-        if waiting and not crew.starting() and len(crew.links) < crew.maximum:
+        if waiting and not crew.starting and crew.size < crew.maximum:
             raise Violation(f"{waiting} tasks wait, but the pool does not grow")
 
     def check_end(self) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from fiber._agent.port import ChildObserver
 from fiber._transport.memory import SimulatedLoop
 from simulation import schedule
-from simulation.agents import Agent, Child
+from simulation.agents import LOST_AFTER, Agent, Child
 from simulation.oracle import Oracle, Violation
 from simulation.remote_hosts import RemoteHost
 from simulation.schedule import (
@@ -148,6 +148,7 @@ class World:
         end = self.loop.now() + PATIENCE
         while not self._master.done() and self.loop.now() < end:
             self.loop.run_for(5)
+        self.loop.run_for(2 * LOST_AFTER)  # what is out of reach notices that, too
 
     def note(self, text: str, *args: object) -> None:
         """Write it into the trace, if there is one."""

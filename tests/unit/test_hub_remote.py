@@ -639,3 +639,39 @@ def test_a_process_forked_by_multiprocessing_has_streams_of_its_own(
         here.send("to the parent")
         assert remote.recv() == "to the parent"
         remote.close()
+
+
+def test_a_queue_whose_host_is_gone_holds_nobody(hosts: Hosts, far: Far) -> None:
+    queue: Any = fiber.Queue()
+    remote: Any = far(queue)
+    remote.put(1)
+    assert queue.get(timeout=PATIENCE) == 1
+    hosts.on_loop(hosts["b"].unlink, "a", "agent a was lost")
+    remote.put(2)
+    with pytest.raises(Unreachable, match="agent a was lost"):
+        remote.get()
+    remote.close()
+    remote.join_thread()
+
+
+def test_the_thread_that_carries_the_answers_does_not_wait_for_one(hosts: Hosts, far: Far) -> None:
+    here, there = fiber.Pipe()
+    outcome: list[Any] = []
+
+    def on_the_loop(data: bytes) -> None:
+        remote = pickle.loads(data)  # fine: nothing is waited for
+        outcome.append(remote)
+        try:
+            remote.recv()
+        except RuntimeError as error:
+            outcome.append(error)
+
+    with hosts.at("a"):
+        data = pickle.dumps(there)
+    hosts.on_loop(on_the_loop, data)
+    assert wait_until(lambda: len(outcome) == 2, PATIENCE)
+    remote, error = outcome
+    assert "wait for itself" in str(error)
+    here.send("on another thread")
+    assert remote.recv() == "on another thread"
+    remote.close()

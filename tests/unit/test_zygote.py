@@ -13,6 +13,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from multiprocessing import spawn
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,10 +33,10 @@ PATIENCE = 10
 class Master:
     """The agent's end of a zygote, spoken by hand."""
 
-    def __init__(self, board: Board, *, preload: bool = False) -> None:
+    def __init__(self, board: Board, *, preload: bool = False, heirloom: str | None = None) -> None:
         self.sock, theirs = socketpair("a test")
         self.sock.settimeout(PATIENCE)
-        self.process = agent._launch(theirs.fileno(), board.fd, preload=preload)
+        self.process = agent._launch(theirs.fileno(), board.fd, heirloom, preload=preload)
         theirs.close()
 
     def start(self, number: int, **options: Any) -> None:
@@ -85,6 +86,7 @@ def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.
         captured=False,
         open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
         hub=None,
+        elders=(os.getpid(),),
     )
 
 
@@ -183,6 +185,30 @@ def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
         os.kill(holder, signal.SIGKILL)
 
 
+@pytest.mark.parametrize("moment", ["at once", "later"])
+def test_it_removes_the_directory_of_an_agent_that_was_killed(moment: str, tmp_path: Path) -> None:
+    directory = tmp_path / "heirloom"
+    directory.mkdir()
+    script = f"""
+        import os, signal
+        from unit.test_zygote import Board, Master
+        master = Master(Board(), heirloom={str(directory)!r})
+        if {moment!r} == "later":
+            master.started(1)
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    _run(script, expect=-signal.SIGKILL)
+    assert census.wait_until(lambda: not directory.exists(), PATIENCE)
+
+
+def test_told_to_quit_it_leaves_the_directory_to_its_agent(board: Board, tmp_path: Path) -> None:
+    master = Master(board, heirloom=str(tmp_path))
+    master.started(1)
+    master.say(zygote.QUIT)
+    master.close()
+    assert tmp_path.exists()
+
+
 @pytest.mark.parametrize("parent", ["os.getppid()", "os.getppid() + 1"])
 def test_a_child_whose_zygote_died_first_does_not_live_on(parent: str) -> None:
     script = f"""
@@ -222,7 +248,7 @@ def test_once_its_imports_made_forking_unsafe_it_forks_no_more(board: Board, met
     master.close()
 
 
-def test_the_main_module_is_imported_once_for_all(board: Board, tmp_path: Any) -> None:
+def test_the_main_module_is_imported_once_for_all(board: Board, tmp_path: Path) -> None:
     main, log = tmp_path / "main_module.py", tmp_path / "log"
     main.write_text(f"import os\nwith open({str(log)!r}, 'a') as f:\n    f.write('imported\\n')\n")
     master = Master(board, preload=True)
@@ -234,7 +260,7 @@ def test_the_main_module_is_imported_once_for_all(board: Board, tmp_path: Any) -
 
 
 @pytest.mark.parametrize("code", ["raise SystemExit(3)", "raise KeyboardInterrupt", "1 / 0"])
-def test_an_import_that_fails_does_not_end_it(board: Board, tmp_path: Any, code: str) -> None:
+def test_an_import_that_fails_does_not_end_it(board: Board, tmp_path: Path, code: str) -> None:
     (tmp_path / "broken_module.py").write_text(code)
     master = Master(board, preload=True)
     preparation = {"preload": ["broken_module"], "sys_path": [str(tmp_path), *sys.path]}
@@ -280,7 +306,7 @@ def inside(board: Board) -> Iterator[tuple[zygote.Zygote, socket.socket]]:
     ours, theirs = socketpair("a test")
     ours.settimeout(PATIENCE)
     watched = os.pidfd_open(os.getpid())
-    made = zygote.Zygote(theirs, board, watched, preload=False)
+    made = zygote.Zygote(theirs, board, [watched], preload=False)
     yield made, ours
     for fd in (watched, made._deaths, made._deaths_in):
         os.close(fd)

@@ -24,6 +24,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
+from fiber._agent import child as child_module
 from fiber._agent import zygote
 from fiber._agent.board import Board
 from fiber._agent.child import interpreter_arguments
@@ -90,10 +91,10 @@ class Agent:
 
     def _zygote(self, *, preload: bool = True) -> _ZygoteLink:
         if not self._zygotes or not preload:
-            link = _ZygoteLink(self, self._loop, self._board.fd, preload=preload)
-            self._zygotes.append(link)
-            if self._hub is not None:
-                link.send(zygote.INHERIT, os.path.dirname(self._hub.access.address))
+            directory = None if self._hub is None else os.path.dirname(self._hub.access.address)
+            self._zygotes.append(
+                _ZygoteLink(self, self._loop, self._board.fd, directory, preload=preload)
+            )
         return self._zygotes[-1]
 
     # What zygotes say, on the loop's thread
@@ -295,14 +296,16 @@ class LocalChild:
 class _ZygoteLink:
     """Our side of one zygote process."""
 
-    def __init__(self, agent: Agent, loop: Loop, board: int, *, preload: bool) -> None:
+    def __init__(
+        self, agent: Agent, loop: Loop, board: int, heirloom: str | None, *, preload: bool
+    ) -> None:
         self._agent = agent
         self._loop = loop
         self._gone = threading.Event()
         self._sock, theirs = socketpair("starting the zygote")
         try:
             with naming_the_limit("starting the zygote"):
-                self._process = _launch(theirs.fileno(), board, preload=preload)
+                self._process = _launch(theirs.fileno(), board, heirloom, preload=preload)
         except BaseException:
             self._sock.close()
             raise
@@ -328,6 +331,7 @@ class _ZygoteLink:
             captured=spec.stdio is not None,
             open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
             hub=self._agent.access(),
+            elders=_elders(),
         )
         self._outbox.send(pickle.dumps((zygote.START, child.id, tuple(start)), protocol=5), fds=fds)
 
@@ -363,11 +367,17 @@ class _ZygoteLink:
         self._agent.heard(self, answer)
 
 
-def _launch(control: int, board: int, *, preload: bool) -> subprocess.Popen[bytes]:
+def _elders() -> tuple[int, ...]:
+    return os.getpid(), *child_module.elders
+
+
+def _launch(
+    control: int, board: int, heirloom: str | None, *, preload: bool
+) -> subprocess.Popen[bytes]:
     # A program that closed its standard streams may have their numbers under ours; the zygote and
     # its children must not.
     fds = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 3) for fd in (control, board)]
-    arguments = f"{fds[0]}, {fds[1]}, {os.getpid()}, {preload}"
+    arguments = f"{fds[0]}, {fds[1]}, {_elders()}, {preload}, {heirloom!r}"
     try:
         return subprocess.Popen(
             interpreter_arguments(

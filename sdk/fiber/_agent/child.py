@@ -30,6 +30,10 @@ _libc = ctypes.CDLL(None, use_errno=True)
 _descriptors: list[int] = []
 _task_channel: UnixChannel | None = None
 _progress: memoryview | None = None
+elders: tuple[int, ...] = ()
+"""Pids of the processes that this one ends with: its parent first; none in a program that Fiber did
+not start.
+"""
 host = ""
 """The host that this process belongs to; empty in a program that Fiber did not start."""
 
@@ -76,7 +80,8 @@ def run(start: Start, fds: list[int], board: Board, agent: int) -> int:
 
 
 def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
-    global _task_channel, _progress, _descriptors
+    global _task_channel, _progress, _descriptors, elders
+    elders = start.elders
     _adopt_stdio(fds, captured=start.captured)
     rest = fds[2:]
     if start.slot is not None:

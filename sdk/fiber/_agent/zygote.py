@@ -6,8 +6,7 @@ sends them signals (a pid that only we can reap cannot be someone else's).  It e
 it, when its agent's process does.
 
 Packets from the agent: ``(START, child, start, descriptor count)``, ``(SIGNAL, child, signum)``,
-``(DESCRIPTORS,)`` (more descriptors for the START that follows), ``(QUIT,)``, ``(INHERIT,
-directory)``: to be removed should the agent's process die before it can do so itself.
+``(DESCRIPTORS,)`` (more descriptors for the START that follows), ``(QUIT,)``.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
 ``(UNFIT, child, reason)``: this zygote's imports made forking unsafe, start that child elsewhere.
 """
@@ -36,7 +35,7 @@ from fiber._agent.board import Board
 from fiber._hub.access import Access
 from fiber._wire import packet
 
-START, SIGNAL, DESCRIPTORS, INHERIT, QUIT = range(5)
+START, SIGNAL, DESCRIPTORS, QUIT = range(4)
 STARTED, FAILED, EXITED, UNFIT = range(4)
 
 _HELD = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -61,31 +60,38 @@ class Start(NamedTuple):
     """Its limits of descriptors, soft and hard: those of its agent's process."""
     hub: Access | None
     """Where it finds the hub of its host."""
+    elders: tuple[int, ...]
+    """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
 
 
 class Zygote:
-    """One loop over three descriptors: the agent's requests, deaths of children, death of the
-    agent.
+    """One loop over descriptors: the agent's requests, deaths of children, deaths of elders.
+
+    ``elders``: pidfds of the agent's process, which comes first, and of those that started it.
     """
 
-    def __init__(self, control: socket.socket, board: Board, agent: int, *, preload: bool) -> None:
+    def __init__(
+        self, control: socket.socket, board: Board, elders: list[int], *, preload: bool
+    ) -> None:
         self._control = control
         self._board = board
-        self._agent = agent
+        self._elders = elders
         self._preload = preload
         self._unfit: str | None = None
         self._pid = os.getpid()
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
         self._descriptors: list[int] = []
-        self._heirlooms: list[str] = []
         self._deaths, self._deaths_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self._poller = select.poll()
-        for fd in (control.fileno(), self._deaths, agent):
+        for fd in (control.fileno(), self._deaths, *elders):
             self._poller.register(fd, select.POLLIN)
 
-    def run(self) -> None:
-        """Serve until told to quit or the agent's process is gone; then kill what is left."""
+    def run(self) -> bool:
+        """Serve until told to quit or an elder is gone, then kill what is left.
+
+        Whether it was told to.
+        """
         self._listen_to_signals()
         while True:
             ready = {fd for fd, _ in self._poller.poll()}
@@ -94,15 +100,14 @@ class Zygote:
             try:
                 if self._control.fileno() in ready and not self._serve():
                     self._end(0)
-                    return
+                    return True
             except (EOFError, ConnectionError):
                 # A dying process closes its descriptors a moment before it counts as dead.
-                ready.add(self._agent)
-            if self._agent in ready:
+                ready.update(self._elders)
+            # All generations below an elder start to count at the same moment.
+            if not ready.isdisjoint(self._elders):
                 self._end(GRACE)
-                for directory in self._heirlooms:
-                    shutil.rmtree(directory, ignore_errors=True)
-                return
+                return False
 
     def _listen_to_signals(self) -> None:
         # Ctrl-C in a terminal is the master's alone.  SIGTERM to us would orphan the children.
@@ -122,8 +127,6 @@ class Zygote:
             self._start(request[1], Start(*request[2]), fds)
         elif request[0] == SIGNAL:
             self._signal(request[1], request[2])
-        elif request[0] == INHERIT:
-            self._heirlooms.append(request[1])
         return bool(request[0] != QUIT)
 
     def _start(self, child: int, start: Start, fds: list[int]) -> None:
@@ -168,9 +171,10 @@ class Zygote:
             self._control.close()
             os.close(self._deaths)
             os.close(self._deaths_in)
+            _close_all(self._elders[1:])
             child_module.die_with(self._pid)
             resource.setrlimit(resource.RLIMIT_NOFILE, start.open_files)
-            code = child_module.run(start, fds, self._board, self._agent)
+            code = child_module.run(start, fds, self._board, self._elders[0])
         except BaseException:
             # The user's own errors do not come here: these are of the system, or Fiber's.
             traceback.print_exc()
@@ -241,18 +245,32 @@ def _close_all(fds: list[int]) -> None:
         os.close(fd)
 
 
-def main(control: int, board: int, agent_pid: int, preload: bool) -> None:
-    """Entry point of the zygote's process."""
+def main(
+    control: int, board: int, elders: tuple[int, ...], preload: bool, heirloom: str | None
+) -> None:
+    """Entry point of the zygote's process.
+
+    ``elders``: pids, the agent's first.  ``heirloom``: a directory to remove should they die before
+    they can do so themselves.
+    """
     # Native threads of libraries such as OpenBLAS, which handle forks, are what this warns of.
     warnings.filterwarnings("ignore", message=".*multi-threaded.*fork", category=DeprecationWarning)
-    try:
-        agent = os.pidfd_open(agent_pid)
-    except ProcessLookupError:
-        sys.exit(0)
-    if os.getppid() != agent_pid:  # it died before we could watch it, and its pid may be another's
-        sys.exit(0)
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control)
+    for fd in (control, board):
+        os.set_inheritable(fd, False)
     # A program that raised its limit after it started us may send more than ours.
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    Zygote(sock, Board(board), agent, preload=preload).run()
+    watched = _watch(elders)
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control)
+    told_to = bool(watched) and Zygote(sock, Board(board), watched, preload=preload).run()
+    if heirloom is not None and not told_to:
+        shutil.rmtree(heirloom, ignore_errors=True)
+
+
+def _watch(elders: tuple[int, ...]) -> list[int]:
+    """Pidfds; none if one of them died before we could watch it."""
+    try:
+        watched = [os.pidfd_open(pid) for pid in elders]
+    except ProcessLookupError:
+        return []
+    return watched if os.getppid() == elders[0] else []  # its pid may be another's by now

@@ -81,6 +81,15 @@ def told() -> Access | None:
     return _access
 
 
+def refuse_on_loop() -> None:
+    """RuntimeError on the thread that would have to carry the answer."""
+    if _hub is not None and _hub.on_loop():
+        raise RuntimeError(
+            "an object of another host is used in a callback on Fiber's own thread, which would "
+            "wait for itself for ever: use it on a thread of the program"
+        )
+
+
 def forget() -> None:
     """In a process forked by someone else: the hub did not come along, but can be reached."""
     global _hub, _access

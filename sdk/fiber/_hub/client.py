@@ -75,6 +75,7 @@ class Line:
         fds: Sequence[int] = (),
     ) -> Reply:
         """Make a request and wait for its answer; NO once ``timeout`` seconds are over."""
+        access.refuse_on_loop()
         self._unsettled = operation
         number = self._next()
         try:

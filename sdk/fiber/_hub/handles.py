@@ -31,6 +31,10 @@ from fiber._wire.packet import BytesLike
 class SharedChannel(Channel, Protocol):
     """A channel that a queue can use: it never has to wait."""
 
+    @property
+    def prompt(self) -> bool:
+        """Whether ``try_send`` is worth a try."""
+
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room but not until it is read."""
 

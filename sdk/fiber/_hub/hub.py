@@ -69,6 +69,10 @@ class Hub:
         """The same, if anybody was told yet."""
         return self._access
 
+    def on_loop(self) -> bool:
+        """Whether the caller is the thread that serves this hub."""
+        return self._loop.on_thread()
+
     def dial(self) -> socket.socket:
         """A stream to this hub for its own process.  Any thread."""
         ours, theirs = socketpair("using a pipe or queue of another host")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import select
 import socket
 import time
@@ -12,9 +11,6 @@ from typing import Any, TypeVar, cast
 from fiber._transport.unix import UnixChannel, UnixCounter, socketpair
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
-
-LOOKS = 20
-"""Tries to send into a full channel before sleeping: about as long as a wake-up takes."""
 
 _Socket = TypeVar("_Socket", bound=socket.socket)
 
@@ -73,6 +69,8 @@ class LocalChannel(UnixChannel):
 
     __slots__ = ("_impatient",)
 
+    prompt = True
+
     def __init__(self, sock: socket.socket) -> None:
         super().__init__(sock)
         self._impatient: Impatient | None = None
@@ -90,13 +88,6 @@ class LocalChannel(UnixChannel):
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room but not, as ``send``, until a bulky one is read."""
-        if not buffers and len(payload) <= packet.INLINE_LIMIT:
-            # The kernel wakes a sender when three quarters of the buffer are free.  A reader that
-            # is at work makes room much sooner, and would run dry until then.
-            for _ in range(LOOKS):
-                if self.try_send(payload):
-                    return
-                os.sched_yield()
         packet.send(self._sock, payload, buffers, ballast=True)
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:

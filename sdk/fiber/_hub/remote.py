@@ -88,6 +88,8 @@ class RemoteObject:
 class RemoteChannel(RemoteObject):
     """One end of a message pipe on another host; a ``SharedChannel``."""
 
+    prompt = False
+
     def __init__(self, home: Access, number: int, grant: int) -> None:
         self._late: deque[Reply] = deque()
         self._watch: Line | None = None

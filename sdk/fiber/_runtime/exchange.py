@@ -76,7 +76,7 @@ class Exchange:
         self.pump = Pump("fiber-pool")
         self.callbacks = Pump("fiber-pool-callbacks")
         self.ended = threading.Event()
-        self.hungry = False
+        self.hungry = True
         """Whether a task that is read now could be sent, or hire a worker, at once."""
         self._loop = runtime().loop
         self._lock = threading.Lock()
@@ -196,6 +196,9 @@ class Exchange:
         assert link.port is not None
         try:
             message, buffers = encode(request, batch, link.known, plain)
+            if request.timeout is not None:
+                timer = self._loop.call_later(request.timeout, self._expired, batch.seq)
+                self._deadlines[batch.seq] = timer
             if not link.port.deliver(batch.seq, message, buffers):
                 return []  # it is gone: ``lost`` will find the batch unsent
         except Exception as error:
@@ -203,9 +206,6 @@ class Exchange:
             # concerns the tasks of this batch only.
             return self._unsendable(batch, error)
         self._unsent.discard(batch.seq)
-        if request.timeout is not None:
-            timer = self._loop.call_later(request.timeout, self._expired, batch.seq)
-            self._deadlines[batch.seq] = timer
         return []
 
     def _withdraw(self, batch: Batch) -> list[Batch]:
@@ -221,6 +221,7 @@ class Exchange:
         ends: list[Sink] = []
         with self._lock:
             self._unsent.discard(batch.seq)
+            self._cancel_deadline(batch.seq)
             self._split(batch.seq, Failure(error), ends)
             plan = self._step()
         self._tell(plan, ends)
@@ -513,8 +514,6 @@ class Exchange:
 
     def _give_up(self, error: BaseException) -> None:
         """Fail all that is not done, and end the workers.  Lock held."""
-        for reader in list(self._readers):
-            reader.absorb(self._ledger)
         for job in list(self._ledger.jobs):
             self._abort(job, error)
         self.crew.cancel()
@@ -546,6 +545,7 @@ class Exchange:
             self.ended.set()
             timers = [*self._timers.values(), *self._deadlines.values()]
             self._timers.clear()
+            self._deadlines.clear()
         for timer in timers:
             timer.cancel()
         self.pump.stop()
