@@ -23,7 +23,6 @@ import select
 import shutil
 import signal
 import socket
-import sys
 import threading
 import time
 import traceback
