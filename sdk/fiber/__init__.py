@@ -48,14 +48,23 @@ _SUBMODULES = frozenset(
 
 _METHODS_OF_THE_DEFAULT_CONTEXT = frozenset(
     {
+        "Array",
+        "Barrier",
         "BoundedSemaphore",
+        "Condition",
         "Event",
         "JoinableQueue",
+        "Lock",
+        "Manager",
         "Pipe",
         "Pool",
         "Queue",
+        "RLock",
+        "RawArray",
+        "RawValue",
         "Semaphore",
         "SimpleQueue",
+        "Value",
         "allow_connection_pickling",
         "cpu_count",
         "freeze_support",

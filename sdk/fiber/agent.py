@@ -59,6 +59,7 @@ class Main:
         except (FiberError, AuthenticationError) as error:
             self._complain(error)
             return 1
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # the program may have blocked some
         signal.signal(signal.SIGTERM, self._on_sigterm)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._end_with_parent()

@@ -111,7 +111,9 @@ class Connection:
             raise self._misuse("write-only")
         try:
             return channel.recv()
-        except EOFError:
+        except EOFError as error:
+            if isinstance(error, ConnectionClosed) and error.reason:
+                raise  # it knows better
             raise self._closed_by() from None
 
     def _closed_by(self) -> ConnectionClosed:
@@ -172,8 +174,9 @@ class Connection:
         if self._channel is None:
             raise self._misuse()
         spawning = reduction.spawning()
-        if spawning is not None:
-            self._given_to.append(weakref.ref(spawning.process))
+        process = getattr(spawning, "process", None)
+        if process is not None:
+            self._given_to.append(weakref.ref(process))
         return _rebuild, (handles.lend(self._channel), self._readable, self._writable)
 
     def _misuse(self, wrong_way: str = "") -> OSError:

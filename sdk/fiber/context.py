@@ -18,6 +18,7 @@ from multiprocessing.context import (
 from typing import TYPE_CHECKING, Any
 
 from fiber import cpu
+from fiber._hub.absent import absent
 from fiber._runtime import methods
 from fiber.process import Process
 
@@ -58,6 +59,17 @@ class BaseContext:
     TimeoutError = TimeoutError
     AuthenticationError = AuthenticationError
     Process: type[Process] = Process
+
+    # What multiprocessing has and Fiber has not yet: each says what to use instead.
+    Lock = staticmethod(absent("Lock"))
+    RLock = staticmethod(absent("RLock"))
+    Condition = staticmethod(absent("Condition"))
+    Barrier = staticmethod(absent("Barrier"))
+    Value = staticmethod(absent("Value"))
+    Array = staticmethod(absent("Array"))
+    RawValue = staticmethod(absent("RawValue"))
+    RawArray = staticmethod(absent("RawArray"))
+    Manager = staticmethod(absent("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)

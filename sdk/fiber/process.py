@@ -51,6 +51,14 @@ class Process(BaseProcess):
         _mp._children.add(self)  # type: ignore[attr-defined]
 
 
+def _disown() -> None:
+    """In a process forked by someone else: the other one's processes are not its to end."""
+    children: set[BaseProcess] = _mp._children  # type: ignore[attr-defined]
+    children -= {child for child in children if isinstance(child, Process)}
+
+
+os.register_at_fork(after_in_child=_disown)
+
 UNGUARDED_MAIN = """\
 a process was started while its own parent's main module was being imported.
 

@@ -20,6 +20,7 @@ from multiprocessing.reduction import ForkingPickler, register
 from typing import Any, ClassVar, cast
 
 from fiber._agent import child
+from fiber._hub import grants
 from fiber._wire import packet
 from fiber.errors import UnpicklableError
 
@@ -135,6 +136,7 @@ def dumps(
         if not (main_is_out_of_reach() and b"__main__" in data):
             return data
     except Exception:
+        # Whether or not cloudpickle can do it, its error says as much.
         pass
     before_retry()
     return _dump(_by_value_pickler(), obj, protocol, buffer_callback)
@@ -142,12 +144,15 @@ def dumps(
 
 def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     """Pickle ``obj`` for a packet: the pickle, and large buffers beside it."""
+    grants.begin_attempt()
     try:
         encoded = packet.dumps(obj)
         if not (main_is_out_of_reach() and b"__main__" in encoded[0]):
             return encoded
     except Exception:
+        # Whether or not cloudpickle can do it, its error says as much.
         pass
+    grants.undo_attempt()
     return packet.dumps(obj, partial(_dump, _by_value_pickler()))
 
 

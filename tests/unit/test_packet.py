@@ -151,7 +151,6 @@ def test_descriptors_go_along(pair: Pair, size: int) -> None:
     message.release()
 
 
-@pytest.mark.xfail(reason="receive does not ask the kernel for MSG_CMSG_CLOEXEC")
 def test_received_descriptors_do_not_leak_into_programs_we_start(pair: Pair) -> None:
     one, other = pair
     packet.send(one, b"", (), [one.fileno()])

@@ -109,6 +109,8 @@ class Zygote:
                 return False
 
     def _listen_to_signals(self) -> None:
+        # A program's thread that blocks signals hands that on to what it starts.
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())
         # Ctrl-C in a terminal is the master's alone.  SIGTERM to us would orphan the children.
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(signum, signal.SIG_IGN)

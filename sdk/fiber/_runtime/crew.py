@@ -129,17 +129,19 @@ class Crew:
         elif not report.reason.startswith("agent "):  # a lost host says nothing of the worker
             text = link.complaint or "\n".join(report.log)
             reason = "it raised an error" if link.complaint else report.reason
-            self._failed(StartError(f"pool worker {link.name!r}", reason, text, TRIES))
+            # A signal may be an accident, and hit several that start at the same time.
+            tries = TRIES + (min(self.maximum, TRIES) if report.exitcode < 0 else 0)
+            self._failed(StartError(f"pool worker {link.name!r}", reason, text, tries), tries)
 
     def refused(self, reason: BaseException) -> None:
         """One could not even be asked for."""
         error = StartError("a pool worker", str(reason), "", TRIES)
         error.__cause__ = reason
-        self._failed(error)
+        self._failed(error, TRIES)
 
-    def _failed(self, error: StartError) -> None:
+    def _failed(self, error: StartError, tries: int) -> None:
         self.failures += 1
-        if self.failures >= TRIES:
+        if self.failures >= tries:
             self.trouble = error
             if self.size == self.starting:
                 self.error = error

@@ -81,7 +81,10 @@ class UnixChannel:
 
     def try_recv(self) -> Message | None:
         """The next message if one is there."""
-        return self.recv() if self.poll(0) else None
+        try:
+            return packet.receive(self._sock, wait=False)
+        except BlockingIOError:
+            return None
 
     def poll(self, timeout: float | None) -> bool:
         """Whether ``recv`` would return or raise at once."""

@@ -59,7 +59,8 @@ _FD = struct.Struct("i")
 _ALIGNMENT = 64
 _RECEIVE = INLINE_LIMIT + len(BALLAST) + 16384
 _ANCILLARY = socket.CMSG_SPACE(_FD.size * (MAX_DESCRIPTORS + 1))
-_DONTWAIT = socket.MSG_DONTWAIT
+_CLOEXEC = int(socket.MSG_CMSG_CLOEXEC)
+_DONTWAIT = int(socket.MSG_DONTWAIT) | _CLOEXEC
 _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
@@ -242,7 +243,7 @@ def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True
     free = _buffers.free
     buffer = free.pop() if free else bytearray(_RECEIVE)
     try:
-        size, ancillary, flags, _ = _recvmsg(sock, buffer, space, 0 if wait else _DONTWAIT)
+        size, ancillary, flags, _ = _recvmsg(sock, buffer, space, _CLOEXEC if wait else _DONTWAIT)
     except BaseException:
         free.append(buffer)
         raise
