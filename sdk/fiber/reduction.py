@@ -156,6 +156,20 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     return packet.dumps(obj, partial(_dump, _by_value_pickler()))
 
 
+def encode_reusable(obj: Any) -> tuple[bytes, list[memoryview], grants.GrantSet | None]:
+    """As ``encode``, for what may be unpickled several times, as a task that runs again.
+
+    Connections and queues in it can be unpickled for as long as the third value is kept.
+    """
+    payload, buffers = encode(obj)
+    if not grants.granted():
+        return payload, buffers, None
+    grants.undo_attempt()
+    with grants.collecting_grants() as kept:
+        payload, buffers = encode(obj)
+    return payload, buffers, kept
+
+
 def dump(obj: Any, file: Any, protocol: int | None = None) -> None:
     """Write the pickle of ``obj`` to ``file``."""
     file.write(dumps(obj, protocol))

@@ -50,18 +50,37 @@ class Audit:
         self._names = names
         self._watched: dict[Worker, float] = {}
         self._patience: dict[Job, int] = {}
+        self._asked: set[Worker] = set()
+        self._left: dict[Worker, int] = {}
+        """Units that each may do, less those that it has done."""
+        self._jobs: set[Job] = set()
         watched = {
+            "open": self._open,
+            "add": self._add,
             "assign": self._assign,
             "receive": self._receive,
             "retry": self._retry,
             "cancel": self._cancel,
             "leave": self._leave,
+            "recall": self._recall,
+            "put_back": self._put_back,
             "lose": self._lose,
         }
         self._real = SimpleNamespace(**{name: getattr(ledger, name) for name in watched})
         vars(ledger).update(watched)
 
     # Each decision
+
+    def _open(self, *args: Any, **options: Any) -> Job:
+        job: Job = self._real.open(*args, **options)
+        self._jobs.add(job)
+        return job
+
+    def _add(self, key: Any, now: float, left: int | None = None) -> Worker:
+        worker: Worker = self._real.add(key, now, left)
+        if left is not None:
+            self._left[worker] = left
+        return worker
 
     def _assign(self, now: float) -> Batch | None:
         pins = {
@@ -108,6 +127,7 @@ class Audit:
         account = self._names.account(job)
         if account is not None:
             _require(not account.cancelled, "a cancelled job is given out")
+            _require(batch.pin is account.plan.everywhere, "a task is pinned, or not, by mistake")
             for index, item in enumerate(batch.items, batch.start):
                 self._check_name(job, account, index, item)
 
@@ -115,8 +135,11 @@ class Audit:
         ref = self._names.ref(job, index, item)
         _require(ref == (account.number, index), f"{ref} is taken for task {index}")
 
-    def _receive(self, *args: Any, **options: Any) -> Receipt | None:
-        receipt: Receipt | None = self._real.receive(*args, **options)
+    def _receive(self, seq: int, *args: Any, **options: Any) -> Receipt | None:
+        batch = self._ledger.batches.get(seq)
+        receipt: Receipt | None = self._real.receive(seq, *args, **options)
+        if batch is not None and seq not in self._ledger.batches and batch.worker in self._left:
+            self._left[batch.worker] -= batch.units
         account = self._names.account(receipt.job) if receipt is not None else None
         if receipt is not None and account is not None:
             for index in range(receipt.start, receipt.start + receipt.size):
@@ -140,6 +163,7 @@ class Audit:
             if any(batch.job is job for batch in list(worker.queue)[1:])
         }
         told: list[Worker] = self._real.cancel(job)
+        self._jobs.discard(job)
         _require(set(told) == holders, "unread batches of a cancelled job are not recalled")
         return told
 
@@ -152,6 +176,15 @@ class Audit:
         )
         _require(worker.leaving is (left or leaving), "a refusal to leave changes the worker")
         return left
+
+    def _recall(self, now: float) -> list[Worker]:
+        asked: list[Worker] = self._real.recall(now)
+        self._asked.update(asked)
+        return asked
+
+    def _put_back(self, worker: Worker, seqs: Iterable[int], now: float) -> None:
+        self._asked.discard(worker)
+        self._real.put_back(worker, seqs, now)
 
     def _lose(
         self, worker: Worker, unread: Iterable[int], running: tuple[int, int] | None
@@ -193,6 +226,8 @@ class Audit:
     def check(self) -> None:
         """Each task is in one place, each worker where it belongs, nobody idle without need."""
         self._check_workers()
+        forgotten = {job for job in self._jobs - self._ledger.jobs if not job.finished}
+        _require(not forgotten, "the ledger has forgotten a job")
         places: dict[Job, list[tuple[str, int, int]]] = {
             job: [
                 ("waiting", stock.start + stock.position, len(stock))
@@ -236,6 +271,9 @@ class Audit:
             for batch in worker.queue:
                 _require(self._ledger.batches.get(batch.seq) is batch, "an unknown batch is held")
                 _require(batch.worker is worker, "a batch is held by another worker")
+            if worker in self._left:
+                left = self._left[worker] - sum(batch.units for batch in worker.queue)
+                _require(worker.left == left, f"{child.name} has {worker.left} left, not {left}")
             if len(worker.queue) == 2:
                 _require(
                     not any(batch.alone for batch in worker.queue),
@@ -258,7 +296,7 @@ class Audit:
         late = []
         for worker in self._ledger.workers:
             if len(worker.queue) == 2 and not self._names.child(worker).agent.is_cut:
-                if worker.recalled:
+                if worker in self._asked:
                     asked += 1
                 elif (
                     now

@@ -175,6 +175,11 @@ def begin_attempt() -> None:
     _attempt.undo.clear()
 
 
+def granted() -> bool:
+    """Whether this attempt granted anything, which works once."""
+    return bool(_attempt.undo)
+
+
 def undo_attempt() -> None:
     """It did not work out: what was granted meanwhile, nobody will ever use."""
     undo, _attempt.undo = _attempt.undo, []

@@ -98,13 +98,13 @@ class Dispatcher(Exchange):
 
     def function(self, function: Callable[..., Any]) -> Function:
         """``function``, pickled; one that pickles as an earlier one did is the same."""
-        data, buffers = reduction.encode(function)
+        data, buffers, kept = reduction.encode_reusable(function)
         with self._lock:
             known = self._functions.get(data)
             if known is not None:
                 return known
-            made = Function(next(self._function_ids), name_of(function), data, buffers, None)
-            if not buffers and len(data) <= FUNCTION_SIZE:
+            made = Function(next(self._function_ids), name_of(function), data, buffers, kept)
+            if not buffers and kept is None and len(data) <= FUNCTION_SIZE:
                 self._functions[data] = made
                 if len(self._functions) > FUNCTIONS:
                     del self._functions[next(iter(self._functions))]
@@ -284,11 +284,11 @@ def _make_call(
 ) -> Call | None:
     """A call, pickled; None if it does not pickle, which the sink is told."""
     try:
-        data, buffers = reduction.encode((function, args, kwargs))
+        data, buffers, kept = reduction.encode_reusable((function, args, kwargs))
         if len(buffers) > work.BUFFERS:
             data, buffers = reduction.dumps((function, args, kwargs), 5), []
     except Exception as error:
         sink.put(0, [Failure(error)], True)
         sink.end()
         return None
-    return Call(name_of(function), data, buffers, sink)
+    return Call(name_of(function), data, buffers, kept, sink)

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from fiber import reduction
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Batch, Job
+from fiber._hub.grants import GrantSet
 from fiber._runtime.reader import Reader
 from fiber._wire import work
 
@@ -33,11 +34,18 @@ class Sink(Protocol):
 class Function:
     """A function that workers are asked to apply, pickled once."""
 
-    __slots__ = ("buffers", "data", "id", "name", "pace")
+    __slots__ = ("buffers", "data", "id", "kept", "name", "pace")
 
     def __init__(
-        self, id_: int, name: str, data: bytes, buffers: Sequence[memoryview], pace: Pace | None
+        self,
+        id_: int,
+        name: str,
+        data: bytes,
+        buffers: Sequence[memoryview],
+        kept: GrantSet | None,
+        pace: Pace | None = None,
     ) -> None:
+        self.kept = kept
         self.id = id_
         self.name = name
         self.data = data
@@ -48,9 +56,17 @@ class Function:
 class Call:
     """One function call: a task by itself."""
 
-    __slots__ = ("buffers", "data", "name", "sink")
+    __slots__ = ("buffers", "data", "kept", "name", "sink")
 
-    def __init__(self, name: str, data: bytes, buffers: Sequence[memoryview], sink: Sink) -> None:
+    def __init__(
+        self,
+        name: str,
+        data: bytes,
+        buffers: Sequence[memoryview],
+        kept: GrantSet | None,
+        sink: Sink,
+    ) -> None:
+        self.kept = kept
         self.name = name
         self.data = data
         self.buffers = buffers
@@ -68,7 +84,7 @@ class Request:
     Without a ``sink`` each of its tasks is a Call with its own.
     """
 
-    __slots__ = ("function", "job", "kind", "reader", "sink", "timeout")
+    __slots__ = ("function", "job", "kept", "kind", "reader", "sink", "timeout")
 
     def __init__(
         self,
@@ -85,6 +101,8 @@ class Request:
         self.sink = sink
         self.timeout = timeout
         self.reader: Reader | None = None
+        self.kept: list[GrantSet] = []
+        """What lets workers unpickle the pipes and queues among the items."""
 
     def task_name(self, task: int, item: Any) -> str:
         """How errors call a task."""
@@ -115,7 +133,7 @@ def encode(
         return work.pack_calls([(call.data, call.buffers) for call in calls]), buffers
     function = request.function
     assert function is not None
-    data, buffers = (pickle.dumps(items, 5), []) if plain else _encode_items(items)
+    data, buffers = (pickle.dumps(items, 5), []) if plain else _encode_items(request, items)
     carry = function.id not in known
     head = work.Head(
         request.kind,
@@ -132,8 +150,10 @@ def encode(
     return message, buffers
 
 
-def _encode_items(items: Any) -> tuple[bytes, list[memoryview]]:
-    data, buffers = reduction.encode(items)
+def _encode_items(request: Request, items: Any) -> tuple[bytes, list[memoryview]]:
+    data, buffers, kept = reduction.encode_reusable(items)
+    if kept is not None:
+        request.kept.append(kept)
     if len(buffers) > work.BUFFERS:
         return reduction.dumps(items, 5), []
     return data, buffers

@@ -1,0 +1,207 @@
+"""Strangers at the doors: they can stop nothing, read nothing and run nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import socket
+import ssl
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pynng
+import pytest
+
+import fiber
+from faults import targets
+from faults.conftest import running
+from faults.program import PATIENCE, wait_for
+from fiber._backends.loopback import LoopbackBackend
+from fiber._transport.credentials import Credentials, make_credentials
+
+GARBAGE = [
+    b"",
+    b"\x00",
+    b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
+    b"\xff" * 5000,
+    os.urandom(1 << 16),
+    b"\x00SP\x00\x00\x11\x00\x00" + bytes(8) + b"\xff" * 64,  # as nng greets, then nonsense
+]
+
+
+class Bomb:
+    """Unpickled anywhere, it leaves a trace."""
+
+    def __init__(self, trace: Path) -> None:
+        self._trace = trace
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self._trace),)
+
+
+@pytest.fixture(scope="module")
+def backend() -> Iterator[LoopbackBackend]:
+    with running(backend="loopback", agents=1) as runtime:
+        assert isinstance(runtime.backend, LoopbackBackend)
+        runtime.backend._output.write("test", "begins")
+        child = fiber.Process(target=targets.nothing)
+        child.start()
+        child.join()
+        yield runtime.backend
+
+
+def works() -> None:
+    child = fiber.Process(target=targets.exit_by, args=("os._exit",))
+    child.start()
+    child.join(PATIENCE)
+    assert child.exitcode == 9
+
+
+def address(backend: LoopbackBackend) -> tuple[str, int]:
+    host, _, port = backend._listener.address.rpartition(":")
+    return host, int(port)
+
+
+@pytest.mark.parametrize("data", GARBAGE, ids=range(len(GARBAGE)))
+def test_garbage_on_the_masters_port(backend: LoopbackBackend, data: bytes) -> None:
+    strangers = [socket.create_connection(address(backend), PATIENCE) for _ in range(3)]
+    for stranger in strangers:
+        stranger.sendall(data)
+    works()
+    for stranger in strangers:
+        stranger.close()
+    works()
+
+
+def test_strangers_that_say_nothing_and_stay_hold_nobody_up(backend: LoopbackBackend) -> None:
+    strangers = [socket.create_connection(address(backend), PATIENCE) for _ in range(50)]
+    works()
+    backend._processes[0].kill()
+    wait_for(lambda: backend._processes[0].agent.host != "loopback-0")
+    works()  # by an agent that had to come in past them
+    for stranger in strangers:
+        stranger.close()
+
+
+def test_tls_without_a_certificate_gets_no_word(backend: LoopbackBackend) -> None:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    with socket.create_connection(address(backend), PATIENCE) as plain:
+        plain.settimeout(PATIENCE)
+        try:
+            with context.wrap_socket(plain, server_hostname="x") as stranger:
+                stranger.sendall(b"hello?")
+                heard = stranger.recv(100)
+        except (ssl.SSLError, ConnectionError):
+            heard = b""
+    assert heard == b""
+    works()
+
+
+def tls_of(credentials: Credentials, *, certificate: bool = True) -> pynng.TLSConfig:
+    own = {"own_key_string": credentials.key, "own_cert_string": credentials.certificate}
+    return pynng.TLSConfig(
+        pynng.TLSConfig.MODE_CLIENT,
+        server_name=credentials.server_name,
+        ca_string=credentials.authority,
+        auth_mode=pynng.TLSConfig.AUTH_MODE_NONE,
+        **(own if certificate else {}),
+    )
+
+
+@pytest.mark.parametrize("certificate", [True, False], ids=["another run's", "none"])
+def test_nng_with_a_foreign_certificate_can_push_nothing(
+    backend: LoopbackBackend, certificate: bool, tmp_path: Path
+) -> None:
+    trace = tmp_path / "unpickled"
+    foreign = make_credentials("loopback").agent_half()
+    with pynng.Pair1(polyamorous=True, send_timeout=300, recv_timeout=300) as stranger:
+        stranger.tls_config = tls_of(foreign, certificate=certificate)
+        with contextlib.suppress(pynng.NNGException):
+            stranger.dial(f"tls+tcp://{backend._listener.address}", block=True)
+            stranger.send(pickle.dumps(Bomb(trace)))
+        with pytest.raises(pynng.NNGException):
+            stranger.recv()
+    works()
+    assert not trace.exists()
+
+
+def test_who_has_the_credentials_and_speaks_nonsense_is_refused_not_unpickled(
+    backend: LoopbackBackend, tmp_path: Path
+) -> None:
+    trace = tmp_path / "unpickled"
+    ours = Credentials.from_environment(backend._credentials)
+    with pynng.Pair1(polyamorous=True, send_timeout=2000, recv_timeout=5000) as odd:
+        odd.tls_config = tls_of(ours)
+        odd.dial(f"tls+tcp://{backend._listener.address}", block=True)
+        odd.send(pickle.dumps(Bomb(trace)))
+        assert b"no agent of Fiber" in odd.recv()
+    works()
+    assert not trace.exists()
+
+
+# The door of the hub, a unix socket in a private directory
+
+
+@pytest.fixture(scope="module")
+def door() -> Iterator[str]:
+    with running(backend="local") as runtime:
+        queue = fiber.Queue()
+        queue.put(1)
+        assert runtime.hub is not None
+        yield runtime.hub.access.address
+
+
+def test_the_door_is_in_a_directory_that_only_this_user_can_enter(door: str) -> None:
+    assert os.stat(os.path.dirname(door)).st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("data", [data for data in GARBAGE if data], ids=range(len(GARBAGE) - 1))
+def test_garbage_at_the_door(door: str, data: bytes) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
+        stranger.settimeout(PATIENCE)
+        stranger.connect(door)
+        try:
+            stranger.send(data)
+            heard = stranger.recv(1 << 16)
+        except OSError:
+            heard = b""
+    assert b"key" not in heard.replace(b"wrong key", b"")
+    works()
+
+
+def test_nothing_that_a_stranger_sends_is_unpickled(door: str, tmp_path: Path) -> None:
+    trace = tmp_path / "unpickled"
+    payload = pickle.dumps(Bomb(trace))
+    for prefix in (b"", b"\x00", b"\x01", b"\x02"):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
+            stranger.settimeout(PATIENCE)
+            stranger.connect(door)
+            try:
+                stranger.send(prefix + payload)
+                stranger.recv(1 << 16)
+            except OSError:
+                pass
+    works()
+    assert not trace.exists()
+
+
+def test_many_who_knock_and_wait_hold_nobody_up(door: str) -> None:
+    strangers = []
+    for _ in range(64):
+        stranger = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        stranger.connect(door)
+        strangers.append(stranger)
+    outer, outer_theirs = fiber.Pipe()
+    child = fiber.Process(target=targets.make_and_send_a_pipe, args=(outer_theirs,))
+    child.start()
+    inner = outer.recv()
+    assert inner.recv() == "through the inner pipe"
+    child.kill()
+    child.join()
+    child.close()
+    for end in (outer, outer_theirs, inner, *strangers):
+        end.close()

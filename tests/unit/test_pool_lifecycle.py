@@ -1,0 +1,414 @@
+"""How a pool grows, shrinks and ends, and that nothing of it stays behind."""
+
+from __future__ import annotations
+
+import gc
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fiber
+from fiber.pool import Pool
+from unit import pool_tasks as tasks
+
+PATIENCE = tasks.PATIENCE
+
+
+def wait_until(condition: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {PATIENCE:g} s: {what}"
+        time.sleep(0.001)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+# The end
+
+
+def test_close_lets_everything_be_done() -> None:
+    pool = fiber.Pool(2)
+    results = [pool.apply_async(tasks.nap_and_return, (n,)) for n in range(100)]
+    mapped = pool.map_async(tasks.square, range(100))
+    iterator = pool.imap(tasks.square, iter(range(100)))
+    pool.close()
+    pool.join()
+    assert [result.get(0) for result in results] == list(range(100))
+    assert mapped.get(0) == list(iterator) == [x * x for x in range(100)]
+    assert pool._pool == []
+
+
+def test_join_waits_for_callbacks() -> None:
+    seen: list[int] = []
+
+    def slowly(value: int) -> None:
+        time.sleep(0.01)
+        seen.append(value)
+
+    pool = fiber.Pool(2)
+    for n in range(10):
+        pool.apply_async(tasks.identity, (n,), callback=slowly)
+    pool.close()
+    pool.join()
+    assert sorted(seen) == list(range(10))
+
+
+def test_join_does_not_wait_for_results_to_be_consumed() -> None:
+    pool = fiber.Pool(2)
+    iterator = pool.imap(tasks.square, iter(range(50)), buffersize=3)
+    pool.close()
+    pool.join()
+    assert list(iterator) == [x * x for x in range(50)]
+
+
+def test_a_closed_pool_takes_nothing_more() -> None:
+    pool = fiber.Pool(1)
+    pool.close()
+    pool.close()
+    for call in (pool.map, pool.map_async, pool.imap, pool.imap_unordered, pool.starmap):
+        with pytest.raises(ValueError, match="Pool not running"):
+            call(tasks.square, [(1,)])
+    for call in (pool.apply, pool.apply_async, pool.broadcast):
+        with pytest.raises(ValueError, match="Pool not running"):
+            call(tasks.square)
+    with pytest.raises(ValueError, match="Pool not running"), pool:
+        pass
+    pool.join()
+
+
+def test_join_before_close_is_an_error() -> None:
+    with fiber.Pool(1) as pool, pytest.raises(ValueError, match="Pool is still running"):
+        pool.join()
+    pool.join()
+
+
+def test_terminate_is_prompt_and_ends_every_wait() -> None:
+    pool = fiber.Pool(3)
+    results = [pool.apply_async(tasks.sleep, (600,)) for _ in range(5)]
+    mapped = pool.map_async(tasks.sleep, [600] * 10_000, chunksize=1)
+    ordered = pool.imap(tasks.sleep, iter([600] * 1000))
+    unordered = pool.imap_unordered(tasks.sleep, [600] * 1000)
+    pids = (
+        pool.broadcast_pids()
+        if hasattr(pool, "broadcast_pids")
+        else [process.pid for process in pool._pool]
+    )
+    began = time.monotonic()
+    pool.terminate()
+    pool.join()
+    assert time.monotonic() - began < 5
+    assert not any(is_alive(pid) for pid in pids)
+    for result in [*results, mapped]:
+        with pytest.raises(fiber.FiberError, match="terminated"):
+            result.get(PATIENCE)
+        assert not result.successful()
+    for iterator in (ordered, unordered):
+        with pytest.raises(fiber.FiberError, match="terminated"):
+            iterator.next(PATIENCE)
+        with pytest.raises(StopIteration):
+            iterator.next(PATIENCE)
+
+
+def test_terminate_ends_workers_that_ignore_sigterm(tmp_path: Path) -> None:
+    pool = fiber.Pool(1)
+    pool.apply(signal.signal, (signal.SIGTERM, signal.SIG_IGN))
+    pool.apply_async(tasks.announce_and_sleep, (tmp_path / "here",))
+    (pid,) = tasks.wait_until_announced(tmp_path / "here")
+    pool.terminate()
+    assert not is_alive(pid)
+    pool.join()
+
+
+def test_terminate_twice_and_after_close() -> None:
+    pool = fiber.Pool(1)
+    pool.close()
+    pool.terminate()
+    pool.terminate()
+    pool.join()
+    pool.join()
+
+
+def test_a_callback_may_terminate_the_pool() -> None:
+    pool = fiber.Pool(2)
+    waiting = pool.map_async(tasks.sleep, [600] * 100, 1)
+    result = pool.apply_async(tasks.square, (3,), callback=lambda _: pool.terminate())
+    with pytest.raises(fiber.FiberError, match="terminated"):
+        waiting.get(PATIENCE)
+    pool.join()
+    assert result.get(PATIENCE) == 9
+
+
+def test_terminate_while_the_input_is_read() -> None:
+    gate = threading.Event()
+
+    def source() -> Iterator[int]:
+        yield 1
+        gate.wait(PATIENCE)
+        yield 2
+
+    pool = fiber.Pool(1)
+    iterator = pool.imap(tasks.square, source())
+    assert iterator.next(PATIENCE) == 1
+    pool.terminate()
+    pool.join()
+    gate.set()
+    with pytest.raises(fiber.FiberError, match="terminated"):
+        iterator.next(PATIENCE)
+
+
+def test_a_map_that_is_waited_for_ends_with_the_pool(tmp_path: Path) -> None:
+    pool = fiber.Pool(1)
+    errors: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            pool.map(tasks.announce_and_sleep, iter([tmp_path / "here"] * 100))
+        except fiber.FiberError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    tasks.wait_until_announced(tmp_path / "here")
+    pool.terminate()
+    thread.join(PATIENCE)
+    assert len(errors) == 1
+    pool.join()
+
+
+# Nobody holds it any more
+
+
+def test_an_unreferenced_pool_ends() -> None:
+    pool = fiber.Pool(2)
+    assert pool.map(tasks.square, range(3)) == [0, 1, 4]
+    pids = [process.pid for process in pool._pool]
+    gone = weakref.ref(pool)
+    with pytest.warns(ResourceWarning, match="unclosed running multiprocessing pool"):
+        del pool
+        gc.collect()
+    assert gone() is None
+    wait_until(lambda: not any(map(is_alive, pids)), "the workers end")
+
+
+def test_a_result_keeps_its_pool() -> None:
+    result = fiber.Pool(1).map_async(tasks.nap_and_return, range(100))
+    assert result.get(PATIENCE) == list(range(100))
+    with pytest.warns(ResourceWarning, match="unclosed running multiprocessing pool"):
+        del result
+        gc.collect()
+
+
+def test_pools_do_not_pickle() -> None:
+    text = "pool objects cannot be passed between processes or pickled"
+    with fiber.Pool(1) as pool, pytest.raises(NotImplementedError, match=text):
+        pickle.dumps(pool)
+    pool.join()
+
+
+def test_a_fork_of_the_program_cannot_use_its_pool() -> None:
+    with fiber.Pool(1) as pool:
+        read, write = os.pipe()
+        pid = os.fork()
+        if pid == 0:
+            try:
+                try:
+                    pool.map(tasks.square, range(3))
+                except RuntimeError as error:
+                    os.write(write, str(error).encode())
+            finally:
+                os._exit(0)
+        os.close(write)
+        with os.fdopen(read) as file:
+            assert f"belongs to process {os.getpid()}" in file.read()
+        os.waitpid(pid, 0)
+        assert pool.map(tasks.square, range(3)) == [0, 1, 4]
+    pool.join()
+
+
+# Programs
+
+
+def run_program(text: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(text)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("ending", ["", "pool.close()", "raise SystemExit(3)", "1 / 0"])
+def test_a_program_may_end_with_a_living_pool(ending: str) -> None:
+    done = run_program(f"""
+        import fiber
+        from unit import pool_tasks as tasks
+        pool = fiber.Pool(2)
+        print(pool.map(tasks.square, range(4)), *[process.pid for process in pool._pool], sep=";")
+        waiting = pool.map_async(tasks.sleep, [600] * 100)
+        {ending}
+    """)
+    values, *pids = done.stdout.strip().split(";")
+    assert values == "[0, 1, 4, 9]"
+    assert done.returncode == {"raise SystemExit(3)": 3, "1 / 0": 1}.get(ending, 0)
+    assert "Traceback" not in done.stderr.replace("Traceback", "", ending == "1 / 0")
+    wait_until(lambda: not any(is_alive(int(pid)) for pid in pids), "the workers end")
+
+
+def test_a_pool_that_is_global_data_of_a_program() -> None:
+    # cpython's bpo-38744 and bpo-39360: the pool is collected when modules are torn down.
+    done = run_program("""
+        import fiber
+        problem = None
+        class Holder:
+            def __init__(self):
+                self.pool = fiber.Pool(processes=1)
+        def test():
+            global problem
+            problem = Holder()
+            problem.pool.map(float, tuple(range(10)))
+        if __name__ == "__main__":
+            test()
+    """)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("call", ["pool.map", "list(pool.imap", "pool.apply"])
+def test_ctrl_c_ends_a_wait(tmp_path: Path, call: str) -> None:
+    path = tmp_path / "here"
+    arguments = "(path,)" if call == "pool.apply" else "[path] * 100"
+    program = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            textwrap.dedent(f"""
+                import pathlib
+                import fiber
+                from unit import pool_tasks as tasks
+                path = pathlib.Path({str(path)!r})
+                with fiber.Pool(2) as pool:
+                    try:
+                        {call}(tasks.announce_and_sleep, {arguments}){")" * call.count("(")}
+                    except KeyboardInterrupt:
+                        print("interrupted", flush=True)
+            """),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    pids = tasks.wait_until_announced(path, 1 if call == "pool.apply" else 2)
+    os.killpg(program.pid, signal.SIGINT)  # as a terminal does: the whole group
+    out, err = program.communicate(timeout=PATIENCE)
+    assert (program.returncode, out, err) == (0, "interrupted\n", "")
+    assert not any(map(is_alive, pids))
+
+
+def test_after_ctrl_c_the_pool_goes_on(tmp_path: Path) -> None:
+    path, gate = tmp_path / "here", tmp_path / "gate"
+    done = run_program(f"""
+        import _thread, pathlib, threading
+        import fiber
+        from unit import pool_tasks as tasks
+        path, gate = pathlib.Path({str(path)!r}), pathlib.Path({str(gate)!r})
+
+        def interrupt():
+            tasks.wait_until_announced(path, 2)
+            _thread.interrupt_main()
+
+        with fiber.Pool(2) as pool:
+            threading.Thread(target=interrupt).start()
+            try:
+                pool.starmap(tasks.announce_and_wait, [(path, gate)] * 500, 1)
+            except KeyboardInterrupt:
+                gate.touch()
+            print(pool.map(tasks.square, range(4)))
+            print(len(tasks.announced(path)))
+        pool.join()
+    """)
+    assert done.stderr == ""
+    assert done.stdout.split("\n")[0] == "[0, 1, 4, 9]"
+
+
+# Size
+
+
+def test_a_pool_follows_the_work(tmp_path: Path) -> None:
+    path, gate = tmp_path / "here", tmp_path / "gate"
+    with fiber.Pool(min_workers=1, max_workers=4, idle_timeout=0.1) as pool:
+        assert len(pool._pool) == 1
+        result = pool.starmap_async(tasks.announce_and_wait, [(path, gate)] * 10, 1)
+        assert len(tasks.wait_until_announced(path, 4)) == 4
+        assert len(pool._pool) == 4
+        gate.touch()
+        assert result.get(PATIENCE) == ["gate"] * 10
+        wait_until(lambda: len(pool._pool) == 1, "idle workers leave")
+        assert pool.apply(tasks.square, (3,)) == 9
+    pool.join()
+
+
+def test_it_grows_for_what_is_read_later(tmp_path: Path) -> None:
+    path, gate = tmp_path / "here", tmp_path / "gate"
+    with fiber.Pool(min_workers=0, max_workers=3) as pool:
+        assert pool._pool == []
+        iterator = pool.imap(tasks.wait_for, iter([gate] * 10))
+        wait_until(lambda: len(pool._pool) == 3, "it grows")
+        gate.touch()
+        assert list(iterator) == ["gate"] * 10
+        assert pool.map(tasks.square, iter(range(5))) == [0, 1, 4, 9, 16]
+        path.touch()
+    pool.join()
+
+
+def test_a_pool_may_have_nobody(tmp_path: Path) -> None:
+    with fiber.Pool(min_workers=0, max_workers=2, idle_timeout=0.05) as pool:
+        assert pool.broadcast(tasks.pid) == []
+        for _ in range(3):
+            assert pool.apply(tasks.square, (3,)) == 9
+            wait_until(lambda: pool._pool == [], "idle workers leave")
+    pool.join()
+
+
+def test_busy_workers_do_not_leave(tmp_path: Path) -> None:
+    path, gate = tmp_path / "here", tmp_path / "gate"
+    with fiber.Pool(min_workers=1, max_workers=3, idle_timeout=0.02) as pool:
+        results = [pool.apply_async(tasks.announce_and_wait, (path, gate)) for _ in range(3)]
+        pids = set(tasks.wait_until_announced(path, 3))
+        time.sleep(0.2)  # ten times as long as an idle one may stay
+        assert {process.pid for process in pool._pool} == pids
+        gate.touch()
+        assert [result.get(PATIENCE) for result in results] == ["gate"] * 3
+    pool.join()
+
+
+def test_processes_look_like_processes() -> None:
+    with fiber.Pool(2) as pool:
+        for process in pool._pool:
+            assert process.is_alive()
+            assert process.pid is not None
+            assert process.exitcode is None
+            assert process in fiber.active_children()
+        assert pool._processes == 2
+        assert "state=RUN pool_size=2" in repr(pool)
+        processes = pool._pool
+    pool.join()
+    assert all(process.exitcode is not None for process in processes)
+    assert not set(processes) & set(fiber.active_children())
