@@ -14,6 +14,10 @@ from fiber._runtime import state
 BACKENDS = ("local", "loopback")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "slow: takes more than a few seconds")
+
+
 @pytest.fixture
 def launch() -> Iterator[Callable[..., Program]]:
     """Starts a script as a ``Program``; what is left of it is ended after the test."""

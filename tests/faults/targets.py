@@ -132,3 +132,25 @@ def make_and_send_a_pipe(connection: Any) -> NoReturn:
 def slow_square(number: int) -> int:
     time.sleep(0.01)
     return number * number
+
+
+def get_one_and_block(queue: Any, connection: Any) -> NoReturn:
+    connection.send(queue.get())
+    block()
+
+
+def echo_each(connections: list[Any]) -> NoReturn:
+    """Send back one message of each connection, then block."""
+    for connection in connections:
+        connection.send(connection.recv())
+    block()
+
+
+def echo_bytes(connection: Any) -> None:
+    """Send back bytes, until the other end is closed."""
+    while True:
+        try:
+            message = connection.recv_bytes()
+        except EOFError:
+            return
+        connection.send_bytes(message)

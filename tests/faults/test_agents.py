@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -14,7 +14,7 @@ import census
 import fiber
 from faults import targets
 from faults.conftest import running
-from faults.program import PATIENCE, alive, stop_and_wait, wait_for
+from faults.program import PATIENCE, Program, alive, stop_and_wait, wait_for
 from fiber._backends.loopback import LoopbackBackend
 
 LOST_AFTER = 1.5
@@ -164,3 +164,21 @@ def test_a_killed_zygote_of_an_agent_costs_its_children_only(backend: LoopbackBa
     for another in again:
         another.join(PATIENCE)
         assert another.exitcode == 0
+
+
+def test_after_good_work_agents_end_with_status_0(launch: Callable[..., Program]) -> None:
+    script = """
+        import fiber
+        from fiber._runtime import state
+        if __name__ == "__main__":
+            with fiber.Pool(2) as pool:
+                pool.map(abs, range(10))
+            child = fiber.Process(target=print)
+            child.start()
+            agents = [process._process for process in state.runtime().backend._processes]
+            child.join()
+            state.shutdown()
+            print({agent.returncode for agent in agents})
+    """
+    program = launch(script, env={"FIBER_BACKEND": "loopback"})
+    assert program.finish() == "{0}\n"

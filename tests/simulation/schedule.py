@@ -213,8 +213,11 @@ class _Draw:
         odd = rng.choice((0.0, 0.0, 0.05, 0.3))
         timeout = rng.choice((None, None, None, None, 0.05, 0.5))
         acts = [act for act in Act if act is not Act.FINE and (act is not Act.ENDLESS or timeout)]
+        many = rng.random() < 0.004
+        if many:
+            low, high = _SECONDS["tiny"]
         tasks = []
-        for _ in range(rng.choice((0, 1, 2, 5, 10, 20, 40, 80))):
+        for _ in range(2500 if many else rng.choice((0, 1, 2, 5, 10, 20, 40, 80))):
             # Times spread evenly over their magnitudes.
             seconds = low * (high / low) ** rng.random()
             act = rng.choice(acts) if rng.random() < odd else Act.FINE
@@ -225,7 +228,7 @@ class _Draw:
         return Job(
             at=at,
             tasks=tuple(tasks) or ((Task(low),) if everywhere else ()),
-            bite=rng.choice((1000, 1000, 1, 7)),
+            bite=rng.choice((300, 3000)) if many else rng.choice((3000, 3000, 1, 7)),
             pause=rng.choice((0.0, 1e-4, 1e-2)),
             retries=rng.choice((3, 3, 1, 0)),
             unit=rng.choice((1, 1, 1, 1, 2, 5)),
@@ -284,7 +287,7 @@ def _plainer(schedule: Schedule) -> Iterator[Schedule]:
     for at, job in enumerate(schedule.jobs):
         for plain in (
             replace(job, cancelled_at=None),
-            replace(job, bite=1000),
+            replace(job, bite=3000),
             replace(job, unit=1),
             replace(job, at=0.0),
             replace(job, everywhere=False),

@@ -11,6 +11,7 @@ import sys
 import textwrap
 import threading
 import time
+import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +20,6 @@ from typing import Any
 import pytest
 
 import fiber
-from fiber.pool import Pool
 from unit import pool_tasks as tasks
 
 PATIENCE = tasks.PATIENCE
@@ -105,11 +105,7 @@ def test_terminate_is_prompt_and_ends_every_wait() -> None:
     mapped = pool.map_async(tasks.sleep, [600] * 10_000, chunksize=1)
     ordered = pool.imap(tasks.sleep, iter([600] * 1000))
     unordered = pool.imap_unordered(tasks.sleep, [600] * 1000)
-    pids = (
-        pool.broadcast_pids()
-        if hasattr(pool, "broadcast_pids")
-        else [process.pid for process in pool._pool]
-    )
+    pids = [process.pid for process in pool._pool]
     began = time.monotonic()
     pool.terminate()
     pool.join()
@@ -195,23 +191,31 @@ def test_a_map_that_is_waited_for_ends_with_the_pool(tmp_path: Path) -> None:
 # Nobody holds it any more
 
 
-def test_an_unreferenced_pool_ends() -> None:
+def test_an_unreferenced_pool_warns_and_ends() -> None:
     pool = fiber.Pool(2)
     assert pool.map(tasks.square, range(3)) == [0, 1, 4]
     pids = [process.pid for process in pool._pool]
     gone = weakref.ref(pool)
-    with pytest.warns(ResourceWarning, match="unclosed running multiprocessing pool"):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         del pool
         gc.collect()
+    (warning,) = caught
+    assert warning.category is ResourceWarning
+    assert "unclosed running multiprocessing pool" in str(warning.message)
+    caught.clear()
+    del warning  # it names its source, the pool
     assert gone() is None
     wait_until(lambda: not any(map(is_alive, pids)), "the workers end")
 
 
 def test_a_result_keeps_its_pool() -> None:
-    result = fiber.Pool(1).map_async(tasks.nap_and_return, range(100))
-    assert result.get(PATIENCE) == list(range(100))
-    with pytest.warns(ResourceWarning, match="unclosed running multiprocessing pool"):
-        del result
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        result = fiber.Pool(1).map_async(tasks.nap_and_return, range(100))
+        assert result.get(PATIENCE) == list(range(100))
+        iterator = fiber.Pool(1).imap(tasks.nap_and_return, iter(range(100)))
+        assert list(iterator) == list(range(100))
         gc.collect()
 
 
@@ -325,14 +329,14 @@ def test_ctrl_c_ends_a_wait(tmp_path: Path, call: str) -> None:
 def test_after_ctrl_c_the_pool_goes_on(tmp_path: Path) -> None:
     path, gate = tmp_path / "here", tmp_path / "gate"
     done = run_program(f"""
-        import _thread, pathlib, threading
+        import pathlib, signal, threading
         import fiber
         from unit import pool_tasks as tasks
         path, gate = pathlib.Path({str(path)!r}), pathlib.Path({str(gate)!r})
 
         def interrupt():
             tasks.wait_until_announced(path, 2)
-            _thread.interrupt_main()
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
         with fiber.Pool(2) as pool:
             threading.Thread(target=interrupt).start()

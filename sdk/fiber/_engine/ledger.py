@@ -184,6 +184,10 @@ class Ledger:
         """Workers with nothing to do, the one that has been so for longest first."""
         return list(self._roster.idle)
 
+    def longest_idle(self) -> Worker | None:
+        """The first of them."""
+        return next(iter(self._roster.idle), None)
+
     def hungry(self) -> bool:
         """Whether somebody could be given something."""
         return bool(self._roster.idle or self._roster.single)

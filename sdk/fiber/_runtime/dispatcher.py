@@ -10,10 +10,11 @@ from typing import Any
 from fiber import reduction
 from fiber._agent.port import ChildPort
 from fiber._engine.chunks import Pace
-from fiber._runtime.exchange import Exchange, Plan, Terms
+from fiber._runtime.exchange import Exchange
 from fiber._runtime.outcome import Failure
 from fiber._runtime.reader import Reader
 from fiber._runtime.requests import Call, Function, Request, Sink, name_of
+from fiber._runtime.staff import Plan, Terms
 from fiber._runtime.workers import PoolProcess
 from fiber._wire import work
 

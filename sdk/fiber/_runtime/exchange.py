@@ -10,11 +10,6 @@
                     │
                     └─► sink.put, sink.end ──► results, iterators, callbacks
 
-Whatever happens, to a worker or to a request, is handled in the same way: under ``_lock`` the
-ledger and the crew take it in, ``_step`` decides what follows, and after the lock is released
-``_act`` does it.  So no event can forget to send what became free, to replace or dismiss a worker,
-or to end a pool that has nothing left to do.
-
 Who touches what: the ledger, the crew, ``_unsent``, ``_readers``, timers and flags are guarded by
 ``_lock``.  ``heard`` runs on the loop's thread or on that of a caller who attends to a worker,
 ``recalled``, ``lost`` and timers on the loop's thread.  None of them may run any of the user's
@@ -25,102 +20,41 @@ A batch in ``_unsent`` is assigned but not sent: nobody can have run it.
 from __future__ import annotations
 
 import pickle
-import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any
 
 from fiber._agent.port import ExitReport
-from fiber._engine.ledger import Batch, Job, Ledger, Loss, Receipt
+from fiber._engine.ledger import Batch, Job, Loss, Receipt
 from fiber._runtime.crew import Crew
 from fiber._runtime.outcome import Encoded, Failure, outcomes
 from fiber._runtime.pump import Pump
 from fiber._runtime.reader import Reader
 from fiber._runtime.requests import Request, Sink, encode, is_plain
+from fiber._runtime.staff import Staff, Terms
 from fiber._runtime.state import runtime
-from fiber._runtime.workers import Link, dismiss
+from fiber._runtime.workers import Link
 from fiber._transport.loop import Timer
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import TimeoutError, WorkerDied
 
 
-class Terms(NamedTuple):
-    """What a pool promises its workers and callers."""
-
-    context: Any
-    initializer: Callable[..., object] | None = None
-    initargs: tuple[Any, ...] = ()
-    minimum: int = 1
-    maximum: int = 1
-    maxtasks: int | None = None
-    retries: int = 3
-    retryable: tuple[type[BaseException], ...] = ()
-    idle_timeout: float = 60.0
-
-
-class Plan(NamedTuple):
-    """What follows from an event: batches to send, workers to dismiss, the pool's end."""
-
-    batches: list[Batch]
-    leaving: list[Link]
-    over: bool
-
-
-class Exchange:
+class Exchange(Staff):
     """The part of a dispatcher that talks to workers."""
 
     def __init__(self, terms: Terms) -> None:
-        self.terms = terms
-        self.pump = Pump("fiber-pool")
-        self.callbacks = Pump("fiber-pool-callbacks")
-        self.ended = threading.Event()
+        super().__init__(terms, runtime().loop, Pump("fiber-pool"), Pump("fiber-pool-callbacks"))
         self.hungry = True
         """Whether a task that is read now could be sent, or hire a worker, at once."""
-        self._loop = runtime().loop
-        self._lock = threading.Lock()
-        self._ledger = Ledger()
         self._unsent: set[int] = set()
         self._readers: list[Reader] = []
         self._deadlines: dict[int, Timer] = {}
-        self._timers: dict[str, Timer] = {}
-        self._closing = False
-        self._terminated = False
         arguments = (terms.initializer, terms.initargs, terms.retryable)
         self.crew = Crew(self, self._lock, terms.context, arguments, terms.minimum, terms.maximum)
 
-    # What follows
-
-    def _step(self) -> Plan:
-        """Decide what follows from what happened.  Lock held; ``_act`` does it."""
-        crew = self.crew
-        self._ledger.starting = crew.starting
-        batches = self._assign()
-        leaving = [worker.key for worker in self._ledger.spent()]
-        for link in leaving:
-            crew.let_go(link)
-        if crew.size < crew.maximum:
-            self._order()
-        over = False
-        if self._closing:
-            leaving += self._nobody_needed()
-            over = self._is_over()
-        return Plan(batches, leaving, over)
-
-    def _act(self, plan: Plan, ends: Iterable[Sink] = ()) -> None:
-        """Do what was decided, on any thread."""
-        self._send_safely(plan.batches)
-        self._tell(plan, ends)
-
-    def _tell(self, plan: Plan, ends: Iterable[Sink] = ()) -> None:
-        """Tell everyone but the workers that get work."""
-        for sink in ends:
-            sink.end()
-        if plan.leaving:
-            dismiss(plan.leaving)
-        if plan.over:
-            self._end()
+    # Giving
 
     def _assign(self) -> list[Batch]:
         now = monotonic()
@@ -149,24 +83,6 @@ class Exchange:
         due = self._ledger.next_recall()
         if due is not None:
             self._later("recall", due - now, self._reconsider)
-
-    def _later(self, name: str, seconds: float, action: Callable[[], None]) -> None:
-        """Do something once the time comes, unless that is intended already.  Lock held."""
-        if name not in self._timers:
-            self._timers[name] = self._loop.call_later(max(seconds, 0.0), self._due, name, action)
-
-    def _due(self, name: str, action: Callable[[], None]) -> None:
-        with self._lock:
-            self._timers.pop(name, None)
-        action()
-
-    def _reconsider(self) -> None:
-        """Time has passed."""
-        with self._lock:
-            plan = self._step()
-        self._act(plan)
-
-    # Giving
 
     def _send(self, batches: Iterable[Batch]) -> None:
         """Send batches, on a thread that may run the user's code."""
@@ -306,6 +222,7 @@ class Exchange:
         ends: list[Sink] = []
         with self._lock:
             batch = self._ledger.batches.get(seq)
+            self._cancel_deadline(seq)
             if kind == work.UNREADABLE:
                 self._split(seq, error, ends)
             elif batch is not None:
@@ -327,6 +244,7 @@ class Exchange:
             return
         with self._lock:
             for seq in seqs:
+                self._cancel_deadline(seq)
                 batch = self._ledger.batches.get(seq)
                 if batch is not None and batch.job is not None:
                     function = batch.job.owner.function
@@ -377,8 +295,6 @@ class Exchange:
                 return
             link.worker = self._ledger.add(link, monotonic(), self.terms.maxtasks)
             self.crew.ready()
-            if self.crew.size > self.crew.minimum:
-                self._later("idle", self.terms.idle_timeout, self._thin_out)
             plan = self._step()
         self._act(plan)
 
@@ -418,83 +334,7 @@ class Exchange:
             ends.append(loss.item.sink)
         self._check_finished(loss.job, ends)
 
-    def _check_crew(self) -> None:
-        """If workers do not start, fail what depends on it.  Lock held."""
-        crew = self.crew
-        if self._terminated or crew.trouble is None:
-            return
-        if crew.error is not None:
-            self._give_up(crew.error)
-        else:
-            for job in set(self._ledger.homeless()):
-                self._abort(job, crew.trouble)
-
-    def _order(self) -> None:
-        """Order workers that are missing.  Lock held."""
-        count = self._missing()
-        if not count:
-            return
-        pause = self.crew.pause()
-        if pause:
-            self._later("hire", pause, self._try_again)
-        else:
-            self._hire_soon(count)
-
-    def _missing(self) -> int:
-        if self._terminated or self.crew.error is not None:
-            return 0
-        if self._closing and not self._ledger.jobs:
-            return 0
-        return self.crew.missing(self._ledger.demand(), len(self._ledger.homeless()))
-
-    def _try_again(self) -> None:
-        """The pause after failures is over: one more try."""
-        with self._lock:
-            if self._missing():
-                self._hire_soon(1)
-
-    def _hire_soon(self, count: int) -> None:
-        self.crew.order(count)
-        # Not on the loop's thread, which agents may need for it.
-        self.pump.post(self._hire)
-
-    def _hire(self) -> None:
-        """Start the workers that are ordered."""
-        while self.crew.ordered:
-            try:
-                link = self.crew.hire()
-            except Exception as error:
-                # Want of descriptors or memory, mostly.
-                with self._lock:
-                    self.crew.refused(error)
-                    self._check_crew()
-            else:
-                if link is not None and self._terminated:
-                    link.kill()
-        self._reconsider()
-
-    def _thin_out(self) -> None:
-        """Let go workers above the minimum that have had nothing to do for a while."""
-        timeout = self.terms.idle_timeout
-        with self._lock:
-            now = monotonic()
-            leaving: list[Link] = []
-            for worker in self._ledger.idle():
-                # The ledger has the last word: one that was given work since stays.
-                if (
-                    self.crew.size > self.crew.minimum
-                    and now - worker.since >= 0.9 * timeout
-                    and self._ledger.leave(worker)
-                ):
-                    self.crew.let_go(worker.key)
-                    leaving.append(worker.key)
-            if self.crew.size > self.crew.minimum:
-                self._later("idle", timeout, self._thin_out)
-            plan = self._step()
-        dismiss(leaving)
-        self._act(plan)
-
-    # Ending
+    # What ends before its time
 
     def _abort(self, job: Job, error: BaseException) -> None:
         """Fail what is not done of a job.  Lock held."""
@@ -511,42 +351,3 @@ class Exchange:
         if request.reader in self._readers:
             self._readers.remove(request.reader)
             request.reader.stop()
-
-    def _give_up(self, error: BaseException) -> None:
-        """Fail all that is not done, and end the workers.  Lock held."""
-        for job in list(self._ledger.jobs):
-            self._abort(job, error)
-        self.crew.cancel()
-        for link in self.crew.staying():
-            self.crew.let_go(link)
-            link.terminate()
-
-    def _nobody_needed(self) -> list[Link]:
-        """Workers to let go since the pool is closed and has nothing left for them.  Lock held."""
-        leaving: list[Link] = []
-        if not self._ledger.jobs and self.crew.size:
-            for link in self.crew.staying():
-                if link.worker is None or self._ledger.leave(link.worker):
-                    self.crew.let_go(link)
-                    leaving.append(link)
-        return leaving
-
-    def _is_over(self) -> bool:
-        """Whether a closed pool has ended.  Lock held."""
-        if self.crew.links or self.crew.ordered:
-            return False
-        return not self._ledger.jobs or self._terminated or self.crew.error is not None
-
-    def _end(self) -> None:
-        """Nobody is left."""
-        with self._lock:
-            if self.ended.is_set():
-                return
-            self.ended.set()
-            timers = [*self._timers.values(), *self._deadlines.values()]
-            self._timers.clear()
-            self._deadlines.clear()
-        for timer in timers:
-            timer.cancel()
-        self.pump.stop()
-        self.callbacks.stop()

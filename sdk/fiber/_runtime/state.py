@@ -24,6 +24,7 @@ from fiber._hub.hub import Hub
 from fiber._runtime import methods
 from fiber._transport.loop import Loop
 from fiber._transport.unix import naming_the_limit
+from fiber.errors import StartError
 
 if TYPE_CHECKING:
     from fiber._backends.base import Backend
@@ -76,6 +77,7 @@ class Runtime:
         """
         agent = self.backend.place()
         same_host = self.backend.same_host
+        preparation = self._preparation(process, agent, same_host)
         with collecting_grants(reusable=False) as grants:
             payload, fds = reduction.dump_process(process, same_host=same_host)
         if grants:
@@ -83,7 +85,7 @@ class Runtime:
         spec = ChildSpec(
             name=process.name,
             method=method,
-            preparation=self._preparation(process, agent, same_host),
+            preparation=preparation,
             payload=payload,
             fds=tuple(fds),
             tasks=tasks,
@@ -92,7 +94,11 @@ class Runtime:
         return agent.start(spec, observer)
 
     def _preparation(self, process: Any, agent: AgentPort, same_host: bool) -> bytes:
-        data = spawn.get_preparation_data(process.name)
+        try:
+            data = spawn.get_preparation_data(process.name)
+        except FileNotFoundError as error:
+            reason = "its working directory is this program's, which was deleted; os.chdir() first"
+            raise StartError(f"process {process.name!r}", reason) from error
         data["authkey"] = bytes(data["authkey"])
         data["host"] = agent.host
         # What such a process starts itself runs on its own host.

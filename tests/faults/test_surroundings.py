@@ -1,0 +1,106 @@
+"""Directories that are missing, full or forbidden, and what a program needs of them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from faults.program import Program
+
+WORK = """
+    import fiber, os, sys
+    from faults import targets
+    if __name__ == "__main__":
+        ours, theirs = fiber.Pipe()
+        child = fiber.Process(target=targets.echo, args=(theirs,))
+        child.start()
+        theirs.close()
+        ours.send(1)
+        print(ours.recv())
+        ours.close()
+        child.join()
+        with fiber.Pool(2) as pool:
+            print(pool.map(abs, [-1, -2]))
+"""
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    made = Path(tempfile.mkdtemp(prefix="d-"))
+    yield made
+    shutil.rmtree(made, ignore_errors=True)
+
+
+def test_no_temporary_directory_at_all(launch_on: Callable[..., Program]) -> None:
+    """Python itself falls back to others; where TMPDIR does not exist nothing is lost."""
+    program = launch_on(WORK, env={"TMPDIR": "/no/such/directory"})
+    assert program.finish() == "1\n[1, 2]\n"
+
+
+def test_a_temporary_directory_that_goes_away_while_it_runs(
+    launch_on: Callable[..., Program], folder: Path
+) -> None:
+    gone = folder / "gone"
+    gone.mkdir()
+    script = WORK.replace(
+        "with fiber.Pool(2)",
+        f"import shutil; shutil.rmtree({str(gone)!r})\n        with fiber.Pool(2)",
+    )
+    program = launch_on(script, env={"TMPDIR": str(gone)})
+    assert program.finish() == "1\n[1, 2]\n"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_runtime_directory_that_cannot_be_written_to_is_named(
+    launch: Callable[..., Program], folder: Path
+) -> None:
+    folder.chmod(0o500)
+    program = launch(WORK, env={"FIBER_RUNTIME_DIRECTORY": str(folder)})
+    assert program.wait() == 1
+    assert str(folder) in program.stderr
+    assert "ConfigError" in program.stderr
+
+
+def test_a_path_too_long_for_a_socket_says_what_to_set(
+    launch_on: Callable[..., Program], folder: Path
+) -> None:
+    deep = folder / ("d" * 100)
+    deep.mkdir()
+    program = launch_on(WORK, env={"FIBER_RUNTIME_DIRECTORY": str(deep)})
+    assert program.wait() == 1
+    assert "FIBER_RUNTIME_DIRECTORY" in program.stderr
+    assert program.left() == []
+    assert list(deep.iterdir()) == []
+
+
+def test_a_working_directory_that_is_gone(launch_on: Callable[..., Program], folder: Path) -> None:
+    gone = folder / "gone"
+    gone.mkdir()
+    script = WORK.replace(
+        "ours, theirs = fiber.Pipe()", "os.rmdir(os.getcwd())\n        ours, theirs = fiber.Pipe()"
+    )
+    program = launch_on(script, cwd=gone)
+    assert program.wait() == 1
+    assert "working directory is this program's, which was deleted" in program.stderr
+    assert program.left() == []
+
+
+def test_a_home_that_does_not_exist(launch_on: Callable[..., Program]) -> None:
+    program = launch_on(WORK, env={"HOME": "/no/such/home"})
+    assert program.finish() == "1\n[1, 2]\n"
+
+
+def test_an_almost_empty_environment(launch_on: Callable[..., Program]) -> None:
+    script = WORK.replace(
+        "ours, theirs = fiber.Pipe()",
+        "kept = {k: os.environ[k] for k in ('FIBER_BACKEND', 'TMPDIR', 'FAULTS_PROGRAM')}\n"
+        "        os.environ.clear(); os.environ.update(kept)\n"
+        "        ours, theirs = fiber.Pipe()",
+    )
+    program = launch_on(script)
+    assert program.finish() == "1\n[1, 2]\n"

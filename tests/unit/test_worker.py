@@ -1,0 +1,322 @@
+"""The loop of a pool worker: what it runs, notes, answers and gives back."""
+
+from __future__ import annotations
+
+import pickle
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from fiber._agent import worker as worker_module
+from fiber._agent.worker import FUNCTIONS, Worker
+from fiber._wire import packet, work
+from unit import pool_tasks as tasks
+
+PATIENCE = tasks.PATIENCE
+
+
+class Channel:
+    """What the dispatcher would hear."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[Any, ...]] = []
+        self.buffers: list[list[memoryview]] = []
+        self.arrived = threading.Condition()
+
+    def send(self, payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
+        with self.arrived:
+            self.said.append(pickle.loads(payload))
+            self.buffers.append([memoryview(bytes(buffer)) for buffer in buffers])
+            self.arrived.notify_all()
+
+    def wait_for(self, count: int) -> None:
+        with self.arrived:
+            assert self.arrived.wait_for(lambda: len(self.said) >= count, PATIENCE)
+
+    def results(self, seq: int) -> list[Any]:
+        """What the tasks of a batch came to, errors as they are."""
+        found: list[Any] = []
+        for words, buffers in zip(self.said, self.buffers, strict=True):
+            if words[0] != seq:
+                continue
+            _, offset, _, _, values, odd = words
+            assert offset == len(found), "results out of order"
+            rest = iter(buffers)
+            for position, kind, data, count in odd:
+                value = pickle.loads(data, buffers=[next(rest) for _ in range(count)])
+                values[position] = value if kind == work.VALUE else (kind, value)
+            found += values
+        return found
+
+
+class Rig:
+    """A worker and what it is given."""
+
+    def __init__(self, retryable: tuple[type[BaseException], ...] = ()) -> None:
+        self.channel = Channel()
+        self.board = memoryview(bytearray(16)).cast("Q")
+        self.worker = Worker(self.channel, self.board, retryable)
+        self._seq = 0
+
+    def give(
+        self,
+        function: Callable[..., Any] | None,
+        items: Any,
+        *,
+        stride: int = 0,
+        unit: int = 1,
+        kind: int = work.MAP,
+        identity: int = 1,
+    ) -> int:
+        """Have a batch run; returns its sequence number."""
+        data = pickle.dumps(function) if function is not None else b""
+        head = work.Head(kind, stride, unit, identity, len(data), 0)
+        body, buffers = packet.dumps(items)
+        return self._handle(work.pack_batch(head, data, body), buffers)
+
+    def call(self, *calls: tuple[Any, ...]) -> int:
+        """Have calls (function, args, kwargs) run."""
+        return self._handle(work.pack_calls([packet.dumps(call) for call in calls]), [])
+
+    def _handle(self, message: bytes, buffers: list[memoryview]) -> int:
+        self._seq += 1
+        payload = memoryview(work.SEQ.pack(self._seq) + message)
+        assert self.worker.handle(packet.Message(payload, buffers, []))
+        return self._seq
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+MODES = pytest.mark.parametrize(
+    "mode",
+    [{"stride": 0}, {"stride": 1}, {"stride": 7}, {"stride": 1000}, {"stride": 7, "unit": 3}],
+)
+
+
+@MODES
+@pytest.mark.parametrize("items", [range(20), list(range(20)), tuple(range(20)), b"abcdefg"])
+def test_results_in_order(rig: Rig, mode: dict[str, int], items: Any) -> None:
+    seq = rig.give(tasks.square, items, **mode)
+    assert rig.channel.results(seq) == [x * x for x in items]
+
+
+@MODES
+def test_errors_in_their_places(rig: Rig, mode: dict[str, int]) -> None:
+    found = rig.channel.results(rig.give(tasks.raise_if_odd, range(30), **mode))
+    for x, value in enumerate(found):
+        if x % 2:
+            kind, error = value
+            assert (kind, error.args) == (work.ERROR, (x,))
+        else:
+            assert value == x
+
+
+@MODES
+def test_stop_iteration_does_not_end_a_batch(rig: Rig, mode: dict[str, int]) -> None:
+    found = rig.channel.results(rig.give(tasks.stop_iteration, range(10), **mode))
+    assert isinstance(found[3][1], StopIteration)
+    assert found[:3] + found[4:] == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+
+
+@MODES
+def test_starmap(rig: Rig, mode: dict[str, int]) -> None:
+    items = [(x, 10) for x in range(10)]
+    seq = rig.give(tasks.add, items, kind=work.STAR, **mode)
+    assert rig.channel.results(seq) == [x + 10 for x in range(10)]
+
+
+@MODES
+def test_results_that_do_not_pickle(rig: Rig, mode: dict[str, int]) -> None:
+    found = rig.channel.results(rig.give(tasks.unreprable_result, range(3), **mode))
+    assert [kind for kind, _ in found] == [work.ERROR] * 3
+
+
+def test_calls(rig: Rig) -> None:
+    seq = rig.call(
+        (tasks.add, (1,), {"y": 2}), (tasks.raise_value_error, (5,), {}), (tasks.pid, (), {})
+    )
+    found = rig.channel.results(seq)
+    assert found[0] == 3
+    assert found[1][1].args == (5,)
+    assert found[2] == tasks.pid()
+
+
+def test_a_call_that_does_not_unpickle(rig: Rig) -> None:
+    good = packet.dumps((tasks.square, (3,), {}))
+    message = work.pack_calls([(b"not a pickle", []), good])
+    seq = rig._handle(message, [])
+    (kind, error), nine = rig.channel.results(seq)
+    assert (kind, type(error), nine) == (work.ERROR, pickle.UnpicklingError, 9)
+
+
+# Snapshots
+
+
+def test_a_reused_object_is_sent_as_it_was(rig: Rig) -> None:
+    assert rig.channel.results(rig.give(tasks.grow, range(50))) == [[x] for x in range(50)]
+
+
+def test_a_reused_buffer_is_sent_before_it_is_used_again(rig: Rig) -> None:
+    pytest.importorskip("numpy")
+    seq = rig.give(tasks.fill, range(5))
+    assert [array[0] for array in rig.channel.results(seq)] == [0, 1, 2, 3, 4]
+    assert len(rig.channel.said) == 5
+
+
+# Functions
+
+
+def test_functions_are_remembered(rig: Rig) -> None:
+    rig.give(tasks.square, [1], identity=7)
+    assert rig.channel.results(rig.give(None, [3], identity=7)) == [9]
+
+
+def test_an_unknown_function_is_asked_for(rig: Rig) -> None:
+    seq = rig.give(None, [3], identity=9)
+    assert rig.channel.said == [(work.UNKNOWN, seq)]
+
+
+def test_the_oldest_functions_are_forgotten(rig: Rig) -> None:
+    for identity in range(FUNCTIONS + 1):
+        rig.give(tasks.square, [1], identity=identity)
+    assert rig.channel.results(rig.give(None, [3], identity=1)) == [9]
+    seq = rig.give(None, [3], identity=0)
+    assert rig.channel.said[-1] == (work.UNKNOWN, seq)
+
+
+def test_what_does_not_unpickle_is_reported(rig: Rig) -> None:
+    rig._handle(work.pack_batch(work.Head(work.MAP, 0, 1, 1, 4, 0), b"junk", b""), [])
+    kind, seq, error = rig.channel.said[-1]
+    assert (kind, seq) == (work.BROKEN, 1)
+    assert isinstance(pickle.loads(error), pickle.UnpicklingError)
+    rig.give(tasks.square, [1], identity=2)
+    rig._handle(work.pack_batch(work.Head(work.MAP, 0, 1, 2, 0, 0), b"", b"junk"), [])
+    kind, seq, error = rig.channel.said[-1]
+    assert (kind, seq) == (work.UNREADABLE, 3)
+
+
+def test_stop(rig: Rig) -> None:
+    payload = memoryview(work.SEQ.pack(0) + work.STOP_MESSAGE)
+    assert not rig.worker.handle(packet.Message(payload, [], []))
+
+
+# Notes
+
+
+def test_each_task_is_noted_before_it_runs(rig: Rig) -> None:
+    seen: list[tuple[int, int]] = []
+    tasks.state["note"] = lambda: seen.append((rig.board[0], rig.board[1]))
+    try:
+        seq = rig.give(note, range(4))
+    finally:
+        del tasks.state["note"]
+    assert seen == [(seq, 0), (seq, 1), (seq, 2), (seq, 3)]
+
+
+def test_of_short_tasks_each_few_are_noted(rig: Rig) -> None:
+    seen: list[int] = []
+    tasks.state["note"] = lambda: seen.append(rig.board[1])
+    try:
+        rig.give(note, range(7), stride=3)
+    finally:
+        del tasks.state["note"]
+    assert seen == [0, 0, 0, 3, 3, 3, 6]
+
+
+def note(_: object) -> None:
+    tasks.state["note"]()
+
+
+# The end of the process
+
+
+@MODES
+def test_what_was_done_before_sys_exit_is_sent(rig: Rig, mode: dict[str, int]) -> None:
+    with pytest.raises(SystemExit):
+        rig.give(exit_at_three, range(10), **mode)
+    assert rig.channel.results(1)[:3] == [0, 1, 2]
+    assert len(rig.channel.results(1)) == 3
+
+
+def exit_at_three(x: int) -> int:
+    if x == 3:
+        raise SystemExit(5)
+    return x
+
+
+def test_other_exceptions_are_the_tasks_own(rig: Rig) -> None:
+    ((_, error),) = rig.channel.results(rig.give(tasks.raise_exotic, [1]))
+    assert isinstance(error, tasks.Exotic)
+
+
+def test_errors_worth_a_retry_are_marked() -> None:
+    rig = Rig((LookupError,))
+    found = rig.channel.results(rig.give(raise_either, range(2)))
+    assert [kind for kind, _ in found] == [work.AGAIN, work.ERROR]
+
+
+def raise_either(x: int) -> None:
+    if x:
+        raise ValueError
+    raise KeyError
+
+
+# Giving back
+
+
+@pytest.mark.parametrize("stride", [0, 1, 50])
+def test_a_batch_that_blocks_is_taken_apart(rig: Rig, stride: int) -> None:
+    gate = threading.Event()
+    tasks.state["gate"] = gate
+    helper = threading.Thread(target=open_when_given_back, args=(rig, gate))
+    helper.start()
+    rig.give(block_at_two, list(range(100)), stride=stride)
+    helper.join()
+    first = rig.channel.said[0]
+    assert first[2] == 3, "what has not begun was not given back"
+    assert first[4] == ([0, 1] if stride < 2 else [])
+    assert rig.channel.results(1) == [0, 1, 2]
+
+
+def open_when_given_back(rig: Rig, gate: threading.Event) -> None:
+    rig.channel.wait_for(1)
+    gate.set()
+
+
+def block_at_two(x: int) -> int:
+    if x == 2:
+        assert tasks.state["gate"].wait(PATIENCE)
+    return x
+
+
+def test_a_batch_that_takes_too_long_gives_back_what_is_left(rig: Rig) -> None:
+    rig.give(slow, list(range(1000)), stride=5)
+    kept = [words[2] for words in rig.channel.said if words[2] is not None]
+    assert kept
+    assert rig.channel.results(1) == list(range(kept[0]))
+    assert kept[0] < 1000
+
+
+def test_chunks_are_not_taken_apart(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_module, "LONG_PATIENCE", 0.0)
+    rig.give(tasks.square, list(range(100)), stride=4, unit=10)
+    (kept,) = [words[2] for words in rig.channel.said if words[2] is not None]
+    assert kept == 10
+    assert rig.channel.results(1) == [x * x for x in range(10)]
+
+
+def slow(x: int) -> int:
+    time.sleep(0.002)
+    return x
+
+
+def test_a_short_batch_is_answered_once(rig: Rig) -> None:
+    for _ in range(20):
+        rig.give(tasks.square, range(50))
+    assert [words[0] for words in rig.channel.said] == list(range(1, 21))
