@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from faults.program import Program
-from fiber import config
-from fiber._runtime import state
+from faults.runtime import running
 
 BACKENDS = ("local", "loopback")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "slow: takes more than a few seconds")
+    config.addinivalue_line("markers", "lost_after(seconds): of silence, for the fixture `wire`")
 
 
 @pytest.fixture
@@ -60,20 +60,3 @@ def local() -> Iterator[None]:
     """The runtime of this very process, on the local backend."""
     with running(backend="local"):
         yield
-
-
-class running:
-    """A fresh runtime with the given settings, for a ``with`` block."""
-
-    def __init__(self, **settings: Any) -> None:
-        self._settings = settings
-
-    def __enter__(self) -> state.Runtime:
-        state.shutdown()
-        self._before = config._current
-        config.install(config.load(self._settings))
-        return state.runtime()
-
-    def __exit__(self, *_: object) -> None:
-        state.shutdown()
-        config._current = self._before

@@ -13,8 +13,8 @@ import pytest
 import census
 import fiber
 from faults import targets
-from faults.conftest import running
 from faults.program import PATIENCE, Program, alive, stop_and_wait, wait_for
+from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 
 LOST_AFTER = 1.5

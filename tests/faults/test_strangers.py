@@ -16,8 +16,8 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.conftest import running
 from faults.program import PATIENCE, wait_for
+from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 from fiber._transport.credentials import Credentials, make_credentials
 

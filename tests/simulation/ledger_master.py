@@ -152,7 +152,7 @@ class LedgerMaster:
         stop = min(start + plan.bite, len(plan.tasks))
         items = [Ref(account.number, index) for index in range(start, stop)]
         self.world.note("job %d is fed %d tasks", account.number, len(items))
-        self.ledger.feed(job, items if stop < len(plan.tasks) or start else tuple(items))
+        self.ledger.feed(job, self._rng.choice((items, items, tuple(items))))
         if not account.cancelled:  # otherwise they are for nobody
             self.world.oracle.fed(account.number, len(items))
         if stop < len(plan.tasks):

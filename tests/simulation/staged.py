@@ -118,9 +118,17 @@ class StagedDispatcher(Dispatcher):
         self._stage = stage
 
     def _send(self, batches: Iterable[Batch]) -> None:
-        batches = list(batches)
+        self._send_later(super()._send, list(batches))
+
+    def _send_safely(self, batches: Iterable[Batch]) -> None:
+        if self._loop.on_thread():
+            super()._send_safely(batches)
+        else:
+            self._send_later(super()._send_safely, list(batches))
+
+    def _send_later(self, send: Callable[[list[Batch]], None], batches: list[Batch]) -> None:
         if batches:
-            self._stage.soon(super()._send, batches)
+            self._stage.soon(send, batches)
 
 
 class WatchedLock:

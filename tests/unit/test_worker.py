@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import pickle
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pytest
@@ -89,8 +90,10 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Rig:
-    return Rig()
+def rig() -> Iterator[Rig]:
+    rig = Rig()
+    yield rig
+    rig.worker.close()
 
 
 MODES = pytest.mark.parametrize(
@@ -153,6 +156,20 @@ def test_a_call_that_does_not_unpickle(rig: Rig) -> None:
     seq = rig._handle(message, [])
     (kind, error), nine = rig.channel.results(seq)
     assert (kind, type(error), nine) == (work.ERROR, pickle.UnpicklingError, 9)
+
+
+def test_results_that_find_no_room_are_errors(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    send = rig.channel.send
+
+    def refuse(payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
+        if len(payload) > 10_000:
+            raise OSError(errno.ENOSPC, "no space left")
+        send(payload, buffers)
+
+    monkeypatch.setattr(rig.channel, "send", refuse)
+    found = rig.channel.results(rig.give(bytes, [3, 20_000]))
+    assert [(kind, error.errno) for kind, error in found] == [(work.ERROR, errno.ENOSPC)] * 2
+    assert rig.channel.results(rig.give(bytes, [3])) == [bytes(3)]
 
 
 # Snapshots
@@ -258,6 +275,7 @@ def test_other_exceptions_are_the_tasks_own(rig: Rig) -> None:
 def test_errors_worth_a_retry_are_marked() -> None:
     rig = Rig((LookupError,))
     found = rig.channel.results(rig.give(raise_either, range(2)))
+    rig.worker.close()
     assert [kind for kind, _ in found] == [work.AGAIN, work.ERROR]
 
 

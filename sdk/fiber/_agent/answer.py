@@ -143,10 +143,19 @@ class Answer:
         odd = [(at - first, kind, data, n) for at, kind, data, n in self._odd if at < stop]
         buffers = self._buffers[: sum(entry[3] for entry in odd)]
         now = time.perf_counter()
-        data = (self.seq, first, kept, now - self._mark, self.values[first:stop], odd)
-        self._channel.send(pickle.dumps(data, 5), buffers)
+        head = (self.seq, first, kept, now - self._mark)
+        done = len(odd)
+        try:
+            data = pickle.dumps((*head, self.values[first:stop], odd), 5)
+            self._channel.send(data, buffers)
+        except ConnectionError:
+            raise
+        except (OSError, MemoryError) as error:
+            # No memory or no descriptor for it here; to say so takes little of either.
+            odd = [(at, work.ERROR, encode_error(error), 0) for at in range(stop - first)]
+            self._channel.send(pickle.dumps((*head, [None] * len(odd), odd), 5))
         self._sent, self._mark = stop, now
-        del self._odd[: len(odd)], self._buffers[: len(buffers)]
+        del self._odd[:done], self._buffers[: len(buffers)]
 
 
 def encode_error(error: BaseException) -> bytes:

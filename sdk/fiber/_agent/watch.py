@@ -28,6 +28,7 @@ class Watch:
         self._asleep = False
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._started = False
+        self._stopped = False
 
     def begin(self, answer: Answer) -> None:
         """The batch of ``answer`` starts to run."""
@@ -43,9 +44,14 @@ class Watch:
         """It has run."""
         self._watched = None
 
+    def stop(self) -> None:
+        """There will be no more."""
+        self._stopped = True
+        self._wake.put(None)
+
     def _run(self) -> None:
         seen = None
-        while True:
+        while not self._stopped:
             # Nothing to watch, or nothing more to do for it.  What begins between these lines is
             # seen by the second; what begins later puts something in.
             self._asleep = True

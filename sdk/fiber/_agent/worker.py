@@ -42,13 +42,13 @@ def run(
             raise SystemExit(1) from None
     channel.send(pickle.dumps((work.READY,)))
     worker = Worker(channel, child.progress(), retryable)
-    while True:
+    more = True
+    while more:
         try:
-            message = channel.recv()
-        except (EOFError, OSError):
-            return
-        if not worker.handle(message):
-            return
+            more = worker.handle(channel.recv())
+        except (EOFError, ConnectionError):  # the agent is gone
+            more = False
+    worker.close()
 
 
 class Worker:
@@ -62,6 +62,10 @@ class Worker:
         self._retryable = retryable
         self._functions: OrderedDict[int, _Function] = OrderedDict()
         self._watch = Watch()
+
+    def close(self) -> None:
+        """End its second thread, if it has one."""
+        self._watch.stop()
 
     def handle(self, message: Message) -> bool:
         """Run and answer one message; False if it says to stop."""

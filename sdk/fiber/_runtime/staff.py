@@ -21,6 +21,10 @@ from fiber._runtime.workers import Link, dismiss
 from fiber._transport.loop import Loop, Timer
 
 
+TICK = 1e-4
+"""Seconds that any timer waits: less, by a rounding error, would be too early again and again."""
+
+
 class Terms(NamedTuple):
     """What a pool promises its workers and callers."""
 
@@ -109,7 +113,8 @@ class Staff(ABC):
     def _later(self, name: str, seconds: float, action: Callable[[], None]) -> None:
         """Do something once the time comes, unless that is intended already.  Lock held."""
         if name not in self._timers:
-            self._timers[name] = self._loop.call_later(max(seconds, 0.0), self._due, name, action)
+            delay = max(seconds, TICK)
+            self._timers[name] = self._loop.call_later(delay, self._due, name, action)
 
     def _due(self, name: str, action: Callable[[], None]) -> None:
         with self._lock:
