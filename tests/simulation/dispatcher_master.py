@@ -35,6 +35,9 @@ class BrokenInput(Exception):
     """What an iterable raises instead of its next item."""
 
 
+MOST = 100
+"""Tasks of one job; more would only take longer."""
+
 ERROR = pickle.dumps(ValueError("as planned"))
 
 
@@ -441,4 +444,5 @@ def _for_pool(job: Job, retries: int) -> Job:
     if job.everywhere:  # a broadcast has no timeout
         tasks = tuple(task for task in job.tasks if task.act is not Act.ENDLESS)
         job = replace(job, tasks=tasks or (Task(1e-3),), timeout=None)
-    return replace(job, retries=retries, alone=job.timeout is not None)
+    tasks = job.tasks[:MOST]
+    return replace(job, tasks=tasks, retries=retries, alone=job.timeout is not None)

@@ -11,10 +11,10 @@ from simulation.ledger_master import LedgerMaster
 from simulation.remote_hosts import RemoteHost
 from simulation.world import World
 
-SCHEDULES = int(os.environ.get("SIMULATION_SCHEDULES", "3000"))
+SCHEDULES = int(os.environ.get("SIMULATION_SCHEDULES", "2500"))
 """Seeds for the ledger in one test session; the slower suites run a part of them."""
 
-PARTS = 10
+PARTS = 5
 """Tests over which a suite is spread."""
 
 

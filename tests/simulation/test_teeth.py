@@ -294,9 +294,9 @@ TELLING = {
 @pytest.mark.parametrize("suite", TELLING)
 def test_everything_happens(suite: str) -> None:
     kinds: Counter[str] = Counter()
-    for seed in SEEDS:
+    for seed in range(150):
         trace: list[str] = []
         run(draw(seed), SUITES[suite], trace)
         text = "\n".join(trace)
         kinds.update(word for word in TELLING[suite] if word in text)
-    assert not [word for word in TELLING[suite] if kinds[word] < 2], kinds
+    assert not [word for word in TELLING[suite] if kinds[word] < 1], kinds

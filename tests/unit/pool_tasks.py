@@ -332,3 +332,14 @@ def current_name(_: object = None) -> tuple[str, bool]:
 
     process = multiprocessing.current_process()
     return process.name, process.daemon
+
+
+class Tattling:
+    """Says when it is pickled."""
+
+    def __init__(self, n: int) -> None:
+        self.n = n
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state["pickled"].append(self.n)
+        return int, (self.n,)

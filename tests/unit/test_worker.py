@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from fiber._agent import worker as worker_module
+from fiber._agent.watch import Watch
 from fiber._agent.worker import FUNCTIONS, Worker
 from fiber._wire import packet, work
 from unit import pool_tasks as tasks
@@ -90,7 +91,15 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
+def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
+    """A worker that takes its time: however slow this machine is, it gives nothing back."""
+    monkeypatch.setattr(Watch, "begin", lambda self, answer: None)
+    monkeypatch.setattr(worker_module, "LONG_PATIENCE", 60.0)
+    return Rig()
+
+
+@pytest.fixture
+def impatient() -> Iterator[Rig]:
     rig = Rig()
     yield rig
     rig.worker.close()
@@ -274,8 +283,7 @@ def test_other_exceptions_are_the_tasks_own(rig: Rig) -> None:
 
 def test_errors_worth_a_retry_are_marked() -> None:
     rig = Rig((LookupError,))
-    found = rig.channel.results(rig.give(raise_either, range(2)))
-    rig.worker.close()
+    found = rig.channel.results(rig.give(raise_either, range(2), stride=1, unit=2))
     assert [kind for kind, _ in found] == [work.AGAIN, work.ERROR]
 
 
@@ -289,17 +297,17 @@ def raise_either(x: int) -> None:
 
 
 @pytest.mark.parametrize("stride", [0, 1, 50])
-def test_a_batch_that_blocks_is_taken_apart(rig: Rig, stride: int) -> None:
+def test_a_batch_that_blocks_is_taken_apart(impatient: Rig, stride: int) -> None:
     gate = threading.Event()
     tasks.state["gate"] = gate
-    helper = threading.Thread(target=open_when_given_back, args=(rig, gate))
+    helper = threading.Thread(target=open_when_given_back, args=(impatient, gate))
     helper.start()
-    rig.give(block_at_two, list(range(100)), stride=stride)
+    impatient.give(block_at_two, list(range(100)), stride=stride)
     helper.join()
-    first = rig.channel.said[0]
+    first = impatient.channel.said[0]
     assert first[2] == 3, "what has not begun was not given back"
     assert first[4] == ([0, 1] if stride < 2 else [])
-    assert rig.channel.results(1) == [0, 1, 2]
+    assert impatient.channel.results(1) == [0, 1, 2]
 
 
 def open_when_given_back(rig: Rig, gate: threading.Event) -> None:
@@ -313,11 +321,11 @@ def block_at_two(x: int) -> int:
     return x
 
 
-def test_a_batch_that_takes_too_long_gives_back_what_is_left(rig: Rig) -> None:
-    rig.give(slow, list(range(1000)), stride=5)
-    kept = [words[2] for words in rig.channel.said if words[2] is not None]
+def test_a_batch_that_takes_too_long_gives_back_what_is_left(impatient: Rig) -> None:
+    impatient.give(slow, list(range(1000)), stride=5)
+    kept = [words[2] for words in impatient.channel.said if words[2] is not None]
     assert kept
-    assert rig.channel.results(1) == list(range(kept[0]))
+    assert impatient.channel.results(1) == list(range(kept[0]))
     assert kept[0] < 1000
 
 

@@ -20,7 +20,6 @@ from fiber._runtime.requests import Sink
 from fiber._runtime.workers import Link, dismiss
 from fiber._transport.loop import Loop, Timer
 
-
 TICK = 1e-4
 """Seconds that any timer waits: less, by a rounding error, would be too early again and again."""
 
