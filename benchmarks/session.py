@@ -54,7 +54,7 @@ class Session:
                 stderr=log,
                 cwd=scratch,
                 env=_environment(contender, scratch),
-                start_new_session=True,  # Ctrl-C is for the run, which stops the contenders
+                process_group=0,  # Ctrl-C is for the run, which stops the contenders
             )
 
     @property

@@ -11,7 +11,7 @@ from simulation.ledger_master import LedgerMaster
 from simulation.remote_hosts import RemoteHost
 from simulation.world import World
 
-SCHEDULES = int(os.environ.get("SIMULATION_SCHEDULES", "2500"))
+SCHEDULES = int(os.environ.get("SIMULATION_SCHEDULES", "2000"))
 """Seeds for the ledger in one test session; the slower suites run a part of them."""
 
 PARTS = 5

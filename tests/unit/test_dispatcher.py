@@ -11,7 +11,7 @@ import pytest
 
 from fiber._agent.port import ExitReport
 from fiber._engine.ledger import PATIENCE
-from fiber._runtime import exchange, requests, workers
+from fiber._runtime import exchange, workers
 from fiber._runtime.dispatcher import Dispatcher
 from fiber._runtime.outcome import Encoded, Failure
 from fiber._runtime.staff import Terms
@@ -136,6 +136,14 @@ class Rig:
         for link in list(self.links):
             self.say(link, work.READY)
 
+    def close(self) -> None:
+        """End it, and find nothing left."""
+        self.dispatcher.terminate(RuntimeError("the test is over"))
+        for link in list(self.dispatcher.crew.links):
+            self.lose(link)
+        assert self.dispatcher.ended.is_set()
+        assert not self.loop.timers
+
     def _start(self, process: Any, observer: Link, *, tasks: bool, method: str) -> Port:
         port = Port(process.name)
         self.ports.append(port)
@@ -167,11 +175,7 @@ class Rig:
 def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     rig = Rig(monkeypatch, 2)
     yield rig
-    rig.dispatcher.terminate(RuntimeError("the test is over"))
-    for link in list(rig.dispatcher.crew.links):
-        rig.lose(link)
-    assert rig.dispatcher.ended.is_set()
-    assert not rig.loop.timers
+    rig.close()
 
 
 def test_a_map(rig: Rig) -> None:
@@ -314,10 +318,3 @@ def test_lost_workers_are_replaced_elsewhere_than_on_the_loop(rig: Rig) -> None:
     assert len(rig.links) == 2
     rig.pump.run()
     assert len(rig.links) == 3
-
-
-def test_an_object_that_many_buffers_belong_to_travels_whole() -> None:
-    np = pytest.importorskip("numpy")
-    many = [np.zeros(1000) for _ in range(work.BUFFERS + 1)]
-    _, buffers = requests._encode_items([many])
-    assert buffers == []

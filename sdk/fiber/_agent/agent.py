@@ -27,7 +27,7 @@ from typing import Any
 from fiber._agent import child as child_module
 from fiber._agent import zygote
 from fiber._agent.board import Board
-from fiber._agent.child import interpreter_arguments
+from fiber._agent.child import Start, interpreter_arguments
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._hub import access
 from fiber._hub.access import Access
@@ -322,7 +322,7 @@ class _ZygoteLink:
         while len(fds) > packet.MAX_DESCRIPTORS:
             some, fds = fds[: packet.MAX_DESCRIPTORS], fds[packet.MAX_DESCRIPTORS :]
             self._outbox.send(pickle.dumps((zygote.DESCRIPTORS,)), fds=some)
-        start = zygote.Start(
+        start = Start(
             spec.method,
             spec.preparation,
             spec.payload,

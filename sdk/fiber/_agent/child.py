@@ -15,14 +15,12 @@ import traceback
 from collections.abc import Iterator
 from multiprocessing import process as mp_process
 from multiprocessing import util
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, NamedTuple, cast
 
 from fiber._agent.board import Board
 from fiber._hub import access
+from fiber._hub.access import Access
 from fiber._transport.unix import UnixChannel
-
-if TYPE_CHECKING:
-    from fiber._agent.zygote import Start
 
 _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -36,6 +34,25 @@ not start.
 """
 host = ""
 """The host that this process belongs to; empty in a program that Fiber did not start."""
+
+
+class Start(NamedTuple):
+    """What a zygote is told of one child, and the child of itself; descriptors come beside it."""
+
+    method: str
+    preparation: bytes
+    payload: bytes
+    slot: int | None
+    """Its place on the progress board; a worker's first descriptor is its task channel."""
+    executable: str | None
+    captured: bool
+    """Whether its output goes to its agent, which wants it line by line."""
+    open_files: tuple[int, int]
+    """Its limits of descriptors, soft and hard: those of its agent's process."""
+    hub: Access | None
+    """Where it finds the hub of its host."""
+    elders: tuple[int, ...]
+    """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
 
 
 def task_channel() -> UnixChannel:
@@ -208,8 +225,6 @@ def interpreter_arguments(executable: str, statement: str) -> list[str]:
 
 def spawned(plan_fd: int) -> None:
     """Entry point of a child in an interpreter of its own."""
-    from fiber._agent.zygote import Start
-
     with os.fdopen(plan_fd, "rb") as file:
         file.seek(0)
         fields, fds, board, agent = pickle.load(file)

@@ -27,11 +27,11 @@ import threading
 import time
 import traceback
 import warnings
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 from fiber._agent import child as child_module
 from fiber._agent.board import Board
-from fiber._hub.access import Access
+from fiber._agent.child import Start
 from fiber._wire import packet
 
 START, SIGNAL, DESCRIPTORS, QUIT = range(4)
@@ -42,25 +42,6 @@ _HELD = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 GRACE = 0.75
 """Seconds that children have, after the agent's process died, to notice it and end by themselves.
 """
-
-
-class Start(NamedTuple):
-    """What a zygote is told of one child; the descriptors come beside it."""
-
-    method: str
-    preparation: bytes
-    payload: bytes
-    slot: int | None
-    """Its place on the progress board; a worker's first descriptor is its task channel."""
-    executable: str | None
-    captured: bool
-    """Whether its output goes to its agent, which wants it line by line."""
-    open_files: tuple[int, int]
-    """Its limits of descriptors, soft and hard: those of its agent's process."""
-    hub: Access | None
-    """Where it finds the hub of its host."""
-    elders: tuple[int, ...]
-    """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
 
 
 class Zygote:

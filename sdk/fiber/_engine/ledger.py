@@ -193,12 +193,8 @@ class Ledger:
         return bool(self._roster.idle or self._roster.single)
 
     def demand(self) -> int:
-        """Tasks that wait or run: as many workers could be used."""
-        waiting = sum(len(job.waiting) for job in self._turns)
-        wanted = (batch for batch in self.batches.values() if batch.job is not None)
-        running = sum(len(batch.items) - batch.received for batch in wanted)
-        pinned = sum(len(worker.pinned) for worker in self._pins)
-        return waiting + running + pinned + len(self._homeless)
+        """Tasks that wait or run."""
+        return sum(job.fed - job.done for job in self.jobs)
 
     # Giving
 

@@ -59,10 +59,14 @@ class Crew:
         """Those that were not told to go."""
         return [link for link in self.links if not link.leaving]
 
+    def wanted(self, demand: int) -> int:
+        """How many workers there should be for so many tasks."""
+        return min(max(demand, self.minimum), self.maximum)
+
     def missing(self, demand: int, newcomers: int) -> int:
         """Workers to order for so many tasks, ``newcomers`` of which only new workers may run."""
-        wanted = min(max(demand, self.minimum), self.maximum) - self.size
-        return max(wanted, min(newcomers - self.starting, self.maximum - self.size), 0)
+        missing = self.wanted(demand) - self.size
+        return max(missing, min(newcomers - self.starting, self.maximum - self.size), 0)
 
     def pause(self) -> float:
         """Seconds to wait before the next order, after what happened to the last ones."""

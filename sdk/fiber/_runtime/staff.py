@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from fiber._engine.ledger import Batch, Job, Ledger
+from fiber._engine.ledger import Batch, Job, Ledger, Worker
 from fiber._runtime.crew import Crew
 from fiber._runtime.pump import Pump
 from fiber._runtime.requests import Sink
@@ -174,20 +174,26 @@ class Staff(ABC):
 
     def _watch_idle(self) -> None:
         """Look again when the worker that has been idle for longest may leave.  Lock held."""
-        idle = self._ledger.longest_idle()
+        idle = self._longest_idle()
         if idle is not None:
             due = idle.since + self.terms.idle_timeout
             self._later("idle", due - self._loop.now(), self._thin_out)
 
+    def _longest_idle(self) -> Worker | None:
+        """The worker that may leave first, if there are more than there should be."""
+        idle = self._ledger.longest_idle()
+        if idle is None or self.crew.size <= self.crew.wanted(self._ledger.demand()):
+            return None
+        return idle
+
     def _thin_out(self) -> None:
-        """Let go workers above the minimum that have had nothing to do for a while."""
+        """Let go workers that have had nothing to do for a while."""
         leaving: list[Link] = []
         with self._lock:
             now, timeout = self._loop.now(), self.terms.idle_timeout
-            while self.crew.size > self.crew.minimum:
-                idle = self._ledger.longest_idle()
+            while (idle := self._longest_idle()) is not None and now >= idle.since + timeout:
                 # The ledger has the last word: one that was given work since stays.
-                if idle is None or now < idle.since + timeout or not self._ledger.leave(idle):
+                if not self._ledger.leave(idle):
                     break
                 self.crew.let_go(idle.key)
                 leaving.append(idle.key)

@@ -34,6 +34,9 @@ class Supervisor(Protocol):
 class Link:
     """One worker's process as its pool sees it; also the ``Popen`` behind its Process object."""
 
+    sentinel = -1
+    """What a Process asks for when it starts; ``PoolProcess`` has a real one, if wanted."""
+
     def __init__(self, supervisor: Supervisor) -> None:
         self.process: PoolProcess | None = None
         """Once it is started."""
@@ -51,7 +54,7 @@ class Link:
         self._pid: int | None = None
         self._born = threading.Event()
         self._exited = threading.Event()
-        self._sentinel: int | None = None
+        self._exit: int | None = None
 
     @property
     def name(self) -> str:
@@ -82,8 +85,8 @@ class Link:
         self.returncode = report.exitcode
         self._exited.set()
         self._born.set()
-        if self._sentinel is not None:
-            os.eventfd_write(self._sentinel, 1)
+        if self._exit is not None:
+            os.eventfd_write(self._exit, 1)
         mp_process._children.discard(self.process)  # type: ignore[attr-defined]
         self._supervisor.lost(self, report)
 
@@ -96,14 +99,13 @@ class Link:
             self._born.wait(runtime().config.start_timeout)
         return self._pid
 
-    @property
-    def sentinel(self) -> int:
+    def exit_descriptor(self) -> int:
         """A descriptor that becomes readable when it is gone; made when first asked for."""
-        if self._sentinel is None:
-            self._sentinel = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        if self._exit is None:
+            self._exit = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
             if self.returncode is not None:
-                os.eventfd_write(self._sentinel, 1)
-        return self._sentinel
+                os.eventfd_write(self._exit, 1)
+        return self._exit
 
     def poll(self) -> int | None:
         """The exit code, None while it runs."""
@@ -128,10 +130,10 @@ class Link:
         self.signal(signal.SIGKILL)
 
     def close(self) -> None:
-        """Give the sentinel's descriptor back."""
-        sentinel, self._sentinel = self._sentinel, None
-        if sentinel is not None:
-            os.close(sentinel)
+        """Give the descriptor back."""
+        descriptor, self._exit = self._exit, None
+        if descriptor is not None:
+            os.close(descriptor)
 
     def __del__(self) -> None:
         self.close()
@@ -162,7 +164,7 @@ class PoolProcess(Process):
         """As in multiprocessing."""
         self._check_closed()  # type: ignore[attr-defined]
         assert self._link is not None
-        return self._link.sentinel
+        return self._link.exit_descriptor()
 
 
 def dismiss(links: Iterable[Link]) -> None:
