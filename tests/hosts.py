@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import pickle
+import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from fiber._hub import access, grants
 from fiber._hub.hub import Hub
@@ -96,3 +99,24 @@ class Hosts:
         for hub in self._hubs.values():
             self.loop.call_soon(hub.close)
         self.loop.stop()
+
+
+PATIENCE = 15.0
+
+
+class Far:
+    """Brings what lives on host a to this process on host b."""
+
+    def __init__(self, hosts: Hosts) -> None:
+        self._hosts = hosts
+
+    def __call__(self, thing: Any) -> Any:
+        with self._hosts.at("a"):
+            data = pickle.dumps(thing)
+        return pickle.loads(data)
+
+
+def background(function: Callable[..., Any], *args: Any) -> threading.Thread:
+    thread = threading.Thread(target=function, args=args)
+    thread.start()
+    return thread

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from faults.program import Program
+from faults.program import LOOPBACK, Program
 from faults.runtime import running
 
 BACKENDS = ("local", "loopback")
@@ -39,7 +39,8 @@ def launch_on(
     """``launch`` on each backend in turn."""
 
     def start(script: str, *arguments: str, **options: Any) -> Program:
-        env = {"FIBER_BACKEND": request.param, **options.pop("env", {})}
+        env = LOOPBACK if request.param == "loopback" else {}
+        env = {**env, **options.pop("env", {})}
         return launch(script, *arguments, env=env, **options)
 
     return start

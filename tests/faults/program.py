@@ -25,6 +25,9 @@ import census
 PATIENCE = 20.0
 """Seconds that a program may take for one step; a busy machine is slow."""
 
+LOOPBACK = {"FIBER_BACKEND": "loopback", "FIBER_AGENTS": "1"}
+"""The environment that puts a program's processes behind an agent."""
+
 GONE = 2.0
 """Seconds after the end of a program within which nothing of it may be left."""
 

@@ -13,7 +13,7 @@ import pytest
 import census
 import fiber
 from faults import targets
-from faults.program import PATIENCE, Program, alive, stop_and_wait, wait_for
+from faults.program import LOOPBACK, PATIENCE, Program, alive, stop_and_wait, wait_for
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 
@@ -180,5 +180,5 @@ def test_after_good_work_agents_end_with_status_0(launch: Callable[..., Program]
             state.shutdown()
             print({agent.returncode for agent in agents})
     """
-    program = launch(script, env={"FIBER_BACKEND": "loopback"})
+    program = launch(script, env=LOOPBACK)
     assert program.finish() == "{0}\n"

@@ -106,7 +106,7 @@ NO_NUMBER = """
 def test_a_number_of_processes_that_is_none(
     launch: Callable[..., Program], processes: object
 ) -> None:
-    assert launch(NO_NUMBER.format(processes=processes)).rest() == "True\n"
+    assert launch(NO_NUMBER.format(processes=processes)).rest(3) == "True\n"
 
 
 @pytest.mark.xfail(strict=True, reason="Pool.__del__ needs what __init__ did not get to")

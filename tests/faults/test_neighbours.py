@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from faults.program import Program
+from faults.program import LOOPBACK, Program
 
 FORKS = """
     import fiber, os, sys
@@ -42,12 +42,19 @@ DAEMON = "daemon = fiber.Process(target=targets.block, daemon=True); daemon.star
 @pytest.mark.parametrize("before", ["pass", "use('before the fork')", DAEMON])
 @pytest.mark.parametrize("end", ["sys.exit(code)", "os._exit(code)"])
 def test_a_program_that_forks_itself_uses_it_in_both(
-    launch_on: Callable[..., Program], before: str, end: str
+    launch: Callable[..., Program], before: str, end: str
 ) -> None:
     after = "print(daemon.is_alive())" if before == DAEMON else "pass"
-    program = launch_on(FORKS.format(before=before, end=end, after=after))
+    program = launch(FORKS.format(before=before, end=end, after=after))
     expected = "0 0 0\n" + ("True\n" if before == DAEMON else "")
     assert program.finish() == expected
+    assert program.stderr == ""
+
+
+def test_one_that_has_agents_does_too(launch: Callable[..., Program]) -> None:
+    script = FORKS.format(before=DAEMON, end="sys.exit(code)", after="print(daemon.is_alive())")
+    program = launch(script, env=LOOPBACK)
+    assert program.finish() == "0 0 0\nTrue\n"
     assert program.stderr == ""
 
 
@@ -81,9 +88,9 @@ BESIDE_MULTIPROCESSING = """
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
-def test_multiprocessing_beside_it(launch_on: Callable[..., Program], method: str) -> None:
-    # multiprocessing's resource tracker ends a moment after the program.
-    program = launch_on(BESIDE_MULTIPROCESSING.format(method=method))
+def test_multiprocessing_beside_it(launch: Callable[..., Program], method: str) -> None:
+    env = LOOPBACK if method == "fork" else {}
+    program = launch(BESIDE_MULTIPROCESSING.format(method=method), env=env)
     assert program.finish() == "9\n0 True\n[1] [2]\n['Process']\n-15 []\n"
     assert program.stderr == ""
 
@@ -103,8 +110,8 @@ MULTIPROCESSING_INSIDE = """
 """
 
 
-def test_multiprocessing_inside_it(launch_on: Callable[..., Program]) -> None:
-    assert launch_on(MULTIPROCESSING_INSIDE).finish() == "[1, 2]\n0\n"
+def test_multiprocessing_inside_it(launch: Callable[..., Program]) -> None:
+    assert launch(MULTIPROCESSING_INSIDE).finish() == "[1, 2]\n0\n"
 
 
 SUBPROCESS = """
@@ -123,9 +130,9 @@ SUBPROCESS = """
 
 
 def test_subprocesses_of_both_sides_are_reaped_by_whoever_started_them(
-    launch_on: Callable[..., Program],
+    launch: Callable[..., Program],
 ) -> None:
-    assert launch_on(SUBPROCESS).finish() == "(3, 'inside\\n')\n0\n"
+    assert launch(SUBPROCESS).finish() == "(3, 'inside\\n')\n0\n"
 
 
 ORPHANS = """
@@ -177,9 +184,10 @@ SIGCHLD = """
     ],
 )
 def test_a_program_with_its_own_idea_of_signals(
-    launch_on: Callable[..., Program], handling: str
+    launch: Callable[..., Program], handling: str
 ) -> None:
-    assert launch_on(SIGCHLD.format(handling=handling)).finish() == "9\n[1, 2]\n"
+    env = LOOPBACK if "mask" in handling else {}
+    assert launch(SIGCHLD.format(handling=handling), env=env).finish() == "9\n[1, 2]\n"
 
 
 THREADS = """
@@ -249,5 +257,5 @@ THREADED_MAIN = """
 """
 
 
-def test_a_main_module_whose_import_starts_threads(launch_on: Callable[..., Program]) -> None:
-    assert launch_on(THREADED_MAIN).finish() == "9\n9\n9\n9\n[1, 2]\n"
+def test_a_main_module_whose_import_starts_threads(launch: Callable[..., Program]) -> None:
+    assert launch(THREADED_MAIN).finish() == "9\n9\n9\n9\n[1, 2]\n"

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from faults.program import Program
+from faults.program import LOOPBACK, Program
 
 UNCAUGHT = """
     import fiber, sys
@@ -85,13 +85,14 @@ ANSWER = """
 
 @pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)], ids=str)
 def test_a_program_whose_standard_streams_are_closed(
-    launch_on: Callable[..., Program], closed: tuple[int, ...]
+    launch: Callable[..., Program], closed: tuple[int, ...]
 ) -> None:
     def close() -> None:
         for fd in closed:
             os.close(fd)
 
-    program = launch_on(ANSWER, stdout=subprocess.DEVNULL, preexec_fn=close)
+    env = LOOPBACK if len(closed) > 1 else {}
+    program = launch(ANSWER, stdout=subprocess.DEVNULL, preexec_fn=close, env=env)
     assert program.wait() == 0
     assert program.answer == "5\n5\n"
     assert program.left() == []
@@ -137,7 +138,7 @@ WRITES_A_LOT = """
 
 
 def test_much_output_arrives_whole_and_in_order(launch: Callable[..., Program]) -> None:
-    program = launch(WRITES_A_LOT, env={"FIBER_BACKEND": "loopback"})
+    program = launch(WRITES_A_LOT, env=LOOPBACK)
     assert program.finish() == "0\n"
     lines = [line for line in program.stderr.splitlines() if line.startswith("[loud@")]
     assert [int(line.split()[-1]) for line in lines] == list(range(20_000))

@@ -90,15 +90,16 @@ def test_a_working_directory_that_is_gone(launch_on: Callable[..., Program], fol
     assert program.left() == []
 
 
-def test_a_home_that_does_not_exist(launch_on: Callable[..., Program]) -> None:
-    program = launch_on(WORK, env={"HOME": "/no/such/home"})
+def test_a_home_that_does_not_exist(launch: Callable[..., Program]) -> None:
+    program = launch(WORK, env={"HOME": "/no/such/home"})
     assert program.finish() == "1\n[1, 2]\n"
 
 
 def test_an_almost_empty_environment(launch_on: Callable[..., Program]) -> None:
     script = WORK.replace(
         "ours, theirs = fiber.Pipe()",
-        "kept = {k: os.environ[k] for k in ('FIBER_BACKEND', 'TMPDIR', 'FAULTS_PROGRAM')}\n"
+        "keep = ('FIBER_BACKEND', 'FIBER_AGENTS', 'TMPDIR', 'FAULTS_PROGRAM')\n"
+        "        kept = {key: os.environ[key] for key in keep if key in os.environ}\n"
         "        os.environ.clear(); os.environ.update(kept)\n"
         "        ours, theirs = fiber.Pipe()",
     )

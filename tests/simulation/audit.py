@@ -108,14 +108,17 @@ class Audit:
             _require(batch.pin is (pinned_to is not None), "a pinned task is not marked")
             _require(pinned_to in (None, worker), "a task runs where it is not pinned to")
             if not batch.pin:
-                self._check_turns(batch.job)
+                self._check_turns(batch.job, worker)
         return batch
 
-    def _check_turns(self, job: Job) -> None:
+    def _check_turns(self, job: Job, given: Worker) -> None:
         """``job`` is given a worker: others that wait must get their turns."""
+        workers = self._ledger.workers
+        # Another one with a single batch is kept free for whoever needs an idle worker.
+        passed = not any(len(worker.queue) == 1 for worker in workers if worker is not given)
         waiting = [other for other in self._ledger.jobs if other.waiting and other is not job]
-        fair = PASSES * (len(self._ledger.jobs) + len(self._ledger.workers))
-        self._patience = {other: self._patience.get(other, fair) - 1 for other in waiting}
+        fair = PASSES * (len(self._ledger.jobs) + len(workers))
+        self._patience = {other: self._patience.get(other, fair) - passed for other in waiting}
         least = min(self._patience.values(), default=0)
         _require(least >= 0, "a job waits while others get all the workers")
 

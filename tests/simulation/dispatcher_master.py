@@ -35,6 +35,9 @@ class BrokenInput(Exception):
     """What an iterable raises instead of its next item."""
 
 
+GRACE = 0.1
+"""Seconds within which a pool must have ordered the workers that it needs."""
+
 MOST = 100
 """Tasks of one job; more would only take longer."""
 
@@ -216,6 +219,7 @@ class DispatcherMaster:
         self._sinks: dict[int, Outcomes] = {}
         self._actors: list[Actor] = []
         self._open_calls: dict[int, int] = {}
+        self._short_since: float | None = None
 
     def begin(self) -> None:
         """Start the workers, and plan the jobs."""
@@ -382,12 +386,25 @@ class DispatcherMaster:
         self._check_size()
 
     def _check_size(self) -> None:
+        if not self._is_short():
+            self._short_since = None
+        elif self._short_since is None:
+            self._short_since = self.world.loop.now()
+            self._later(GRACE, self._check_still_short, self._short_since)
+
+    def _check_still_short(self, since: float) -> None:
+        if self._short_since == since:
+            raise Violation("there is work, but the pool does not grow")
+
+    def _is_short(self) -> bool:
+        """Whether there is work for more workers, and none are on their way."""
         crew = self._dispatcher.crew
-        if self._dispatcher._closing or crew.error or crew.pause():
-            return
-        waiting = sum(len(job.waiting) for job in self._ledger.jobs)
-        if waiting and not crew.starting and crew.size < crew.maximum:
-            raise Violation(f"{waiting} tasks wait, but the pool does not grow")
+        if self._dispatcher._closing or crew.error or crew.pause() or crew.starting:
+            return False
+        tasks = sum(job.fed - job.done for job in self._ledger.jobs)
+        # A worker that still runs what was cancelled is not there for the others.
+        lost = sum(bool(it.queue) and it.queue[0].job is None for it in self._ledger.workers)
+        return bool(tasks) and crew.size < min(tasks + lost, crew.maximum)
 
     def check_end(self) -> None:
         """All is quiet: then the pool closes, and nothing stays behind."""
@@ -397,6 +414,7 @@ class DispatcherMaster:
             if missing and not excused:
                 raise Violation(f"only {account.fed} tasks of job {account.number} were fed")
         if not self._dispatcher._closing:
+            self._check_rest()
             self.drain()
         self.world.run_out()
         if not self._dispatcher.ended.is_set():
@@ -406,6 +424,14 @@ class DispatcherMaster:
         for worker in self.world.workers:
             if worker.born and not worker.dead:
                 raise Violation(f"{worker.name} outlives the pool")
+
+    def _check_rest(self) -> None:
+        """Nothing was to be done for long."""
+        crew = self._dispatcher.crew
+        if self.world.has_links or crew.error or crew.pause():
+            return
+        if crew.size != crew.minimum:
+            raise Violation(f"the pool rests with {crew.size} workers")
 
     def done(self) -> bool:
         """Every job is over, and the pool too if it was closed."""
@@ -430,7 +456,7 @@ def _terms(schedule: Schedule) -> Terms:
         maxtasks=schedule.left,
         retries=schedule.jobs[0].retries,
         retryable=(Again,),
-        idle_timeout=schedule.linger or 60.0,
+        idle_timeout=60.0 if schedule.linger is None else schedule.linger + 1e-3,
     )
 
 

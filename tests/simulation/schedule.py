@@ -121,6 +121,13 @@ class Repeat:
 
 
 @dataclass(frozen=True, slots=True)
+class Refusal:
+    """The ``start``-th time that a worker is to be started the system says no."""
+
+    start: int
+
+
+@dataclass(frozen=True, slots=True)
 class Drain:
     """Some worker is asked to leave."""
 
@@ -134,7 +141,9 @@ class Terminate:
     at: float
 
 
-Fault: TypeAlias = Crash | Kill | StillBirth | Stop | Slow | Cut | Repeat | Drain | Terminate
+Fault: TypeAlias = (
+    Crash | Kill | StillBirth | Stop | Slow | Cut | Repeat | Refusal | Drain | Terminate
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +249,7 @@ class _Draw:
 
     def faults(self, workers: int, remote: int) -> Iterator[Fault]:
         rng = self.rng
-        kinds = ["crash", "crash", "kill", "birth", "stop", "slow", "repeat", "drain"]
+        kinds = ["crash", "crash", "kill", "birth", "stop", "slow", "repeat", "refusal", "drain"]
         kinds += ["cut"] * (3 if remote else 0)
         for _ in range(rng.choice((0, 1, 1, 2, 4, 8))):
             # Also those workers that replace the first ones.
@@ -258,6 +267,8 @@ class _Draw:
                     yield Slow(worker, rng.choice((3.0, 100.0)))
                 case "repeat":
                     yield Repeat(worker, rng.randint(1, 10))
+                case "refusal":
+                    yield Refusal(workers + rng.randint(1, 5))
                 case "drain":
                     yield Drain(self.time())
                 case "cut":

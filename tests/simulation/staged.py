@@ -24,6 +24,7 @@ from fiber._runtime.dispatcher import Dispatcher, Terms
 from fiber.process import Process
 from simulation.agents import Child
 from simulation.remote_hosts import NoCapture, RemoteHost
+from simulation.schedule import Refusal
 
 if TYPE_CHECKING:
     from simulation.world import World
@@ -47,6 +48,9 @@ class Stage:
         self.rng = random.Random(f"{world.schedule.seed} stage")
         self._world = world
         self._started = 0
+        self._refusals = {
+            fault.start for fault in world.schedule.faults if isinstance(fault, Refusal)
+        }
         self._longest = self.rng.choice(MOMENTS)
         self._stack = ExitStack()
 
@@ -68,6 +72,10 @@ class Stage:
     ) -> Child | RemoteChild:
         """Start a worker on some agent."""
         self._started += 1
+        if self._started in self._refusals:
+            self._world.note("the start of a worker is refused")
+            self._world.oracle.stillborn += 1
+            raise OSError("too many open files")
         agent = self.rng.choice([agent for agent in self._world.agents if not agent.lost])
         if isinstance(agent, RemoteHost):
             return agent.start_for_master(f"start {self._started}", observer)

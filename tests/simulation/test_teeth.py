@@ -294,7 +294,7 @@ TELLING = {
 @pytest.mark.parametrize("suite", TELLING)
 def test_everything_happens(suite: str) -> None:
     kinds: Counter[str] = Counter()
-    for seed in range(150):
+    for seed in range(250):
         trace: list[str] = []
         run(draw(seed), SUITES[suite], trace)
         text = "\n".join(trace)

@@ -139,12 +139,16 @@ class World:
         finally:
             self._master.leave_process()
 
+    @property
+    def has_links(self) -> bool:
+        """Whether there are links, whose heartbeats never end."""
+        return any(isinstance(agent, RemoteHost) for agent in self.agents)
+
     def run_out(self) -> None:
         """Let everything happen."""
-        if not any(isinstance(agent, RemoteHost) for agent in self.agents):
+        if not self.has_links:
             self.loop.run_for(END)
             return
-        # Links have heartbeats to the end of time.
         end = self.loop.now() + PATIENCE
         while not self._master.done() and self.loop.now() < end:
             self.loop.run_for(5)

@@ -41,8 +41,15 @@ def test_message_carries_the_target(target: float) -> None:
 def test_slow_tasks_travel_alone_and_do_not_queue() -> None:
     slow = pace(1.0)
     assert slow.batch_size(1000, 4) == 1
-    assert slow.depth() == 1
-    assert pace(SLOW / 2).depth() == 2
+    assert not slow.may_queue(1000)
+    assert pace(SLOW / 2).may_queue(1)
+    assert Pace().may_queue(1)
+
+
+def test_less_than_a_message_is_worth_does_not_queue() -> None:
+    short = pace(FLOOR / 100)
+    assert not short.may_queue(99)
+    assert short.may_queue(101)
 
 
 def test_growth_is_bounded_by_what_was_measured() -> None:

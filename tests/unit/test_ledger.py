@@ -88,6 +88,20 @@ def test_jobs_take_turns() -> None:
     assert order[:6] == [one, other] * 3
 
 
+@pytest.mark.parametrize("needs", ["alone", "slow"])
+def test_a_job_that_needs_an_idle_worker_gets_one(needs: str) -> None:
+    ledger, (worker,) = ledger_with(1)
+    big = job_of(ledger, range(1000))
+    assign_all(ledger)
+    small = job_of(ledger, ["x"], alone=needs == "alone", pace=known(2 * SLOW))
+    given = []
+    for _ in range(5):
+        given += [batch.job for batch in assign_all(ledger)]
+        answer(ledger, worker.queue[0])
+    assert small in given, "the worker is always given more, and never idle"
+    assert given.count(big) >= 2
+
+
 def test_what_starting_workers_can_do_does_not_queue() -> None:
     ledger, _ = ledger_with(1)
     ledger.starting = 3

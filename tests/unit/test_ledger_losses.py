@@ -109,8 +109,10 @@ def test_a_cancelled_job_is_forgotten() -> None:
     running, unread = assign_all(ledger)
     assert ledger.cancel(job) == [worker]
     assert not assign_all(ledger)
+    assert ledger.demand() == 2, "they still hold up a worker"
     ledger.put_back(worker, [unread.seq], 0.0)
     assert answer(ledger, running) == []
+    assert ledger.demand() == 0
     assert not job.waiting
     assert ledger.idle() == [worker], "the worker is not free for other work"
 

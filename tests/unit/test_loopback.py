@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import signal
 import socket
 import sys
@@ -15,11 +16,16 @@ import pytest
 import census
 import fiber
 from fiber import config
+from fiber._agent.port import ChildSpec
 from fiber._backends import loopback
+from fiber._backends.output import Output
+from fiber._backends.remote import RemoteAgent
+from fiber._hub.access import Access
 from fiber._runtime import state
 from fiber._transport.link import LinkError
+from fiber._wire import messages
 from fiber.errors import StartError
-from unit.agent_children import run_forever
+from unit.agent_children import Recorder, run_forever
 
 PATIENCE = 15
 
@@ -173,3 +179,68 @@ def test_the_runtime_can_be_shut_down_and_made_again() -> None:
         with running():
             stop(start())
     assert census.wait_until(lambda: len(os.listdir("/proc/self/fd")) <= before, PATIENCE)
+
+
+# The master's side of one agent, without its process
+
+
+class Silent:
+    """A hub, and a link, that a test can do without."""
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+        self.access = Access("local", "nowhere", b"")
+
+    def link(self, *_: Any, **__: Any) -> Silent:
+        return self
+
+    def unlink(self, *_: Any) -> None:
+        pass
+
+    def attach(self, _observer: Any) -> None:
+        pass
+
+    def send(self, frame: Any) -> None:
+        self.sent.append(messages.decode(frame))
+
+
+@pytest.fixture
+def remote() -> tuple[RemoteAgent, Silent, Recorder]:
+    link = Silent()
+    agent = RemoteAgent("far", link, Output(), on_lost=lambda *_: None)  # type: ignore[arg-type]
+    observer = Recorder()
+    agent.start(ChildSpec("child", "fork", b"", b"", tasks=True), observer)
+    return agent, link, observer
+
+
+def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
+    agent, link, observer = remote
+    agent.join(link)
+    agent.on_frame(messages.Started(1, 77).encode())
+    agent.on_frame(messages.Said(1, pickle.dumps("in time"), ()).encode())
+    agent.on_lost("silence")
+    agent.on_frame(messages.Said(1, pickle.dumps("late"), ()).encode())
+    agent.on_frame(messages.Exited(1, 0, 0, "exit status 0").encode())
+    assert observer.words == ["in time"]
+    assert observer.events == ["started", "said", "exited"]
+    assert observer.report.reason == "agent far lost: silence"
+    assert observer.report.exitcode == -signal.SIGKILL
+
+
+def test_what_was_asked_before_it_joined_is_sent_when_it_does(remote: Any) -> None:
+    agent, link, observer = remote
+    (child,) = agent._children.values()
+    for seq in (3, 4, 5):
+        child.deliver(seq, b"work")
+    agent.join(link)
+    assert [message.seq for message in link.sent[1:]] == [3, 4, 5]
+    agent.on_lost("silence")
+    assert not child.deliver(6, b"too late")
+    assert observer.events == ["exited"]
+
+
+def test_a_lost_agent_starts_nothing_more(remote: Any) -> None:
+    agent, _, _ = remote
+    agent.on_lost("silence")
+    with pytest.raises(RuntimeError, match="agent far cannot start child: silence"):
+        agent.start(ChildSpec("child", "fork", b"", b""), Recorder())

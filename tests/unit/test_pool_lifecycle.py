@@ -249,6 +249,11 @@ def test_a_fork_of_the_program_cannot_use_its_pool() -> None:
 # Programs
 
 
+@pytest.fixture(autouse=True)
+def _programs_find_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]), prepend=os.pathsep)
+
+
 def run_program(text: str, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(text)],

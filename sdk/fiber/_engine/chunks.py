@@ -75,9 +75,13 @@ class Pace:
             return 1
         return min(int(target / seconds), GROWTH * self.largest, LIMIT)
 
-    def depth(self) -> int:
-        """Messages in flight for each worker: the one that runs and, if tasks are fast, another."""
-        return 1 if self.seconds is not None and self.seconds >= SLOW else 2
+    def may_queue(self, waiting: int) -> bool:
+        """Whether to send something to a worker that has something to do already.
+
+        Not slow tasks, which another worker may run sooner; and nothing that takes less time than
+        its message: it waits for more, until a worker asks for it by being idle.
+        """
+        return self.seconds is None or FLOOR / waiting <= self.seconds < SLOW
 
     def stride(self) -> int:
         """Tasks that a worker runs for each note of where it is.

@@ -49,6 +49,7 @@ class Ledger:
         self._roster = Roster()
         self._pins: dict[Worker, None] = {}
         self._homeless: list[tuple[Job, Span]] = []
+        self._cancelled: set[Batch] = set()
 
     # Jobs
 
@@ -123,6 +124,7 @@ class Ledger:
         for batch in self.batches.values():
             if batch.job is job:
                 batch.job = None
+                self._cancelled.add(batch)
                 if batch.worker.queue[0] is not batch:
                     holders.append(batch.worker)
         for worker in list(self._pins):
@@ -193,8 +195,8 @@ class Ledger:
         return bool(self._roster.idle or self._roster.single)
 
     def demand(self) -> int:
-        """Tasks that wait or run."""
-        return sum(job.fed - job.done for job in self.jobs)
+        """Tasks that wait or run; of cancelled ones, the batches that still hold up a worker."""
+        return sum(job.fed - job.done for job in self.jobs) + len(self._cancelled)
 
     # Giving
 
@@ -203,20 +205,22 @@ class Ledger:
 
         Idle workers come first; jobs take turns.
         """
-        if not self.hungry():
-            return None
         if self._pins and (batch := self._assign_pinned(now)):
             return batch
-        for _ in range(len(self._turns)):
-            job = self._turns[0]
-            if not job.waiting:
-                job.listed = False
-                self._turns.popleft()
-                continue
-            self._turns.rotate(-1)
-            worker = self._worker_for(job)
-            if worker is not None:
-                return self._cut(job, worker, now)
+        turns = self._turns
+        if not turns or not self.hungry():
+            return None
+        passed = 0
+        for _ in range(len(turns)):
+            job = turns.popleft()
+            worker = self._worker_for(job, passed) if job.waiting else None
+            batch = self._cut(job, worker, now) if worker is not None else None
+            job.listed = bool(job.waiting)
+            if job.listed:
+                turns.append(job)
+            if batch is not None:
+                return batch
+            passed += job.listed
         return None
 
     def _assign_pinned(self, now: float) -> Batch | None:
@@ -228,20 +232,28 @@ class Ledger:
                 return self._send(job, worker, span, now)
         return None
 
-    def _worker_for(self, job: Job) -> Worker | None:
+    def _worker_for(self, job: Job, passed: int) -> Worker | None:
+        """Who may be given tasks of ``job``.
+
+        ``passed`` jobs have waited for longer, for a worker that has nothing else to do: as many
+        workers are not given more, so that they will have nothing to do.
+        """
         idle = self._roster.last_idle()
         if idle is not None:
             return idle
-        if job.pace.depth() < 2 or job.waiting.first_alone():
+        if job.waiting.first_alone() or not job.pace.may_queue(len(job.waiting)):
             return None
         # What a worker that is about to start can run should not queue behind something else.
         if self.starting and len(job.waiting) <= self.starting:
             return None
-        return self._roster.first_single()
+        return self._roster.single_after(passed)
 
     def _cut(self, job: Job, worker: Worker, now: float) -> Batch:
-        workers = len(self.workers) + self.starting
-        size = job.pace.batch_size(len(job.waiting), workers, job.unit, job.target)
+        waiting = len(job.waiting)
+        size = 1
+        if waiting > 1:
+            workers = len(self.workers) + self.starting
+            size = job.pace.batch_size(waiting, workers, job.unit, job.target)
         if worker.left is not None:
             size = min(size, worker.left * job.unit)
         return self._send(job, worker, job.waiting.take(size), now)
@@ -305,6 +317,7 @@ class Ledger:
 
     def _close_batch(self, batch: Batch, now: float) -> None:
         del self.batches[batch.seq]
+        self._cancelled.discard(batch)
         worker = batch.worker
         if worker.queue[0] is batch:
             worker.since = now
@@ -371,12 +384,15 @@ class Ledger:
         self._finish(job)
         return Receipt(job, batch.start, 1, batch)
 
+    def uneven(self) -> bool:
+        """Whether somebody has nothing to do while others have more than they can do at once."""
+        return bool(self._roster.idle and self._roster.deep)
+
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for the batch that they have not read, since others have nothing to do."""
-        roster = self._roster
-        if not roster.idle or not roster.deep or any(job.waiting for job in self._turns):
+        if any(job.waiting for job in self._turns):
             return []
-        return roster.recall(now)
+        return self._roster.recall(now)
 
     def next_recall(self) -> float | None:
         """When ``recall`` could next return something, if nothing else happens."""
@@ -398,6 +414,7 @@ class Ledger:
         losses: list[Loss] = []
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):
             del self.batches[batch.seq]
+            self._cancelled.discard(batch)
             if batch.job is not None:
                 suspects = batch.suspects(running) if batch is guilty else range(0)
                 losses += self._lose_batch(batch.job, batch.rest(), suspects)

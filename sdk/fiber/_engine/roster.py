@@ -42,9 +42,9 @@ class Roster:
         """The worker that became idle last: its memory is warm, and the others may leave."""
         return next(reversed(self.idle), None)
 
-    def first_single(self) -> Worker | None:
-        """The worker that will need something to do first."""
-        return next(iter(self.single), None)
+    def single_after(self, spared: int) -> Worker | None:
+        """The worker that will need something to do first, sparing some that will before it."""
+        return next(itertools.islice(self.single, spared, None), None)
 
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for what they have not read, one for each idle one; marks them."""
@@ -55,8 +55,6 @@ class Roster:
 
     def next_recall(self) -> float | None:
         """When ``recall`` could next return something, if nothing else happens."""
-        if not self.idle or not self.deep:
-            return None
         return min((worker.since + PATIENCE for worker in self._candidates()), default=None)
 
     def _candidates(self) -> Iterator[Worker]:

@@ -73,7 +73,8 @@ class Exchange(Staff):
                 break
         for reader in self._readers:
             reader.make_room(len(ledger.workers))
-        self._recall(now)
+        if ledger.uneven():
+            self._recall(now)
         return batches
 
     def _recall(self, now: float) -> None:

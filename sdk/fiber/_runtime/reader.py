@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any
 
@@ -18,6 +18,9 @@ from fiber._engine.ledger import Job, Ledger
 
 AHEAD = 3
 """Messages worth of tasks that are read ahead for each worker."""
+
+
+FEW = 16
 
 
 class Reader:
@@ -42,15 +45,20 @@ class Reader:
         """Read it all; raises what the iterable raises.  ``hungry`` is called after each chunk."""
         unit = self._job.unit
         iterator = iter(iterable)
-        while not self.stopped:
-            chunk = list(islice(iterator, unit))
-            if not chunk:
-                return
-            self._read += len(chunk)
+        if unit == 1:
+            chunks: Iterator[Sequence[Any]] = zip(iterator)
+        else:
+            chunks = iter(lambda: list(islice(iterator, unit)), [])
+        # A reader that nobody holds to account looks around after a few only.
+        often = 1 if self.limit is not None else max(FEW // unit, 1)
+        for count, chunk in enumerate(chunks, 1):
             self.inbox.extend(chunk)
+            self._read += len(chunk)
             hungry()
-            if self._full():
+            if count % often == 0 and self._full():
                 self._wait()
+            if self.stopped:
+                return
 
     def _full(self) -> bool:
         ahead = len(self.inbox) + len(self._job.waiting)
