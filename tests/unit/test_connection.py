@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import signal
@@ -343,6 +344,7 @@ def test_sending_connections_leaves_no_descriptor_behind() -> None:
     here.send(other)
     one.send(1)
     assert one.recv() == 2
+    gc.collect()  # what earlier tests left to the collector must not go while we count
     before = open_descriptors(os.getpid())
     for _ in range(10):
         end, far_end = Pipe()
@@ -351,6 +353,6 @@ def test_sending_connections_leaves_no_descriptor_behind() -> None:
         queue.get().send(1)
         assert end.recv() == 1
         del end, far_end, queue
-    assert wait_until(lambda: open_descriptors(os.getpid()) == before, PATIENCE)
+    assert wait_until(lambda: open_descriptors(os.getpid()) <= before, PATIENCE)
     here.send("done")
     process.join(PATIENCE)
