@@ -248,6 +248,7 @@ def command(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.timeout(90)  # starts every contender; the processors may be busy
 def test_a_tiny_run_of_everything(tmp_path: Path) -> None:
     only = ["--contenders", "multiprocessing", "--size", "0.002", "--rounds", "1"]
     with command(tmp_path, *only) as process:
