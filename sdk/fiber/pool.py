@@ -151,7 +151,7 @@ class Pool:
         """As ``apply``, but return at once with a result to wait for."""
         self._check_running()
         result = AsyncResult(self, callback, error_callback)
-        self._dispatcher.call(result, func, args, kwds, self._limit(timeout))
+        self._dispatcher.post(result, func, args, kwds, self._limit(timeout))
         return result
 
     def broadcast(self, func: _Function, *args: Any) -> list[Any]:
@@ -374,7 +374,7 @@ class Pool:
         request = dispatcher.stream(work.MAP, function, buffer, limit=buffersize, **options)
         if buffersize is not None:
             buffer.reader = request.reader
-            iterator._cancel = partial(dispatcher.post, dispatcher.cancel, request)
+            iterator._cancel = partial(dispatcher.soon, dispatcher.cancel, request)
         threading.Thread(
             target=_feed,
             args=(dispatcher, request, iterable),
@@ -495,7 +495,7 @@ def _abandon(dispatcher: Dispatcher) -> None:
         _end(dispatcher)
     else:
         # The garbage collector runs anywhere, even where a lock is held that this needs.
-        dispatcher.post(_end, dispatcher)
+        dispatcher.soon(_end, dispatcher)
 
 
 def _sizes(processes: int | None, low: int | None, high: int | None) -> tuple[int, int]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import pickle
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from multiprocessing import process as mp_process
 from types import SimpleNamespace
@@ -13,17 +12,17 @@ from typing import Any
 from fiber._backends.remote import RemoteChild
 from fiber._engine import ledger as engine
 from fiber._runtime.dispatcher import Terms
-from fiber._runtime.outcome import Encoded, Failure
-from fiber._runtime.requests import Call, Request
+from fiber._runtime.requests import Call, Function, Request
 from fiber._wire import work
-from fiber._wire.packet import Message
-from fiber.errors import StartError, TimeoutError, WorkerDied
+from fiber.errors import StartError
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation
+from simulation.outcomes import BrokenInput, Outcomes
 from simulation.schedule import Act, Job, Schedule, Task
 from simulation.staged import Actor, Stage, StagedDispatcher, StagedProcess, WatchedLock
-from simulation.workers import Ready, Ref, Results, Unknown, Unreadable, Work, Worker
+from simulation.wire import Wire, perform, perform_nowhere, perform_other
+from simulation.workers import Ref
 from simulation.world import World
 
 
@@ -31,146 +30,11 @@ class Again(Exception):
     """What the pool retries."""
 
 
-class BrokenInput(Exception):
-    """What an iterable raises instead of its next item."""
-
-
 GRACE = 0.1
 """Seconds within which a pool must have ordered the workers that it needs."""
 
 MOST = 100
 """Tasks of one job; more would only take longer."""
-
-ERROR = pickle.dumps(ValueError("as planned"))
-
-
-def perform(job: int, index: int) -> int:
-    """Stands for the user's function; it never runs."""
-    raise NotImplementedError
-
-
-def perform_other(job: int, index: int) -> int:
-    """Another one."""
-    raise NotImplementedError
-
-
-def _value(ref: Ref) -> int:
-    return ref.job * 1000 + ref.task
-
-
-class Wire:
-    """The dispatcher's own messages, from the worker's side."""
-
-    def __init__(self, batches: dict[int, engine.Batch], seed: int) -> None:
-        self._batches = batches
-        self._rng = random.Random(f"{seed} wire")
-        self.pinned: dict[int, int] = {}
-        """The index of the task in each batch that carries a broadcast call."""
-
-    def work(
-        self, worker: Worker, seq: int, payload: bytes, buffers: Sequence[memoryview]
-    ) -> Work | Unknown | None:
-        """What a packet says."""
-        head = work.Head._make(work.HEAD.unpack_from(payload))
-        body = memoryview(payload)[work.HEAD.size :]
-        if head.kind == work.STOP:
-            return None
-        if head.kind == work.CALLS:
-            calls = [pickle.loads(call)[1] for call, _ in work.unpack_calls(body, head.size)]
-            if seq in self.pinned:
-                calls = [(calls[0][0], self.pinned[seq])]
-            return Work(seq, [Ref(*call) for call in calls], 1, 1, apart=True)
-        if self._rng.random() < 0.02:
-            worker.functions.clear()
-        if head.size:
-            worker.functions.add(head.function)
-        elif head.function not in worker.functions:
-            return Unknown(seq)
-        items = pickle.loads(body[head.size :])
-        return Work(seq, [Ref(*item) for item in items], head.stride or 1, head.unit)
-
-    def message(self, said: Any) -> Message:
-        """What a worker says."""
-        words: tuple[Any, ...]
-        if isinstance(said, Ready):
-            words = (work.READY,)
-        elif isinstance(said, Unknown):
-            words = (work.UNKNOWN, said.seq)
-        elif isinstance(said, Unreadable):
-            words = (work.UNREADABLE, said.seq, ERROR)
-        else:
-            words = self._results(said)
-        return Message(memoryview(pickle.dumps(words)), [], [])
-
-    def _results(self, said: Results) -> tuple[Any, ...]:
-        values: list[int | None] = []
-        odd = []
-        for at, (ref, act) in enumerate(said.tasks):
-            values.append(_value(ref) if act is Act.FINE else None)
-            if act is not Act.FINE:
-                kind = work.AGAIN if act is Act.RETRIED else work.ERROR
-                odd.append((at, kind, ERROR, 0))
-        return said.seq, said.offset, said.kept, said.seconds, values, odd
-
-
-class Outcomes:
-    """Where the dispatcher puts the outcomes of one job, or of one call of it; a ``Sink``."""
-
-    def __init__(self, master: DispatcherMaster, account: Account, call: int | None = None) -> None:
-        self.account = account
-        self.call = call
-        self.request: Request | None = None
-        self._master = master
-        self._oracle = master.world.oracle
-        self._ended = False
-
-    def put(self, start: int, outcomes: list[Any], mixed: bool = True) -> None:
-        """Outcomes of tasks from ``start`` on."""
-        for index, outcome in enumerate(outcomes, start if self.call is None else self.call):
-            self._put(Ref(self.account.number, index), outcome)
-        if self.request is not None and self.request.reader is not None:
-            # The user takes them a little later.
-            self._master.stage.soon(self.request.reader.consume, len(outcomes))
-
-    def _put(self, ref: Ref, outcome: Any) -> None:
-        error = outcome.error if type(outcome) is Failure else None
-        if isinstance(error, BrokenInput):
-            if self.request is None or ref.task != self.request.job.fed:
-                raise Violation(f"the error of the input takes the place of {ref}")
-        elif isinstance(error, WorkerDied):
-            self._oracle.died(ref, error.attempts)
-        elif isinstance(error, TimeoutError):
-            self._oracle.delivered(ref, "too late")
-        elif type(outcome) is Encoded:
-            act = self._master.world.task(ref).act
-            if act is Act.UNREADABLE:
-                self._oracle.delivered(ref, "unreadable")
-            elif (act is Act.RETRIED) is not (outcome.kind == work.AGAIN):
-                raise Violation(f"{ref} has the error of another task")
-            else:
-                self._oracle.delivered(ref, act)
-        elif outcome != _value(ref):
-            raise Violation(f"{ref} has the result {outcome!r}")
-        else:
-            self._oracle.delivered(ref, Act.FINE)
-
-    def end(self) -> None:
-        """That was all."""
-        if self._ended:
-            raise Violation(f"job {self.account.number} ends twice")
-        self._ended = True
-        if self.call is None or self._master.ended_call(self.account):
-            self._master.world.note("job %d is finished", self.account.number)
-            self._oracle.finished(self.account.number)
-
-    def abort(self, error: BaseException) -> None:
-        """There will be no more."""
-        if isinstance(error, StartError) and self._oracle.stillborn < 3:
-            raise Violation("the pool gives up though workers can start")
-        if self.account.finished:
-            raise Violation(f"job {self.account.number} is aborted after it was finished")
-        self._master.world.note("job %d is aborted: %s", self.account.number, type(error).__name__)
-        self.account.cancelled = True
 
 
 class Names:
@@ -212,7 +76,7 @@ class DispatcherMaster:
         schedule = world.schedule
         self._dispatcher = dispatcher(self.stage, _terms(schedule))
         self._ledger = self._dispatcher._ledger
-        self.language = Wire(self._ledger.batches, schedule.seed)
+        self.language = Wire(schedule.seed)
         self._audit = Audit(world, self._ledger, Names())
         lock: Any = WatchedLock(self._check)
         self._dispatcher._lock = self._dispatcher.crew._lock = lock
@@ -267,8 +131,11 @@ class DispatcherMaster:
         self.world.oracle.fed(account.number, stop - start)
         for index in range(start, stop):
             one = Outcomes(self, account, index)
-            arguments = (account.number, index)
-            self._dispatcher.call(one, perform, arguments, {}, timeout=plan.timeout)
+            item: Any = (account.number, index)
+            if plan.tasks[index].act is Act.UNSENDABLE:
+                item = (self.stage.bad_item(item),)
+            call = self._rng.choice((self._dispatcher.call, self._dispatcher.post))
+            call(one, perform, item, {}, timeout=plan.timeout)
         if not account.closed:
             self._later(plan.pause, self._go_on_calling, account, sink, stop)
         elif not plan.tasks:
@@ -300,22 +167,33 @@ class DispatcherMaster:
         return {"unit": plan.unit, "exact": exact, "timeout": plan.timeout}
 
     def _items(self, account: Account) -> list[Any]:
-        kind = self._rng.choice((tuple, Ref._make))  # pickled on any thread, or only on some
-        return [kind((account.number, index)) for index in range(len(account.plan.tasks))]
+        # What is plain is pickled on any thread, the rest must not be on the loop's.
+        kind: Callable[[tuple[int, int]], Any] = self._rng.choice((tuple, self.stage.item))
+        tasks = account.plan.tasks
+        if any(task.act is Act.UNSENDABLE for task in tasks):
+            kind = self.stage.item
+        return [
+            (self.stage.bad_item if task.act is Act.UNSENDABLE else kind)((account.number, index))
+            for index, task in enumerate(tasks)
+        ]
+
+    def _function(self, account: Account) -> Function:
+        account.broken = self._rng.random() < 0.03
+        some = perform, perform_other
+        function = perform_nowhere if account.broken else some[account.number % 2]
+        return self._dispatcher.function(function)
 
     def _map(self, account: Account, sink: Outcomes) -> None:
         account.closed = True
         self.world.oracle.fed(account.number, len(account.plan.tasks))
-        function = self._dispatcher.function(perform if account.number % 2 else perform_other)
         sink.request = self._dispatcher.map(
-            work.MAP, function, self._items(account), sink, **self._options(account)
+            work.MAP, self._function(account), self._items(account), sink, **self._options(account)
         )
 
     def _stream(self, account: Account, sink: Outcomes) -> None:
-        function = self._dispatcher.function(perform)
         limit = self._rng.choice((None, None, 1, 5))
         request = sink.request = self._dispatcher.stream(
-            work.MAP, function, sink, limit=limit, **self._options(account)
+            work.MAP, self._function(account), sink, limit=limit, **self._options(account)
         )
         actor = Actor(self.stage, lambda actor: self._read(actor, account, request))
         assert request.reader is not None
@@ -375,6 +253,8 @@ class DispatcherMaster:
     def _check(self) -> None:
         """The dispatcher's lock is released."""
         self.world.count()
+        if self.stage.pickled_on_loop:
+            raise Violation("the user's code runs on the loop's thread")
         for job in self._ledger.jobs:
             request: Request = job.owner
             if isinstance(request.sink, Outcomes):
@@ -468,7 +348,7 @@ def for_pool(schedule: Schedule) -> Schedule:
 
 def _for_pool(job: Job, retries: int) -> Job:
     if job.everywhere:  # a broadcast has no timeout
-        tasks = tuple(task for task in job.tasks if task.act is not Act.ENDLESS)
+        tasks = tuple(task for task in job.tasks if task.act not in (Act.ENDLESS, Act.UNSENDABLE))
         job = replace(job, tasks=tasks or (Task(1e-3),), timeout=None)
     tasks = job.tasks[:MOST]
     return replace(job, tasks=tasks, retries=retries, alone=job.timeout is not None)

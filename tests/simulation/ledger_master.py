@@ -196,9 +196,7 @@ class LedgerMaster:
         elif isinstance(said, Results):
             self._take(said)
         elif isinstance(said, Unreadable):
-            receipt = self.ledger.split(said.seq, self._now)
-            if receipt is not None:
-                self._deliver(receipt.job, receipt.item(receipt.start), "unreadable")
+            self._split(said.seq)
         self._settle()
 
     def heard_late(self, child: Child, said: Any) -> None:
@@ -223,6 +221,11 @@ class LedgerMaster:
         for at, (ref, act) in enumerate(said.tasks, receipt.start):
             if act is not Act.RETRIED or not self.ledger.retry(receipt, at):
                 self._deliver(receipt.job, ref, act)
+
+    def _split(self, seq: int) -> None:
+        receipt = self.ledger.split(seq, self._now)
+        if receipt is not None:
+            self._deliver(receipt.job, receipt.item(receipt.start), "unreadable")
 
     def _deliver(self, job: engine.Job, ref: Ref, outcome: Act | str) -> None:
         self.world.oracle.delivered(ref, outcome)
@@ -297,6 +300,9 @@ class LedgerMaster:
             member: Member = batch.worker.key
             assert batch.job is not None
             account: Account = batch.job.owner
+            if any(self.world.task(ref).act is Act.UNSENDABLE for ref in batch.items):
+                self._split(batch.seq)
+                continue
             work = Work(batch.seq, batch.items, batch.stride, account.plan.unit)
             member.child.deliver(batch.seq, work)
             if account.plan.timeout is not None:
@@ -308,18 +314,21 @@ class LedgerMaster:
 
     def _scale(self) -> None:
         staying = sum(not member.leaving for member in self._members.values())
-        schedule = self.world.schedule
-        wanted = max(schedule.min_workers, min(schedule.max_workers, self.ledger.demand()))
+        schedule, wanted = self.world.schedule, self._wanted()
         newcomers = len(self.ledger.homeless()) - self.ledger.starting
         if not self._terminated:
             missing = max(wanted - staying, min(newcomers, schedule.max_workers - staying))
             for _ in range(missing):
                 self._start()
-        if schedule.linger is not None and staying > schedule.min_workers:
+        if schedule.linger is not None and staying > wanted:
             for worker in self.ledger.idle():
                 if self._idle_since.get(worker) != worker.since:
                     self._idle_since[worker] = worker.since
                     self._later(schedule.linger, self._dismiss, worker, worker.since)
+
+    def _wanted(self) -> int:
+        schedule = self.world.schedule
+        return max(schedule.min_workers, min(schedule.max_workers, self.ledger.demand()))
 
     def _start(self) -> None:
         member = Member(self)
@@ -333,7 +342,7 @@ class LedgerMaster:
         member: Member = worker.key
         staying = sum(not member.leaving for member in self._members.values())
         idle = worker in self.ledger.idle() and worker.since == since
-        if idle and staying > self.world.schedule.min_workers:
+        if idle and staying > self._wanted():
             self._leave(member)
 
     def _set_timer(self) -> None:

@@ -28,6 +28,8 @@ class Account:
         self.fed = 0
         self.closed = False
         self.cancelled = False
+        self.broken = False
+        """Its function does not unpickle."""
         self.refused = False
         """Not all of it could be asked for."""
         self.finished = False

@@ -24,6 +24,8 @@ class Act(enum.Enum):
     """Kills the first ``times`` workers that run it."""
     UNREADABLE = enum.auto()
     """No worker can unpickle it."""
+    UNSENDABLE = enum.auto()
+    """It does not even pickle."""
     ENDLESS = enum.auto()
 
 

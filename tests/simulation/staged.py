@@ -19,12 +19,13 @@ from unittest import mock
 from fiber._agent import service
 from fiber._backends.remote import RemoteChild
 from fiber._engine.ledger import Batch
-from fiber._runtime import exchange, workers
+from fiber._runtime import dispatcher, exchange, workers
 from fiber._runtime.dispatcher import Dispatcher, Terms
 from fiber.process import Process
 from simulation.agents import Child
 from simulation.remote_hosts import NoCapture, RemoteHost
 from simulation.schedule import Refusal
+from simulation.workers import Ref
 
 if TYPE_CHECKING:
     from simulation.world import World
@@ -53,6 +54,9 @@ class Stage:
         }
         self._longest = self.rng.choice(MOMENTS)
         self._stack = ExitStack()
+        self.pickled_on_loop = False
+        self.item = _item_of(self)
+        self.bad_item = BadItem
 
     def enter(self) -> None:
         """Take the places."""
@@ -60,6 +64,7 @@ class Stage:
         enter(mock.patch.object(exchange, "runtime", return_value=self))
         enter(mock.patch.object(workers, "runtime", return_value=self))
         enter(mock.patch.object(exchange, "monotonic", self.loop.now))
+        enter(mock.patch.object(dispatcher, "monotonic", self.loop.now))
         enter(mock.patch.object(exchange, "Pump", partial(StagedPump, self)))
         enter(mock.patch.object(service, "Capture", NoCapture))
 
@@ -92,6 +97,28 @@ class Stage:
     def _off_loop(self, callback: Callable[..., object], args: tuple[Any, ...]) -> None:
         with self.loop.off_thread():
             callback(*args)
+
+
+def _item_of(stage: Stage) -> type[tuple[int, int]]:
+    class Item(tuple[int, int]):
+        """A task whose pickling is the user's code."""
+
+        __slots__ = ()
+
+        def __reduce__(self) -> tuple[Any, ...]:
+            stage.pickled_on_loop |= stage.loop.on_thread()
+            return Ref, tuple(self)
+
+    return Item
+
+
+class BadItem(tuple[int, int]):
+    """A task that does not pickle."""
+
+    __slots__ = ()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise TypeError("cannot pickle this")
 
 
 class StagedPump:

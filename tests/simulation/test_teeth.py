@@ -176,6 +176,12 @@ class GrowsTooLate(StagedDispatcher):
         return super()._missing() if self.crew.size < self.crew.minimum else 0
 
 
+class PicklesOnTheLoop(StagedDispatcher):
+    def _send_safely(self, batches: Iterable[Batch]) -> None:
+        for batch in batches:
+            self._send_safely(self._send_one(batch, plain=False))
+
+
 BROKEN = [
     ForgetsLostBatches,
     KeepsLostBatches,
@@ -203,6 +209,7 @@ BROKEN = [
     TellsOthers,
     NeverLetsGo,
     GrowsTooLate,
+    PicklesOnTheLoop,
 ]
 
 
@@ -276,6 +283,9 @@ TELLING = {
         "a stream",
         "a broadcast",
         "Unknown(",
+        "Broken(",
+        "cannot be sent",
+        "the start of a worker is refused",
         "is aborted",
         "is refused",
         "the pool is closed",

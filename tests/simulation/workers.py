@@ -63,6 +63,12 @@ class Unknown(NamedTuple):
     seq: int
 
 
+class Broken(NamedTuple):
+    """The function of batch ``seq`` does not unpickle."""
+
+    seq: int
+
+
 class Ready(NamedTuple):
     """The worker can be given work."""
 
@@ -165,7 +171,7 @@ class Worker:
         if work is None:
             self._world.oracle.stopped(self, len(self._child.inbox))
             self.die(0)
-        elif isinstance(work, Unknown):
+        elif isinstance(work, Unknown | Broken):
             self._say(work)
             self._wait()
         else:
@@ -252,5 +258,5 @@ class Worker:
     def _say(self, message: Any) -> None:
         self._messages += 1
         self._child.say(message)
-        if self._messages in self._repeats and not isinstance(message, Ready | Unknown):
+        if self._messages in self._repeats and not isinstance(message, Ready | Unknown | Broken):
             self._child.say(message)

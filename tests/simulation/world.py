@@ -26,7 +26,7 @@ from simulation.schedule import (
     Task,
     Terminate,
 )
-from simulation.workers import Ref, Unknown, Work, Worker
+from simulation.workers import Broken, Ref, Unknown, Work, Worker
 
 PATIENCE = 300
 """Simulated seconds after which what did not happen over links never will."""
@@ -64,7 +64,7 @@ class Language(Protocol):
 
     def work(
         self, worker: Worker, seq: int, payload: Any, buffers: Sequence[memoryview]
-    ) -> Work | Unknown | None:
+    ) -> Work | Unknown | Broken | None:
         """What a delivered packet says, or what ``worker`` says to it; None: stop."""
 
     def message(self, said: Any) -> Any:

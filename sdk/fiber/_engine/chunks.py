@@ -83,6 +83,11 @@ class Pace:
         """
         return self.seconds is None or FLOOR / waiting <= self.seconds < SLOW
 
+    @property
+    def short(self) -> bool:
+        """Whether tasks are known to take less than what is worth a message."""
+        return self.seconds is not None and self.seconds < FLOOR
+
     def stride(self) -> int:
         """Tasks that a worker runs for each note of where it is.
 

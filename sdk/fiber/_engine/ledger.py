@@ -165,6 +165,8 @@ class Ledger:
 
     def spent(self) -> list[Worker]:
         """Workers that did all that they may do, each once; they are given nothing more."""
+        if not self._roster.spent:
+            return []
         spent, self._roster.spent = list(self._roster.spent), {}
         for worker in spent:
             self._fence(worker)
@@ -211,16 +213,19 @@ class Ledger:
         if not turns or not self.hungry():
             return None
         passed = 0
-        for _ in range(len(turns)):
-            job = turns.popleft()
+        while passed < len(turns) and passed <= len(self._roster.single):
+            job = turns[passed]
             worker = self._worker_for(job, passed) if job.waiting else None
+            if worker is None and job.waiting:
+                passed += 1  # it keeps its place, and a worker from being given more
+                continue
+            del turns[passed]
             batch = self._cut(job, worker, now) if worker is not None else None
             job.listed = bool(job.waiting)
             if job.listed:
                 turns.append(job)
             if batch is not None:
                 return batch
-            passed += job.listed
         return None
 
     def _assign_pinned(self, now: float) -> Batch | None:
@@ -235,8 +240,8 @@ class Ledger:
     def _worker_for(self, job: Job, passed: int) -> Worker | None:
         """Who may be given tasks of ``job``.
 
-        ``passed`` jobs have waited for longer, for a worker that has nothing else to do: as many
-        workers are not given more, so that they will have nothing to do.
+        ``passed`` jobs whose turn it was wait for a worker that has nothing else to do, so as many
+        of those that will have it soon are spared.
         """
         idle = self._roster.last_idle()
         if idle is not None:

@@ -19,6 +19,9 @@ TRIES = 3
 LONGEST_PAUSE = 60.0
 """Seconds between two tries, at most, while workers that are there go on."""
 
+IDLE_PAUSE = 1.0
+"""Seconds before one is replaced when many have died with nothing to do."""
+
 
 class Crew:
     """The workers of a pool, ``minimum`` to ``maximum`` of them.
@@ -70,10 +73,10 @@ class Crew:
 
     def pause(self) -> float:
         """Seconds to wait before the next order, after what happened to the last ones."""
-        excess = max(self.failures - TRIES, self.idle_deaths - TRIES - self.maximum)
-        if excess < 0:
-            return 0.0
-        return min(2.0 ** min(excess, 10), LONGEST_PAUSE)
+        if self.failures >= TRIES and self.size > self.starting:
+            return min(2.0 ** min(self.failures - TRIES, 10), LONGEST_PAUSE)
+        # With nobody at work the next failure is the end: no need to put it off.
+        return IDLE_PAUSE if self.idle_deaths > TRIES + self.maximum else 0.0
 
     def order(self, count: int) -> None:
         """Count workers that somebody will ``hire``."""

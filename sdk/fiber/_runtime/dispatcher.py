@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from time import monotonic
 from typing import Any
 
 from fiber import reduction
 from fiber._agent.port import ChildPort
-from fiber._engine.chunks import Pace
+from fiber._engine.chunks import FLOOR, Pace
 from fiber._runtime.exchange import Exchange
 from fiber._runtime.outcome import Failure
 from fiber._runtime.reader import Reader
@@ -38,6 +39,7 @@ class Dispatcher(Exchange):
         self._functions: dict[bytes, Function] = {}
         self._function_ids = itertools.count(1)
         self._calls = self._open(work.CALLS, exact=True)
+        self._last_post = 0.0
 
     def start(self) -> None:
         """Start the first workers; raises what stands in the way of one."""
@@ -80,6 +82,33 @@ class Dispatcher(Exchange):
             return None
         port: ChildPort | None = plan.batches[0].worker.key.port
         return port
+
+    def post(
+        self,
+        sink: Sink,
+        function: Callable[..., Any],
+        args: Iterable[Any],
+        kwargs: Mapping[str, Any],
+        timeout: float | None = None,
+    ) -> None:
+        """One call that nobody waits for yet: of many short ones in a row, several travel together.
+
+        Each would else wake a worker, which costs more than the call.
+        """
+        job = self._calls.job
+        now = monotonic()
+        hurried = now - self._last_post < FLOOR and job.fed - job.done >= self.crew.size
+        self._last_post = now
+        if timeout is not None or not hurried or not job.pace.short:
+            self.call(sink, function, args, kwargs, timeout)
+            return
+        call = _make_call(sink, function, args, kwargs)
+        if call is not None:
+            call.detach()
+            with self._lock:
+                self._check()
+                self._ledger.feed(job, [call])
+                self._later("calls", 0.0, self._reconsider)
 
     def broadcast(self, sink: Sink, function: Callable[..., Any], args: Sequence[Any]) -> None:
         """The same call on every worker, present or starting; ``sink`` gets one outcome of each."""
@@ -186,7 +215,7 @@ class Dispatcher(Exchange):
             plan = self._step()
         self._act(plan)
 
-    def post(self, action: Callable[..., None], *args: Any) -> None:
+    def soon(self, action: Callable[..., None], *args: Any) -> None:
         """Have something done on the loop's thread: for finalizers, which may hold any lock."""
         self._loop.call_soon(action, *args)
 

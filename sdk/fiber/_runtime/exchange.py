@@ -20,8 +20,7 @@ A batch in ``_unsent`` is assigned but not sent: nobody can have run it.
 from __future__ import annotations
 
 import pickle
-from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from time import monotonic
 from typing import Any
 
@@ -58,10 +57,10 @@ class Exchange(Staff):
 
     def _assign(self) -> list[Batch]:
         now = monotonic()
-        ledger = self._ledger
+        ledger, readers = self._ledger, self._readers
         batches: list[Batch] = []
         while True:
-            for reader in self._readers:
+            for reader in readers:
                 reader.absorb(ledger)
             while (batch := ledger.assign(now)) is not None:
                 self._unsent.add(batch.seq)
@@ -69,9 +68,9 @@ class Exchange(Staff):
             # A reader looks whether somebody is hungry after it put something in: so say it, and
             # then look whether something was put in.
             self.hungry = ledger.hungry() or self.crew.size < self.crew.maximum
-            if not (self.hungry and any(reader.inbox for reader in self._readers)):
+            if not (self.hungry and any(reader.inbox for reader in readers)):
                 break
-        for reader in self._readers:
+        for reader in readers:
             reader.make_room(len(ledger.workers))
         if ledger.uneven():
             self._recall(now)
@@ -85,11 +84,13 @@ class Exchange(Staff):
         if due is not None:
             self._later("recall", due - now, self._reconsider)
 
-    def _send(self, batches: Iterable[Batch]) -> None:
+    def _send(self, batches: Sequence[Batch]) -> None:
         """Send batches, on a thread that may run the user's code."""
-        todo = deque(batches)
-        while todo:
-            todo.extend(self._send_one(todo.popleft(), plain=False))
+        while batches:
+            more: list[Batch] = []
+            for batch in batches:
+                more += self._send_one(batch, plain=False)
+            batches = more
 
     def _send_safely(self, batches: Iterable[Batch]) -> None:
         """Send batches, on any thread: the pump does it where the user's code could run."""

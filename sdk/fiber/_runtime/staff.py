@@ -82,9 +82,10 @@ class Staff(ABC):
         crew = self.crew
         self._ledger.starting = crew.starting
         batches = self._assign()
-        leaving = [worker.key for worker in self._ledger.spent()]
-        for link in leaving:
-            crew.let_go(link)
+        leaving: list[Link] = []
+        for worker in self._ledger.spent():
+            crew.let_go(worker.key)
+            leaving.append(worker.key)
         if crew.size < crew.maximum:
             self._order()
         if crew.size > crew.minimum:
