@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import tempfile
 import uuid
 from collections.abc import Iterator
@@ -19,6 +20,12 @@ LIMITS = {"unit": 20, "simulation": 60, "faults": 60, "examples": 180, "conforma
 _CALL = pytest.StashKey[pytest.CallInfo[None]]()
 _WATCH = pytest.StashKey[Watch]()
 _BEFORE = pytest.StashKey[Snapshot]()
+
+
+def pytest_configure() -> None:
+    # A shell without job control starts what it puts in the background with interrupts ignored,
+    # and every program that a test starts would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
