@@ -7,9 +7,12 @@ It takes everything from its environment, nothing from its command line:
 ``FIBER_AGENT_NAME``         what the master calls it
 ``FIBER_AGENT_PARENT``       optional: the pid of a process on this host to end with
 ``FIBER_AGENT_INHERITS``     optional: a directory of that process, to be removed if it is killed
+``FIBER_AGENT_LOST_GRACE``   optional: serve one master after the other.  Wait for the first for as
+                           long as it takes, for one that was lost for so many seconds
 ``FIBER_START_TIMEOUT``      seconds to find the master, as for every Fiber process
 
-Exit status 0: the master ended it.  1: it could not join, or lost the master; stderr says why.
+Exit status 0: the master ended it, or the grace for a lost one is over.  1: it could not join, or
+lost the master; stderr says why.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import os
 import shutil
 import signal
 import sys
+import time
 from typing import NoReturn
 
 from fiber import config
@@ -27,7 +31,7 @@ from fiber._hub.hub import Hub
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
-from fiber._transport.link import Link
+from fiber._transport.link import Link, LinkError
 from fiber._transport.loop import Loop
 from fiber.errors import AuthenticationError, ConfigError, FiberError
 
@@ -36,29 +40,35 @@ _CREDENTIALS = "FIBER_AGENT_CREDENTIALS"
 _NAME = "FIBER_AGENT_NAME"
 _PARENT = "FIBER_AGENT_PARENT"
 _INHERITS = "FIBER_AGENT_INHERITS"
+_LOST_GRACE = "FIBER_AGENT_LOST_GRACE"
+_ORPHANED = "FIBER_AGENT_ORPHANED"  # since when (time.monotonic), from an agent to its next life
 
 _DRAIN_GRACE = 10.0
 """Seconds that children have to end when this process is told to (SIGTERM)."""
+
+_REFUSED_PAUSE = 0.5
+"""Seconds before a master that refused this agent is asked again, or another in its place."""
 
 
 class Main:
     """The life of an agent: dial, serve, end."""
 
     def __init__(self) -> None:
+        self._environment = dict(os.environ)
         self._name = os.environ.get(_NAME) or f"agent-{os.getpid()}"
+        self._lost_grace = _seconds(_LOST_GRACE)
+        self._orphaned = _seconds(_ORPHANED)
         self._loop = Loop()
         self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
         self._agent = Agent(self._loop, self._name, self._hub)
         self._service: AgentService | None = None
         self._status = 0
+        self._again = False
+        self._told_to_end = False
 
     def run(self) -> int:
         """Serve until the end; the exit status."""
-        try:
-            dialer = self._dial()
-        except (FiberError, AuthenticationError) as error:
-            self._complain(error)
-            return 1
+        dialer = self._dial()
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # the program may have blocked some
         signal.signal(signal.SIGTERM, self._on_sigterm)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -67,6 +77,9 @@ class Main:
         dialer.close()
         self._agent.close()
         self._hub.close()
+        if self._again:
+            # Nothing of what the last master did or left may reach the next one.
+            os.execve(sys.executable, sys.orig_argv, self._environment)
         return self._status
 
     def _dial(self) -> AgentDialer:
@@ -77,8 +90,15 @@ class Main:
             Identity.of_this_process(self._name, pid=str(os.getpid())),
             on_link=self._joined,
             on_failed=self._failed,
-            timeout=config.current().start_timeout,
+            timeout=self._patience(),
         )
+
+    def _patience(self) -> float | None:
+        if self._lost_grace is None:
+            return config.current().start_timeout
+        if self._orphaned is None:
+            return None
+        return max(self._orphaned + self._lost_grace - time.monotonic(), 0.0)
 
     def _complain(self, what: object) -> None:
         print(f"fiber agent {self._name}: {what}", file=sys.stderr, flush=True)
@@ -90,12 +110,25 @@ class Main:
 
     def _failed(self, error: Exception) -> None:
         self._complain(error)
-        self._status = 1
+        if self._lost_grace is None or not isinstance(error, LinkError):
+            self._status = 1
+        elif self._orphaned is None or self._patience():
+            # It was there and refused us: it is ending, or took our name for another's.
+            self._again = True
+            self._loop.call_later(_REFUSED_PAUSE, self._loop.stop)
+            return
         self._loop.stop()
 
     def _ended(self, reason: str) -> None:
-        if reason.startswith("lost"):
+        lost = reason.startswith("lost")
+        if lost:
             self._complain(reason)
+        if self._lost_grace is not None and not self._told_to_end:
+            self._again = True
+            self._environment.pop(_ORPHANED, None)
+            if lost:
+                self._environment[_ORPHANED] = str(time.monotonic())
+        elif lost:
             self._status = 1
         self._link.close("the agent ended", then=self._loop.stop)
 
@@ -103,6 +136,7 @@ class Main:
         self._loop.interrupt(self._drain)
 
     def _drain(self) -> None:
+        self._told_to_end = True
         if self._service is None:
             self._loop.stop()
         else:
@@ -132,6 +166,16 @@ def _read(credentials: str) -> Credentials:
     return Credentials.from_environment(credentials)
 
 
+def _seconds(variable: str) -> float | None:
+    value = os.environ.pop(variable, None)
+    if value is None:
+        return None
+    try:
+        return float(value)
+    except ValueError:
+        raise ConfigError(f"{variable}={value!r} is not a number of seconds") from None
+
+
 def _required(variable: str) -> str:
     # The children, who run anybody's code, shall not have it.
     value = os.environ.pop(variable, "")
@@ -143,5 +187,14 @@ def _required(variable: str) -> str:
     return value
 
 
+def main() -> int:
+    """Run one agent to its end; the exit status."""
+    try:
+        return Main().run()
+    except (FiberError, AuthenticationError) as error:
+        print(f"fiber agent: {error}", file=sys.stderr)
+        return 1
+
+
 if __name__ == "__main__":
-    sys.exit(Main().run())
+    sys.exit(main())

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
+import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -105,3 +108,40 @@ def test_an_almost_empty_environment(launch_on: Callable[..., Program]) -> None:
     )
     program = launch_on(script)
     assert program.finish() == "1\n[1, 2]\n"
+
+
+FIRST_PROCESS = """
+    import fiber, os, subprocess, sys
+    from pathlib import Path
+    from faults.program import wait_for
+
+    def leave_orphans():
+        for _ in range(5):
+            subprocess.Popen(["sh", "-c", "sleep 0.1 &"]).wait()
+
+    def processes():
+        return [stat.read_text().split()[1:3] for stat in Path("/proc").glob("[0-9]*/stat")]
+
+    if __name__ == "__main__":
+        print(os.getpid())
+        child = fiber.Process(target=leave_orphans)
+        child.start()
+        child.join()
+        wait_for(lambda: not any(name in ("(sleep)", "(sh)") for name, _ in processes()))
+        print([name for name, state in processes() if state == "Z"])
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may make a process namespace")
+def test_process_1_of_a_container_leaves_no_zombies(tmp_path: Path) -> None:
+    """As in a pod, where nobody else reaps what children leave behind."""
+    script = tmp_path / "program.py"
+    script.write_text(textwrap.dedent(FIRST_PROCESS))
+    done = subprocess.run(
+        ["unshare", "--pid", "--fork", "--mount-proc", sys.executable, str(script)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert (done.stdout, done.stderr) == ("1\n[]\n", "")

@@ -23,6 +23,7 @@ from fiber._hub.access import Access
 from fiber._transport.unix import UnixChannel
 
 _PR_SET_PDEATHSIG = 1
+_PR_SET_CHILD_SUBREAPER = 36
 _libc = ctypes.CDLL(None, use_errno=True)
 
 _descriptors: list[int] = []
@@ -87,6 +88,11 @@ def die_with(parent: int) -> None:
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
+
+
+def adopt_orphans() -> None:
+    """Have the kernel make this process the parent of what our children leave behind."""
+    _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def run(start: Start, fds: list[int], board: Board, agent: int) -> int:

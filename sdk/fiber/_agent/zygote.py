@@ -242,6 +242,9 @@ def main(
     # A program that raised its limit after it started us may send more than ours.
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    if elders[0] == 1:
+        # In a container nobody else would reap them: the agent waits for what it started only.
+        child_module.adopt_orphans()
     watched = _watch(elders)
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control)
     told_to = bool(watched) and Zygote(sock, Board(board), watched, preload=preload).run()

@@ -15,15 +15,17 @@ from fiber._transport.session_link import SessionLink
 from fiber._wire.messages import ProtocolError
 from fiber.errors import AuthenticationError, FiberError
 
-_PAUSE_MIN, _PAUSE_MAX = 0.1, 2.0
-"""Seconds between attempts to dial for the first time, growing."""
+_PAUSE_MIN, _PAUSE_MAX = 0.1, 0.5
+"""Seconds between attempts to dial for the first time, growing: a thousand agents that wait for a
+master must neither flood its network nor keep it waiting."""
 
 _LONGER = 2
 """How much more patient an agent is than its master."""
 
 
 class AgentDialer:
-    """An agent's end: dials the master at ``host:port`` until it answers or ``timeout`` is over.
+    """An agent's end: dials the master at ``host:port`` until it answers or ``timeout`` is over
+    (None: for as long as it takes).
 
     Calls back once, on the loop's thread: ``on_link`` with the link, or ``on_failed`` with an
     AuthenticationError, VersionMismatch or LinkError.  A link that breaks later is dialled again
@@ -39,7 +41,7 @@ class AgentDialer:
         *,
         on_link: Callable[[Link], None],
         on_failed: Callable[[FiberError | AuthenticationError], None],
-        timeout: float = 30.0,
+        timeout: float | None = 30.0,
     ) -> None:
         self._loop = loop
         self._address = address
@@ -61,7 +63,7 @@ class AgentDialer:
             on_gone=Pipe.disconnected,
             on_pipe=self._introduce,
         )
-        self._deadline = loop.call_later(timeout, self._too_late)
+        self._deadline = None if timeout is None else loop.call_later(timeout, self._too_late)
         # A dial that does not block never reports a failure, so the first one gets a thread.
         threading.Thread(target=self._dial, name="fiber-dial", daemon=True).start()
 
@@ -122,7 +124,7 @@ class AgentDialer:
         pipe.link = link
         link.connected(pipe, welcome.arrived)
         if self._link is None:
-            self._deadline.cancel()
+            self._cancel_deadline()
             self._link = link
             self._on_link(link)
 
@@ -156,5 +158,9 @@ class AgentDialer:
 
     def _stop(self) -> None:
         self._over.set()
-        self._deadline.cancel()
+        self._cancel_deadline()
         self._socket.close()
+
+    def _cancel_deadline(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()

@@ -37,7 +37,7 @@ _TURN = 64
 """Messages taken in one turn of the loop, so that a flood leaves others their turn."""
 
 _SEND_TIMEOUT = 1.0
-_REDIAL_MIN, _REDIAL_MAX = 0.1, 2.0
+_REDIAL_MIN, _REDIAL_MAX = 0.1, 0.5
 
 
 class Untrusted(Exception):

@@ -1,0 +1,170 @@
+"""An agent that outlives its masters, as in a pool that waits for work."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from faults.program import Program, wait_for
+from fiber._transport.credentials import MasterCredentials, make_credentials
+
+AGENT = """
+    import runpy, sys
+    sys.argv = ["agent"]
+    runpy.run_module("fiber.agent", run_name="__main__")
+"""
+
+MASTER = """
+    import pickle, signal, sys
+    from fiber._transport.link import Patience
+    from fiber._transport.listener import MasterListener
+    from fiber._transport.loop import Loop
+    from fiber._wire.messages import Shutdown
+
+    class Observer:
+        def on_frame(self, frame): pass
+        def on_suspect(self): pass
+        def on_trusted(self): pass
+        def on_lost(self, reason): print("lost", reason, flush=True)
+
+    links = []
+    def joined(link):
+        links.append(link)
+        link.attach(Observer())
+        print("joined", link.peer.name, flush=True)
+
+    def end(*_):
+        def act():
+            for link in links:
+                link.send(Shutdown(0.0).encode())
+            listener.close("the master ended", then=loop.stop)
+        loop.interrupt(act)
+
+    loop = Loop()
+    signal.signal(signal.SIGTERM, end)
+    listener = MasterListener(
+        loop, sys.argv[2], pickle.load(open(sys.argv[1], "rb")),
+        on_agent=joined, on_refused=lambda reason: None,
+        patience=Patience(0.2, 0.5, 1.0),
+    )
+    print("listens", flush=True)
+    loop.run()
+"""
+
+
+class Pool:
+    """One address where masters come and go, and one agent that dials it."""
+
+    def __init__(self, launch: Callable[..., Program], folder: Path) -> None:
+        self.credentials: MasterCredentials = make_credentials("warm")
+        self._path = folder / "credentials"
+        self._path.write_bytes(pickle.dumps(self.credentials))
+        self._launch = launch
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.address = f"127.0.0.1:{free.getsockname()[1]}"
+
+    def agent(self, grace: float, **env: str) -> Program:
+        told = {
+            "FIBER_AGENT_ADDRESS": self.address,
+            "FIBER_AGENT_CREDENTIALS": self.credentials.agent_half().to_environment(),
+            "FIBER_AGENT_NAME": "warm-0",
+            "FIBER_AGENT_PARENT": str(os.getpid()),
+            "FIBER_AGENT_LOST_GRACE": str(grace),
+            "FIBER_START_TIMEOUT": "0.2",
+        }
+        return self._launch(AGENT, env={**told, **env})
+
+    def master(self) -> Program:
+        master = self._launch(MASTER, str(self._path), self.address)
+        assert master.line() == "listens"
+        return master
+
+
+@pytest.fixture
+def pool(launch: Callable[..., Program], tmp_path: Path) -> Pool:
+    return Pool(launch, tmp_path)
+
+
+def test_it_waits_for_its_first_master_for_longer_than_agents_of_a_run(pool: Pool) -> None:
+    agent = pool.agent(grace=0.1)
+    with pytest.raises(AssertionError, match="still runs"):
+        agent.wait(1.0)
+    assert pool.master().line() == "joined warm-0"
+
+
+def test_it_serves_one_master_after_the_other_and_keeps_nothing_of_them(pool: Pool) -> None:
+    agent = pool.agent(grace=30)
+    descriptors = []
+    for _ in range(3):
+        master = pool.master()
+        assert master.line() == "joined warm-0"
+        descriptors.append(len(os.listdir(f"/proc/{agent.pid}/fd")))
+        master.signal(signal.SIGTERM)
+        assert master.wait() == 0
+    assert len(set(descriptors)) == 1
+    # A master that is on its way out refuses newcomers.
+    assert set(agent.stderr.splitlines()) <= {
+        f"fiber agent warm-0: the master at {pool.address} refused this agent: "
+        "this master is ending"
+    }
+
+
+def test_it_finds_the_next_master_when_the_last_was_killed(pool: Pool) -> None:
+    agent = pool.agent(grace=30)
+    for _ in range(2):
+        master = pool.master()
+        assert master.line() == "joined warm-0"
+        master.kill()
+    assert pool.master().line() == "joined warm-0"
+    # Silent where a master was gone before the agent had heard that it is welcome.
+    for line in agent.stderr.splitlines():
+        assert line.startswith("fiber agent warm-0: lost the master: ")
+
+
+def test_it_ends_when_no_master_comes_after_a_lost_one(pool: Pool) -> None:
+    agent = pool.agent(grace=0.5)
+    master = pool.master()
+    assert master.line() == "joined warm-0"
+    master.kill()
+    assert agent.wait() == 0
+    assert agent.left() == []
+    assert "lost the master" in agent.stderr
+    assert f"no master answered at {pool.address} within 0." in agent.stderr
+
+
+def test_a_master_that_said_goodbye_is_not_lost(pool: Pool) -> None:
+    agent = pool.agent(grace=0.5)
+    master = pool.master()
+    assert master.line() == "joined warm-0"
+    master.signal(signal.SIGTERM)
+    assert master.wait() == 0
+    with pytest.raises(AssertionError, match="still runs"):
+        agent.wait(1.5)
+
+
+def test_sigterm_ends_it_while_it_waits(pool: Pool) -> None:
+    agent = pool.agent(grace=30)
+    wait_for(lambda: _handles(agent.pid, signal.SIGTERM))
+    agent.signal(signal.SIGTERM)
+    assert agent.wait() == 0
+    assert agent.left() == []
+
+
+def test_a_grace_that_is_no_number(pool: Pool) -> None:
+    agent = pool.agent(grace=1, FIBER_AGENT_LOST_GRACE="soon")
+    assert agent.wait() == 1
+    assert "FIBER_AGENT_LOST_GRACE='soon' is not a number of seconds" in agent.stderr
+
+
+def _handles(pid: int, signum: int) -> bool:
+    status = Path(f"/proc/{pid}/status").read_text()
+    caught = re.search(r"SigCgt:\t(\w+)", status)
+    return caught is not None and bool(int(caught[1], 16) >> (signum - 1) & 1)
