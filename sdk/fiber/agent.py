@@ -1,6 +1,6 @@
 """``python -m fiber.agent``: the process that runs children on another host for a master.
 
-It takes everything from its environment, nothing from its command line:
+It takes everything from its environment, nothing from its command line (but ``--help``):
 
 ``FIBER_AGENT_ADDRESS``      ``host:port`` of the master
 ``FIBER_AGENT_CREDENTIALS``  the agent's half of the credentials, or the directory that holds it
@@ -12,16 +12,18 @@ It takes everything from its environment, nothing from its command line:
 ``FIBER_START_TIMEOUT``      seconds to find the master, as for every Fiber process
 
 Exit status 0: the master ended it, or the grace for a lost one is over.  1: it could not join, or
-lost the master; stderr says why.
+lost the master; stderr says why.  2: it was given arguments.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from typing import NoReturn
 
 from fiber import config
@@ -58,6 +60,7 @@ class Main:
         self._name = os.environ.get(_NAME) or f"agent-{os.getpid()}"
         self._lost_grace = _seconds(_LOST_GRACE)
         self._orphaned = _seconds(_ORPHANED)
+        self._parent = _pid(_PARENT)
         self._loop = Loop()
         self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
         self._agent = Agent(self._loop, self._name, self._hub)
@@ -143,11 +146,10 @@ class Main:
             self._service.stop("told to end by SIGTERM", _DRAIN_GRACE)
 
     def _end_with_parent(self) -> None:
-        parent = os.environ.get(_PARENT)
-        if parent is None:
+        if self._parent is None:
             return
         try:
-            watched = os.pidfd_open(int(parent))
+            watched = os.pidfd_open(self._parent)
         except ProcessLookupError:
             self._parent_died()
         self._loop.register(watched, self._parent_died)
@@ -171,9 +173,21 @@ def _seconds(variable: str) -> float | None:
     if value is None:
         return None
     try:
-        return float(value)
+        seconds = float(value)
     except ValueError:
-        raise ConfigError(f"{variable}={value!r} is not a number of seconds") from None
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds >= 0):
+        raise ConfigError(f"{variable}={value!r} is not a number of seconds")
+    return seconds
+
+
+def _pid(variable: str) -> int | None:
+    value = os.environ.get(variable)
+    if value is None:
+        return None
+    if not (value.isascii() and value.isdigit() and 0 < int(value) < 2**31):
+        raise ConfigError(f"{variable}={value!r} is not the id of a process")
+    return int(value)
 
 
 def _required(variable: str) -> str:
@@ -187,8 +201,10 @@ def _required(variable: str) -> str:
     return value
 
 
-def main() -> int:
+def main(arguments: Sequence[str] = ()) -> int:
     """Run one agent to its end; the exit status."""
+    if arguments:
+        return _explain(arguments)
     try:
         return Main().run()
     except (FiberError, AuthenticationError) as error:
@@ -196,5 +212,17 @@ def main() -> int:
         return 1
 
 
+def _explain(arguments: Sequence[str]) -> int:
+    if set(arguments) & {"-h", "--help"}:
+        print(__doc__)
+        return 0
+    print(
+        f"fiber agent: it takes no arguments, but was given {' '.join(arguments)!r}. It is "
+        "configured by its environment: see python -m fiber.agent --help",
+        file=sys.stderr,
+    )
+    return 2
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

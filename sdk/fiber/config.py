@@ -5,8 +5,8 @@ pyproject.toml upward from the working directory, environment variables (`FIBER_
 `backend`, and so on), `fiber.init()`. All four know the same keys, those of `Config`. A key
 that does not exist and a value that does not fit are a ConfigError wherever they come from.
 
-Variables whose names begin with `FIBER_AGENT_` or `FIBER_CHILD_` are not configuration:
-Fiber passes them to the processes that it starts.
+Some variables `FIBER_AGENT_*` are not configuration: an agent is told by them where its master
+is, and what belongs to it (see `fiber.agent`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from fiber.errors import ConfigError
 
-__all__ = ["Config", "current", "guard", "init", "install", "load"]
+__all__ = ["Config", "current", "guard", "init", "install", "load", "use"]
 
 
 class _Rule(NamedTuple):
@@ -98,8 +98,8 @@ def _key(default: Any, rule: _Rule, *, fixed: bool = False) -> Any:
 class Config:
     """What can be configured; each key's type and default is in the signature.
 
-    Keys marked * are read when the first process, pool, pipe or queue is made, and cannot
-    change after that; the others hold for what is made next.
+    Keys marked * are read when the first process, pool, pipe, queue, event or semaphore is
+    made, and cannot change after that; the others hold for what is made next.
 
     backend*: where processes run. "local" starts them on this machine as children of the
         program. "loopback" does the same through agents, separate processes that reach the
@@ -147,6 +147,7 @@ def _not_in_use() -> bool:
 _lock = threading.Lock()
 _current: Config | None = None
 _in_use: Callable[[], bool] = _not_in_use
+_used = False  # something that is no part of the runtime was built on it, such as a pipe
 
 
 def current() -> Config:
@@ -159,6 +160,14 @@ def current() -> Config:
     return _current
 
 
+def use() -> Config:
+    """`current()`, for something that is built on it: a later `init()` respects that."""
+    global _used
+    config = current()
+    _used = True
+    return config
+
+
 def init(**settings: object) -> Config:
     """Set keys of `Config` for this program, and return the configuration that results.
 
@@ -169,7 +178,7 @@ def init(**settings: object) -> Config:
     global _current
     with _lock:
         config = load(settings)
-        if _current is not None and _in_use():
+        if _current is not None and (_used or _in_use()):
             _refuse_late_change(_current, config)
         _current = config
     return config
@@ -177,9 +186,9 @@ def init(**settings: object) -> Config:
 
 def install(config: Config) -> None:
     """Put a configuration in force as it is: how a child gets its parent's."""
-    global _current
+    global _current, _used
     with _lock:
-        _current = config
+        _current, _used = config, False
 
 
 def guard(in_use: Callable[[], bool]) -> None:
@@ -267,7 +276,9 @@ def _unknown(setting: _Setting) -> str:
 
     valid = [setting.spelling(key) for key in _KEYS]
     written = setting.spelling(setting.key)
-    close = difflib.get_close_matches(written, valid, n=1)
+    # An agent's variables are suggested only to who meant one: they configure no program.
+    close = difflib.get_close_matches(written, AGENT_VARIABLES, n=1, cutoff=0.9)
+    close = close or difflib.get_close_matches(written, valid, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
     return f"unknown key {written!r} in {setting.source}.{hint} Valid are: {', '.join(valid)}."
 
@@ -290,7 +301,22 @@ def _from_init(settings: Mapping[str, object]) -> Iterator[_Setting]:
 
 
 _PREFIX = "FIBER_"
-_INTERNAL = ("FIBER_AGENT_", "FIBER_CHILD_")
+
+AGENT_VARIABLES = frozenset(
+    {
+        "FIBER_AGENT_ADDRESS",
+        "FIBER_AGENT_CREDENTIALS",
+        "FIBER_AGENT_INHERITS",
+        "FIBER_AGENT_LOST_GRACE",
+        "FIBER_AGENT_NAME",
+        "FIBER_AGENT_NAMESPACE",
+        "FIBER_AGENT_ORPHANED",
+        "FIBER_AGENT_PARENT",
+        "FIBER_AGENT_POOL",
+        "FIBER_AGENT_PROCESSES",
+    }
+)
+"""What an agent is told, by a backend or in a pod: known by name, so that a typo is found."""
 
 
 def _variable(key: str) -> str:
@@ -299,7 +325,7 @@ def _variable(key: str) -> str:
 
 def _from_environment(environ: Mapping[str, str]) -> Iterator[_Setting]:
     for name, value in environ.items():
-        if not name.startswith(_PREFIX) or name.startswith(_INTERNAL):
+        if not name.startswith(_PREFIX) or name in AGENT_VARIABLES:
             continue
         if _is_service_link(name, environ):
             continue

@@ -44,7 +44,7 @@ MASTER = """
     def tell(link):
         # Once it has acknowledged something, it knows that it was welcome.
         statistics = link.statistics()
-        if statistics.queued_frames or statistics.unacknowledged_datagrams:
+        if not statistics.frames_sent or statistics.unacknowledged_datagrams:
             loop.call_later(0.01, tell, link)
         else:
             print("joined", link.peer.name, flush=True)
