@@ -5,16 +5,18 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from multiprocessing import spawn
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import census
 from fiber import reduction
-from fiber._agent import agent as agent_module
+from fiber._agent import zygote_link
 from fiber._agent.agent import Agent, LocalChild
 from fiber._agent.port import ChildSpec
 from fiber._transport.loop import Loop
@@ -145,6 +147,54 @@ def test_what_a_dead_worker_never_read_is_named(shared: Agent) -> None:
     assert report.running == (17, 4)
 
 
+def test_an_answer_that_nobody_can_handle_ends_its_worker(
+    shared: Agent, loop: Loop, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The master must not wait for it."""
+    child, observer = begin(shared, answer_sums, tasks=True)
+
+    def said(message: Any) -> None:
+        message.release()
+        raise ValueError("not this one")
+
+    observer.said = said
+    child.deliver(1, pickle.dumps(7))
+    report = observer.wait_for_exit()
+    assert report.reason == "killed by its agent: not this one"
+    settled(loop)
+    assert "ValueError: not this one" in capsys.readouterr().err
+
+
+def test_one_that_was_killed_before_it_was_born_is_gone_at_once(own: Agent, tmp_path: Path) -> None:
+    """Though its zygote imports the program's main module, for ever for all we know."""
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+    (tmp_path / "slow.py").write_text(f"open({str(gate)!r}).read()")
+    preparation = {"preload": ["slow"], "sys_path": [str(tmp_path), *sys.path]}
+    child, observer = begin(own, run_forever, preparation=preparation, tasks=True)
+    writer = os.open(gate, os.O_WRONLY)  # returns once the import has begun
+    child.signal(signal.SIGKILL)
+    report = observer.wait_for_exit()
+    assert report.reason == "killed by SIGKILL before it had started"
+    assert child.pid is None
+    os.close(writer)
+    # The zygote goes on, and the next child is not given what was its.
+    other, second = begin(own, run_forever, tasks=True)
+    end(other, second)
+
+
+def test_closing_waits_for_no_import(own: Agent, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+    (tmp_path / "slow.py").write_text(f"open({str(gate)!r}).read()")
+    preparation = {"preload": ["slow"], "sys_path": [str(tmp_path), *sys.path]}
+    _, observer = begin(own, run_forever, preparation=preparation)
+    writer = os.open(gate, os.O_WRONLY)
+    own.close()
+    assert observer.wait_for_exit().exitcode == -signal.SIGKILL
+    os.close(writer)
+
+
 def test_what_an_idle_worker_has_not_read_can_be_taken_back(shared: Agent) -> None:
     child, observer = begin(shared, read_never, tasks=True)
     observer.wait_for_words(1)
@@ -238,7 +288,7 @@ def test_a_zygote_that_cannot_be_launched_is_an_error_of_the_start(
 
     before = len(os.listdir("/proc/self/fd"))
     with monkeypatch.context() as broken:
-        broken.setattr(agent_module, "_launch", refuse)
+        broken.setattr(zygote_link, "_launch", refuse)
         with pytest.raises(FileNotFoundError, match="no interpreter"):
             begin(own, os._exit, 0, tasks=True, fds=(os.dup(1),))
     settled(own._loop)

@@ -6,6 +6,7 @@ import errno
 import os
 import pickle
 import resource
+import select
 import signal
 import socket
 import subprocess
@@ -20,7 +21,7 @@ import pytest
 
 import census
 from fiber import reduction
-from fiber._agent import agent, child, zygote
+from fiber._agent import child, zygote, zygote_link
 from fiber._agent.board import Board
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
@@ -36,7 +37,7 @@ class Master:
     def __init__(self, board: Board, *, preload: bool = False, heirloom: str | None = None) -> None:
         self.sock, theirs = socketpair("a test")
         self.sock.settimeout(PATIENCE)
-        self.process = agent._launch(theirs.fileno(), board.fd, heirloom, preload=preload)
+        self.process = zygote_link._launch(theirs.fileno(), board.fd, heirloom, preload=preload)
         theirs.close()
 
     def start(self, number: int, **options: Any) -> None:
@@ -45,7 +46,7 @@ class Master:
         for first in range(0, len(fds), 200):
             last = first + 200 >= len(fds)
             message = (zygote.START, number, tuple(_start(**options)))
-            request = message if last else (zygote.DESCRIPTORS,)
+            request = message if last else (zygote.DESCRIPTORS, number)
             packet.send(self.sock, pickle.dumps(request), fds=fds[first : first + 200])
         for fd in fds:
             os.close(fd)
@@ -291,8 +292,12 @@ def test_more_descriptors_than_it_was_born_to_hold(board: Board) -> None:
     second = master.started(2, fds=fds)
     assert not gone(first)
     assert not gone(second)
-    limits = [resource.prlimit(pid, resource.RLIMIT_NOFILE) for pid in (first, second)]
-    assert limits == [(256, hard), (soft, hard)], "a child has its program's limit of the moment"
+
+    def limits() -> list[tuple[int, int]]:
+        return [resource.prlimit(pid, resource.RLIMIT_NOFILE) for pid in (first, second)]
+
+    # Each child has its program's limit of the moment, as one of the first things it sets.
+    assert census.wait_until(lambda: limits() == [(256, hard), (soft, hard)], PATIENCE), limits()
     for pid in (first, second):
         os.kill(pid, signal.SIGKILL)
     master.close()
@@ -332,6 +337,17 @@ def test_a_refused_fork_is_told_and_leaks_nothing(
         assert text == "the system refused a new process: Resource temporarily unavailable"
     assert len(os.listdir("/proc/self/fd")) == before
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()
+
+
+def test_what_came_ahead_of_a_start_that_never_came_is_closed(master: Master) -> None:
+    reader, writer = os.pipe()
+    packet.send(master.sock, pickle.dumps((zygote.DESCRIPTORS, 1)), fds=[writer])
+    os.close(writer)
+    master.started(2)
+    assert select.select([reader], [], [], PATIENCE)[0]
+    assert os.read(reader, 1) == b""
+    os.close(reader)
+    master.say(zygote.SIGNAL, 2, signal.SIGKILL)
 
 
 def test_descriptors_that_nobody_took_are_closed_in_the_child(

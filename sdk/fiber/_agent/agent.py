@@ -10,25 +10,19 @@ thread.
 
 from __future__ import annotations
 
-import fcntl
 import itertools
 import os
-import pickle
-import resource
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import threading
 from collections.abc import Sequence
 from typing import Any
 
-from fiber._agent import child as child_module
 from fiber._agent import zygote
 from fiber._agent.board import Board
-from fiber._agent.child import Start, interpreter_arguments
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
 from fiber._hub import access
 from fiber._hub.access import Access
 from fiber._hub.hub import Hub
@@ -37,12 +31,11 @@ from fiber._transport.outbox import Outbox
 from fiber._transport.unix import naming_the_limit, socketpair, wait_readable
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike
+from fiber.errors import TooManyOpenFiles
 
 _SEQ = struct.Struct("<Q")
 _ATTENTION = 5e-3
 """Seconds that a caller waits for a worker itself before it leaves the answer to the loop."""
-
-_QUIT_TIMEOUT = 10.0
 
 
 class Agent:
@@ -55,15 +48,16 @@ class Agent:
         self._lock = threading.Lock()
         self._ids = itertools.count(1)
         self._children: dict[int, LocalChild] = {}
+        self._forsaken: dict[int, int | None] = {}
         self._board = Board()
-        self._zygotes: list[_ZygoteLink] = []
+        self._zygotes: list[ZygoteLink] = []
         self._closed = False
 
     def start(self, spec: ChildSpec, observer: ChildObserver) -> LocalChild:
         """Start a child; it has its pid when ``observer.started`` is called."""
         with self._lock:
             if self._closed:
-                _close_all(spec.fds)
+                close_all(spec.fds)
                 raise RuntimeError("this process is ending: no process can be started any more")
             child = LocalChild(self, next(self._ids), spec, observer)
             self._children[child.id] = child
@@ -89,22 +83,22 @@ class Agent:
         """What our children are told of this host's hub."""
         return self._hub.access if self._hub is not None else access.told()
 
-    def _zygote(self, *, preload: bool = True) -> _ZygoteLink:
+    def _zygote(self, *, preload: bool = True) -> ZygoteLink:
         if not self._zygotes or not preload:
             directory = None if self._hub is None else os.path.dirname(self._hub.access.address)
             self._zygotes.append(
-                _ZygoteLink(self, self._loop, self._board.fd, directory, preload=preload)
+                ZygoteLink(self, self._loop, self._board.fd, directory, preload=preload)
             )
         return self._zygotes[-1]
 
     # What zygotes say, on the loop's thread
 
-    def heard(self, link: _ZygoteLink, answer: tuple[Any, ...]) -> None:
+    def heard(self, link: ZygoteLink, answer: tuple[Any, ...]) -> None:
         """An answer of a zygote about one of our children."""
         child = self._children.get(answer[1])
         if child is None:
-            return
-        if answer[0] == zygote.STARTED:
+            self._heard_of_forsaken(link, answer)
+        elif answer[0] == zygote.STARTED:
             child.pid = answer[2]
             child.release_descriptors()
             child.observer.started(answer[2])
@@ -115,12 +109,25 @@ class Agent:
         elif answer[0] == zygote.UNFIT:
             self._start_elsewhere(child)
 
-    def zygote_gone(self, link: _ZygoteLink) -> None:
+    def forsake(self, child: LocalChild) -> None:
+        """It was killed before it was born, and its zygote may be busy for long: it is gone now."""
+        if child.pid is None and child.id in self._children:
+            self._forsaken[child.id], child.slot = child.slot, None
+            self._gone(child, -signal.SIGKILL, "killed by SIGKILL before it had started")
+
+    def _heard_of_forsaken(self, link: ZygoteLink, answer: tuple[Any, ...]) -> None:
+        if answer[0] == zygote.STARTED:
+            link.send(zygote.SIGNAL, answer[1], signal.SIGKILL)
+        elif (slot := self._forsaken.pop(answer[1], None)) is not None:
+            self._board.release(slot)  # it can no longer write there
+
+    def zygote_gone(self, link: ZygoteLink) -> None:
         """A zygote died, and its children with it."""
         with self._lock:
             if link in self._zygotes:
                 self._zygotes.remove(link)
-        for child in [c for c in self._children.values() if c.zygote is link]:
+            bereft = [child for child in self._children.values() if child.zygote is link]
+        for child in bereft:
             self._gone(child, -signal.SIGKILL, "killed by SIGKILL, together with its zygote")
 
     def _start_elsewhere(self, child: LocalChild) -> None:
@@ -146,6 +153,8 @@ class Agent:
         with self._lock:
             del self._children[child.id]
         unread, running = self._bury(child)
+        if child.fault is not None:
+            reason = f"killed by its agent: {child.fault}"
         child.observer.exited(ExitReport(exitcode, reason, unread, running, host=self.host))
 
     def _bury(self, child: LocalChild) -> tuple[tuple[int, ...], tuple[int, int] | None]:
@@ -167,10 +176,12 @@ class LocalChild:
         self.host = agent.host
         self.pid: int | None = None
         self.slot: int | None = None
-        self.zygote: _ZygoteLink | None = None
+        self.fault: Exception | None = None
+        self.zygote: ZygoteLink | None = None
         self.observer = observer
         self.spec = spec
         self._fds = spec.fds
+        self._agent = agent
         self._loop = agent._loop
         self._ours: socket.socket | None = None
         self._theirs: socket.socket | None = None
@@ -181,12 +192,14 @@ class LocalChild:
                 self._open_channel(agent)
         except BaseException:
             self.release_descriptors()
+            if self.slot is not None:
+                agent._board.release(self.slot)
             raise
 
     def _open_channel(self, agent: Agent) -> None:
+        self.slot = agent._board.claim()
         ours, theirs = socketpair("starting a pool worker")
         ours.setblocking(False)
-        self.slot = agent._board.claim()
         # We keep the child's end too: what it has not read when it dies, or when another worker is
         # idle, is read from there.  The kernel gives each packet to exactly one reader.
         self._ours, self._theirs = ours, theirs
@@ -200,17 +213,17 @@ class LocalChild:
         try:
             with naming_the_limit("starting a process"):
                 if self.spec.stdio is None:
-                    fds += map(_dup_or_null, (1, 2))
+                    fds += map(dup_or_null, (1, 2))
                 fds += map(os.dup, [*(self.spec.stdio or ()), *ours, *self._fds])
         except BaseException:
-            _close_all(fds)
+            close_all(fds)
             raise
         return fds
 
     def release_descriptors(self) -> None:
         """It has its own now: the other end must see EOF when the child lets go."""
         fds, self._fds = self._fds, ()
-        _close_all(fds)
+        close_all(fds)
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to the worker; False if it is gone."""
@@ -242,6 +255,13 @@ class LocalChild:
         """Signal the child through its zygote."""
         if self.zygote is not None:
             self.zygote.send(zygote.SIGNAL, self.id, signum)
+        if signum == signal.SIGKILL and self.pid is None:
+            self._loop.call_soon(self._agent.forsake, self)
+
+    def condemn(self, fault: Exception) -> None:
+        """Something to or from it is lost for good: only its end can tell the master so."""
+        self.fault = self.fault or fault
+        self.signal(signal.SIGKILL)
 
     def hang_up(self) -> tuple[int, ...]:
         """It is gone: hear its last words, recall what it never read.  On the loop."""
@@ -276,128 +296,31 @@ class LocalChild:
             message = packet.receive(self._ours)
         except (BlockingIOError, EOFError):
             return False
-        self.observer.said(message)
+        except TooManyOpenFiles as error:
+            self.condemn(error)
+            return True
+        try:
+            self.observer.said(message)
+        except Exception as error:
+            self.condemn(error)
+            raise
         return True
 
     def _recall(self) -> list[int]:
         assert self._theirs is not None
         assert self._outbox is not None
         seqs = []
-        try:
-            while True:
+        while True:
+            try:
                 message = packet.receive(self._theirs, wait=False)
-                seqs.append(_SEQ.unpack_from(message.payload)[0])
-                message.release()
-        except (BlockingIOError, EOFError):
-            pass
+            except (BlockingIOError, EOFError):
+                break
+            except TooManyOpenFiles as error:
+                self.condemn(error)
+                continue
+            seqs.append(_SEQ.unpack_from(message.payload)[0])
+            message.release()
         return seqs + [_SEQ.unpack_from(payload)[0] for payload in self._outbox.recall()]
-
-
-class _ZygoteLink:
-    """Our side of one zygote process."""
-
-    def __init__(
-        self, agent: Agent, loop: Loop, board: int, heirloom: str | None, *, preload: bool
-    ) -> None:
-        self._agent = agent
-        self._loop = loop
-        self._gone = threading.Event()
-        self._sock, theirs = socketpair("starting the zygote")
-        try:
-            with naming_the_limit("starting the zygote"):
-                self._process = _launch(theirs.fileno(), board, heirloom, preload=preload)
-        except BaseException:
-            self._sock.close()
-            raise
-        finally:
-            theirs.close()
-        self._sock.setblocking(False)
-        self._outbox = Outbox(loop, self._sock)
-        loop.register(self._sock.fileno(), self._receive)
-
-    def request(self, child: LocalChild) -> None:
-        """Ask for a child."""
-        spec = child.spec
-        fds = child.descriptors()
-        while len(fds) > packet.MAX_DESCRIPTORS:
-            some, fds = fds[: packet.MAX_DESCRIPTORS], fds[packet.MAX_DESCRIPTORS :]
-            self._outbox.send(pickle.dumps((zygote.DESCRIPTORS,)), fds=some)
-        start = Start(
-            spec.method,
-            spec.preparation,
-            spec.payload,
-            child.slot,
-            spec.executable,
-            captured=spec.stdio is not None,
-            open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
-            hub=self._agent.access(),
-            elders=_elders(),
-        )
-        self._outbox.send(pickle.dumps((zygote.START, child.id, tuple(start)), protocol=5), fds=fds)
-
-    def send(self, *request: Any) -> None:
-        """Ask for something else."""
-        self._outbox.send(pickle.dumps(request))
-
-    def quit(self) -> None:
-        """End it and its children, and wait for that; on any thread but the loop's."""
-        self.send(zygote.QUIT)
-        try:
-            self._process.wait(_QUIT_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        if self._loop.running:
-            # Its last words tell of its children.
-            self._gone.wait(_QUIT_TIMEOUT)
-
-    def _receive(self) -> None:
-        try:
-            answer = packet.loads(packet.receive(self._sock))
-        except BlockingIOError:
-            return
-        except (EOFError, ConnectionError):
-            self._loop.unregister(self._sock.fileno())
-            self._outbox.close()
-            self._sock.close()
-            self._process.wait()
-            self._agent.zygote_gone(self)
-            self._gone.set()
-            return
-        self._agent.heard(self, answer)
-
-
-def _elders() -> tuple[int, ...]:
-    return os.getpid(), *child_module.elders
-
-
-def _launch(
-    control: int, board: int, heirloom: str | None, *, preload: bool
-) -> subprocess.Popen[bytes]:
-    # A program that closed its standard streams may have their numbers under ours; the zygote and
-    # its children must not.
-    fds = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 3) for fd in (control, board)]
-    arguments = f"{fds[0]}, {fds[1]}, {_elders()}, {preload}, {heirloom!r}"
-    try:
-        return subprocess.Popen(
-            interpreter_arguments(
-                sys.executable, f"from fiber._agent.zygote import main; main({arguments})"
-            ),
-            pass_fds=fds,
-            stdin=subprocess.DEVNULL,
-            stdout=_null_if_closed(1),
-            stderr=_null_if_closed(2),
-            # Ctrl-C in the terminal is for the program's own group.  A session of its own would
-            # make the kernel's scheduler share the processors between program and children by half
-            # (sched_autogroup), however many children there are.
-            process_group=0,
-        )
-    finally:
-        _close_all(fds)
-
-
-def _null_if_closed(fd: int) -> int | None:
-    return None if _is_standard_stream(fd) else subprocess.DEVNULL
 
 
 def describe(exitcode: int) -> str:
@@ -408,21 +331,3 @@ def describe(exitcode: int) -> str:
         return f"killed by {signal.Signals(-exitcode).name}"
     except ValueError:
         return f"killed by signal {-exitcode}"
-
-
-def _dup_or_null(fd: int) -> int:
-    return os.dup(fd) if _is_standard_stream(fd) else os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
-
-
-def _is_standard_stream(fd: int) -> bool:
-    # Python makes no descriptor inheritable by itself: one that is not has taken the number of a
-    # stream that the program closed.
-    try:
-        return os.get_inheritable(fd)
-    except OSError:
-        return False
-
-
-def _close_all(fds: Sequence[int]) -> None:
-    for fd in fds:
-        os.close(fd)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pickle
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 
-from fiber._agent.agent import Agent
+from fiber._agent.agent import Agent, LocalChild
 from fiber._agent.capture import Capture
 from fiber._agent.port import ChildSpec, ExitReport
 from fiber._hub.hub import Hub
@@ -74,11 +75,9 @@ class AgentService:
 
     def _start(self, message: messages.Start) -> None:
         name, method, preparation, payload, tasks = pickle.loads(message.spec)
-        child = _Observed(self, self._loop, message.child)
-        self._children[message.child] = child
+        child = self._children[message.child] = _Observed(self, message.child)
         child.start(
-            self._agent,
-            ChildSpec(name, method, preparation, payload, tasks=tasks, stdio=child.capture.stdio),
+            self._agent, self._loop, ChildSpec(name, method, preparation, payload, tasks=tasks)
         )
 
     def forget(self, child: int) -> None:
@@ -108,34 +107,43 @@ class AgentService:
 class _Observed:
     """One child, heard for the master; a ``ChildObserver``."""
 
-    def __init__(self, service: AgentService, loop: Loop, number: int) -> None:
+    def __init__(self, service: AgentService, number: int) -> None:
         self._service = service
         self._number = number
         self._delivered = 0
-        self.capture = Capture(loop, self._wrote, service.busy)
+        self._capture: Capture | None = None
+        self._child: LocalChild | None = None
 
-    def start(self, agent: Agent, spec: ChildSpec) -> None:
+    def start(self, agent: Agent, loop: Loop, spec: ChildSpec) -> None:
         """Start it."""
         try:
-            self._child = agent.start(spec, self)
+            self._capture = Capture(loop, self._wrote, self._service.busy)
+            self._child = agent.start(replace(spec, stdio=self._capture.stdio), self)
         except Exception as error:
             # Whatever keeps a child from starting here, the one who asked is the master.
             self.exited(ExitReport(1, f"could not be started: {error}", host=agent.host))
 
     def obey(self, message: messages.Deliver | messages.Signal | messages.TakeBack) -> None:
         """What the master wants of it."""
+        child = self._child
+        if child is None:
+            return  # it could not be started, and the master is being told
         if isinstance(message, messages.Deliver):
             self._delivered += 1
             buffers = [memoryview(buffer) for buffer in message.buffers]
-            self._child.deliver(message.seq, message.payload, buffers)
+            try:
+                child.deliver(message.seq, message.payload, buffers)
+            except OSError as error:
+                child.condemn(error)
         elif isinstance(message, messages.Signal):
-            self._child.signal(message.signum)
+            child.signal(message.signum)
         else:
-            self._child.take_back()
+            child.take_back()
 
     def started(self, pid: int) -> None:
         """It exists."""
-        self.capture.started()
+        if self._capture is not None:
+            self._capture.started()
         self._service.send(messages.Started(self._number, pid))
 
     def said(self, message: packet.Message) -> None:
@@ -149,7 +157,7 @@ class _Observed:
 
     def exited(self, report: ExitReport) -> None:
         """Its last lines, then its end."""
-        log = self.capture.finish()
+        log = self._capture.finish() if self._capture is not None else ()
         end = messages.Exited(self._number, self._delivered, *report._replace(log=log))
         self._service.send(end)
         self._service.forget(self._number)

@@ -6,7 +6,7 @@ sends them signals (a pid that only we can reap cannot be someone else's).  It e
 it, when its agent's process does.
 
 Packets from the agent: ``(START, child, start, descriptor count)``, ``(SIGNAL, child, signum)``,
-``(DESCRIPTORS,)`` (more descriptors for the START that follows), ``(QUIT,)``.
+``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
 ``(UNFIT, child, reason)``: this zygote's imports made forking unsafe, start that child elsewhere.
 """
@@ -61,7 +61,7 @@ class Zygote:
         self._pid = os.getpid()
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
-        self._descriptors: list[int] = []
+        self._descriptors: tuple[int, list[int]] = (0, [])  # child, what came ahead for it
         self._deaths, self._deaths_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self._poller = select.poll()
         for fd in (control.fileno(), self._deaths, *elders):
@@ -103,13 +103,21 @@ class Zygote:
         fds, message.fds = message.fds, []
         request: tuple[Any, ...] = packet.loads(message)
         if request[0] == DESCRIPTORS:
-            self._descriptors += fds
+            self._descriptors = (request[1], [*self._kept_for(request[1]), *fds])
         elif request[0] == START:
-            fds, self._descriptors = [*self._descriptors, *fds], []
+            fds = [*self._kept_for(request[1]), *fds]
             self._start(request[1], Start(*request[2]), fds)
         elif request[0] == SIGNAL:
             self._signal(request[1], request[2])
         return bool(request[0] != QUIT)
+
+    def _kept_for(self, child: int) -> list[int]:
+        """What came ahead for it; what is left of a START that never came is closed."""
+        (owner, fds), self._descriptors = self._descriptors, (0, [])
+        if owner == child:
+            return fds
+        _close_all(fds)
+        return []
 
     def _start(self, child: int, start: Start, fds: list[int]) -> None:
         if start.method == "fork" and not self._fit(start):

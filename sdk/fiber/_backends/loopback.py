@@ -159,7 +159,9 @@ class _AgentProcess:
             self._process.wait()
 
     def _ended(self) -> None:
+        status = self._process.poll()
+        if status is None:
+            return
         self._loop.unregister(self._watched)
         os.close(self._watched)
-        status = self._process.wait()
         self.agent.lose(f"its process ended with status {status}")

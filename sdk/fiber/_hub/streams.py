@@ -180,6 +180,9 @@ class SocketStream:
         except BrokenPipeError:
             # The reading side will say so, after what it still has for us.
             pass
+        except BaseException:
+            _close_all(fds)
+            raise
         _close_all(fds)
         return True
 

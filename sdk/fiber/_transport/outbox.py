@@ -11,10 +11,9 @@ from collections.abc import Callable, Sequence
 from fiber._transport.loop import Loop
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike
-from fiber.errors import TooManyOpenFiles
 
 _PAUSE = 0.05
-"""Seconds before a message that lacked a descriptor is tried again."""
+"""Seconds before a message that the system refused is tried again."""
 
 _Waiting = tuple[BytesLike, Sequence[memoryview], tuple[int, ...]]
 
@@ -88,8 +87,9 @@ class Outbox:
                 try:
                     if not self._try(*self._waiting[0]):
                         return
-                except TooManyOpenFiles:
-                    # Its sender cannot be told any more.  Others' ends give descriptors back.
+                except OSError:
+                    # No descriptor or no memory.  Its sender cannot be told any more, and others'
+                    # ends give back what is missing.
                     self._watch(None)
                     self._loop.call_later(_PAUSE, self._watch, self._flush)
                     if self._stalled:

@@ -157,13 +157,17 @@ class SessionLink:
                 observer.on_trusted()
 
     def _hand_over(self) -> None:
-        """Tell the observer what waits for it.  If it fails, the rest waits for the next turn."""
+        """Tell the observer what waits for it.
+
+        A frame that it fails on cannot count as handled: the other side relies on each.
+        """
         try:
             while self._inbox and (observer := self._observer):
                 observer.on_frame(self._inbox.popleft())
-        finally:
-            if self._inbox and self._observer:
-                self._loop.call_soon(self._hand_over)
+        except Exception as error:
+            self._inbox.clear()
+            self._lose(f"{type(error).__name__} on what it said: {error}")
+            raise
         if self._lost is not None and (observer := self._observer):
             self._observer = None
             observer.on_lost(self._lost)
