@@ -1,13 +1,13 @@
 # One target per chore. Everything happens in .venv, which the first target makes.
-#   PYTHON=python3.12 make test    chooses the interpreter of a new .venv
 
 PYTHON ?=
 BACKEND ?= local
 VENV := .venv
 BIN := $(VENV)/bin
+CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast lint bench conformance clean
+.PHONY: help demo test test-fast e2e lint bench conformance crds images cluster cluster-down clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -16,13 +16,19 @@ help:
 demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
-## make test          every test: style, unit, simulation, faults, conformance, examples
+## make test          every test, those on a real cluster included
 test: $(VENV)/.with-dev $(VENV)/.with-testsuite
+	$(CLUSTER) prepare
 	$(BIN)/python -m pytest
 
-## make test-fast     what to run at every save: style, unit, simulation
+## make test-fast     what to run at every save: style, unit, contract, simulation
 test-fast: $(VENV)/.with-dev
-	$(BIN)/python -m pytest -q tests/unit tests/simulation
+	$(BIN)/python -m pytest -q tests/unit tests/contract tests/simulation
+
+## make e2e           the operator and its chart on a real cluster: KUBECONFIG, kind or our own
+e2e: $(VENV)/.with-dev
+	$(CLUSTER) prepare
+	$(BIN)/python -m pytest tests/e2e
 
 ## make lint          style, types and import contracts, each tool's own words
 lint: $(VENV)/.with-dev
@@ -39,10 +45,29 @@ bench: $(VENV)/.with-bench
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(BIN)/python tests/conformance/run.py --backend $(BACKEND)
 
+## make crds          crds/fiberpools.yaml and the chart's copy, from the model
+crds: $(VENV)/.with-dev
+	$(BIN)/python -m fiber_api.schema
+
+## make images        the operator's and the worker's image, by docker or buildah, into build/images
+images: $(VENV)/.made
+	$(CLUSTER) images
+
+## make cluster       a Kubernetes cluster on this machine, with the images; prints KUBECONFIG (root, Go)
+cluster: $(VENV)/.made
+	$(CLUSTER) up --images
+
+## make cluster-down  stops it and deletes what it was
+cluster-down: $(VENV)/.made
+	$(CLUSTER) down
+
 ## make clean         remove the environment and what the tools wrote
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+##
+## PYTHON=python3.12 make test    chooses the interpreter of a new .venv; make clean first
 
 # The environment. Each stamp is newer than what its installation was made from.
 $(VENV)/.made:

@@ -14,8 +14,18 @@ import pytest
 
 from leaks import Snapshot, Watch, shut_down_runtime
 
-# Seconds for one test, by folder; a test with its own timeout marker keeps that.
-LIMITS = {"unit": 20, "simulation": 60, "faults": 60, "examples": 180, "conformance": 900}
+# Seconds for one test, by folder; a test with its own timeout marker keeps that. They are there to
+# end a hang: about ten times what the slowest needs alone on a machine, as it may have company.
+LIMITS = {
+    "chart": 30,
+    "conformance": 900,
+    "contract": 20,
+    "e2e": 180,
+    "examples": 180,
+    "faults": 60,
+    "simulation": 60,
+    "unit": 20,
+}
 
 _CALL = pytest.StashKey[pytest.CallInfo[None]]()
 _WATCH = pytest.StashKey[Watch]()

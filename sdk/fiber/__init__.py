@@ -1,4 +1,4 @@
-"""Python's multiprocessing whose processes are pods.
+"""Python's multiprocessing, whose processes can run under agents on other machines.
 
 ``import fiber as mp``: the names, signatures and semantics are multiprocessing's.  Importing has no
 effect; the first process, pool, pipe or queue starts what it needs.
@@ -9,38 +9,56 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
     from fiber.adoption import adopt as adopt
     from fiber.config import Config as Config
     from fiber.config import init as init
+    from fiber.errors import AdoptionError as AdoptionError
+    from fiber.errors import AgentLost as AgentLost
     from fiber.errors import AuthenticationError as AuthenticationError
     from fiber.errors import BufferTooShort as BufferTooShort
     from fiber.errors import ConfigError as ConfigError
+    from fiber.errors import ConnectionClosed as ConnectionClosed
     from fiber.errors import FiberError as FiberError
+    from fiber.errors import LinkError as LinkError
+    from fiber.errors import NotInFiber as NotInFiber
     from fiber.errors import ProcessError as ProcessError
     from fiber.errors import StartError as StartError
     from fiber.errors import TimeoutError as TimeoutError
+    from fiber.errors import TooManyOpenFiles as TooManyOpenFiles
+    from fiber.errors import UnpicklableError as UnpicklableError
+    from fiber.errors import VersionMismatch as VersionMismatch
     from fiber.errors import WorkerDied as WorkerDied
     from fiber.process import Process as Process
     from fiber.process import active_children as active_children
     from fiber.process import current_process as current_process
     from fiber.process import parent_process as parent_process
     from fiber.resources import meta as meta
+    from fiber.util import SUBDEBUG as SUBDEBUG
+    from fiber.util import SUBWARNING as SUBWARNING
 
 _SUBMODULES = frozenset(
     {
+        "adoption",
+        "config",
         "connection",
         "context",
+        "cpu",
+        "dummy",
         "errors",
         "managers",
         "pool",
         "process",
         "queues",
         "reduction",
+        "resource_tracker",
+        "resources",
         "results",
+        "shared_memory",
         "sharedctypes",
+        "spawn",
         "synchronize",
         "util",
     }
@@ -81,15 +99,25 @@ _METHODS_OF_THE_DEFAULT_CONTEXT = frozenset(
 )
 
 _HOMES = {
+    "AdoptionError": "errors",
+    "AgentLost": "errors",
     "AuthenticationError": "errors",
     "BufferTooShort": "errors",
     "Config": "config",
     "ConfigError": "errors",
+    "ConnectionClosed": "errors",
     "FiberError": "errors",
+    "LinkError": "errors",
+    "NotInFiber": "errors",
     "Process": "process",
     "ProcessError": "errors",
+    "SUBDEBUG": "util",
+    "SUBWARNING": "util",
     "StartError": "errors",
     "TimeoutError": "errors",
+    "TooManyOpenFiles": "errors",
+    "UnpicklableError": "errors",
+    "VersionMismatch": "errors",
     "WorkerDied": "errors",
     "active_children": "process",
     "adopt": "adoption",
@@ -117,4 +145,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *_SUBMODULES})
+    return sorted({*__all__, *_SUBMODULES, "__version__"})

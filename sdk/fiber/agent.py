@@ -33,9 +33,9 @@ from fiber._hub.hub import Hub
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
-from fiber._transport.link import Link, LinkError
+from fiber._transport.link import Link
 from fiber._transport.loop import Loop
-from fiber.errors import AuthenticationError, ConfigError, FiberError
+from fiber.errors import AuthenticationError, ConfigError, FiberError, LinkError
 
 _ADDRESS = "FIBER_AGENT_ADDRESS"
 _CREDENTIALS = "FIBER_AGENT_CREDENTIALS"

@@ -39,6 +39,11 @@ class Connection:
     """One end of a pipe.  EOFError when the last holder of the other end has closed it or died."""
 
     def __init__(self, channel: Channel, readable: bool = True, writable: bool = True) -> None:
+        if isinstance(channel, int):
+            raise TypeError(
+                f"a fiber Connection is made by Pipe(), not from descriptor {channel}: "
+                "for that use multiprocessing.connection.Connection"
+            )
         self._channel: Channel | None = channel
         self._readable = readable
         self._writable = writable
@@ -52,7 +57,10 @@ class Connection:
         channel = self._channel
         if channel is None or not self._writable:
             raise self._misuse("read-only")
-        payload, buffers = reduction.encode(obj)
+        try:
+            payload, buffers = reduction.encode(obj)
+        except reduction.REFUSALS as error:
+            raise reduction.blame({"the object to send": obj}, error) from error
         channel.send(payload, buffers)
 
     def send_bytes(self, buf: BytesLike, offset: int = 0, size: int | None = None) -> None:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from multiprocessing import process as _mp_process
 from multiprocessing import spawn, util
 from multiprocessing.context import (
@@ -14,10 +14,13 @@ from multiprocessing.context import (
     BufferTooShort,
     ProcessError,
     TimeoutError,
+    assert_spawning,
+    get_spawning_popen,
+    set_spawning_popen,
 )
 from typing import TYPE_CHECKING, Any
 
-from fiber import cpu
+from fiber import config, cpu
 from fiber._hub.absent import absent
 from fiber._runtime import methods
 from fiber.process import Process
@@ -30,7 +33,19 @@ if TYPE_CHECKING:
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
     from fiber.synchronize import BoundedSemaphore, Event, Semaphore
 
-__all__ = ["BaseContext", "DefaultContext", "ForkProcess", "ForkServerProcess", "SpawnProcess"]
+__all__ = [
+    "BaseContext",
+    "DefaultContext",
+    "ForkContext",
+    "ForkProcess",
+    "ForkServerContext",
+    "ForkServerProcess",
+    "SpawnContext",
+    "SpawnProcess",
+    "assert_spawning",
+    "get_spawning_popen",
+    "set_spawning_popen",
+]
 
 
 class ForkProcess(Process):
@@ -88,24 +103,28 @@ class BaseContext:
         """Two connected ends of a pipe."""
         from fiber.connection import Pipe
 
+        config.use()
         return Pipe(duplex)
 
     def Queue(self, maxsize: int = 0) -> Queue:
         """A queue for any number of processes."""
         from fiber.queues import Queue
 
+        config.use()
         return Queue(maxsize)
 
     def JoinableQueue(self, maxsize: int = 0) -> JoinableQueue:
         """A queue whose items are accounted for by ``task_done`` and ``join``."""
         from fiber.queues import JoinableQueue
 
+        config.use()
         return JoinableQueue(maxsize)
 
     def SimpleQueue(self) -> SimpleQueue:
         """A queue without a feeder thread."""
         from fiber.queues import SimpleQueue
 
+        config.use()
         return SimpleQueue()
 
     # Synchronization
@@ -114,18 +133,21 @@ class BaseContext:
         """A flag to wait for."""
         from fiber.synchronize import Event
 
+        config.use()
         return Event()
 
     def Semaphore(self, value: int = 1) -> Semaphore:
         """A semaphore."""
         from fiber.synchronize import Semaphore
 
+        config.use()
         return Semaphore(value)
 
     def BoundedSemaphore(self, value: int = 1) -> BoundedSemaphore:
         """A semaphore that is never released more often than acquired."""
         from fiber.synchronize import BoundedSemaphore
 
+        config.use()
         return BoundedSemaphore(value)
 
     # Work
@@ -133,16 +155,35 @@ class BaseContext:
     def Pool(
         self,
         processes: int | None = None,
-        initializer: Callable[..., Any] | None = None,
+        initializer: Callable[..., object] | None = None,
         initargs: Iterable[Any] = (),
         maxtasksperchild: int | None = None,
-        **options: Any,
+        *,
+        min_workers: int | None = None,
+        max_workers: int | None = None,
+        retries: int | None = None,
+        retry_exceptions: type[BaseException] | Sequence[type[BaseException]] = (),
+        error_handling: bool = False,
+        task_timeout: float | None = None,
+        idle_timeout: float | None = 60.0,
     ) -> Pool:
-        """A pool of workers; ``options`` are those of ``fiber.pool.Pool``."""
+        """A pool of workers; ``fiber.pool.Pool`` says what the options mean."""
         from fiber.pool import Pool
 
-        context = self.get_context()
-        return Pool(processes, initializer, initargs, maxtasksperchild, context=context, **options)
+        return Pool(
+            processes,
+            initializer,
+            initargs,
+            maxtasksperchild,
+            context=self.get_context(),
+            min_workers=min_workers,
+            max_workers=max_workers,
+            retries=retries,
+            retry_exceptions=retry_exceptions,
+            error_handling=error_handling,
+            task_timeout=task_timeout,
+            idle_timeout=idle_timeout,
+        )
 
     # Settings
 
@@ -198,10 +239,31 @@ class BaseContext:
         return reduction
 
 
-class _ConcreteContext(BaseContext):
-    def __init__(self, method: str, process: type[Process]) -> None:
-        super().__init__(method)
-        self.Process = process
+class ForkContext(BaseContext):
+    """The context of the start method ``fork``."""
+
+    Process = ForkProcess
+
+    def __init__(self) -> None:
+        super().__init__("fork")
+
+
+class ForkServerContext(BaseContext):
+    """The context of the start method ``forkserver``."""
+
+    Process = ForkServerProcess
+
+    def __init__(self) -> None:
+        super().__init__("forkserver")
+
+
+class SpawnContext(BaseContext):
+    """The context of the start method ``spawn``."""
+
+    Process = SpawnProcess
+
+    def __init__(self) -> None:
+        super().__init__("spawn")
 
 
 class DefaultContext(BaseContext):
@@ -227,8 +289,8 @@ class DefaultContext(BaseContext):
 
 
 _contexts: dict[str, BaseContext] = {
-    "fork": _ConcreteContext("fork", ForkProcess),
-    "forkserver": _ConcreteContext("forkserver", ForkServerProcess),
-    "spawn": _ConcreteContext("spawn", SpawnProcess),
+    "fork": ForkContext(),
+    "forkserver": ForkServerContext(),
+    "spawn": SpawnContext(),
 }
 default = DefaultContext()

@@ -10,6 +10,8 @@
     │       ├── AgentLost         an agent that is out of reach
     │       ├── ConfigError       a key or value that is wrong (also ValueError)
     │       ├── ConnectionClosed  the other end of a link is gone (also EOFError)
+    │       ├── LinkError         no way between program and agent, a port in use for instance
+    │       ├── NotInFiber        a part of multiprocessing that Fiber has not (yet)
     │       ├── StartError        a process that does not start, an initializer that fails
     │       ├── TooManyOpenFiles  the limit of file descriptors is reached (also OSError)
     │       ├── UnpicklableError  an object that cannot travel (also PicklingError, TypeError)
@@ -26,6 +28,7 @@ from __future__ import annotations
 
 import errno
 import pickle
+import resource
 import signal
 from collections.abc import Sequence
 from multiprocessing import AuthenticationError, BufferTooShort, ProcessError, TimeoutError
@@ -39,7 +42,9 @@ __all__ = [
     "ConfigError",
     "ConnectionClosed",
     "FiberError",
+    "LinkError",
     "MaybeEncodingError",
+    "NotInFiber",
     "ProcessError",
     "StartError",
     "TimeoutError",
@@ -117,6 +122,14 @@ class ConnectionClosed(EOFError, FiberError):
         self.reason = reason
 
 
+class LinkError(FiberError):
+    """A link between a master and an agent cannot be made, or the other side refused it."""
+
+
+class NotInFiber(FiberError, NotImplementedError):
+    """A part of multiprocessing that this version of Fiber does not have; says what to use."""
+
+
 class StartError(FiberError):
     """A process cannot start, or its initializer fails.
 
@@ -140,8 +153,6 @@ class TooManyOpenFiles(FiberError, OSError):
     """No file descriptor is left (errno EMFILE); says the limit and how to raise it."""
 
     def __init__(self, doing: str) -> None:
-        import resource  # only needed once things have gone wrong
-
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         ceiling = "no hard limit" if hard == resource.RLIM_INFINITY else f"the hard limit is {hard}"
         super().__init__(
@@ -255,8 +266,8 @@ def _advice(exitcode: int | None) -> str:
     if exitcode < 0:
         return "find out who sends this signal to the program's processes."
     return (
-        "the task ended its process itself, by os._exit(), sys.exit() or native code. "
-        "Let it return or raise instead."
+        "the task ended its process itself: by os._exit(), by native code, or with a "
+        "KeyboardInterrupt. Let it return, or raise another exception, instead."
     )
 
 

@@ -6,6 +6,7 @@ code which ignores it also runs there.
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import warnings
@@ -23,9 +24,9 @@ from multiprocessing.pool import (  # type: ignore[attr-defined]
 )
 from typing import Any
 
-from fiber import config, cpu
 from fiber import context as fiber_context
 from fiber._engine.chunks import default_chunksize
+from fiber._runtime import options
 from fiber._runtime.dispatcher import Dispatcher, Terms
 from fiber._runtime.outcome import Failure
 from fiber._runtime.requests import Request
@@ -63,9 +64,13 @@ _Callback = Callable[[Any], object]
 class Pool:
     """A pool of worker processes.
 
-    ``processes`` is fixed; ``min_workers`` and ``max_workers`` in its place make the pool follow
-    the work.  Beyond multiprocessing:
+    ``processes`` is their number, by default ``cpu_count()``.  Each begins with
+    ``initializer(*initargs)``, and is replaced after ``maxtasksperchild`` tasks (None: never).
+    ``context`` is that of the start method.  Beyond multiprocessing:
 
+    * ``min_workers`` (by default 1) and ``max_workers`` (by default ``cpu_count()``), in place of
+      ``processes``, make the pool follow the work.  A worker above ``min_workers`` that has had
+      nothing to do for ``idle_timeout`` seconds (None: for ever) leaves.
     * A task whose worker dies runs again elsewhere, at most ``retries`` times (None: as
       configured), then it raises ``WorkerDied``; other tasks never notice.
     * A task that raises one of ``retry_exceptions`` (with ``error_handling=True`` any Exception)
@@ -73,6 +78,8 @@ class Pool:
     * A task that runs for longer than ``task_timeout`` seconds, or the ``timeout=`` of its call,
       raises TimeoutError, and its worker is killed and replaced.
     """
+
+    _state = INIT  # until ``__init__`` is through; ``__del__`` looks at it
 
     def __init__(
         self,
@@ -88,20 +95,15 @@ class Pool:
         retry_exceptions: type[BaseException] | Sequence[type[BaseException]] = (),
         error_handling: bool = False,
         task_timeout: float | None = None,
-        idle_timeout: float = IDLE_TIMEOUT,
+        idle_timeout: float | None = IDLE_TIMEOUT,
     ) -> None:
-        self._state = INIT  # __del__ looks at it
-        minimum, maximum = _sizes(processes, min_workers, max_workers)
-        if maxtasksperchild is not None and (
-            not _is_int(maxtasksperchild) or maxtasksperchild <= 0
-        ):
-            raise ValueError("maxtasksperchild must be a positive int or None")
+        minimum, maximum = options.sizes(processes, min_workers, max_workers)
         if initializer is not None and not callable(initializer):
             raise TypeError("initializer must be a callable")
         self._ctx = context or fiber_context.default.get_context()
         self._processes = maximum
-        self._maxtasksperchild = maxtasksperchild
-        self._task_timeout = _positive("task_timeout", task_timeout)
+        self._maxtasksperchild = options.max_tasks(maxtasksperchild)
+        self._task_timeout = options.seconds("task_timeout", task_timeout)
         self._owner = os.getpid()
         self._dispatcher = Dispatcher(
             Terms(
@@ -110,10 +112,10 @@ class Pool:
                 initargs=tuple(initargs),
                 minimum=minimum,
                 maximum=maximum,
-                maxtasks=maxtasksperchild,
-                retries=_retries(retries),
-                retryable=(Exception,) if error_handling else _classes(retry_exceptions),
-                idle_timeout=_positive("idle_timeout", idle_timeout) or IDLE_TIMEOUT,
+                maxtasks=self._maxtasksperchild,
+                retries=options.retries(retries),
+                retryable=(Exception,) if error_handling else options.exceptions(retry_exceptions),
+                idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
             )
         )
         self._dispatcher.start()
@@ -130,11 +132,17 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> Any:
-        """Call ``func(*args, **kwds)`` in a worker and return its result."""
+        """Call ``func(*args, **kwds)`` in a worker and return its result.
+
+        TimeoutError, and the worker is killed, if it runs for longer than ``timeout`` seconds; None
+        stands for the pool's ``task_timeout``, infinity for no limit.
+        """
         self._check_running()
         result = AsyncResult(self)
-        worker = self._dispatcher.call(result, func, args, kwds, self._limit(timeout))
-        while worker is not None and not result.ready() and worker.attend():
+        dispatcher = self._dispatcher
+        limit = self._limit(timeout)
+        worker = dispatcher.call(result, func, args, kwds, limit, until=result.ready)
+        while worker is not None and not result.ready() and dispatcher.attend(worker):
             pass
         return result.get()
 
@@ -148,7 +156,11 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> AsyncResult:
-        """As ``apply``, but return at once with a result to wait for."""
+        """As ``apply``, but return at once with a result to wait for.
+
+        In another thread ``callback`` is called with the result, or ``error_callback`` with what
+        was raised; both must be quick, since all of a pool's callbacks wait for each other.
+        """
         self._check_running()
         result = AsyncResult(self, callback, error_callback)
         self._dispatcher.post(result, func, args, kwds, self._limit(timeout))
@@ -175,7 +187,8 @@ class Pool:
         """``[func(x) for x in iterable]``, the calls spread over the workers.
 
         ``chunksize`` consecutive items go to one worker together; left out, it adapts to how long
-        they take.  An iterator is read as fast as it is worked off.
+        they take.  An iterator is read as fast as it is worked off.  ``timeout``, as in ``apply``,
+        is that of each single task.
         """
         return self._map(work.MAP, func, iterable, chunksize, timeout)
 
@@ -200,7 +213,11 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> MapResult:
-        """As ``map``, but return at once with a result to wait for.  ``iterable`` is read first."""
+        """As ``map``, but return at once with a result to wait for.  ``iterable`` is read first.
+
+        ``callback`` gets the list of results, ``error_callback`` the first error, as in
+        ``apply_async``.
+        """
         result = MapResult(self, callback, error_callback)
         self._map_async(work.MAP, func, iterable, chunksize, timeout, result)
         return result
@@ -215,7 +232,7 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> MapResult:
-        """As ``starmap``, but return at once with a result to wait for."""
+        """As ``map_async``, for ``starmap``."""
         result = MapResult(self, callback, error_callback)
         self._map_async(work.STAR, func, iterable, chunksize, timeout, result)
         return result
@@ -229,7 +246,7 @@ class Pool:
         timeout: float | None = None,
         buffersize: int | None = None,
     ) -> IMapIterator:
-        """An iterator over ``func(x) for x in iterable``, in order.
+        """An iterator over ``func(x) for x in iterable``, in order; ``timeout`` as in ``map``.
 
         ``iterable`` is read in another thread, little faster than it is worked off; with
         ``buffersize`` also at most so many items ahead of what the iterator has given out.
@@ -283,7 +300,9 @@ class Pool:
         result: MapResult,
     ) -> Request | None:
         self._check_running()
-        _check_chunksize(chunksize)
+        if chunksize is not None:
+            chunksize = options.chunksize(chunksize)
+        limit = self._limit(timeout)
         try:
             items = iterable if isinstance(iterable, _SLICEABLE) else tuple(iterable)
         except Exception as error:
@@ -306,7 +325,7 @@ class Pool:
             result,
             unit=chunksize or 1,
             exact=chunksize == 1,
-            timeout=self._limit(timeout),
+            timeout=limit,
         )
 
     def _map_stream(
@@ -320,7 +339,9 @@ class Pool:
     ) -> Request | None:
         """A map that reads its input on this thread."""
         self._check_running()
-        _check_chunksize(chunksize)
+        if chunksize is not None:
+            chunksize = options.chunksize(chunksize)
+        limit = self._limit(timeout)
         try:
             function = self._dispatcher.function(func)
         except Exception as error:
@@ -332,7 +353,7 @@ class Pool:
             result,
             unit=chunksize or 1,
             exact=chunksize == 1,
-            timeout=self._limit(timeout),
+            timeout=limit,
         )
         try:
             self._dispatcher.read(request, iterable)
@@ -352,9 +373,9 @@ class Pool:
         buffersize: int | None,
     ) -> IMapIterator:
         self._check_running()
-        _check_chunksize(chunksize)
-        if buffersize is not None and buffersize < 1:
-            raise ValueError(f"buffersize must be 1+, not {buffersize!r}")
+        chunksize = options.chunksize(chunksize)
+        buffersize = options.buffersize(buffersize)
+        limit = self._limit(timeout)
         buffer = iterator._buffer
         dispatcher = self._dispatcher
         try:
@@ -362,16 +383,12 @@ class Pool:
         except Exception as error:
             _fail(buffer, error)
             return iterator
-        options: dict[str, Any] = {
-            "unit": chunksize,
-            "exact": chunksize == 1,
-            "timeout": self._limit(timeout),
-        }
+        terms: dict[str, Any] = {"unit": chunksize, "exact": chunksize == 1, "timeout": limit}
         if buffersize is None and isinstance(iterable, (*_SLICEABLE, list)):
             items = tuple(iterable) if isinstance(iterable, list) else iterable
-            dispatcher.map(work.MAP, function, items, buffer, **options)
+            dispatcher.map(work.MAP, function, items, buffer, **terms)
             return iterator
-        request = dispatcher.stream(work.MAP, function, buffer, limit=buffersize, **options)
+        request = dispatcher.stream(work.MAP, function, buffer, limit=buffersize, **terms)
         if buffersize is not None:
             buffer.reader = request.reader
             iterator._cancel = partial(dispatcher.soon, dispatcher.cancel, request)
@@ -384,7 +401,8 @@ class Pool:
         return iterator
 
     def _limit(self, timeout: float | None) -> float | None:
-        return self._task_timeout if timeout is None else _positive("timeout", timeout)
+        """Seconds that a task may take; None: any."""
+        return self._task_timeout if timeout is None else options.seconds("timeout", timeout)
 
     def _call_back(self, action: Callable[[], None]) -> bool:
         """Have a callback run; False if the pool was terminated and none runs any more."""
@@ -496,57 +514,3 @@ def _abandon(dispatcher: Dispatcher) -> None:
     else:
         # The garbage collector runs anywhere, even where a lock is held that this needs.
         dispatcher.soon(_end, dispatcher)
-
-
-def _sizes(processes: int | None, low: int | None, high: int | None) -> tuple[int, int]:
-    """Smallest and largest number of workers."""
-    if low is None and high is None:
-        count = cpu.cpu_count() if processes is None else processes
-        if count < 1:
-            raise ValueError("Number of processes must be at least 1")
-        return count, count
-    if processes is not None:
-        raise ValueError(
-            "processes= is a fixed number of workers: give it, or min_workers= and max_workers="
-        )
-    low = 1 if low is None else low
-    high = max(low, cpu.cpu_count()) if high is None else high
-    if not 0 <= low <= high or high < 1:
-        raise ValueError(
-            f"min_workers={low} and max_workers={high}: expected 0 <= min_workers <= max_workers, "
-            "and max_workers >= 1"
-        )
-    return low, high
-
-
-def _is_int(value: object) -> bool:
-    return isinstance(value, int)
-
-
-def _retries(retries: int | None) -> int:
-    if retries is None:
-        return config.current().retries
-    if not _is_int(retries) or retries < 0:
-        raise ValueError(f"retries must be a whole number of at least 0, not {retries!r}")
-    return retries
-
-
-def _positive(name: str, seconds: float | None) -> float | None:
-    if seconds is not None and not seconds > 0:
-        raise ValueError(f"{name} must be a number of seconds above 0, not {seconds!r}")
-    return seconds
-
-
-def _classes(
-    wanted: type[BaseException] | Sequence[type[BaseException]],
-) -> tuple[type[BaseException], ...]:
-    classes: tuple[Any, ...] = (wanted,) if isinstance(wanted, type) else tuple(wanted)
-    for cls in classes:
-        if not (isinstance(cls, type) and issubclass(cls, BaseException)):
-            raise TypeError(f"retry_exceptions must be exception classes, not {cls!r}")
-    return classes
-
-
-def _check_chunksize(chunksize: int | None) -> None:
-    if chunksize is not None and chunksize < 1:
-        raise ValueError(f"Chunksize must be 1+, not {chunksize!r}")

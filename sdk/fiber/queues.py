@@ -78,7 +78,7 @@ class Queue:
             payload, buffers = reduction.encode(obj)
         except Exception as error:
             self._slots.give_back()
-            self._on_queue_feeder_error(error, obj)
+            self._on_queue_feeder_error(reduction.blame({"the item": obj}, error), obj)
         except BaseException:
             self._slots.give_back()
             raise

@@ -12,11 +12,21 @@ import os
 import pickle
 import sys
 from collections import ChainMap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from itertools import islice
 from multiprocessing import context as mp_context
 from multiprocessing import reduction as mp_reduction
-from multiprocessing.reduction import ForkingPickler, register
+from multiprocessing.reduction import (
+    DupFd,
+    ForkingPickler,
+    recv_handle,
+    recvfds,
+    register,
+    send_handle,
+    sendfds,
+)
+from types import FunctionType, ModuleType
 from typing import Any, ClassVar, cast
 
 from fiber._agent import child
@@ -24,9 +34,27 @@ from fiber._hub import grants
 from fiber._wire import packet
 from fiber.errors import UnpicklableError
 
-__all__ = ["AbstractReducer", "ForkingPickler", "Spawning", "dump", "dumps", "register"]
+__all__ = [
+    "AbstractReducer",
+    "DupFd",
+    "ForkingPickler",
+    "Spawning",
+    "dump",
+    "dumps",
+    "recv_handle",
+    "recvfds",
+    "register",
+    "send_handle",
+    "sendfds",
+]
 
 AbstractReducer = mp_reduction.AbstractReducer
+
+REFUSALS = (TypeError, pickle.PicklingError)
+"""What picklers raise for what they cannot do."""
+
+_DEPTH = 20
+_BREADTH = 1000
 
 
 class InheritedDescriptor:
@@ -77,10 +105,10 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
     mp_context.set_spawning_popen(cast("Any", attempt if same_host else RemoteSpawning(process)))
     try:
         payload = dumps(process, before_retry=attempt.reset)
-    except (TypeError, AttributeError, pickle.PicklingError) as error:
-        blame = _blame(process, error)
+    except (*REFUSALS, AttributeError) as error:
+        culprit = _blame_process(process, error)
         attempt.reset()
-        raise blame from error
+        raise culprit from error
     except BaseException:
         attempt.reset()
         raise
@@ -89,17 +117,71 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
     return payload, attempt.fds
 
 
-def _blame(process: Any, reason: Exception) -> UnpicklableError:
+def _blame_process(process: Any, reason: Exception) -> UnpicklableError:
     """The error that names what of a Process does not pickle."""
     parts = {"the target": process._target}
     parts |= {f"argument {index}": value for index, value in enumerate(process._args)}
     parts |= {f"argument {name!r}": value for name, value in process._kwargs.items()}
+    whole = f"process {process.name!r}"
+    named = {f"{what} of {whole}": part for what, part in parts.items()}
+    return _name_culprit(named, whole, reason)
+
+
+def blame(parts: Mapping[str, Any], reason: Exception, whole: str = "") -> Exception:
+    """The error to raise when ``parts`` of ``whole``, by what they are called, did not pickle.
+
+    It names the culprit and the way to it.  A ``reason`` that is no pickler's refusal, but an error
+    of the user's own, is returned as it is.
+    """
+    if not isinstance(reason, REFUSALS):
+        return reason
+    return _name_culprit(parts, whole or next(iter(parts)), reason)
+
+
+def _name_culprit(parts: Mapping[str, Any], whole: str, reason: Exception) -> UnpicklableError:
     for what, part in parts.items():
-        try:
-            dumps(part)
-        except Exception as error:
-            return UnpicklableError(f"{what} of process {process.name!r}", str(error))
-    return UnpicklableError(f"process {process.name!r}", str(reason))
+        refusal = _refusal(part)
+        if refusal is not None:
+            error = UnpicklableError(what, refusal, _way_to_culprit(part))
+            break
+    else:
+        error = UnpicklableError(whole, str(reason))
+    error.__cause__ = reason
+    return error
+
+
+def _refusal(obj: Any) -> str | None:
+    """Why ``obj`` does not pickle; None if it does."""
+    grants.begin_attempt()
+    try:
+        dumps(obj)
+    except Exception as error:
+        return str(error)  # the error itself would keep what our callers hold, in a cycle
+    finally:
+        grants.undo_attempt()
+    return None
+
+
+def _way_to_culprit(obj: Any) -> str:
+    """From ``obj`` to the innermost part that does not pickle, as Python spells it."""
+    way = ""
+    for _ in range(_DEPTH):  # what refers to itself has no innermost part
+        for step, part in islice(_parts(obj), _BREADTH):
+            if _refusal(part) is not None:
+                way, obj = way + step, part
+                break
+        else:
+            break
+    return way
+
+
+def _parts(obj: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(obj, dict):
+        yield from ((f"[{key!r}]", value) for key, value in obj.items())
+    elif isinstance(obj, list | tuple):
+        yield from ((f"[{index}]", value) for index, value in enumerate(obj))
+    elif not isinstance(obj, type | FunctionType | ModuleType):
+        yield from ((f".{name}", value) for name, value in getattr(obj, "__dict__", {}).items())
 
 
 class RemoteSpawning:
@@ -153,7 +235,11 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
         # Whether or not cloudpickle can do it, its error says as much.
         pass
     grants.undo_attempt()
-    return packet.dumps(obj, partial(_dump, _by_value_pickler()))
+    try:
+        return packet.dumps(obj, partial(_dump, _by_value_pickler()))
+    except BaseException:
+        grants.undo_attempt()
+        raise
 
 
 def encode_reusable(obj: Any) -> tuple[bytes, list[memoryview], grants.GrantSet | None]:
@@ -205,10 +291,22 @@ def _by_value_pickler() -> Any:
 
     class ByValue(cloudpickle.Pickler):  # type: ignore[misc]
         dispatch_table: ClassVar[Any] = ChainMap(
-            cast("Any", ForkingPickler)._extra_reducers, cloudpickle.Pickler.dispatch_table
+            cast("Any", ForkingPickler)._extra_reducers,
+            {io.TextIOWrapper: _reduce_file},
+            cloudpickle.Pickler.dispatch_table,
         )
 
     return ByValue
+
+
+def _reduce_file(file: io.TextIOWrapper) -> Any:
+    """Refuse open files, of which cloudpickle would make copies in memory."""
+    for name in ("stdout", "stderr"):
+        if file is getattr(sys, name):
+            return getattr, (sys, name)
+    raise TypeError(
+        f"cannot pickle the open file {file.name!r}: pass its path and open it where it is used"
+    )
 
 
 def _dump(

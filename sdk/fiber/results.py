@@ -6,7 +6,9 @@ terminated or cannot go on raises an error instead of waiting for ever.
 
 from __future__ import annotations
 
+import contextlib
 import threading
+import time
 import types
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -40,9 +42,9 @@ class ApplyResult:
         self._outcome: Any = None
         self._mixed = False
         self._done = False
-        # Held until the result is there; whoever waits takes it and hands it on.
-        self._lock = threading.Lock()
-        self._lock.acquire()
+        self._settling = threading.Lock()
+        # Locks of those who wait, each its own: one that is interrupted leaves nothing half done.
+        self._waiters: list[threading.Lock] = []
 
     def ready(self) -> bool:
         """Whether the call has completed."""
@@ -56,14 +58,21 @@ class ApplyResult:
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the result is there or ``timeout`` seconds are over."""
-        if not self._done and self._lock.acquire(True, -1 if timeout is None else max(0, timeout)):
-            self._lock.release()
+        if self._done:
+            return
+        waiter = threading.Lock()
+        waiter.acquire()
+        self._waiters.append(waiter)
+        # ``_complete`` notes first that it is done and looks for waiters then.
+        if not self.ready() and not waiter.acquire(True, _patience(timeout)):
+            with contextlib.suppress(ValueError):  # it is there this very moment
+                self._waiters.remove(waiter)
 
     def get(self, timeout: float | None = None) -> Any:
         """The result, or the exception that the call raised; TimeoutError if there is neither."""
         self.wait(timeout)
         if not self._done:
-            raise TimeoutError
+            raise _too_late(timeout)
         outcome = self._settled()
         if type(outcome) is Failure:
             raise outcome.error
@@ -102,11 +111,12 @@ class ApplyResult:
     def _complete(self) -> None:
         self._pool = None
         self._done = True
-        self._lock.release()
+        while self._waiters:
+            self._waiters.pop().release()
 
     def _settled(self) -> Any:
         if self._mixed:
-            with self._lock:
+            with self._settling:
                 self._settle()
         return self._outcome
 
@@ -120,6 +130,17 @@ class ApplyResult:
 
 
 AsyncResult = ApplyResult
+
+
+def _patience(timeout: float | None) -> float:
+    """``timeout`` as locks want it."""
+    return -1 if timeout is None else min(max(0, timeout), threading.TIMEOUT_MAX)
+
+
+def _too_late(timeout: float | None) -> TimeoutError:
+    return TimeoutError(
+        f"no result within {timeout} s; its task goes on, and its result can still be waited for"
+    )
 
 
 class MapResult(ApplyResult):
@@ -200,17 +221,23 @@ class _Buffer:
 
     def wait(self, timeout: float | None) -> Any:
         """The next outcome; StopIteration at the end, TimeoutError if it takes too long."""
+        patience = threading.TIMEOUT_MAX if timeout is None else timeout
+        deadline = time.monotonic() + patience
         with self._arrived:
             self._waiting += 1
             try:
-                self._arrived.wait_for(lambda: self.items or self.finished, timeout)
-                if self.items:
-                    return self.items.popleft()
+                while True:
+                    finished = self.finished  # the last items come before it
+                    with contextlib.suppress(IndexError):  # other threads take them, too
+                        return self.items.popleft()
+                    if finished:
+                        raise StopIteration
+                    left = deadline - time.monotonic()
+                    if left <= 0:
+                        raise _too_late(timeout)
+                    self._arrived.wait(min(left, threading.TIMEOUT_MAX))
             finally:
                 self._waiting -= 1
-        if self.finished:
-            raise StopIteration
-        raise TimeoutError
 
 
 class _OrderedBuffer(_Buffer):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from fiber._hub.absent import absent
+from fiber._hub.absent import Absent
 from fiber._hub.local import LocalCounter
 
 if TYPE_CHECKING:
@@ -32,10 +32,21 @@ SEM_VALUE_MAX = 2**31 - 1
 RECHECK = 1.0
 """Seconds after which whoever waits for a bell looks for itself: its ringer may have died."""
 
-Lock = absent("Lock")
-RLock = absent("RLock")
-Condition = absent("Condition")
-Barrier = absent("Barrier")
+
+class Lock(Absent):
+    pass
+
+
+class RLock(Absent):
+    pass
+
+
+class Condition(Absent):
+    pass
+
+
+class Barrier(Absent):
+    pass
 
 
 class Semaphore:

@@ -18,6 +18,7 @@ from pathlib import Path
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from conformance.cpython_suite.tiers import reason_of
 from conformance.exclusions import EXCLUSIONS
 from conformance.runner import Target, list_cases, run_groups
 from conformance.verdict import Verdict
@@ -43,7 +44,14 @@ CLASSES = (
 )
 # An agent on another host cannot share a pid or a file with the master.
 TIERS = {"local": ("core", "local"), "loopback": ("core",)}
+# Agents start children by the same code behind a link: there one method is enough.
 METHODS = {"local": ("spawn", "forkserver"), "loopback": ("spawn",)}
+_TIER_SAYS = {
+    "core": "part of every run",
+    "local": "needs one host",
+    "ext": "promised to nobody",
+    "na": "not applicable",
+}
 LIMIT = 60.0  # seconds for one test
 JOBS = 2
 
@@ -60,22 +68,31 @@ def run_once(
     """One pass over the selected classes with one backend and one start method."""
     target = Target(module, method, frozenset(TIERS[backend]), limit, (("FIBER_BACKEND", backend),))
     started = time.monotonic()
-    report = run_groups(target, select(target, substring), jobs)
+    groups, left_out = select(target, substring)
+    report = run_groups(target, groups, jobs)
     listed = EXCLUSIONS[backend] if module == "fiber" else {}
     title = f"{module}, {backend}, {method}" if module == "fiber" else f"{module}, {method}"
-    return Verdict(title, report, listed, time.monotonic() - started)
+    return Verdict(title, report, listed, time.monotonic() - started, left_out)
 
 
-def select(target: Target, substring: str = "") -> list[list[str]]:
-    """The ids to run, one list per class."""
+def select(target: Target, substring: str = "") -> tuple[list[list[str]], dict[str, str]]:
+    """The ids to run, one list per class; and those of the same classes that are left out, each
+    with the reason.
+    """
     groups: dict[str, list[str]] = {}
+    left_out: dict[str, str] = {}
     for case in list_cases(target):
         id_ = f"{case['class_name']}.{case['method']}"
         wanted = case["base_name"] in CLASSES and case["type"] in ("processes", None)
-        if wanted and case["tier"] in target.tiers and substring in id_:
+        if not wanted or substring not in id_:
+            continue
+        if case["tier"] in target.tiers:
             groups.setdefault(case["class_name"], []).append(id_)
+        else:
+            reason = reason_of(case["base_name"], case["method"], case["type"])
+            left_out[id_] = f"{_TIER_SAYS[case['tier']]}: {reason}"
     # The largest first, so that no long class is left for one job at the end.
-    return sorted(groups.values(), key=len, reverse=True)
+    return sorted(groups.values(), key=len, reverse=True), left_out
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from conformance.run import select
 from conformance.runner import Outcome, Report, Target, list_cases, run_group
 from conformance.verdict import Verdict
 
@@ -66,6 +67,16 @@ def test_a_run_of_nothing_fails() -> None:
 
 def test_the_report_gives_each_exclusion_its_reason() -> None:
     report = Report([Outcome("C.a", "fail"), Outcome("C.b", "fail", detail="its traceback")])
-    text = Verdict("t", report, {"C.a": "a reason"}, 0).text()
+    text = Verdict("t", report, {"C.a": "a reason"}, 0, {"C.c": "another reason"}).text()
     assert "C.a: a reason" in text
+    assert "Left out:\n  C.c: another reason" in text
     assert "=== fail: C.b\nits traceback" in text
+
+
+@pytest.mark.parametrize("tiers", [{"core"}, {"core", "local"}])
+def test_what_is_left_out_of_the_classes_that_run_has_a_reason(tiers: set[str]) -> None:
+    groups, left_out = select(Target("multiprocessing", "spawn", frozenset(tiers), 60))
+    assert not {id_ for group in groups for id_ in group} & left_out.keys()
+    assert all(not line.endswith(": ") for line in left_out.values())
+    assert left_out["TestSimpleQueue.test_closed"].startswith("promised to nobody")
+    assert ("WithProcessesTestProcess.test_set_executable" in left_out) == (tiers == {"core"})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from conformance.runner import Outcome, Report
 
@@ -13,12 +13,13 @@ _GOOD = ("pass", "skip")
 
 @dataclass(frozen=True)
 class Verdict:
-    """One run against one list of exclusions (id -> reason)."""
+    """One run against one list of exclusions (id -> reason); what was not run, and why."""
 
     title: str
     report: Report
     exclusions: Mapping[str, str]
     seconds: float
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def failures(self) -> list[Outcome]:
@@ -67,6 +68,7 @@ class Verdict:
         return "\n".join(
             [
                 *_listing("Known not to pass", ((o.id, self.exclusions[o.id]) for o in excluded)),
+                *_listing("Left out", self.left_out.items()),
                 *_listing("Skipped by CPython", ((o.id, o.detail) for o in skipped)),
                 *_listing("Listed but passing; strike them off", ((o.id, "") for o in self.stale)),
                 *_listing("Answered by the standard library", _named(self.report.fallbacks)),

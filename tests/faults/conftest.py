@@ -52,7 +52,8 @@ def backend(request: pytest.FixtureRequest) -> Iterator[str]:
     with running(backend=request.param, agents=2) as runtime:
         if request.param == "loopback":
             # The thread that writes what agents tell lives as long as the runtime.
-            runtime.backend._output.write("test", "begins")
+            loopback: Any = runtime.backend
+            loopback._output.write("test", "begins")
         yield request.param
 
 

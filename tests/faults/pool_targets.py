@@ -72,10 +72,22 @@ def leave(how: str) -> None:
     sys.exit(4)
 
 
+def nap(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
 def note_and_return(folder: str, number: int) -> int:
     """Leave a file for each run of each number."""
     Path(folder, f"{number}-{time.monotonic_ns()}-{os.getpid()}").touch()
     time.sleep(0.005)
+    return number
+
+
+def note_and_nap(folder: str, number: int) -> int:
+    """As ``note_and_return``, but long enough to be killed in the middle."""
+    Path(folder, f"{number}-{time.monotonic_ns()}-{os.getpid()}").touch()
+    time.sleep(0.05)
     return number
 
 
@@ -118,7 +130,8 @@ def nested(depth: int) -> int:
     if not depth:
         return 0
     with fiber.Pool(1) as pool:
-        return 1 + pool.apply(nested, (depth - 1,))
+        deeper: int = pool.apply(nested, (depth - 1,))
+    return 1 + deeper
 
 
 def wait_for_company(folder: str, number: int, size: int) -> int:

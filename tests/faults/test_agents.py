@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -59,7 +60,7 @@ def test_a_killed_agent_ends_its_own_processes_and_no_other(
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL
         assert "agent loopback-0 lost" in child._popen.report.reason
-        wait_for(lambda pid=child.pid: not alive(pid), 2)
+        wait_for(partial(_gone, child.pid), 2)
     for child in spared:
         assert child.is_alive()
         child.terminate()
@@ -142,12 +143,16 @@ def test_every_agent_killed_again_and_again_the_pool_goes_on(backend: LoopbackBa
             hosts = [process.agent.host for process in backend._processes]
             for host in hosts:
                 os.kill(pid_of(backend, host), signal.SIGKILL)
-            wait_for(lambda old=hosts: all(_joined(backend, old)))
+            wait_for(partial(_joined, backend, hosts))
         assert result.get(PATIENCE) == [n * n for n in range(200)]
 
 
-def _joined(backend: LoopbackBackend, old: list[str]) -> list[bool]:
-    return [p.agent.joined and p.agent.host not in old for p in backend._processes]
+def _joined(backend: LoopbackBackend, old: list[str]) -> bool:
+    return all(p.agent.joined and p.agent.host not in old for p in backend._processes)
+
+
+def _gone(pid: int) -> bool:
+    return not alive(pid)
 
 
 def test_a_killed_zygote_of_an_agent_costs_its_children_only(backend: LoopbackBackend) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pickle
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -42,7 +44,9 @@ MASTER = """
 
 
 @pytest.fixture
-def master(launch: Callable[..., Program], tmp_path: Path) -> Callable[..., Program]:
+def master(
+    launch: Callable[..., Program], tmp_path: Path
+) -> Callable[..., tuple[Program, Program]]:
     """Starts an agent beside a master that expects it; ``before`` runs in it first."""
     credentials = make_credentials("test")
     path = tmp_path / "credentials"
@@ -117,9 +121,14 @@ def test_wrong_version_of(
         ({"FIBER_AGENT_CREDENTIALS": "garbage"}, "credentials in the environment"),
         ({"FIBER_AGENT_CREDENTIALS": "/no/such/folder"}, "/no/such/folder"),
         ({"FIBER_AGENT_ADDRESS": "nonsense"}, "nonsense"),
+        ({"FIBER_AGENT_PARENT": "abc"}, "FIBER_AGENT_PARENT='abc' is not the id of a process"),
+        ({"FIBER_AGENT_PARENT": "0"}, "FIBER_AGENT_PARENT='0' is not the id of a process"),
+        ({"FIBER_AGENT_LOST_GRACE": "nan"}, "'nan' is not a number of seconds"),
+        ({"FIBER_AGENT_ADRESS": "x"}, "Did you mean 'FIBER_AGENT_ADDRESS'?"),
+        ({"FIBER_BACKEND": "typo"}, "'typo' for 'backend'"),
         ({"FIBER_AGENT_ADDRESS": "127.0.0.1:1", "FIBER_START_TIMEOUT": "0.5"}, "127.0.0.1:1"),
     ],
-    ids=["no address", "no credentials", "garbage", "no folder", "bad address", "nobody there"],
+    ids=lambda given: " ".join(given) if isinstance(given, dict) else "",
 )
 def test_an_agent_that_is_told_nonsense(
     master: Callable[..., tuple[Program, Program]], told: dict[str, str], words: str
@@ -128,3 +137,18 @@ def test_an_agent_that_is_told_nonsense(
     assert agent.wait() == 1
     assert words in agent.stderr
     assert "Traceback" not in agent.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["--help"], 0, "FIBER_AGENT_ADDRESS"),
+        (["--port", "7"], 2, "no arguments, but was given '--port 7'"),
+    ],
+)
+def test_an_agent_with_a_command_line(arguments: list[str], status: int, words: str) -> None:
+    command = [sys.executable, "-m", "fiber.agent", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    assert done.returncode == status
+    assert words in (done.stderr if status else done.stdout)
+    assert "Traceback" not in done.stderr

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 import fiber
 from faults.program import Program
+from fiber import config
+from fiber.connection import Connection
 
 UNGUARDED_PROCESS = """
     import fiber, sys
@@ -76,7 +79,14 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
         (lambda: fiber.Pool(2, task_timeout=0), ValueError, "task_timeout"),
         (lambda: fiber.Pool(min_workers=3, max_workers=2), ValueError, "max_workers"),
         (lambda: fiber.Pool(2, max_workers=4), (TypeError, ValueError), "processes"),
-        (lambda: fiber.Process(group=1), AssertionError, "group"),
+        (lambda: fiber.Pool(min_workers=cast("Any", 1.5)), TypeError, "min_workers.*1.5"),
+        (lambda: fiber.Pool(max_workers=cast("Any", "2")), TypeError, "max_workers.*'2'"),
+        (lambda: fiber.Pool(2, retries=True), TypeError, "retries.*True"),
+        (lambda: fiber.Pool(2, task_timeout=cast("Any", "3")), TypeError, "task_timeout.*'3'"),
+        (lambda: fiber.Pool(2, idle_timeout=cast("Any", "x")), TypeError, "idle_timeout.*'x'"),
+        (lambda: fiber.Pool(2, task_timeout=math.nan), ValueError, "task_timeout.*nan"),
+        (lambda: Connection(cast("Any", 0)), TypeError, "multiprocessing.connection.Connection"),
+        (lambda: fiber.Process(group=cast("Any", 1)), AssertionError, "group"),
         (lambda: fiber.Semaphore(-1), ValueError, "value"),
         (lambda: fiber.get_context("typo"), ValueError, "typo"),
         (lambda: fiber.set_start_method("typo", force=True), ValueError, "typo"),
@@ -102,14 +112,12 @@ NO_NUMBER = """
 
 
 @pytest.mark.parametrize("processes", [2.5, "4", True])
-@pytest.mark.xfail(strict=True, reason="Pool does not look what it is given")
 def test_a_number_of_processes_that_is_none(
     launch: Callable[..., Program], processes: object
 ) -> None:
     assert launch(NO_NUMBER.format(processes=processes)).rest(3) == "True\n"
 
 
-@pytest.mark.xfail(strict=True, reason="Pool.__del__ needs what __init__ did not get to")
 def test_a_misspelt_option_of_a_pool_is_the_only_thing_on_stderr(
     launch: Callable[..., Program],
 ) -> None:
@@ -139,6 +147,27 @@ def test_bad_environment_is_named_at_the_first_use(
     assert program.wait() == 1
     assert words in program.stderr
     assert program.left() == []
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "Pipe()",
+        "Queue()",
+        "JoinableQueue()",
+        "SimpleQueue()",
+        "Event()",
+        "Semaphore()",
+        "get_context('spawn').BoundedSemaphore()",
+    ],
+)
+def test_bad_environment_is_named_where_no_process_is_made(
+    monkeypatch: pytest.MonkeyPatch, statement: str
+) -> None:
+    monkeypatch.setattr(config, "_current", None)
+    monkeypatch.setenv("FIBER_BACKEND", "typo")
+    with pytest.raises(fiber.ConfigError, match="'typo' for 'backend'"):
+        eval(f"fiber.{statement}")
 
 
 def test_a_port_in_use(launch: Callable[..., Program]) -> None:

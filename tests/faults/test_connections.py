@@ -180,7 +180,8 @@ def test_a_connection_sent_through_a_connection_outlives_its_sender(
 
 
 @pytest.mark.xfail(
-    reason="the hub keeps what a handle stands for until somebody takes it, or the program ends"
+    reason="nobody tells the hub that the kernel threw a message away together with its pipe: the "
+    "handle in it is kept until somebody takes it, or the program ends"
 )
 def test_a_handle_that_nobody_took_is_no_holder(start: Callable[..., Any]) -> None:
     outer, outer_theirs = fiber.Pipe()

@@ -69,7 +69,6 @@ BARE = """
 """
 
 
-@pytest.mark.xfail(reason="errors.py opens a file to say that no file can be opened", strict=True)
 def test_the_error_itself_needs_no_descriptor(launch: Callable[..., Program]) -> None:
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
@@ -252,3 +251,74 @@ LOOPBACK = (
 def test_with_agents_too(launch: Callable[..., Program]) -> None:
     program = launch(LOOPBACK, env={"FIBER_BACKEND": "loopback", "FIBER_AGENTS": "1"})
     assert program.finish() == "TooManyOpenFiles 64 24\nrefused\n0\n"
+
+
+ANSWER = (
+    PRELUDE
+    + """
+    def fill():
+        fillers = []
+        try:
+            while True:
+                fillers.append(os.dup(1))
+        except OSError:
+            return fillers
+
+    if __name__ == "__main__":
+        pool = fiber.Pool(2, retries=0)
+        pool.map(abs, range(10))
+        limit(held() + 3)
+        fillers = fill()
+        try:
+            getattr(pool, sys.argv[1])(bytes, (1 << 20,)).get()
+        except fiber.WorkerDied as error:
+            print("too many open files" in str(error), flush=True)
+        for fd in fillers:
+            os.close(fd)
+        limit(1000)
+        print(pool.apply(abs, (-1,)))
+        pool.terminate()
+"""
+)
+
+
+def test_an_answer_that_cannot_be_received_is_told(launch: Callable[..., Program]) -> None:
+    assert launch(ANSWER, "apply_async").finish() == "True\n1\n"
+
+
+AGENT_WITHOUT = (
+    PRELUDE
+    + """
+    import subprocess
+
+    def agent():
+        found = subprocess.run(
+            ["pgrep", "-f", "-P", str(os.getpid()), "fiber.agent"], capture_output=True, text=True
+        )
+        return int(found.stdout)
+
+    if __name__ == "__main__":
+        pool = fiber.Pool(2, retries=0)
+        pool.map(abs, range(10))
+        pid = agent()
+        before = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (8, before[1]))
+        try:
+            print(pool.apply_async(len, (bytes(1 << 20),)).get())
+        except fiber.WorkerDied as error:
+            print("too many open files" in str(error).lower())
+        for worker in pool._pool:
+            worker.kill()
+        try:
+            pool.apply(abs, (-1,))
+        except (fiber.WorkerDied, fiber.StartError) as error:
+            print("told")
+        pool.terminate()
+        print("over")
+"""
+)
+
+
+def test_an_agent_that_has_none_left_says_so(launch: Callable[..., Program]) -> None:
+    program = launch(AGENT_WITHOUT, env={"FIBER_BACKEND": "loopback", "FIBER_AGENTS": "1"})
+    assert program.finish() == "True\ntold\nover\n"

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import pty
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -164,3 +168,56 @@ def test_an_impatient_user_presses_it_again_and_again(launch: Callable[..., Prog
 
     wait_for(ended)
     assert program.left() == []
+
+
+PRINTS_FROM_A_CHILD = """
+import fcntl, fiber, termios
+
+def say(word):
+    print(word, flush=True)
+
+if __name__ == "__main__":
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+    settings = termios.tcgetattr(0)
+    settings[3] |= termios.TOSTOP
+    termios.tcsetattr(0, termios.TCSANOW, settings)
+    with fiber.Pool(1) as pool:
+        pool.map_async(say, ["hello"]).get(10)
+    child = fiber.get_context("spawn").Process(target=print, args=("goodbye",))
+    child.start()
+    child.join(10)
+    print("exit code", child.exitcode, flush=True)
+"""
+
+
+def test_a_terminal_that_stops_background_jobs_does_not_stop_children(tmp_path: Path) -> None:
+    script = tmp_path / "prints.py"
+    script.write_text(PRINTS_FROM_A_CHILD)
+    ours, theirs = pty.openpty()
+    try:
+        with subprocess.Popen(
+            [sys.executable, str(script)],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+        ) as program:
+            os.close(theirs)
+            try:
+                shown = _read_all(ours)
+                assert program.wait(10) == 0, shown
+            finally:
+                program.kill()
+    finally:
+        os.close(ours)
+    assert shown.split() == ["hello", "goodbye", "exit", "code", "0"]
+
+
+def _read_all(terminal: int) -> str:
+    shown = b""
+    try:
+        while data := os.read(terminal, 4096):
+            shown += data
+    except OSError:  # how a terminal says that nobody writes to it any more
+        pass
+    return shown.decode()

@@ -6,7 +6,7 @@ import functools
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ def test_the_exception_comes_with_the_remote_traceback(pool: Pool) -> None:
 
 
 def test_every_kind_of_call_raises_it(pool: Pool) -> None:
-    calls = [
+    calls: list[Callable[[], Any]] = [
         lambda: pool.map(tasks.fail_if_odd, range(10)),
         lambda: pool.map(tasks.fail_if_odd, range(10), chunksize=3),
         lambda: list(pool.imap(tasks.fail_if_odd, range(10))),
@@ -80,8 +80,8 @@ def test_what_does_not_travel_back_is_an_error_that_shows_it(
 
 
 def test_what_does_not_travel_there_is_an_error_at_once(pool: Pool) -> None:
-    lock = threading.Lock()
-    calls = [
+    lock: Any = threading.Lock()
+    calls: list[Callable[[], Any]] = [
         lambda: pool.apply(abs, (lock,)),
         lambda: pool.apply(functools.partial(abs, lock)),
         lambda: pool.map(abs, [lock]),
@@ -127,11 +127,24 @@ def test_the_last_lines_of_a_dead_worker_are_in_the_error(backend: str) -> None:
         assert "  | about to die" in str(caught.value)
 
 
-@pytest.mark.parametrize("how", ["os._exit", "sys.exit"])
-def test_a_task_that_ends_its_process(pool: Pool, how: str) -> None:
+def test_a_task_that_ends_its_process(pool: Pool) -> None:
     with pytest.raises(WorkerDied, match="exit status"):
-        pool.apply(tasks.leave, (how,))
+        pool.apply(tasks.leave, ("os._exit",))
     works(pool)
+
+
+def test_sys_exit_is_an_exception_of_the_task(pool: Pool) -> None:
+    calls: list[Callable[[], Any]] = [
+        lambda: pool.apply(tasks.leave, ("sys.exit",)),
+        lambda: pool.map(tasks.leave, ["sys.exit"] * 3),
+        lambda: list(pool.imap(tasks.leave, ["sys.exit"])),
+    ]
+    for call in calls:
+        with pytest.raises(SystemExit) as caught:
+            call()
+        assert caught.value.code == 4
+        assert "in leave" in str(caught.value.__cause__)
+        works(pool)
 
 
 # Workers that never come to be

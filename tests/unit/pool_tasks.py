@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -54,6 +55,18 @@ def sleep(seconds: float) -> float:
 def nap_and_return(x: int) -> int:
     time.sleep(0.0005)
     return x
+
+
+def gather(iterator: Iterator[Any]) -> list[Any]:
+    """For tests: all results, errors in their places."""
+    found: list[Any] = []
+    while True:
+        try:
+            found.append(next(iterator))
+        except StopIteration:
+            return found
+        except (Exception, SystemExit) as error:
+            found.append(error)
 
 
 # Meeting points between a task and its test: files, which any process sees
@@ -111,6 +124,14 @@ def count(path: Path) -> int:
     return len(path.read_text().splitlines())
 
 
+def count_and_exit(task: tuple[Path, bool]) -> int:
+    path, leaves = task
+    lines = count(path)
+    if leaves:
+        sys.exit(4)
+    return lines
+
+
 def runs(path: Path) -> int:
     return len(path.read_text().splitlines()) if path.exists() else 0
 
@@ -121,8 +142,8 @@ def runs(path: Path) -> int:
 def die(how: str) -> NoReturn:
     if how == "exit":
         os._exit(3)
-    if how == "sys.exit":
-        sys.exit(4)
+    if how == "interrupt":
+        raise KeyboardInterrupt
     if how == "segfault":
         # No core file, which would take long to write.
         import resource

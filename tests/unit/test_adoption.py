@@ -391,7 +391,6 @@ class TestDuration:
 
 
 def test_gymnasiums_vector_environment(fiber: Any) -> None:
-    pytest.importorskip("gymnasium")
     module: Any = importlib.import_module("gymnasium.vector.async_vector_env")
     before = dict(vars(module))
     with Adoption(module, fiber) as adopted:

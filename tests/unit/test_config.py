@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fiber import config
+from fiber import agent, config
 from fiber.config import Config, load
 from fiber.errors import ConfigError, FiberError
 
@@ -24,6 +24,7 @@ def _bare_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """No configuration in force, none in the environment, none above the directory."""
     monkeypatch.setattr(config, "_current", None)
     monkeypatch.setattr(config, "_in_use", config._not_in_use)
+    monkeypatch.setattr(config, "_used", False)
     for name in [name for name in os.environ if name.startswith("FIBER_")]:
         monkeypatch.delenv(name)
     (tmp_path / "pyproject.toml").write_text("")
@@ -108,9 +109,14 @@ class TestSources:
         assert load(environ=environ).runtime_directory == str(tmp_path)
         assert load({"runtime_directory": tmp_path}).runtime_directory == str(tmp_path)
 
-    def test_variables_between_fibers_own_processes_are_not_configuration(self) -> None:
-        environ = {"FIBER_AGENT_ADDRESS": "x", "FIBER_CHILD_FD": "3", "OTHER": "y"}
+    def test_what_an_agent_is_told_is_not_configuration(self) -> None:
+        environ = dict.fromkeys(config.AGENT_VARIABLES, "x") | {"OTHER": "y"}
         assert load(environ=environ) == Config()
+
+    def test_an_agent_is_told_nothing_else(self) -> None:
+        named = {value for value in vars(agent).values() if str(value).startswith("FIBER_AGENT_")}
+        assert named <= config.AGENT_VARIABLES
+        assert len(named) == 7
 
     def test_kubernetes_service_variables_are_not_configuration(self) -> None:
         environ = {
@@ -145,6 +151,14 @@ class TestUnknownKeys:
         text = str(caught.value)
         assert "environment variable FIBER_BAKEND" in text
         assert "Did you mean 'FIBER_BACKEND'?" in text
+
+    @pytest.mark.parametrize(
+        ("variable", "meant"),
+        [("FIBER_AGENT_ADRESS", "FIBER_AGENT_ADDRESS"), ("FIBER_AGENT_COUNT", "FIBER_AGENTS")],
+    )
+    def test_beside_those_that_an_agent_is_told(self, variable: str, meant: str) -> None:
+        with pytest.raises(ConfigError, match=f"{variable}. Did you mean '{meant}'?"):
+            load(environ={variable: "4"})
 
     def test_in_pyproject(self, pyproject: Callable[[str], Path]) -> None:
         path = pyproject("[tool.fiber]\nlisten-port = 1")
@@ -242,6 +256,14 @@ class TestBadValues:
         assert "environment variable FIBER_LOST_AFTER" in text
         assert "5 s (default)" in text
 
+    def test_a_directory_that_cannot_be_written_to(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        # Root, as whom a container runs tests, may write to any: so the kernel does not decide.
+        monkeypatch.setattr(os, "access", lambda path, mode: not mode & os.W_OK)
+        with pytest.raises(ConfigError, match="a directory that exists and can be written to"):
+            load({"runtime_directory": tmp_path})
+
 
 class TestCurrent:
     def test_is_read_once(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,6 +339,27 @@ class TestInit:
         assert "Call fiber.init() before" in text
         assert "FIBER_BACKEND" in text
         assert config.current().backend == "local"
+
+    def test_another_backend_once_something_was_built_on_it(self) -> None:
+        assert config.use() == Config()
+        with pytest.raises(ConfigError, match="too late for backend='loopback'"):
+            config.init(backend="loopback")
+        assert config.init(retries=1).retries == 1
+
+    def test_a_configuration_that_cannot_be_read_is_not_in_use(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("FIBER_BACKEND", "typo")
+        with pytest.raises(ConfigError, match="typo"):
+            config.use()
+        monkeypatch.delenv("FIBER_BACKEND")
+        config.current()
+        assert config.init(backend="loopback").backend == "loopback"
+
+    def test_a_child_that_was_handed_one_has_not_used_it(self) -> None:
+        config.use()
+        config.install(Config())
+        assert config.init(backend="loopback").backend == "loopback"
 
     def test_keys_of_later_calls_may_change_while_in_use(self) -> None:
         config.init(backend="loopback")

@@ -18,7 +18,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber.connection import Connection, Pipe
-from fiber.errors import ConnectionClosed
+from fiber.errors import ConnectionClosed, UnpicklableError
 
 PATIENCE = 15.0
 
@@ -66,6 +66,9 @@ def test_what_has_no_pickle_is_an_error_and_nothing_is_sent() -> None:
     one, other = Pipe()
     with pytest.raises(TypeError, match="pickle"):
         one.send(threading.Lock())
+    assert not other.poll()
+    with pytest.raises(UnpicklableError, match=r"the object to send .*\(at \['a'\]\)"):
+        one.send({"a": threading.Lock()})
     assert not other.poll()
 
 
@@ -356,3 +359,12 @@ def test_sending_connections_leaves_no_descriptor_behind() -> None:
     assert wait_until(lambda: open_descriptors(os.getpid()) <= before, PATIENCE)
     here.send("done")
     process.join(PATIENCE)
+
+
+def test_what_could_not_be_sent_keeps_no_end_of_another_pipe_open() -> None:
+    one, _other = Pipe()
+    inner, inner_other = Pipe()
+    with pytest.raises(UnpicklableError, match=r"\(at \[1\]\)"):
+        one.send([inner_other, threading.Lock()])
+    inner_other.close()
+    assert inner.poll(10), "the hub keeps it"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import multiprocessing
 import os
 import subprocess
@@ -140,3 +141,9 @@ def test_cpu_count_and_loggers_are_reached_through_a_context() -> None:
     assert spawn.get_logger() is multiprocessing.get_logger()
     assert spawn.freeze_support() is None
     assert spawn.reducer.ForkingPickler is multiprocessing.reduction.ForkingPickler
+
+
+def test_a_contexts_pool_has_the_options_of_the_class() -> None:
+    options = dict(inspect.signature(fiber.pool.Pool).parameters)
+    del options["context"]
+    assert dict(inspect.signature(fiber.Pool).parameters) == options

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import pickle
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -35,6 +37,9 @@ class ManualLoop:
 
     def on_thread(self) -> bool:
         return True
+
+    def depend(self, dependent: object) -> None:
+        pass
 
     def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
         callback(*args)
@@ -318,3 +323,41 @@ def test_lost_workers_are_replaced_elsewhere_than_on_the_loop(rig: Rig) -> None:
     assert len(rig.links) == 2
     rig.pump.run()
     assert len(rig.links) == 3
+
+
+def test_a_finished_request_keeps_nothing(rig: Rig) -> None:
+    # Whoever waits for the collector waits long where large arrays count as one object each.
+    gc.disable()
+    try:
+        sinks = [rig.map(range(2)), rig.map([])]
+        call = Sink()
+        rig.dispatcher.call(call, tasks.square, (3,), {}, timeout=60.0)
+        cancelled = Sink()
+        request = rig.dispatcher.map(
+            work.MAP, rig.dispatcher.function(tasks.square), range(9), cancelled
+        )
+        rig.dispatcher.cancel(request)
+        del request
+        while any(link.worker and link.worker.queue for link in rig.links):
+            for link in rig.links:
+                assert link.worker is not None
+                for batch in list(link.worker.queue):
+                    rig.answer(link, batch.seq, [None] * len(batch.items))
+                    del batch
+        dead = [weakref.ref(sink) for sink in (*sinks, call, cancelled)]
+        del sinks, call, cancelled
+        assert [ref() for ref in dead] == [None] * 4
+    finally:
+        gc.enable()
+
+
+def test_a_task_on_the_board_was_read_whoever_sent_it(rig: Rig) -> None:
+    sink = rig.map(range(1), timeout=60.0)
+    (link,) = [link for link in rig.links if link.worker and link.worker.queue]
+    (batch,) = link.worker.queue  # type: ignore[union-attr]
+    rig.dispatcher._unsent.add(batch.seq)  # its sender has not come to say that it is sent
+    job = batch.job
+    assert job is not None
+    rig.lose(link, running=(batch.seq, 0))
+    assert job.attempts == {0: 1}
+    assert not sink.ended

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -12,7 +13,10 @@ from typing import Any
 
 import pytest
 
+from census import wait_until
+from fiber._transport import loop as loop_module
 from fiber._transport.loop import Loop
+from fiber.errors import FiberError
 
 PATIENCE = 10
 
@@ -239,3 +243,59 @@ def test_a_signal_handler_interrupts_the_loop_of_the_main_thread() -> None:
 def test_now_is_monotonic_seconds() -> None:
     before: Callable[[], float] = time.monotonic
     assert before() <= Loop.now() <= time.monotonic()
+
+
+@pytest.mark.parametrize("seconds", [math.inf, 1e7, 1e300])
+def test_a_timer_of_ages_does_not_stop_it(loop: Loop, seconds: float) -> None:
+    timer = loop.call_later(seconds, pytest.fail, "so soon")
+    settled(loop)
+    settled(loop)
+    timer.cancel()
+    settled(loop)
+
+
+def test_timers_that_were_cancelled_long_before_their_time_do_not_pile_up(loop: Loop) -> None:
+    loop.call_later(300, pytest.fail)  # comes before them, and is not due either
+    for _ in range(20):
+        for timer in [loop.call_later(600, pytest.fail) for _ in range(1000)]:
+            timer.cancel()
+        settled(loop)
+    assert len(loop._timers) < 5000
+
+
+class Dependent:
+    def __init__(self) -> None:
+        self.error: FiberError | None = None
+
+    def broken(self, error: FiberError) -> None:
+        self.error = error
+
+
+def test_who_depends_on_it_is_told_if_it_fails() -> None:
+    loop = Loop()
+    dependent, forgotten = Dependent(), Dependent()
+    loop.depend(dependent)
+    loop.depend(forgotten)
+    del forgotten
+    loop.call_soon(os.close, loop._epoll.fileno())
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        loop.run()
+    assert isinstance(dependent.error, FiberError)
+    assert not loop.running
+    with pytest.raises(FiberError, match="has ended by OSError"):
+        loop.depend(dependent)
+    loop.call_soon(pytest.fail)  # nobody does
+    loop.stop()
+
+
+def test_descriptors_that_somebody_closed_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop_module, "LONGEST_POLL", 0.05)
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    loop, dependent = Loop(), Dependent()
+    loop.depend(dependent)
+    loop.start_thread("loop under test")
+    settled(loop)
+    os.close(loop._epoll.fileno())
+    assert wait_until(lambda: dependent.error is not None, PATIENCE)
+    assert loop._thread is not None
+    loop._thread.join(PATIENCE)

@@ -22,9 +22,8 @@ from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._hub.access import Access
 from fiber._runtime import state
-from fiber._transport.link import LinkError
 from fiber._wire import messages
-from fiber.errors import StartError
+from fiber.errors import LinkError, StartError
 from unit.agent_children import Recorder, run_forever
 
 PATIENCE = 15

@@ -20,12 +20,12 @@ import pytest
 from fiber._transport.credentials import Credentials, MasterCredentials, make_credentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Hello, Identity
-from fiber._transport.link import Link, LinkError, Patience
+from fiber._transport.link import Link, Patience
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber._transport.nng import Socket, url_of
 from fiber._transport.session import Frame
-from fiber.errors import AuthenticationError, ConfigError, VersionMismatch
+from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
 
 # Once used, nng keeps threads and two descriptors for as long as the process lives.  The census of
 # what tests leave behind begins after the collection, and so after this.

@@ -90,7 +90,8 @@ def test_objects_arrive_whole(pool: Pool, chunksize: int | None) -> None:
 
 
 def test_large_arguments_and_results(pool: Pool) -> None:
-    np = pytest.importorskip("numpy")
+    import numpy as np
+
     arrays = [np.full(200_000, n) for n in range(6)]
     for chunksize in (None, 1, 2):
         back = pool.map(tasks.identity, arrays, chunksize)
@@ -99,7 +100,8 @@ def test_large_arguments_and_results(pool: Pool) -> None:
 
 
 def test_an_object_with_very_many_buffers(pool: Pool) -> None:
-    np = pytest.importorskip("numpy")
+    import numpy as np
+
     arrays = [np.full(1000, n) for n in range(1500)]
     (back,) = pool.map(tasks.identity, [arrays])
     assert all((a == b).all() for a, b in zip(arrays, back, strict=True))
@@ -126,14 +128,14 @@ def test_a_reused_object_is_returned_as_it_was_after_its_task(pool: Pool, call: 
 
 
 def test_a_reused_array_is_returned_as_it_was_after_its_task(pool: Pool) -> None:
-    pytest.importorskip("numpy")
     found = pool.map(tasks.fill, range(30), chunksize=1)
     assert [array[0] for array in found] == list(range(30))
     assert [array[-1] for array in found] == list(range(30))
 
 
 def test_arguments_are_sent_as_they_were_at_the_call(pool: Pool) -> None:
-    np = pytest.importorskip("numpy")
+    import numpy as np
+
     array = np.zeros(10_000)
     results = []
     for n in range(50):
@@ -485,44 +487,3 @@ def test_initializer_runs_in_each_worker() -> None:
     with fiber.Pool(2, tasks.remember, ("set",)) as pool:
         assert pool.broadcast(tasks.recall) == ["set", "set"]
     pool.join()
-
-
-# What a person can get wrong
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "text"),
-    [
-        ({"processes": 0}, ValueError, "Number of processes must be at least 1"),
-        ({"processes": -1}, ValueError, "Number of processes must be at least 1"),
-        ({"maxtasksperchild": 0}, ValueError, "maxtasksperchild must be a positive int or None"),
-        ({"maxtasksperchild": 0.5}, ValueError, "maxtasksperchild must be a positive int or None"),
-        ({"maxtasksperchild": "9"}, ValueError, "maxtasksperchild must be a positive int or None"),
-        ({"initializer": 1}, TypeError, "initializer must be a callable"),
-        ({"processes": 2, "min_workers": 1}, ValueError, "processes="),
-        ({"min_workers": 3, "max_workers": 2}, ValueError, "min_workers=3"),
-        ({"min_workers": -1, "max_workers": 2}, ValueError, "min_workers=-1"),
-        ({"min_workers": 0, "max_workers": 0}, ValueError, "max_workers"),
-        ({"retries": -1}, ValueError, "retries"),
-        ({"retries": 1.5}, ValueError, "retries"),
-        ({"task_timeout": 0}, ValueError, "task_timeout"),
-        ({"idle_timeout": -1}, ValueError, "idle_timeout"),
-        ({"retry_exceptions": [1]}, TypeError, "retry_exceptions must be exception classes"),
-        ({"retry_exceptions": int}, TypeError, "retry_exceptions"),
-    ],
-)
-def test_bad_options_are_named(options: dict[str, Any], error: type[Exception], text: str) -> None:
-    with pytest.raises(error, match=text):
-        fiber.Pool(**options)
-
-
-def test_bad_arguments_are_named(pool: Pool) -> None:
-    for call in (pool.map, pool.map_async, pool.imap, pool.imap_unordered):
-        with pytest.raises(ValueError, match="Chunksize must be 1"):
-            call(tasks.square, range(3), 0)
-    with pytest.raises(ValueError, match="timeout"):
-        pool.apply(tasks.square, (1,), timeout=0)
-    with pytest.raises(ValueError, match="buffersize"):
-        pool.imap(tasks.square, range(3), buffersize=0)
-    with pytest.raises(TypeError):
-        pool.map(tasks.square, 3)  # type: ignore[arg-type]

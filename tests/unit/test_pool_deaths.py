@@ -35,7 +35,6 @@ def pool() -> Iterator[Pool]:
     ("how", "exitcode", "reason"),
     [
         ("exit", 3, "exit status 3"),
-        ("sys.exit", 4, "exit status 4"),
         ("kill", -signal.SIGKILL, "SIGKILL"),
         ("segfault", -signal.SIGSEGV, "SIGSEGV"),
     ],
@@ -50,6 +49,30 @@ def test_a_task_that_kills_its_worker_fails_with_the_reason(
     assert "PoolWorker-" in error.worker
     assert (error.exitcode, error.attempts) == (exitcode, 4)
     assert error.pid is not None
+
+
+@pytest.mark.parametrize("chunksize", [None, 1, 10])
+def test_sys_exit_ends_the_worker_and_is_not_tried_again(
+    pool: Pool, tmp_path: Path, chunksize: int | None
+) -> None:
+    before = {process.pid for process in pool._pool}
+    items = [(tmp_path / str(n), n == 3) for n in range(20)]
+    iterator = pool.imap(tasks.count_and_exit, items, chunksize or 1)
+    found = tasks.gather(iterator)
+    assert [type(value) for value in found] == [int] * 3 + [SystemExit] + [int] * 16
+    assert all(tasks.runs(path) == 1 for path, _ in items)
+    with pytest.raises(SystemExit):
+        pool.map(tasks.count_and_exit, [(tmp_path / "again", True)], chunksize)
+    assert tasks.runs(tmp_path / "again") == 1
+    deadline = time.monotonic() + PATIENCE
+    while before <= {process.pid for process in pool._pool}:
+        assert time.monotonic() < deadline, "its worker goes on"
+        time.sleep(0.001)
+
+
+def test_a_keyboard_interrupt_in_a_task_is_named_in_the_advice(pool: Pool) -> None:
+    with pytest.raises(WorkerDied, match="KeyboardInterrupt"):
+        pool.apply(tasks.die, ("interrupt",))
 
 
 def test_a_task_runs_again_when_its_worker_died(pool: Pool, tmp_path: Path) -> None:

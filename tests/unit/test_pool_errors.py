@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from multiprocessing.pool import MaybeEncodingError, RemoteTraceback  # type: ignore[attr-defined]
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import fiber
+from fiber.errors import UnpicklableError
 from fiber.pool import Pool
 from unit import pool_tasks as tasks
 
@@ -23,18 +26,6 @@ def pool() -> Iterator[Pool]:
     assert pool.apply_async(tasks.square, (3,)).get(PATIENCE) == 9, "the pool does not go on"
     pool.close()
     pool.join()
-
-
-def gather(iterator: Iterator[Any]) -> list[Any]:
-    """All results, errors in their places."""
-    found: list[Any] = []
-    while True:
-        try:
-            found.append(next(iterator))
-        except StopIteration:
-            return found
-        except Exception as error:
-            found.append(error)
 
 
 # Tasks that raise
@@ -51,7 +42,7 @@ def test_an_exception_comes_with_its_remote_traceback(pool: Pool) -> None:
 @pytest.mark.parametrize("chunksize", [None, 1, 4])
 def test_errors_stay_with_their_tasks(pool: Pool, chunksize: int | None) -> None:
     pool.map(tasks.identity, range(100))
-    found = gather(pool.imap(tasks.raise_if_odd, range(40), chunksize or 1))
+    found = tasks.gather(pool.imap(tasks.raise_if_odd, range(40), chunksize or 1))
     for index, value in enumerate(found):
         assert value == index if index % 2 == 0 else value.args == (index,)
     with pytest.raises(ValueError, match=r"\d"):
@@ -85,7 +76,7 @@ def test_what_is_not_an_exception_reaches_the_caller(pool: Pool) -> None:
 def test_results_that_do_not_travel_are_errors_of_their_tasks_only(
     pool: Pool, chunksize: int
 ) -> None:
-    found = gather(pool.imap(tasks.odd_results, range(30), chunksize))
+    found = tasks.gather(pool.imap(tasks.odd_results, range(30), chunksize))
     for index, value in enumerate(found):
         if index % 5 in (2, 3):
             assert isinstance(value, MaybeEncodingError)
@@ -138,7 +129,7 @@ def test_of_many_tasks_only_those_whose_arguments_do_not_pickle_fail(
     pool.map(tasks.identity, range(1000))  # batches become large
     bad = {3, 200, 201, 499}
     items = [tasks.Unpicklable() if n in bad else n for n in range(500)]
-    found = gather(pool.imap(tasks.identity, source(items)))
+    found = tasks.gather(pool.imap(tasks.identity, source(items)))
     assert {n for n, value in enumerate(found) if isinstance(value, RuntimeError)} == bad
     assert all(value == n for n, value in enumerate(found) if n not in bad)
 
@@ -150,7 +141,7 @@ def test_of_many_tasks_only_those_whose_arguments_do_not_unpickle_fail(
     pool.map(tasks.identity, range(1000))
     bad = {3, 200, 201, 499}
     items = [tasks.UnreadableInWorker() if n in bad else n for n in range(500)]
-    found = gather(pool.imap(tasks.identity, items, chunksize))
+    found = tasks.gather(pool.imap(tasks.identity, items, chunksize))
     assert {n for n, value in enumerate(found) if isinstance(value, RuntimeError)} == bad
     assert all(value == n for n, value in enumerate(found) if n not in bad)
     assert "cannot be unpickled in a worker" in str(found[3])
@@ -167,6 +158,34 @@ def test_a_call_whose_arguments_do_not_unpickle(pool: Pool) -> None:
                 result.get(PATIENCE)
         else:
             assert result.get(PATIENCE) == n
+
+
+def test_the_argument_that_does_not_pickle_is_named(pool: Pool) -> None:
+    lock: Any = threading.Lock()
+    identity = tasks.identity
+    calls: list[tuple[str, Callable[[], Any]]] = [
+        ("argument 1 of add()", lambda: pool.apply(tasks.add, (1, lock))),
+        ("argument 'y' of add()", lambda: pool.apply(tasks.add, (1,), {"y": lock})),
+        ("argument 0 of identity()", lambda: pool.broadcast(identity, lock)),
+        ("the item of task 1 of identity()", lambda: pool.map(identity, [1, lock])),
+        ("the item of task 1 of identity()", lambda: pool.map(identity, iter([1, lock]), 2)),
+        ("the function lock.acquire", lambda: pool.map(lock.acquire, [1])),
+        ("the function lock.acquire", lambda: pool.apply(lock.acquire)),
+    ]
+    for what, call in calls:
+        with pytest.raises(UnpicklableError, match=r"_thread\.lock") as caught:
+            call()
+        assert caught.value.what == what
+
+
+def test_so_is_the_way_to_it(pool: Pool) -> None:
+    with pytest.raises(UnpicklableError, match=r"\(at \['a'\]\[1\]\.lock\)"):
+        pool.map(tasks.identity, [{"a": [1, SimpleNamespace(lock=threading.Lock())]}])
+
+
+def test_an_open_file_is_refused_as_in_multiprocessing(pool: Pool) -> None:
+    with open(__file__) as file, pytest.raises(TypeError, match="pass its path"):
+        pool.apply(tasks.identity, (file,))
 
 
 # Functions

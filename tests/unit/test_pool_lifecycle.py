@@ -401,8 +401,12 @@ def test_busy_workers_do_not_leave(tmp_path: Path) -> None:
     with fiber.Pool(min_workers=1, max_workers=3, idle_timeout=0.02) as pool:
         results = [pool.apply_async(tasks.announce_and_wait, (path, gate)) for _ in range(3)]
         pids = set(tasks.wait_until_announced(path, 3))
-        time.sleep(0.2)  # ten times as long as an idle one may stay
-        assert {process.pid for process in pool._pool} == pids
+        # A timer that comes after any with which the pool, by now, may watch for idle workers.
+        passed, loop = threading.Event(), pool._dispatcher._loop
+        loop.call_later(0.04, passed.set)
+        assert passed.wait(PATIENCE)
+        staying = [link.process for link in pool._dispatcher.crew.staying()]
+        assert {process.pid for process in staying if process is not None} == pids
         gate.touch()
         assert [result.get(PATIENCE) for result in results] == ["gate"] * 3
     pool.join()
@@ -421,3 +425,54 @@ def test_processes_look_like_processes() -> None:
     pool.join()
     assert all(process.exitcode is not None for process in processes)
     assert not set(processes) & set(fiber.active_children())
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+def test_classes_of_a_main_that_goes_by_value_come_back_as_themselves(backend: str) -> None:
+    done = run_program(
+        """
+        import fiber
+        class Point:
+            def __init__(self, x):
+                self.x = x
+        class Trouble(Exception):
+            pass
+        def make(x):
+            return Point(x), make
+        def fail(x):
+            raise Trouble(x)
+        if __name__ == "__main__":
+            with fiber.Pool(1) as pool:
+                point, function = pool.apply(make, (3,))
+                print(isinstance(point, Point), point.x, function is make)
+                try:
+                    pool.map(fail, [4])
+                except Trouble as error:
+                    print(error.args)
+        """,
+        env=os.environ | {"FIBER_BACKEND": backend},
+    )
+    assert (done.stdout, done.stderr) == ("True 3 True\n(4,)\n", "")
+
+
+def test_a_signal_handler_may_terminate_the_pool_that_it_interrupts() -> None:
+    done = run_program("""
+        import signal, threading
+        import fiber
+        from fiber._engine.ledger import Ledger
+        assign = Ledger.assign
+        def interrupted(self, now):
+            if armed and threading.current_thread() is threading.main_thread():
+                armed.pop()
+                signal.raise_signal(signal.SIGTERM)
+            return assign(self, now)
+        armed = []
+        Ledger.assign = interrupted
+        pool = fiber.Pool(1)
+        signal.signal(signal.SIGTERM, lambda *_: pool.terminate())
+        armed.append(True)
+        pool.apply_async(abs, (1,))
+        pool.join()
+        print("ended")
+    """)
+    assert (done.stdout, done.stderr) == ("ended\n", "")

@@ -17,7 +17,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
-from fiber._hub.absent import NotInFiber
+from fiber.errors import NotInFiber
 
 MORE_THAN_FITS = 3000
 """Items that no socket's buffer holds."""
@@ -162,6 +162,12 @@ def test_an_item_that_does_not_pickle_is_reported(capsys: pytest.CaptureFixture[
     queue.put("next", block=False)
     assert queue.qsize() == 1
     assert queue.get() == "next"
+
+
+def test_so_is_what_of_it_does_not(capsys: pytest.CaptureFixture[str]) -> None:
+    queue: Any = fiber.Queue()
+    queue.put({"a": threading.Lock()})
+    assert "the item cannot be pickled (at ['a'])" in capsys.readouterr().err
 
 
 def test_the_hook_for_errors_can_be_overridden() -> None:

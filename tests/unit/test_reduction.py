@@ -7,6 +7,7 @@ import multiprocessing.reduction
 import os
 import pickle
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -18,6 +19,7 @@ from fiber._agent import child
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
 from fiber.connection import Pipe
+from fiber.errors import UnpicklableError
 from fiber.process import Process
 
 
@@ -72,7 +74,8 @@ def test_reducers_registered_with_multiprocessing_count(monkeypatch: pytest.Monk
 
 
 def test_encode_puts_large_buffers_beside_the_pickle() -> None:
-    numpy = pytest.importorskip("numpy")
+    import numpy
+
     array = numpy.arange(100_000)
     payload, buffers = reduction.encode({"array": array})
     assert len(payload) < 1000
@@ -175,3 +178,31 @@ def test_a_connection_cannot_be_pickled_by_just_anyone_without_a_trace() -> None
     with pytest.raises(OSError, match="handle is closed"):
         pickle.dumps(closed)
     open_end.close()
+
+
+def test_open_files_are_refused_and_standard_streams_are_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "stdout", sys.__stdout__)  # pytest's own is of another class
+    with open(__file__) as file, pytest.raises(TypeError, match=r"open file .*pass its path"):
+        reduction.dumps((lambda: None, file))
+    function, stream = pickle.loads(reduction.dumps((lambda: 3, sys.stdout)))
+    assert function() == 3
+    assert stream is sys.stdout
+
+
+def test_blame_names_what_refers_to_itself_too() -> None:
+    loop: list[Any] = [threading.Lock()]
+    loop.insert(0, loop)
+    error = reduction.blame({"it": loop}, TypeError("no"))
+    assert isinstance(error, UnpicklableError)
+    assert error.what == "it"
+
+
+def test_blame_is_for_refusals_only() -> None:
+    reason = RuntimeError("the user's own")
+    assert reduction.blame({"it": 1}, reason) is reason
+
+
+def test_the_names_of_multiprocessings_module_are_there() -> None:
+    assert set(multiprocessing.reduction.__all__) <= set(reduction.__all__)  # type: ignore[attr-defined]

@@ -12,7 +12,7 @@ import pytest
 
 import fiber
 from fiber import synchronize
-from fiber._hub.absent import NotInFiber
+from fiber.errors import NotInFiber
 
 PATIENCE = 15.0
 

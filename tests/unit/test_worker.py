@@ -189,7 +189,6 @@ def test_a_reused_object_is_sent_as_it_was(rig: Rig) -> None:
 
 
 def test_a_reused_buffer_is_sent_before_it_is_used_again(rig: Rig) -> None:
-    pytest.importorskip("numpy")
     seq = rig.give(tasks.fill, range(5))
     assert [array[0] for array in rig.channel.results(seq)] == [0, 1, 2, 3, 4]
     assert len(rig.channel.said) == 5
@@ -266,8 +265,17 @@ def note(_: object) -> None:
 def test_what_was_done_before_sys_exit_is_sent(rig: Rig, mode: dict[str, int]) -> None:
     with pytest.raises(SystemExit):
         rig.give(exit_at_three, range(10), **mode)
-    assert rig.channel.results(1)[:3] == [0, 1, 2]
-    assert len(rig.channel.results(1)) == 3
+    *done, last = rig.channel.results(1)
+    assert done == [0, 1, 2]
+    assert isinstance(last[1], SystemExit)
+    assert [words[2] for words in rig.channel.said if words[2] is not None] == [4]
+
+
+def test_a_call_that_exits_is_answered_first(rig: Rig) -> None:
+    with pytest.raises(SystemExit):
+        rig.call((exit_at_three, (3,), {}))
+    ((_, error),) = rig.channel.results(1)
+    assert isinstance(error, SystemExit)
 
 
 def exit_at_three(x: int) -> int:

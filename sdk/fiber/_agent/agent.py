@@ -192,14 +192,17 @@ class LocalChild:
                 self._open_channel(agent)
         except BaseException:
             self.release_descriptors()
-            if self.slot is not None:
-                agent._board.release(self.slot)
             raise
 
     def _open_channel(self, agent: Agent) -> None:
-        self.slot = agent._board.claim()
-        ours, theirs = socketpair("starting a pool worker")
+        slot = agent._board.claim()
+        try:
+            ours, theirs = socketpair("starting a pool worker")
+        except BaseException:
+            agent._board.release(slot)
+            raise
         ours.setblocking(False)
+        self.slot = slot
         # We keep the child's end too: what it has not read when it dies, or when another worker is
         # idle, is read from there.  The kernel gives each packet to exactly one reader.
         self._ours, self._theirs = ours, theirs

@@ -14,6 +14,7 @@ from multiprocessing.reduction import ForkingPickler
 from operator import length_hint
 from typing import Any, Protocol
 
+from fiber._agent import by_name
 from fiber._wire import packet, work
 
 
@@ -109,9 +110,8 @@ class Answer:
             if len(buffers) > work.BUFFERS:
                 data, buffers = pickle.dumps(value, 5), []
         except Exception as error:
-            # Sockets and the like need multiprocessing's reducers, which only its pickler knows.
             try:
-                data, buffers = bytes(ForkingPickler.dumps(value)), []
+                data, buffers = _pickle_unusual(value)
             except Exception:
                 self._odd.append((position, work.ERROR, encode_error(unsendable(error, value)), 0))
                 return
@@ -158,20 +158,33 @@ class Answer:
         del self._odd[:done], self._buffers[: len(buffers)]
 
 
+def _pickle_unusual(value: Any) -> tuple[bytes, list[memoryview]]:
+    """What plain pickle refuses."""
+    try:
+        # Sockets and the like need multiprocessing's reducers, which only its pickler knows.
+        return bytes(ForkingPickler.dumps(value)), []
+    except Exception:
+        data, buffers = packet.dumps(value, by_name.dumps)
+        return (data, buffers) if len(buffers) <= work.BUFFERS else (by_name.dumps(value), [])
+
+
 def encode_error(error: BaseException) -> bytes:
     """Pickle an error, with its traceback as text, so that it surely unpickles."""
     from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 
     wrapped = ExceptionWithTraceback(error, error.__traceback__)
-    try:
-        data = pickle.dumps(wrapped)
-        pickle.loads(data)
-        return data
-    except Exception as reason:
-        # An error that cannot be sent still has to say what happened, and where.
-        substitute = ExceptionWithTraceback(unsendable(reason, error), None)
-        substitute.tb = wrapped.tb
-        return pickle.dumps(substitute)
+    refusals = []
+    for dumps in (pickle.dumps, by_name.dumps):
+        try:
+            data = dumps(wrapped)
+            pickle.loads(data)
+            return data
+        except Exception as reason:
+            refusals.append(reason)
+    # An error that cannot be sent still has to say what happened, and where.
+    substitute = ExceptionWithTraceback(unsendable(refusals[0], error), None)
+    substitute.tb = wrapped.tb
+    return pickle.dumps(substitute)
 
 
 def unsendable(reason: BaseException, value: Any) -> Exception:

@@ -12,6 +12,9 @@ from typing import NamedTuple, Protocol
 
 from fiber._wire.packet import BytesLike, Message
 
+UNKNOWN = 255
+"""Exit code of a child of which it is not known, as in multiprocessing."""
+
 
 class ExitReport(NamedTuple):
     """How a child ended."""

@@ -29,6 +29,9 @@ SMALL = frozenset({int, float, bool, type(None)})
 
 _Function = Callable[..., Any]
 
+_ANSWERED = object()
+"""In place of a function: the batch has its answer."""
+
 
 def run(
     initializer: Callable[..., object] | None,
@@ -86,16 +89,15 @@ class Worker:
     def _answer(
         self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview], started: float
     ) -> None:
-        function: _Function | None
         if head.kind == work.CALLS and head.size == 1:
             self._run_call(seq, body, buffers, started)
             return
         if head.kind == work.CALLS:
             items: Any = list(work.unpack_calls(body, head.size))
-            function = _Caller(buffers)
+            function: Any = _Caller(buffers)
         else:
             function = self._function(seq, head, body, buffers)
-            if function is None:
+            if function is _ANSWERED:
                 return
             try:
                 items = pickle.loads(body[head.size :], buffers=buffers[head.buffers :])
@@ -115,12 +117,14 @@ class Worker:
         try:
             function, args, kwargs = pickle.loads(body[work.CALL.size :], buffers=buffers)
             value = function(*args, **kwargs)
-        except (SystemExit, KeyboardInterrupt):
+        except KeyboardInterrupt:
             raise
         except BaseException as error:
             answer = self._start(seq, (), started, exact=True)
             answer.fail(error)
             answer.flush()
+            if isinstance(error, SystemExit):
+                raise
             return
         if type(value) in SMALL:
             self._say(seq, 0, None, time.perf_counter() - started, [value], ())
@@ -149,20 +153,22 @@ class Worker:
 
     def _function(
         self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview]
-    ) -> _Function | None:
+    ) -> Any:
+        """The function of a batch, whatever it is: to call it may be the error; or _ANSWERED."""
         functions = self._functions
         if head.size:
             try:
                 function = pickle.loads(body[: head.size], buffers=buffers[: head.buffers])
             except Exception as error:
                 self._say(work.BROKEN, seq, encode_error(error))
-                return None
+                return _ANSWERED
             functions[head.function] = function
             if len(functions) > FUNCTIONS:
                 functions.popitem(last=False)
         elif head.function not in functions:
             self._say(work.UNKNOWN, seq)
-        return functions.get(head.function)
+            return _ANSWERED
+        return functions[head.function]
 
     def _say(self, *words: Any) -> None:
         self._channel.send(pickle.dumps(words))
@@ -252,14 +258,19 @@ class Worker:
             answer.fail(StopIteration())
 
     def _failed(self, answer: Answer, error: BaseException) -> None:
-        if isinstance(error, SystemExit | KeyboardInterrupt):
-            # It ends this process, as in multiprocessing; what was done before it counts.
-            self._watch.end()
-            if not answer.exact:
-                answer.settle()
+        if not isinstance(error, KeyboardInterrupt):
+            answer.fail(error)
+            if not isinstance(error, SystemExit):
+                return
+        # It ends this process, as in multiprocessing; what was done before it counts.
+        self._watch.end()
+        if not answer.exact:
+            answer.settle()
+        if isinstance(error, SystemExit):
+            answer.give_back()
+        else:
             answer.flush()
-            raise error
-        answer.fail(error)
+        raise error
 
 
 def _spread(function: _Function) -> _Function:

@@ -95,6 +95,8 @@ class Zygote:
         # Ctrl-C in a terminal is the master's alone.  SIGTERM to us would orphan the children.
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(signum, signal.SIG_IGN)
+        # A terminal with `stty tostop` stops whole groups that are not its own when they print.
+        signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.set_wakeup_fd(self._deaths_in, warn_on_full_buffer=False)
 

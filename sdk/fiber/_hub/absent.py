@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from fiber.errors import FiberError
-
-
-class NotInFiber(FiberError, NotImplementedError):
-    """A part of multiprocessing that this version of Fiber does not have; names what to use."""
-
+from fiber.errors import NotInFiber
 
 _INSTEAD = {
     "Lock": "use Semaphore(1)",
@@ -23,18 +18,21 @@ _INSTEAD = {
     "RawArray": "send the array through a Pipe or Queue",
     "copy": "send the object through a Pipe or Queue",
     "synchronized": "send the object through a Pipe or Queue",
+    "SharedMemory": "send the buffer through a Pipe or Queue",
+    "ShareableList": "send the list through a Pipe or Queue",
     "Manager": "keep the object in one process and talk to it through a Pipe or Queue",
 }
 
 
-def refuse(name: str, instead: str = "") -> NoReturn:
+def refuse(name: str) -> NoReturn:
     """Raise the error for ``name``."""
-    advice = instead or _INSTEAD[name]
-    raise NotInFiber(f"Fiber has no {name} yet: it shares no memory and no locks. Please {advice}.")
+    raise NotInFiber(
+        f"Fiber has no {name} yet: it shares no memory and no locks. Please {_INSTEAD[name]}."
+    )
 
 
 def absent(name: str) -> Callable[..., Any]:
-    """A function that stands where multiprocessing has ``name``, and refuses."""
+    """A function that stands where multiprocessing has a function ``name``, and refuses."""
 
     def stand_in(*_args: Any, **_options: Any) -> NoReturn:
         refuse(name)
@@ -42,3 +40,19 @@ def absent(name: str) -> Callable[..., Any]:
     stand_in.__name__ = stand_in.__qualname__ = name
     stand_in.__doc__ = f"Not there yet: {_INSTEAD[name]}."
     return stand_in
+
+
+class Absent:
+    """Base of the classes that stand where multiprocessing has one, for annotations and
+    ``isinstance``: whoever makes an object is refused.
+    """
+
+    _name: str
+
+    def __init_subclass__(cls) -> None:
+        if cls.__name__ in _INSTEAD:  # not a user's subclass of one of them
+            cls._name = cls.__name__
+            cls.__doc__ = f"Not there yet: {_INSTEAD[cls._name]}."
+
+    def __init__(self, *_args: Any, **_options: Any) -> None:
+        refuse(self._name)

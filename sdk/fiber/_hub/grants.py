@@ -68,7 +68,11 @@ class GrantSet:
             line.close()  # a hub takes back what was granted on a stream when it ends
 
     def __del__(self) -> None:
-        self.release()
+        # Whoever lets go of it, or the collector, may be in the middle of anything.
+        for registry, grant in self._direct:
+            registry.release_soon(grant)
+        for line in self._lines.values():
+            line.close()
 
     def _line(self, home: Access) -> Line:
         if home not in self._lines:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar, cast
 
+from fiber._transport.loop import LONGEST_POLL
 from fiber._transport.unix import UnixChannel, UnixCounter, socketpair
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
@@ -139,7 +140,7 @@ class LocalCounter(UnixCounter):
                 left = None if deadline is None else deadline - time.monotonic()
                 if left is not None and left <= 0:
                     return False
-                poller.poll(left)
+                poller.poll(None if left is None else min(left, LONGEST_POLL))
         return True
 
     def __del__(self) -> None:

@@ -35,11 +35,20 @@ class Entry:
 
 
 class Registry:
-    """The objects of one hub.  Any thread."""
+    """The objects of one hub.  Any thread.
 
-    def __init__(self, host: Callable[[Kind, int], Hosted], discard: Callable[[Hosted], None]):
+    ``soon`` has something done in a moment, and takes no lock for it.
+    """
+
+    def __init__(
+        self,
+        host: Callable[[Kind, int], Hosted],
+        discard: Callable[[Hosted], None],
+        soon: Callable[..., None],
+    ):
         self._host = host
         self._discard = discard
+        self._soon = soon
         self._lock = threading.Lock()
         # Ids are unguessable only in so far as nobody without the hub's key gets to ask for one.
         self._numbers = itertools.count(1)
@@ -97,6 +106,10 @@ class Registry:
             entry = self._grants.get(grant)
             if entry is not None:
                 self._end(entry, grant)
+
+    def release_soon(self, grant: int) -> None:
+        """The same for finalizers, which run anywhere, even where this thread holds a lock."""
+        self._soon(self.release, grant)
 
     def close(self) -> None:
         """Let go of everything."""

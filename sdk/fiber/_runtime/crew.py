@@ -11,7 +11,7 @@ from typing import Any
 from fiber._agent import worker
 from fiber._agent.port import ExitReport
 from fiber._runtime.workers import Link, PoolProcess, Supervisor, dismiss
-from fiber.errors import StartError
+from fiber.errors import FiberError, StartError
 
 TRIES = 3
 """Workers that may fail to start, one after the other, before the pool gives up or hesitates."""
@@ -52,7 +52,7 @@ class Crew:
         self.failures = 0
         self.idle_deaths = 0
         self.trouble: StartError | None = None
-        self.error: StartError | None = None
+        self.error: FiberError | None = None
         self._supervisor = supervisor
         self._lock = lock
         self._context = context

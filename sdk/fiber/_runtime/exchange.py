@@ -14,16 +14,22 @@ Who touches what: the ledger, the crew, ``_unsent``, ``_readers``, timers and fl
 ``_lock``.  ``heard`` runs on the loop's thread or on that of a caller who attends to a worker,
 ``recalled``, ``lost`` and timers on the loop's thread.  None of them may run any of the user's
 code: a batch whose pickling could goes to the pump, values whose unpickling could stay ``Encoded``.
-A batch in ``_unsent`` is assigned but not sent: nobody can have run it.
+A batch in ``_unsent`` is assigned and not known to be sent: nobody can have run it, unless its
+worker says so.
+
+A job and its request know each other, and a request its results: ``_over`` parts them, so that they
+are freed when the user lets go of them, not when the collector comes.
 """
 
 from __future__ import annotations
 
 import pickle
+from collections import deque
 from collections.abc import Iterable, Sequence
 from time import monotonic
 from typing import Any
 
+from fiber import reduction
 from fiber._agent.port import ExitReport
 from fiber._engine.ledger import Batch, Job, Loss, Receipt
 from fiber._runtime.crew import Crew
@@ -31,6 +37,7 @@ from fiber._runtime.outcome import Encoded, Failure, outcomes
 from fiber._runtime.pump import Pump
 from fiber._runtime.reader import Reader
 from fiber._runtime.requests import Request, Sink, encode, is_plain
+from fiber._runtime.shield import unbroken
 from fiber._runtime.staff import Staff, Terms
 from fiber._runtime.state import runtime
 from fiber._runtime.workers import Link
@@ -86,17 +93,21 @@ class Exchange(Staff):
 
     def _send(self, batches: Sequence[Batch]) -> None:
         """Send batches, on a thread that may run the user's code."""
-        while batches:
-            more: list[Batch] = []
-            for batch in batches:
-                more += self._send_one(batch, plain=False)
-            batches = more
+        left = deque(batches)
+        try:
+            while left:
+                left.extend(self._send_one(left[0], plain=False))
+                left.popleft()
+        except BaseException:
+            # Ctrl-C, while the user's code ran: others wait for these tasks' results, too.
+            self.pump.post(self._send, left)
+            raise
 
     def _send_safely(self, batches: Iterable[Batch]) -> None:
         """Send batches, on any thread: the pump does it where the user's code could run."""
         for batch in batches:
-            job = batch.job
-            if job is None or job.owner.kind == work.CALLS or is_plain(batch.items):
+            request = _request(batch)
+            if request is None or request.kind == work.CALLS or is_plain(batch.items):
                 self._send_safely(self._send_one(batch, plain=True))
             else:
                 self.pump.post(self._send, (batch,))
@@ -106,14 +117,17 @@ class Exchange(Staff):
 
         ``plain``: its items are known to pickle without the user's code.
         """
-        job = batch.job
-        if job is None:
+        request = _request(batch)
+        if request is None:
             return self._withdraw(batch)
-        request: Request = job.owner
         link: Link = batch.worker.key
         assert link.port is not None
         try:
-            message, buffers = encode(request, batch, link.known, plain)
+            if plain or request.kind == work.CALLS:
+                message, buffers = encode(request, batch, link.known, plain)
+            else:
+                with unbroken.lifted:
+                    message, buffers = encode(request, batch, link.known, plain)
             if request.timeout is not None:
                 timer = self._loop.call_later(request.timeout, self._expired, batch.seq)
                 self._deadlines[batch.seq] = timer
@@ -122,6 +136,10 @@ class Exchange(Staff):
         except Exception as error:
             # Whatever the user's pickler raises, or the system for want of memory or descriptors,
             # concerns the tasks of this batch only.
+            return self._unsendable(batch, error)
+        except BaseException as error:
+            if unbroken.up():  # it may have been a signal's handler
+                raise
             return self._unsendable(batch, error)
         self._unsent.discard(batch.seq)
         return []
@@ -137,6 +155,8 @@ class Exchange(Staff):
 
     def _unsendable(self, batch: Batch, error: BaseException) -> list[Batch]:
         ends: list[Sink] = []
+        if len(batch.items) == 1 and isinstance(error, Exception):
+            error = _blame_item(batch, error)
         with self._lock:
             self._unsent.discard(batch.seq)
             self._cancel_deadline(batch.seq)
@@ -178,6 +198,7 @@ class Exchange(Staff):
                     self._put_or_retry(receipt, results, ends)
                 else:
                     self._put(receipt, results, ends, mixed=bool(odd))
+                self._check_finished(receipt.job, ends)
             if self._deadlines:
                 self._cancel_deadline(seq)
             plan = self._step()
@@ -195,7 +216,6 @@ class Exchange(Staff):
                 ends.append(sink)
         else:
             request.sink.put(receipt.start, results, mixed)
-        self._check_finished(receipt.job, ends)
 
     def _put_or_retry(self, receipt: Receipt, results: list[Any], ends: list[Sink]) -> None:
         """Hand results on but those whose tasks get another try.  Lock held."""
@@ -215,9 +235,15 @@ class Exchange(Staff):
         if not job.finished:
             return
         request: Request = job.owner
-        self._stop_reader(request)
-        if request.sink is not None and request.sink not in ends:
+        if request.sink is not None:
             ends.append(request.sink)
+        self._over(request)
+
+    def _over(self, request: Request) -> None:
+        """Its job is finished, or nobody wants the rest.  Lock held."""
+        self._stop_reader(request)
+        request.job.owner = None
+        request.kept.clear()
 
     def _unreadable(self, kind: str, seq: int, error: Encoded) -> None:
         """A worker cannot unpickle a batch, or its function: then no task of its job can run."""
@@ -239,6 +265,7 @@ class Exchange(Staff):
         receipt = self._ledger.split(seq, monotonic())
         if receipt is not None:
             self._put(receipt, [failure], ends)
+            self._check_finished(receipt.job, ends)
 
     def recalled(self, link: Link, seqs: list[int]) -> None:
         """A worker will never see these batches."""
@@ -275,6 +302,7 @@ class Exchange(Staff):
                     f"its worker {link.name!r} was killed"
                 )
                 self._put(receipt, [Failure(error)], ends)
+                self._check_finished(receipt.job, ends)
             self.crew.let_go(link)
             plan = self._step()
         link.kill()
@@ -308,11 +336,17 @@ class Exchange(Staff):
             if link.worker is not None:
                 held = [batch.seq for batch in link.worker.queue]
                 unread = {*report.unread, *self._unsent.intersection(held)}
+                if report.running is not None:
+                    # Whoever sent it may not have come to say so.
+                    unread.discard(report.running[0])
                 self._unsent.difference_update(held)
                 for seq in held:
                     self._cancel_deadline(seq)
-                for loss in self._ledger.lose(link.worker, unread, report.running):
+                losses = self._ledger.lose(link.worker, unread, report.running)
+                for loss in losses:
                     self._put_loss(loss, link, report, ends)
+                for job in {loss.job for loss in losses}:
+                    self._check_finished(job, ends)
             self._check_crew()
             plan = self._step()
         self._act(plan, ends)
@@ -334,7 +368,6 @@ class Exchange(Staff):
         else:
             loss.item.sink.put(0, [Failure(error)], True)
             ends.append(loss.item.sink)
-        self._check_finished(loss.job, ends)
 
     # What ends before its time
 
@@ -346,10 +379,25 @@ class Exchange(Staff):
         else:
             for call in self._ledger.unfinished(job):
                 call.sink.abort(error)
-        self._stop_reader(request)
         self._ledger.cancel(job)
+        self._over(request)
 
     def _stop_reader(self, request: Request) -> None:
         if request.reader in self._readers:
             self._readers.remove(request.reader)
             request.reader.stop()
+
+
+def _blame_item(batch: Batch, error: Exception) -> Exception:
+    """What the caller hears of a task that cannot be sent."""
+    request = _request(batch)
+    if request is None or request.function is None:
+        return error
+    name = request.task_name(batch.start, batch.items[0])
+    return reduction.blame({f"the item of {name}": batch.items[0]}, error)
+
+
+def _request(batch: Batch) -> Request | None:
+    """Whose batch it is; None once nobody wants it."""
+    job = batch.job
+    return None if job is None else job.owner

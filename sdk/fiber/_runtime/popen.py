@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import threading
 from multiprocessing.process import BaseProcess
 
-from fiber._agent.port import ChildPort, ExitReport
+from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
 from fiber._runtime.state import runtime
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.packet import Message
-from fiber.errors import StartError
+from fiber.errors import FiberError, StartError
 
 
 class Popen:
@@ -34,6 +35,7 @@ class Popen:
             self.sentinel = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._closed = False
         try:
+            runtime().loop.depend(self)
             port = runtime().start(process, self, method=method)
             if self.returncode is None:
                 self._port = port
@@ -46,7 +48,7 @@ class Popen:
 
     def _wait_for_birth(self, host: str) -> None:
         timeout = runtime().config.start_timeout
-        if not self._born.wait(timeout):
+        if not self._born.wait(min(timeout, threading.TIMEOUT_MAX)):
             raise StartError(
                 f"process {self._name!r}",
                 f"its agent on host {host!r} did not start it within {timeout:g} s (start_timeout)",
@@ -81,6 +83,14 @@ class Popen:
         # Each held the other; the sentinel's descriptor goes when the last user of this lets go.
         self._port = None
 
+    def broken(self, error: FiberError) -> None:
+        """Nobody will say how it ends: then it ends now."""
+        if self.returncode is None:
+            # What the loop failed for, descriptors that were closed, may be in the way of both.
+            with contextlib.suppress(OSError):
+                self.kill()
+            self.exited(ExitReport(UNKNOWN, str(error)))
+
     # What Process asks
 
     def poll(self) -> int | None:
@@ -89,7 +99,7 @@ class Popen:
 
     def wait(self, timeout: float | None = None) -> int | None:
         """Wait for the exit code."""
-        self._exited.wait(timeout)
+        self._exited.wait(None if timeout is None else min(timeout, threading.TIMEOUT_MAX))
         return self.returncode
 
     def terminate(self) -> None:

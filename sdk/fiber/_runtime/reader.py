@@ -15,6 +15,7 @@ from itertools import islice
 from typing import Any
 
 from fiber._engine.ledger import Job, Ledger
+from fiber._runtime.shield import unbroken
 
 AHEAD = 3
 """Messages worth of tasks that are read ahead for each worker."""
@@ -67,10 +68,12 @@ class Reader:
         )
 
     def _wait(self) -> None:
-        with self._lock:
-            if not self._full() or self.stopped:
-                return
+        with unbroken, self._lock:
+            # ``consume`` counts first and looks for this then: one of both sees the other.
             self._blocked = True
+            if not self._full() or self.stopped:
+                self._blocked = False
+                return
         self._gate.acquire()
 
     # Others
@@ -98,7 +101,7 @@ class Reader:
         """The user took the results of so many tasks."""
         self._consumed += tasks
         if self._blocked:
-            with self._lock:
+            with unbroken, self._lock:
                 self._release_if_room()
 
     def _release_if_room(self) -> None:

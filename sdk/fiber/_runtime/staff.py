@@ -8,6 +8,7 @@ worker, or to end a pool that has nothing left to do.
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -176,7 +177,7 @@ class Staff(ABC):
     def _watch_idle(self) -> None:
         """Look again when the worker that has been idle for longest may leave.  Lock held."""
         idle = self._longest_idle()
-        if idle is not None:
+        if idle is not None and self.terms.idle_timeout < math.inf:
             due = idle.since + self.terms.idle_timeout
             self._later("idle", due - self._loop.now(), self._thin_out)
 

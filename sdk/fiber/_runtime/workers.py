@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import threading
@@ -96,7 +97,7 @@ class Link:
     def pid(self) -> int | None:
         """Its pid; waits until it has one."""
         if self._pid is None and not runtime().loop.on_thread():
-            self._born.wait(runtime().config.start_timeout)
+            self._born.wait(min(runtime().config.start_timeout, threading.TIMEOUT_MAX))
         return self._pid
 
     def exit_descriptor(self) -> int:
@@ -113,13 +114,15 @@ class Link:
 
     def wait(self, timeout: float | None = None) -> int | None:
         """Wait for the exit code."""
-        self._exited.wait(timeout)
+        self._exited.wait(None if timeout is None else min(timeout, threading.TIMEOUT_MAX))
         return self.returncode
 
     def signal(self, signum: int) -> None:
         """Send it a signal."""
         if self.returncode is None and self.port is not None:
-            self.port.signal(signum)
+            # A program that has closed our descriptors has to hear of that, not of this.
+            with contextlib.suppress(OSError):
+                self.port.signal(signum)
 
     def terminate(self) -> None:
         """SIGTERM."""

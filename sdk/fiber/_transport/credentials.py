@@ -1,8 +1,7 @@
 """Who may talk to whom: a certificate authority per run, one certificate for each side.
 
 nng checks the server's name in the certificate, not its address, so one certificate serves a
-master behind any address.  The authority's key is forgotten once both certificates are signed:
-nobody can make a third one.
+master behind any address.
 """
 
 from __future__ import annotations
@@ -11,24 +10,12 @@ import base64
 import datetime
 import json
 import os
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fiber.errors import AuthenticationError, ConfigError
-
-if TYPE_CHECKING:
-    from cryptography import x509
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-VALID_FOR = datetime.timedelta(days=365)
-"""A run that lasts longer cannot take new agents."""
-
-CLOCK_SKEW = datetime.timedelta(days=1)
-"""How far an agent's clock may be behind."""
-
-_POOL = re.compile(r"[a-z0-9]([a-z0-9.-]{0,100}[a-z0-9])?")
+from fiber_api.certificates import RUN_VALIDITY, make_certificates
+from fiber_api.names import InvalidName
 
 _FILES = {
     "server_name": "server-name",
@@ -114,89 +101,24 @@ class MasterCredentials(Credentials):
 
 
 def make_credentials(pool: str) -> MasterCredentials:
-    """New credentials for the master and the agents of ``pool``, related to no others."""
-    if not _POOL.fullmatch(pool):
+    """New credentials for the master and the agents of ``pool``, related to no others.
+
+    They are valid for ``fiber_api.certificates.RUN_VALIDITY``: a run that lasts longer cannot take
+    new agents.
+    """
+    try:
+        made = make_certificates(
+            f"master.{pool}.fiber", f"agent.{pool}.fiber", valid_for=RUN_VALIDITY
+        )
+    except InvalidName:
         raise ConfigError(
-            f"{pool!r} cannot be the name of a pool: use up to 102 lower-case letters, digits, '-' "
-            "and '.', with a letter or digit at both ends"
-        )
-    authority = _Authority()
-    server_name = f"master.{pool}.fiber"
-    certificate, key = authority.issue(server_name, server=True)
-    own, own_key = authority.issue(f"agent.{pool}.fiber", server=False)
+            f"{pool!r} cannot be the name of a pool: use up to 240 lower-case letters, digits, '-' "
+            "and '.', with a letter or digit at both ends of each part"
+        ) from None
+    agent = Credentials(made.server_name, made.authority, made.agent.certificate, made.agent.key)
     return MasterCredentials(
-        server_name,
-        authority.certificate,
-        certificate,
-        key,
-        agent=Credentials(server_name, authority.certificate, own, own_key),
+        made.server_name, made.authority, made.master.certificate, made.master.key, agent=agent
     )
-
-
-class _Authority:
-    """A certificate authority that exists for one ``make_credentials``."""
-
-    def __init__(self) -> None:
-        from cryptography import x509
-        from cryptography.hazmat.primitives.asymmetric import ec
-        from cryptography.x509.oid import NameOID
-
-        self._key = ec.generate_private_key(ec.SECP256R1())
-        self._name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Fiber run")])
-        builder = self._builder(self._name, self._key.public_key()).add_extension(
-            x509.BasicConstraints(ca=True, path_length=0), critical=True
-        )
-        self.certificate = self._sign(builder)
-
-    def issue(self, name: str, *, server: bool) -> tuple[str, str]:
-        """A certificate for ``name`` and its key."""
-        from cryptography import x509
-        from cryptography.hazmat.primitives.asymmetric import ec
-        from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-
-        key = ec.generate_private_key(ec.SECP256R1())
-        usage = ExtendedKeyUsageOID.SERVER_AUTH if server else ExtendedKeyUsageOID.CLIENT_AUTH
-        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Fiber")])
-        builder = (
-            self._builder(subject, key.public_key())
-            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
-            .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
-        )
-        return self._sign(builder), _pem(key)
-
-    def _builder(
-        self, subject: x509.Name, key: ec.EllipticCurvePublicKey
-    ) -> x509.CertificateBuilder:
-        from cryptography import x509
-
-        now = datetime.datetime.now(datetime.UTC)
-        return (
-            x509.CertificateBuilder()
-            .subject_name(subject)
-            .issuer_name(self._name)
-            .public_key(key)
-            .serial_number(x509.random_serial_number())
-            .not_valid_before(now - CLOCK_SKEW)
-            .not_valid_after(now + VALID_FOR)
-        )
-
-    def _sign(self, builder: x509.CertificateBuilder) -> str:
-        from cryptography.hazmat.primitives import hashes, serialization
-
-        signed = builder.sign(self._key, hashes.SHA256())
-        return signed.public_bytes(serialization.Encoding.PEM).decode().strip()
-
-
-def _pem(key: ec.EllipticCurvePrivateKey) -> str:
-    from cryptography.hazmat.primitives import serialization
-
-    pem = key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
-    )
-    return pem.decode().strip()
 
 
 def _write_private(path: Path, text: str) -> None:

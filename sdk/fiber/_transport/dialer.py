@@ -9,11 +9,11 @@ from collections.abc import Callable
 from fiber._transport import handshake
 from fiber._transport.credentials import Credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
-from fiber._transport.link import Link, LinkError, Patience, Poller
+from fiber._transport.link import Link, Patience, Poller
 from fiber._transport.nng import Pipe, Socket, SocketClosed, Unreachable, Untrusted, url_of
 from fiber._transport.session_link import SessionLink
 from fiber._wire.messages import ProtocolError
-from fiber.errors import AuthenticationError, FiberError
+from fiber.errors import AuthenticationError, FiberError, LinkError
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 0.5
 """Seconds between attempts to dial for the first time, growing: a thousand agents that wait for a

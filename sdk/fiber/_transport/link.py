@@ -13,11 +13,6 @@ from typing import Any, NamedTuple, Protocol
 
 from fiber._transport.handshake import Identity
 from fiber._transport.session import HEARTBEAT, Frame, Statistics
-from fiber.errors import FiberError
-
-
-class LinkError(FiberError):
-    """A link between a master and an agent cannot be made, or the other side refused it."""
 
 
 class Patience(NamedTuple):

@@ -6,6 +6,7 @@ one at a time, must not block, and an exception in one is reported and does not 
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import itertools
 import os
@@ -13,11 +14,28 @@ import select
 import sys
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
+
+from fiber.errors import FiberError
 
 Callback = Callable[[], object]
+
+LONGEST_POLL = 60.0
+"""Seconds that one wait in the kernel lasts at most: it takes no more than 2**31 milliseconds, and
+would never end by itself if somebody closed the descriptors.
+"""
+
+_MANY_TIMERS = 1024
+
+
+class Dependent(Protocol):
+    """Waits for what only a loop can bring."""
+
+    def broken(self, error: FiberError) -> None:
+        """The loop has failed, and brings nothing any more.  On its thread, once."""
 
 
 class Timer:
@@ -47,6 +65,9 @@ class Loop:
         self._ready: deque[Callback] = deque()
         self._timers: list[tuple[float, int, Timer]] = []
         self._sequence = itertools.count()
+        self._sweep_at = _MANY_TIMERS
+        self._dependents: weakref.WeakSet[Dependent] = weakref.WeakSet()
+        self._failure: FiberError | None = None
         self._thread: threading.Thread | None = None
         self._ident: int | None = None
         self._running = False
@@ -65,6 +86,16 @@ class Loop:
     def running(self) -> bool:
         """Whether it still calls back."""
         return self._running
+
+    def depend(self, dependent: Dependent) -> None:
+        """Tell ``dependent`` if the loop fails; raises at once if it has failed already.
+
+        It is held weakly.
+        """
+        with self._wake_lock:
+            if self._failure is not None:
+                raise self._failure
+            self._dependents.add(dependent)
 
     @staticmethod
     def now() -> float:
@@ -132,15 +163,39 @@ class Loop:
         """Call back until stopped."""
         self._ident = threading.get_ident()
         self._running = True
-        while self._running:
-            try:
-                events = self._epoll.poll(self._timeout())
-            except InterruptedError:
-                continue
-            self._dispatch(events)
-            self._run_ready()
-            self._run_timers()
+        try:
+            while self._running:
+                self._run_once()
+        except BaseException as error:
+            self._break(error)
+            raise
         self._close()
+
+    def _run_once(self) -> None:
+        try:
+            events = self._epoll.poll(self._timeout())
+        except InterruptedError:
+            return
+        self._dispatch(events)
+        self._run_ready()
+        self._run_timers()
+
+    def _break(self, error: BaseException) -> None:
+        """Whoever waits must not wait for ever: tell them that nothing will come."""
+        failure = FiberError(
+            f"the thread that Fiber waits with has ended by {error!r}: what was asked for cannot "
+            "arrive. Look whether the program closes descriptors that are not its own, as "
+            "os.closerange() does, and start it again"
+        )
+        failure.__cause__ = error
+        self._running = False
+        with self._wake_lock:
+            self._failure = failure
+            dependents = list(self._dependents)
+        for dependent in dependents:
+            _call(lambda told=dependent: told.broken(failure))  # type: ignore[misc]
+        with contextlib.suppress(OSError):  # the descriptors may be what it failed for
+            self._close()
 
     def stop(self) -> None:
         """End the loop after what it is doing; from another thread, wait until it has ended."""
@@ -156,12 +211,14 @@ class Loop:
     def _stop(self) -> None:
         self._running = False
 
-    def _timeout(self) -> float | None:
+    def _timeout(self) -> float:
         if self._ready:
             return 0
         while self._timers and self._timers[0][2].callback is None:
             heapq.heappop(self._timers)
-        return max(0.0, self._timers[0][0] - self.now()) if self._timers else None
+        if not self._timers:
+            return LONGEST_POLL
+        return min(LONGEST_POLL, max(0.0, self._timers[0][0] - self.now()))
 
     def _dispatch(self, events: list[tuple[int, int]]) -> None:
         for fd, event in events:
@@ -186,6 +243,11 @@ class Loop:
                 _call(timer.callback)
 
     def _add_timer(self, timer: Timer) -> None:
+        if len(self._timers) >= self._sweep_at:
+            # Those that were cancelled long before their time would pile up.
+            self._timers = [entry for entry in self._timers if entry[2].callback is not None]
+            heapq.heapify(self._timers)
+            self._sweep_at = max(_MANY_TIMERS, 2 * len(self._timers))
         heapq.heappush(self._timers, (timer.due, next(self._sequence), timer))
 
     def _woken(self) -> None:

@@ -50,6 +50,8 @@ class SimulatedLoop:
         """Call it in the next turn."""
         self._ready.append(lambda: callback(*args))
 
+    interrupt = call_soon
+
     def call_later(
         self, seconds: float, callback: Callable[..., None], *args: Any
     ) -> SimulatedTimer:

@@ -25,10 +25,10 @@ from typing import Any
 import pynng
 
 from fiber._transport.credentials import Credentials
-from fiber._transport.link import LinkError, Poller
+from fiber._transport.link import Poller
 from fiber._transport.session import BUDGET
 from fiber._transport.session_link import SessionLink
-from fiber.errors import AuthenticationError, ConfigError, TooManyOpenFiles
+from fiber.errors import AuthenticationError, ConfigError, LinkError, TooManyOpenFiles
 
 _LARGEST = 4 * BUDGET
 """nng refuses longer messages unread; no session sends one."""

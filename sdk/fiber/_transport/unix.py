@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Iterator, Sequence
 
+from fiber._transport.loop import LONGEST_POLL
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import TooManyOpenFiles
@@ -178,5 +179,8 @@ def wait_readable(fd: int, timeout: float | None) -> bool:
         raise OSError("handle is closed")
     poller = select.poll()
     poller.register(fd, select.POLLIN)
-    milliseconds = None if timeout is None else max(0.0, timeout) * 1000
-    return bool(poller.poll(milliseconds))
+    while timeout is not None and timeout > LONGEST_POLL:
+        if poller.poll(LONGEST_POLL * 1000):
+            return True
+        timeout -= LONGEST_POLL
+    return bool(poller.poll(None if timeout is None else max(0.0, timeout) * 1000))

@@ -43,7 +43,6 @@ EXT = {
     "TestSimpleQueue.test_closed": "_reader, _writer",
     "TestStartMethod.test_context": "child reports the parent's method",
     "TestStartMethod.test_context_check_module_types": "types of forkserver preload",
-    "TestStartMethod.test_set_get": "class names of contexts",
     "TestStartMethod.test_get_all": "exact list of methods",
 }
 
@@ -122,8 +121,20 @@ _TABLES: tuple[tuple[Tier, dict[str, str]], ...] = (
 
 def tier_of(class_name: str, method: str, type_: str | None = None) -> Tier:
     """The tier of one test; `type_` is processes, manager, or None for an untyped class."""
+    return _find(class_name, method, type_)[0]
+
+
+def reason_of(class_name: str, method: str, type_: str | None = None) -> str:
+    """Why a test is in its tier; empty for what is part of every run."""
+    return _find(class_name, method, type_)[1]
+
+
+def _find(class_name: str, method: str, type_: str | None) -> tuple[Tier, str]:
     keys = (f"{class_name}.{method}[{type_}]", f"{class_name}.{method}", f"{class_name}.*")
     for tier, table in _TABLES:
-        if any(key in table for key in keys):
-            return tier
-    return "core" if class_name in KNOWN_CLASSES else "ext"
+        for key in keys:
+            if key in table:
+                return tier, table[key]
+    if class_name in KNOWN_CLASSES:
+        return "core", ""
+    return "ext", "a class that is newer than this list"

@@ -1,0 +1,309 @@
+"""Every name that the SDK and the operator must agree on.  Standard library only.
+
+A name that appears in a cluster is part of the contract: objects made by an older release carry it.
+Add to this module freely; change nothing in it without a new API version.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from typing import Final
+
+# -- The resource
+
+GROUP: Final = "fiber.dev"
+VERSION: Final = "v1alpha1"
+API_VERSION: Final = "fiber.dev/v1alpha1"
+KIND: Final = "FiberPool"
+LIST_KIND: Final = "FiberPoolList"
+PLURAL: Final = "fiberpools"
+SINGULAR: Final = "fiberpool"
+SHORT_NAMES: Final = ("fp", "fpool")
+CATEGORIES: Final = ("all", "fiber")
+CRD_NAME: Final = f"{PLURAL}.{GROUP}"
+
+# -- Who writes: field managers of server-side apply, and the value of LABEL_MANAGED_BY
+
+SDK_MANAGER: Final = "fiber-sdk"
+"""Owns ``spec.replicas``, ``spec.scaleDown.release`` and ``spec.master``."""
+OPERATOR_MANAGER: Final = "fiber-operator"
+"""Owns the status, the pods, the Service, its EndpointSlice and the Secret; never the spec."""
+
+# -- Labels and annotations
+
+LABEL_POOL: Final = f"{GROUP}/pool"
+LABEL_POOL_UID: Final = f"{GROUP}/pool-uid"
+"""Tells a pool from an earlier one of the same name: pods are selected by it."""
+LABEL_TEMPLATE_HASH: Final = f"{GROUP}/template-hash"
+"""The hash of the user's template alone, so that a new operator restarts nothing."""
+LABEL_EPOCH: Final = f"{GROUP}/epoch"
+"""The master's epoch when the pod was made."""
+LABEL_MANAGED_BY: Final = "app.kubernetes.io/managed-by"
+LABEL_SERVICE_NAME: Final = "kubernetes.io/service-name"
+"""Kubernetes': ties an EndpointSlice to its Service."""
+LABEL_SLICE_MANAGED_BY: Final = "endpointslice.kubernetes.io/managed-by"
+"""Kubernetes': who writes an EndpointSlice."""
+ANNOTATION_DELETION_COST: Final = "controller.kubernetes.io/pod-deletion-cost"
+"""Kubernetes': of two pods alike, policy Any deletes the one with the lower cost first."""
+
+# -- The worker container
+
+WORKER_CONTAINER: Final = "worker"
+"""What ``spec.workerContainer`` is when left out."""
+
+ENV_NAME: Final = "FIBER_AGENT_NAME"
+"""The pod's name: what the master calls the agent, and releases it by."""
+ENV_ADDRESS: Final = "FIBER_AGENT_ADDRESS"
+"""``host:port`` of the pool's Service."""
+ENV_CREDENTIALS: Final = "FIBER_AGENT_CREDENTIALS"
+"""The folder that holds the agent's half of the credentials."""
+ENV_POOL: Final = "FIBER_AGENT_POOL"
+ENV_NAMESPACE: Final = "FIBER_AGENT_NAMESPACE"
+ENV_PROCESSES: Final = "FIBER_AGENT_PROCESSES"
+"""How many children the agent runs: ``spec.processesPerPod``."""
+ENV_LOST_GRACE: Final = "FIBER_AGENT_LOST_GRACE"
+"""Seconds that an agent outlives its master: ``spec.master.lostGraceSeconds``."""
+
+CREDENTIALS_VOLUME: Final = "fiber-credentials"
+CREDENTIALS_DIRECTORY: Final = "/etc/fiber/credentials"
+
+# -- The way to the master
+
+MASTER_PORT: Final = 7070
+"""The port of the Service; the master itself listens where ``spec.master.port`` says."""
+MASTER_PORT_NAME: Final = "fiber"
+ENDPOINT_SCHEME: Final = "tls+tcp"
+
+# -- The Secret: its keys, and the files that the agent finds in CREDENTIALS_DIRECTORY
+
+KEY_AUTHORITY: Final = "ca.crt"
+KEY_SERVER_NAME: Final = "server-name"
+KEY_AGENT_CERTIFICATE: Final = "agent.crt"
+KEY_AGENT_KEY: Final = "agent.key"
+KEY_MASTER_CERTIFICATE: Final = "master.crt"
+KEY_MASTER_KEY: Final = "master.key"
+
+AGENT_FILES: Final = {
+    KEY_AUTHORITY: "ca.crt",
+    KEY_SERVER_NAME: "server-name",
+    KEY_AGENT_CERTIFICATE: "tls.crt",
+    KEY_AGENT_KEY: "tls.key",
+}
+"""Which keys of the Secret a pod may see, and the file that each becomes.  Never the master's."""
+
+MASTER_FILES: Final = {
+    KEY_AUTHORITY: "ca.crt",
+    KEY_SERVER_NAME: "server-name",
+    KEY_MASTER_CERTIFICATE: "tls.crt",
+    KEY_MASTER_KEY: "tls.key",
+}
+"""The same for a pod that runs a master and mounts the Secret instead of reading it by the API."""
+
+# -- Limits
+
+MAX_POOL_NAME: Final = 50
+"""Leaves room for what is appended to it: pod and Service names end at 63 characters."""
+MAX_RELEASE: Final = 500
+"""Pods that one ``spec.scaleDown.release`` may name."""
+MAX_PROBLEMS: Final = 10
+"""Problems that a status shows."""
+POD_SUFFIX_LENGTH: Final = 10
+"""Hexadecimal digits that end a pod's name; forty bits, drawn at random and never used again."""
+
+POOL_NAME_PATTERN: Final = "[a-z]([-a-z0-9]*[a-z0-9])?"
+"""A Service is called after the pool: its name must be a DNS label that begins with a letter."""
+
+_POOL_NAME = re.compile(POOL_NAME_PATTERN)
+_POD_SUFFIX = re.compile(f"[0-9a-f]{{{POD_SUFFIX_LENGTH}}}")
+
+
+class InvalidName(ValueError):
+    """A name that Kubernetes would refuse; the message says which, why, and what to use."""
+
+
+def check_pool_name(pool: str) -> str:
+    """``pool`` itself, if a FiberPool may have that name; else ``InvalidName``."""
+    if len(pool) > MAX_POOL_NAME:
+        raise InvalidName(
+            f"the pool name {pool!r} has {len(pool)} characters, more than {MAX_POOL_NAME}: the "
+            "names of its pods and its Service are made from it. Use a shorter one."
+        )
+    if not _POOL_NAME.fullmatch(pool):
+        raise InvalidName(
+            f"{pool!r} cannot be the name of a pool: its Service is called after it. Use "
+            "lower-case letters, digits and '-', with a letter first and no '-' at the end."
+        )
+    return pool
+
+
+def pod_name(pool: str, suffix: str) -> str:
+    """The name of one pod: at most 61 characters.  The caller draws the suffix."""
+    if not _POD_SUFFIX.fullmatch(suffix):
+        raise InvalidName(f"{suffix!r} is not {POD_SUFFIX_LENGTH} hexadecimal digits")
+    return f"{pool}-{suffix}"
+
+
+def service_name(pool: str) -> str:
+    """The Service that agents dial: at most 57 characters."""
+    return f"{pool}-master"
+
+
+def endpoint_slice_name(pool: str) -> str:
+    """The Service's one EndpointSlice."""
+    return service_name(pool)
+
+
+def secret_name(pool: str) -> str:
+    """The Secret with both halves of the credentials: at most 54 characters."""
+    return f"{pool}-tls"
+
+
+def master_lease_name(pool: str) -> str:
+    """The Lease that the SDK makes and names in ``spec.master.leaseName``."""
+    return pool
+
+
+def server_name(pool: str, namespace: str) -> str:
+    """The name in the master's certificate; agents check it instead of the address.
+
+    At most 127 characters, of the 253 that a certificate takes.
+    """
+    return f"master.{pool}.{namespace}.fiber"
+
+
+def agent_server_name(pool: str, namespace: str) -> str:
+    """The name in the agents' certificate.  One for all: what they may do does not differ."""
+    return f"agent.{pool}.{namespace}.fiber"
+
+
+def address_of(host: str, port: int) -> str:
+    """``host:port``, an IPv6 address in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def endpoint_of(host: str, port: int) -> str:
+    """The address as ``status.endpoint`` shows it."""
+    return f"{ENDPOINT_SCHEME}://{address_of(host, port)}"
+
+
+# -- What a status says
+
+
+class ConditionType(StrEnum):
+    """The types of ``status.conditions``."""
+
+    ACCEPTED = "Accepted"
+    """The operator understands the spec and the API server accepts its pods."""
+    READY = "Ready"
+    """As many workers as wanted are ready."""
+    PROGRESSING = "Progressing"
+    """Something is under way: pods are created, waited for, replaced or deleted."""
+    DEGRADED = "Degraded"
+    """Workers fail or cannot be had; the reason is the worst problem's."""
+    MASTER_ALIVE = "MasterAlive"
+    """Unknown while there is no master, or no Lease to tell by."""
+    SCALING_LIMITED = "ScalingLimited"
+    """``replicas`` asks for more than ``maxReplicas``, or for fewer than ``minReplicas``."""
+    SUSPENDED = "Suspended"
+    """``spec.suspend`` holds the pool at no pods."""
+
+
+class Phase(StrEnum):
+    """``status.phase``: the conditions in one word, for people.  Programs read the conditions."""
+
+    PENDING = "Pending"
+    """New; the operator has not judged it yet."""
+    SCALING = "Scaling"
+    """Workers are on their way, or are leaving."""
+    READY = "Ready"
+    """What is wanted is there, even if that is nothing."""
+    DEGRADED = "Degraded"
+    """Something is wrong that may still pass; problems say what."""
+    FAILED = "Failed"
+    """Nothing more is created until the spec changes; problems say why."""
+    SUSPENDED = "Suspended"
+    TERMINATING = "Terminating"
+    """The pool is being deleted."""
+
+
+class Reason(StrEnum):
+    """Why: reasons of problems, conditions and events.  The SDK raises those of problems.
+
+    Where Kubernetes has a word for it, this is Kubernetes' word.
+    """
+
+    # Problems: the spec, or what the API server makes of it.
+    INVALID_SPEC = "InvalidSpec"
+    """The operator cannot read the spec."""
+    INVALID_TEMPLATE = "InvalidTemplate"
+    """The API server refuses a pod of this template (422)."""
+    QUOTA_EXCEEDED = "QuotaExceeded"
+    """A ResourceQuota refuses more pods (403)."""
+    FORBIDDEN = "Forbidden"
+    """An admission policy or missing rights refuse the pod (403 for any other cause)."""
+    NAME_TAKEN = "NameTaken"
+    """An object that is not the pool's has a name that the pool needs."""
+    INVALID_CREDENTIALS = "InvalidCredentials"
+    """The pool's Secret is damaged or about to expire."""
+    INVALID_RELEASE = "InvalidRelease"
+    """``scaleDown.release`` names what is not a pod of this pool."""
+
+    # Problems: pods that do not start.
+    INVALID_IMAGE_NAME = "InvalidImageName"
+    IMAGE_NEVER_PULL = "ErrImageNeverPull"
+    IMAGE_PULL_ERROR = "ImagePullError"
+    CONTAINER_CONFIG_ERROR = "CreateContainerConfigError"
+    CONTAINER_ERROR = "CreateContainerError"
+    RUN_CONTAINER_ERROR = "RunContainerError"
+    UNSCHEDULABLE = "Unschedulable"
+    STARTUP_TIMEOUT = "StartupTimeout"
+    """Not ready for ``failurePolicy.startupTimeoutSeconds``."""
+
+    # Problems: pods that end.
+    CONTAINER_FAILED = "ContainerFailed"
+    """The worker exited with a code other than 0."""
+    OOM_KILLED = "OOMKilled"
+    COMPLETED = "Completed"
+    """The worker exited with code 0 though nobody released it."""
+    DISRUPTED = "Disrupted"
+    """Evicted, preempted, deleted by someone, or its node is gone: replaced and not counted."""
+    NOT_READY = "NotReady"
+    """A pod that was ready is not any more."""
+    BACKOFF_LIMIT_EXCEEDED = "BackoffLimitExceeded"
+    """``failurePolicy.backoffLimit`` failures in a row: nothing more is created."""
+
+    # Problems: the master and the API server.
+    MASTER_LOST = "MasterLost"
+    """The master's Lease has expired."""
+    API_UNAVAILABLE = "ApiUnavailable"
+
+    # Conditions: what is neither good nor bad news.
+    AS_EXPECTED = "AsExpected"
+    CREATING = "Creating"
+    STARTING = "Starting"
+    BACKING_OFF = "BackingOff"
+    DRAINING = "Draining"
+    """More workers are ready than wanted, and only the master may say which are idle."""
+    DELETING = "Deleting"
+    UPDATING = "Updating"
+    """Pods of an older template are there."""
+    SCALED_TO_ZERO = "ScaledToZero"
+    SUSPENDED = "Suspended"
+    NOT_SUSPENDED = "NotSuspended"
+    TERMINATING = "Terminating"
+    NO_MASTER = "NoMaster"
+    LEASE_RENEWED = "LeaseRenewed"
+    LEASE_NOT_CHECKED = "LeaseNotChecked"
+    """``spec.master.leaseName`` is absent, or the Lease was not seen yet."""
+    WITHIN_BOUNDS = "WithinBounds"
+    ABOVE_MAXIMUM = "AboveMaximum"
+    BELOW_MINIMUM = "BelowMinimum"
+
+    # Events that are no condition.
+    SCALED_UP = "ScaledUp"
+    SCALED_DOWN = "ScaledDown"
+    RELEASED = "Released"
+    REPLACED = "Replaced"
+    RECOVERED = "Recovered"
+    MASTER_CHANGED = "MasterChanged"

@@ -1,0 +1,313 @@
+"""FiberPool in fiber.dev/v1alpha1: the one definition of what may stand in it.
+
+The schema that the API server enforces is generated from these models (``schema.py``), docstrings
+and rules included; the operator and the tests read resources with them.  Lists are tuples and
+everything is frozen: a pool that was read is a value.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, PrivateAttr, ValidationError
+
+from fiber_api import names
+from fiber_api.model import Model, Rule, Time, describe
+from fiber_api.status import Condition, Failures, FiberPoolStatus, Problem
+from fiber_api.template import Template, container_names
+
+__all__ = [
+    "Condition",
+    "FailurePolicy",
+    "Failures",
+    "FiberPool",
+    "FiberPoolSpec",
+    "FiberPoolStatus",
+    "InvalidPool",
+    "Master",
+    "Metadata",
+    "Problem",
+    "ScaleDown",
+    "ScaleUp",
+    "Update",
+]
+
+_DAY = 86_400
+
+
+class InvalidPool(ValueError):
+    """A resource that cannot be understood; ``errors`` say why, each naming its field."""
+
+    def __init__(self, errors: tuple[str, ...]) -> None:
+        super().__init__("; ".join(errors))
+        self.errors = errors
+
+
+# -- spec
+
+
+def _is_reachable(host: str) -> bool:
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return not (
+        address.is_unspecified
+        or address.is_loopback
+        or address.is_multicast
+        or address.is_link_local
+        or host == "255.255.255.255"
+        or getattr(address, "ipv4_mapped", None)
+        or getattr(address, "scope_id", None)
+    )
+
+
+class Master(Model):
+    """The program that uses the pool. Written by the SDK when it attaches; absent in a warm pool
+    that waits for one."""
+
+    RULES: ClassVar = (
+        Rule(
+            "host",
+            "isIP(self.host) && ip(self.host).isGlobalUnicast()",
+            "must be an IP address that the pods can reach, for it is put in an "
+            "EndpointSlice: no host name, no loopback and no link-local address. Write the "
+            "address of the master's pod or host.",
+            lambda master: _is_reachable(master.host),
+        ),
+        Rule(
+            "epoch",
+            "self.epoch >= oldSelf.epoch",
+            "must never fall: a lower one is that of a master that was "
+            "replaced. Let the new master take an epoch above the one that is there.",
+            None,
+        ),
+    )
+
+    host: Annotated[str, Field(min_length=1, max_length=45)]
+    """IP address that the master listens at; the pods must be able to reach it."""
+    port: Annotated[int, Field(ge=1, le=65535)]
+    """TCP port that the master listens at."""
+    epoch: Annotated[int, Field(ge=1, le=2**53)]
+    """Which master this is: higher with every new one, and never lower than before."""
+    lease_name: Annotated[
+        str | None,
+        Field(min_length=1, max_length=253, pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$"),
+    ] = None
+    """Name of the Lease in this namespace that the master renews. Left out, nobody checks whether
+    the master is alive."""
+    lease_duration_seconds: Annotated[int, Field(ge=5, le=3600)] = 30
+    """The master counts as lost when its Lease was not renewed for so long. It renews it every
+    third of this."""
+    on_lost: Literal["Delete", "ScaleToMin", "Retain"] = "Delete"
+    """What becomes of the pool when its master is lost: Delete deletes it with everything it has,
+    ScaleToMin goes back to minReplicas, Retain changes nothing."""
+    lost_grace_seconds: Annotated[int, Field(ge=0, le=_DAY)] = 60
+    """How long the workers and the pool outlive a lost master, so that it may come back."""
+
+
+PodName = Annotated[str, Field(min_length=1, max_length=63)]
+
+
+class ScaleDown(Model):
+    """How the pool gets smaller."""
+
+    policy: Literal["ReleasedOnly", "Any"] = "ReleasedOnly"
+    """ReleasedOnly: a ready worker goes only when the master has released it by name, so that no
+    running task is lost. Any: the operator chooses; for pools that are scaled by kubectl or an
+    autoscaler."""
+    release: Annotated[
+        tuple[PodName, ...],
+        Field(
+            strict=False,
+            max_length=names.MAX_RELEASE,
+            json_schema_extra={"x-kubernetes-list-type": "set"},
+        ),
+    ] = ()
+    """Names of pods that the master has fenced and no longer needs; the operator deletes them.
+    Written by the SDK."""
+    idle_timeout_seconds: Annotated[int, Field(ge=0, le=_DAY)] = 60
+    """How long a worker may be idle before the SDK releases it."""
+
+
+class ScaleUp(Model):
+    """How the pool gets larger."""
+
+    max_in_flight: Annotated[int, Field(ge=1, le=5000)] = 200
+    """Pods that are created at once, at most. The operator begins with one and doubles as long as
+    the API server accepts them."""
+
+
+class FailurePolicy(Model):
+    """What follows when workers fail: exit with another code than 0, or run out of memory. Workers
+    that the cluster ends (eviction, preemption, a lost node) are replaced at once and not
+    counted."""
+
+    RULES: ClassVar = (
+        Rule(
+            "backoffBaseSeconds",
+            # A default of the whole is judged before those of its fields are filled in.
+            "!has(self.backoffBaseSeconds) || !has(self.backoffMaxSeconds)"
+            " || self.backoffBaseSeconds <= self.backoffMaxSeconds",
+            "must not be above backoffMaxSeconds: lower the one or raise the other.",
+            lambda policy: policy.backoff_base_seconds <= policy.backoff_max_seconds,
+        ),
+    )
+
+    backoff_base_seconds: Annotated[int, Field(ge=1, le=3600)] = 5
+    """How long to wait after the first failure before the next pod is created. Doubled with each
+    failure in a row."""
+    backoff_max_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 300
+    """The longest wait between two attempts."""
+    backoff_limit: Annotated[int, Field(ge=0, le=10_000)] = 6
+    """Failures in a row after which nothing more is created until the spec changes."""
+    startup_timeout_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 900
+    """How long a pod may take to become ready before that is a problem in the status."""
+
+
+class Update(Model):
+    """How pods of an older template are replaced."""
+
+    strategy: Literal["OnIdle", "Recreate", "OnDelete"] = "OnIdle"
+    """OnIdle: when the master releases them. Recreate: all at once, now. OnDelete: when somebody
+    deletes them."""
+
+
+class FiberPoolSpec(Model):
+    """What is wanted."""
+
+    RULES: ClassVar = (
+        Rule(
+            "minReplicas",
+            "self.minReplicas <= self.maxReplicas",
+            "must not be above spec.maxReplicas: lower the one or raise the other.",
+            lambda spec: spec.min_replicas <= spec.max_replicas,
+        ),
+        Rule(
+            "workerContainer",
+            "self.template.spec.containers.exists(c, c.name == self.workerContainer)",
+            "must be the name of a container in "
+            "spec.template.spec.containers: give the container that runs the agent this name "
+            f"('{names.WORKER_CONTAINER}' where the field is left out), or write its name here.",
+            lambda spec: spec.worker_container in container_names(spec.template),
+        ),
+        Rule(
+            "workerContainer",
+            "self.workerContainer == oldSelf.workerContainer",
+            "cannot be changed: the pods that run are judged by it. Make a new FiberPool.",
+            None,
+        ),
+    )
+
+    replicas: Annotated[int | None, Field(ge=0, le=2**31 - 1)] = None
+    """Workers wanted now. Held between minReplicas and maxReplicas; left out, it is minReplicas.
+    Written by the SDK or by kubectl scale: leave it out of manifests that are applied again and
+    again."""
+    min_replicas: Annotated[int, Field(ge=0, le=100_000)] = 0
+    """Workers that are kept even when there is nothing to do."""
+    max_replicas: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    """Workers that there may be at most, whatever replicas says."""
+    suspend: bool = False
+    """True: delete all pods and keep the resource."""
+    processes_per_pod: Annotated[int, Field(ge=1, le=1024)] = 1
+    """Processes that each worker's agent runs side by side."""
+    template: Template
+    """The pod that a worker runs in, as in a Deployment's template. Its fields win over what Fiber
+    adds."""
+    worker_container: Annotated[str, Field(min_length=1, max_length=63)] = names.WORKER_CONTAINER
+    """Name of the container that runs Fiber's agent and by which a worker is judged. Cannot be
+    changed."""
+    master: Master | None = None
+    scale_down: ScaleDown = ScaleDown()
+    scale_up: ScaleUp = ScaleUp()
+    failure_policy: FailurePolicy = FailurePolicy()
+    update: Update = Update()
+
+
+# -- The resource
+
+
+class Metadata(Model):
+    """What the operator needs of an object's metadata."""
+
+    name: Annotated[str, Field(min_length=1)]
+    namespace: str = ""
+    uid: str = ""
+    resource_version: str = ""
+    generation: int = 0
+    creation_timestamp: Time | None = None
+    deletion_timestamp: Time | None = None
+    labels: dict[str, str] = Field(default_factory=dict)
+    annotations: dict[str, str] = Field(default_factory=dict)
+
+
+class FiberPool(Model):
+    """A pool of worker pods for Python programs that use Fiber."""
+
+    RULES: ClassVar = (
+        Rule(
+            "metadata.name",
+            f"size(self.metadata.name) <= {names.MAX_POOL_NAME}",
+            f"must have at most {names.MAX_POOL_NAME} characters: the names of its "
+            "pods and its Service are made from it. Use a shorter name.",
+            lambda pool: len(pool.metadata.name) <= names.MAX_POOL_NAME,
+        ),
+        Rule(
+            "metadata.name",
+            f"self.metadata.name.matches('^{names.POOL_NAME_PATTERN}$')",
+            "must consist of lower-case letters, digits and '-', begin with a "
+            "letter and not end with '-': a Service is called after it. Use another name.",
+            lambda pool: re.fullmatch(names.POOL_NAME_PATTERN, pool.metadata.name) is not None,
+        ),
+        Rule(
+            "spec.master.epoch",
+            "!has(self.spec.master) || !has(self.status) || !has(self.status.masterEpoch)"
+            " || self.spec.master.epoch >= self.status.masterEpoch",
+            "must not be below status.masterEpoch, which an earlier master of "
+            "this pool had. Let the new master take a higher one.",
+            lambda pool: (
+                pool.spec.master is None
+                or pool.spec.master.epoch >= (pool.status.master_epoch or 0)
+            ),
+        ),
+    )
+
+    api_version: Literal["fiber.dev/v1alpha1"] = names.API_VERSION
+    kind: Literal["FiberPool"] = names.KIND
+    metadata: Metadata
+    spec: FiberPoolSpec
+    status: FiberPoolStatus = FiberPoolStatus()
+
+    _unread: tuple[str, ...] = PrivateAttr(default=())
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """What was wrong in the status that this was read from, and was left out."""
+        return self._unread
+
+    @classmethod
+    def read(cls, document: object) -> FiberPool:
+        """The resource in the API's JSON.
+
+        Raises ``InvalidPool``, and nothing else, if the spec cannot be understood.  What cannot
+        be understood in the status is left out and told in ``unread``.
+        """
+        unread: tuple[str, ...] = ()
+        try:
+            if isinstance(document, Mapping) and "status" in document:
+                status, unread = FiberPoolStatus.salvage(document["status"] or {})
+                document = {**document, "status": status}
+            pool = cls.model_validate(document)
+        except ValidationError as error:
+            raise InvalidPool(describe(error)) from None
+        pool._unread = unread
+        return pool
+
+    @property
+    def wanted(self) -> int:
+        """``replicas`` between the bounds."""
+        replicas = self.spec.min_replicas if self.spec.replicas is None else self.spec.replicas
+        return max(self.spec.min_replicas, min(self.spec.max_replicas, replicas))

@@ -1,0 +1,71 @@
+"""Whether a master uses the pool: what may be taken from it, and what becomes of it without one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from fiber_api.names import ConditionType
+from fiber_api.v1alpha1 import Condition, FiberPool
+from fiber_operator import plans
+from fiber_operator.revisions import spec_hash
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """The master, as far as the operator can tell."""
+
+    attached: bool
+    """A master may have given work to the pods, so that only it knows which are idle."""
+    alive: bool | None
+    """None: there is none, or nobody can tell."""
+    lost_since: float | None = None
+    """Set while ``alive`` is False."""
+    due: float | None = None
+    """When the grace of a lost master ends, if it has not ended."""
+    gone: bool = False
+    """The grace is over and this process itself found the Lease expired: ``onLost`` applies."""
+
+    @property
+    def grace_is_over(self) -> bool:
+        """It is lost for good, unless the operator comes to know better."""
+        return self.alive is False and self.due is None
+
+
+def judge(pool: FiberPool, lease: plans.Master, now: float) -> Attachment:
+    """What the spec, the Lease and the status together say.
+
+    After a restart the operator does not know for a while; it goes by the status meanwhile, if
+    that is of this master, and neither deletes for a lost master nor creates for one.
+    """
+    master = pool.spec.master
+    if master is None:
+        return Attachment(attached=False, alive=None)
+    if master.lease_name is None:
+        return Attachment(attached=True, alive=None)
+    before = _condition(pool)
+    alive = lease.alive
+    if alive is None and before is not None and before.status != "Unknown":
+        alive = before.status == "True"
+    if alive is not False:
+        return Attachment(attached=True, alive=alive)
+    since = _lost_since(before, now)
+    due = since + master.lost_grace_seconds
+    if now < due:
+        return Attachment(attached=True, alive=False, lost_since=since, due=due)
+    gone = lease.alive is False
+    return Attachment(attached=not gone, alive=False, lost_since=since, gone=gone)
+
+
+def _lost_since(before: Condition | None, now: float) -> float:
+    if before is not None and before.status == "False" and before.last_transition_time:
+        return before.last_transition_time
+    return float(math.floor(now))
+
+
+def _condition(pool: FiberPool) -> Condition | None:
+    """What the status says of this very master."""
+    if pool.status.failures.spec_hash != spec_hash(pool):
+        return None
+    conditions = pool.status.conditions
+    return next((c for c in conditions if c.type == ConditionType.MASTER_ALIVE), None)

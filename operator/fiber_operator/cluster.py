@@ -1,0 +1,371 @@
+"""The only door to the API server.  JSON documents go in and come out; nothing is cached.
+
+What can go wrong is one of these, so that a caller says what it does about it::
+
+    ApiError
+    ├── Gone         404  not there (any more)
+    ├── Conflict     409  the name is taken, or a precondition does not hold
+    ├── Refused      403  quota, policy, or no right
+    ├── Invalid      400, 422 and the rest of 4xx  asking again will not help
+    └── Unavailable  the answer is not known: 5xx, no connection, too late, nonsense
+        └── TooMany  429  not now; ``retry_after`` says when
+
+A call that ends in ``Unavailable`` may have been carried out.  Nothing is tried again in here:
+whoever asks plans anew, which is safer than a repeated request that was right a minute ago.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import aiohttp
+from kubernetes.aio import config
+from kubernetes.aio.client.api_client import ApiClient
+from kubernetes.aio.client.configuration import Configuration
+from kubernetes.aio.client.rest import RESTClientObject
+
+from fiber_api import names
+
+__all__ = [
+    "ApiError",
+    "Cluster",
+    "Configuration",
+    "Conflict",
+    "Gone",
+    "Invalid",
+    "Refused",
+    "Resource",
+    "TooMany",
+    "Unavailable",
+    "load_configuration",
+    "open_session",
+]
+
+Body = dict[str, Any]
+T = TypeVar("T")
+Observer = Callable[[str, str, str, float], None]
+"""Told of each call: verb, resource, HTTP status or what went wrong, seconds."""
+
+PAGE = 500
+"""Objects in one answer to a list: of 1,000 pods with a page of JSON each, only half in memory."""
+
+READ_TIMEOUT = 30.0
+WRITE_TIMEOUT = 10.0
+"""Shorter, so that no write of an operator that lost its Lease is under way for long."""
+CONNECT_TIMEOUT = 5.0
+LONGEST_RETRY_AFTER = 60.0
+
+_MERGE_PATCH = "application/merge-patch+json"
+_MESSAGE_LIMIT = 2000
+
+
+class Resource(NamedTuple):
+    """A kind of object, as the API's paths name it."""
+
+    group: str
+    version: str
+    plural: str
+
+    def path(self, namespace: str | None, name: str = "", subresource: str = "") -> str:
+        """The path of one object or, without a name, of all in ``namespace`` (None: in all)."""
+        start = f"/apis/{self.group}/{self.version}" if self.group else f"/api/{self.version}"
+        scope = f"namespaces/{namespace}" if namespace is not None else ""
+        return "/".join(part for part in (start, scope, self.plural, name, subresource) if part)
+
+
+POOLS = Resource(names.GROUP, names.VERSION, names.PLURAL)
+PODS = Resource("", "v1", "pods")
+SERVICES = Resource("", "v1", "services")
+SECRETS = Resource("", "v1", "secrets")
+EVENTS = Resource("", "v1", "events")
+SLICES = Resource("discovery.k8s.io", "v1", "endpointslices")
+LEASES = Resource("coordination.k8s.io", "v1", "leases")
+
+
+class ApiError(Exception):
+    """A call that did not succeed.  ``str`` says what was asked and what came back."""
+
+    def __init__(self, message: str, *, what: str = "", status: int = 0, reason: str = "") -> None:
+        super().__init__(f"{what}: {message}" if what else message)
+        self.message = message
+        """The API server's own words."""
+        self.status = status
+        self.reason = reason
+        """The API server's word for the error, ``AlreadyExists`` for example."""
+
+
+class Gone(ApiError):
+    """There is no such object."""
+
+
+class Conflict(ApiError):
+    """The name is taken, or the object is not the one that was meant."""
+
+
+class Refused(ApiError):
+    """A quota, a policy or a missing right forbids it."""
+
+
+class Invalid(ApiError):
+    """The API server cannot accept this, now or later."""
+
+
+class Unavailable(ApiError):
+    """It is not known whether the call was carried out."""
+
+
+class TooMany(Unavailable):
+    """The API server asks to come back after ``retry_after`` seconds."""
+
+    def __init__(self, message: str, *, retry_after: float, **about: Any) -> None:
+        super().__init__(message, **about)
+        self.retry_after = retry_after
+
+
+class Cluster:
+    """One API server.
+
+    ``permit`` is called before each call that changes something and raises where this process may
+    not.  ``connections`` bounds the calls under way; further ones wait for their turn.
+    """
+
+    def __init__(
+        self,
+        configuration: Configuration,
+        *,
+        connections: int,
+        permit: Callable[[], None] = lambda: None,
+        observe: Observer = lambda verb, resource, code, seconds: None,
+    ) -> None:
+        configuration.connection_pool_maxsize = connections
+        # Looking for proxies and .netrc costs two turns of a thread for each call; a proxy that
+        # the API server needs stands in the kubeconfig.
+        configuration.client_session_kwargs = {"trust_env": False}
+        self._client = ApiClient(configuration)
+        self._client.user_agent = "fiber-operator"
+        self._turns = asyncio.Semaphore(connections)
+        self._permit = permit
+        self._observe = observe
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._client.close()
+
+    async def read(self, resource: Resource, namespace: str, name: str) -> Body:
+        """The object as it is now, not as a cache had it."""
+        return await self._call("get", resource, namespace, name)
+
+    async def list(
+        self,
+        resource: Resource,
+        namespace: str | None,
+        keep: Callable[[Body], T],
+        *,
+        selector: str = "",
+        fields: str = "",
+    ) -> list[T]:
+        """What ``keep`` makes of each object there is now (``namespace`` None: anywhere).
+
+        The bodies are dropped page by page: a thousand pods are more than should be in memory.
+        """
+        kept: list[T] = []
+        query = {"limit": str(PAGE), "labelSelector": selector, "fieldSelector": fields}
+        while True:
+            page = await self._call("list", resource, namespace, query=query)
+            items, more = _items(page, f"list {resource.plural}")
+            kept += [keep(item) for item in items]
+            if not more:
+                return kept
+            query["continue"] = more
+
+    async def create(
+        self, resource: Resource, namespace: str, body: Body, *, dry_run: bool = False
+    ) -> Body:
+        """Create the object; the answer is what it became."""
+        query = {"dryRun": "All"} if dry_run else {}
+        return await self._call("create", resource, namespace, query=query, body=body)
+
+    async def replace(self, resource: Resource, namespace: str, name: str, body: Body) -> Body:
+        """Replace the object; Conflict if ``metadata.resourceVersion`` is not its current one."""
+        return await self._call("update", resource, namespace, name, body=body)
+
+    async def patch(
+        self, resource: Resource, namespace: str, name: str, patch: Body, subresource: str = ""
+    ) -> Body:
+        """A JSON merge patch: None removes a field, a list replaces the list."""
+        return await self._call(
+            "patch", resource, namespace, name, subresource=subresource, body=patch
+        )
+
+    async def delete(
+        self,
+        resource: Resource,
+        namespace: str,
+        name: str,
+        *,
+        uid: str,
+        resource_version: str | None = None,
+        grace: int | None = None,
+    ) -> None:
+        """Delete this very object; Conflict if another has its name, or it changed since."""
+        preconditions = {"uid": uid, "resourceVersion": resource_version}
+        options: Body = {
+            "apiVersion": "v1",
+            "kind": "DeleteOptions",
+            "preconditions": {key: value for key, value in preconditions.items() if value},
+            "propagationPolicy": "Background",
+        }
+        if grace is not None:
+            options["gracePeriodSeconds"] = grace
+        await self._call("delete", resource, namespace, name, body=options)
+
+    async def _call(
+        self,
+        verb: str,
+        resource: Resource,
+        namespace: str | None,
+        name: str = "",
+        *,
+        subresource: str = "",
+        query: Mapping[str, str] | None = None,
+        body: Body | None = None,
+    ) -> Body:
+        path = resource.path(namespace, name, subresource)
+        shown = f"{resource.plural}/{subresource}" if subresource else resource.plural
+        what = f"{verb} {shown} {name}".rstrip() + (f" in {namespace}" if namespace else "")
+        async with self._turns:
+            if verb in _WRITES:
+                self._permit()
+            started = time.perf_counter()
+            code = "cancelled"
+            try:
+                status, headers, data = await self._send(verb, path, query or {}, body)
+                code = str(status)
+                return _answer(status, headers, data, what)
+            except (TimeoutError, aiohttp.ClientError, OSError) as error:
+                # A TimeoutError says nothing of its own.
+                code = "timeout" if isinstance(error, TimeoutError) else "connection"
+                raise Unavailable(str(error) or "no answer in time", what=what) from error
+            except Unavailable as error:
+                code = code if error.status else "garbage"
+                raise
+            finally:
+                self._observe(verb, shown, code, time.perf_counter() - started)
+
+    async def _send(
+        self, verb: str, path: str, query: Mapping[str, str], body: Body | None
+    ) -> tuple[int, Mapping[str, str], bytes]:
+        headers = {"Accept": "application/json"}
+        if body is not None:
+            headers["Content-Type"] = _MERGE_PATCH if verb == "patch" else "application/json"
+        request = await self._client.param_serialize(
+            _METHODS[verb],
+            path,
+            query_params=[(key, value) for key, value in query.items() if value],
+            header_params=headers,
+            body=body,
+            auth_settings=["BearerToken"],
+        )
+        timeout = aiohttp.ClientTimeout(
+            total=WRITE_TIMEOUT if verb in _WRITES else READ_TIMEOUT, sock_connect=CONNECT_TIMEOUT
+        )
+        response = await self._client.call_api(*request, _request_timeout=timeout)
+        data = await response.read()
+        return response.status, response.headers, data
+
+
+_METHODS = {
+    "get": "GET",
+    "list": "GET",
+    "create": "POST",
+    "update": "PUT",
+    "patch": "PATCH",
+    "delete": "DELETE",
+}
+_WRITES = {"create", "update", "patch", "delete"}
+
+
+async def load_configuration() -> Configuration:
+    """Where the API server is and how to log in: KUBECONFIG, else the pod's own account."""
+    configuration = Configuration()
+    file = os.environ.get("KUBECONFIG")
+    if not file and "KUBERNETES_SERVICE_HOST" in os.environ:
+        config.load_incluster_config(configuration)
+    else:
+        await config.load_kube_config(
+            config_file=file or None, client_configuration=configuration, persist_config=False
+        )
+    return configuration
+
+
+async def open_session(configuration: Configuration) -> aiohttp.ClientSession:
+    """A session that is logged in, for whoever has a client of his own."""
+    token = await configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
+    tls = RESTClientObject(configuration).ssl_context
+    return aiohttp.ClientSession(
+        connector=aiohttp.TCPConnector(limit=0, ssl=tls),
+        headers={"Authorization": token} if token else None,
+        proxy=configuration.proxy,
+    )
+
+
+def _items(page: Body, what: str) -> tuple[list[Body], str]:
+    """The items of a list and how to go on.
+
+    Strict, because a list that is taken for empty by mistake makes the operator create pods.
+    """
+    items, metadata = page.get("items"), page.get("metadata")
+    if (
+        not str(page.get("kind", "")).endswith("List")
+        or not isinstance(items, list)
+        or not isinstance(metadata, dict)
+        or not all(isinstance(item, dict) for item in items)
+    ):
+        raise Unavailable("the answer is no list of objects", what=what)
+    return items, str(metadata.get("continue") or "")
+
+
+def _answer(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Body:
+    """The document in an answer; what is no success is raised."""
+    try:
+        body = json.loads(data)
+    except ValueError:
+        body = None
+    if 200 <= status < 300:
+        if isinstance(body, dict):
+            return body
+        raise Unavailable(f"the answer is no JSON object: {_excerpt(data)}", what=what)
+    raise _error(status, headers, body if isinstance(body, dict) else {}, data, what)
+
+
+def _error(status: int, headers: Mapping[str, str], body: Body, data: bytes, what: str) -> ApiError:
+    message = str(body.get("message") or "") or _excerpt(data) or f"HTTP status {status}"
+    about: dict[str, Any] = {
+        "what": what,
+        "status": status,
+        "reason": str(body.get("reason") or ""),
+    }
+    message = message[:_MESSAGE_LIMIT]
+    if status == 429:
+        return TooMany(message, retry_after=_retry_after(headers), **about)
+    # Without a Status it was not the API server that answered but something on the way to it.
+    if status >= 500 or status in (401, 408, 410) or body.get("kind") != "Status":
+        return Unavailable(message, **about)
+    return {404: Gone, 409: Conflict, 403: Refused}.get(status, Invalid)(message, **about)
+
+
+def _retry_after(headers: Mapping[str, str]) -> float:
+    try:
+        seconds = float(headers.get("Retry-After", ""))
+    except ValueError:
+        return 1.0
+    return min(max(seconds, 0.1), LONGEST_RETRY_AFTER) if seconds == seconds else 1.0
+
+
+def _excerpt(data: bytes) -> str:
+    return data[:200].decode(errors="replace").strip()

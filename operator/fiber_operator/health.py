@@ -1,0 +1,68 @@
+"""When the operator is well: what /healthz and /readyz answer.
+
+Not alive means that a restart may help: something in this process is stuck.  Not ready means that
+pools are not served as they should be, whoever is to blame; a restart would change nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fiber_operator.lease import Guard
+from fiber_operator.resync import Resync
+from fiber_operator.worker import Queue
+
+LATE_TURN = 30.0
+"""Seconds that a pool may wait for its turn while the operator is ready."""
+STUCK_TURN = 600.0
+"""Longer than any turn takes whose every call ends by its timeout."""
+STUCK_QUEUE = 120.0
+"""Seconds without the end of any turn while a pool waits."""
+MISSED_RESYNCS = 2.5
+
+
+@dataclass
+class Health:
+    """Both checks.  Each returns what is wrong, a sentence each."""
+
+    guard: Guard
+    queue: Queue
+    resync: Resync
+    clock: Callable[[], float]
+    watching: bool = False
+
+    def __post_init__(self) -> None:
+        self._began = self.clock()
+
+    def alive(self) -> list[str]:
+        """Why this process should be restarted."""
+        now, statistics = self.clock(), self.queue.statistics()
+        wrong = []
+        if statistics.longest_run > STUCK_TURN:
+            wrong.append(f"the turn of a pool takes {statistics.longest_run:.0f} s so far")
+        if min(statistics.longest_wait, statistics.since_last_end) > STUCK_QUEUE:
+            wrong.append(
+                f"no turn has ended for {statistics.since_last_end:.0f} s, and pools are waiting"
+            )
+        tried = now - (self._began if self.resync.tried is None else self.resync.tried)
+        # One list takes as long as its timeout where the API server is silent.
+        if tried > 2 * self.resync.seconds + 120:
+            wrong.append(f"the pools were not even tried to be listed for {tried:.0f} s")
+        return wrong
+
+    def ready(self) -> list[str]:
+        """Why pools are not served as they should be."""
+        now, statistics = self.clock(), self.queue.statistics()
+        wrong = list(self.resync.failures.values())
+        if not self.guard.held:
+            wrong.append(f"this operator does not act: {self.guard.why}")
+        if self.resync.succeeded is None:
+            wrong.append("the pools were not listed yet")
+        elif now - self.resync.succeeded > MISSED_RESYNCS * self.resync.seconds:
+            wrong.append(f"the pools were last listed {now - self.resync.succeeded:.0f} s ago")
+        if not self.watching:
+            wrong.append("nothing is watched: changes are seen late")
+        if statistics.longest_wait > LATE_TURN:
+            wrong.append(f"a pool waits for its turn for {statistics.longest_wait:.0f} s")
+        return wrong

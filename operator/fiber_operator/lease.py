@@ -1,0 +1,182 @@
+"""The operator's own Lease: of several operators with one Lease, at most one acts.
+
+Whether somebody else's Lease has run out is judged by this process's monotonic clock, from when it
+last saw the Lease change; clocks of different machines are never compared.  The holder counts its
+own time from before it asked, and stops well before others may begin::
+
+    asked                            holder stops          others may begin
+      |------------ 2/3 of the duration ---|---- what is under way ends ---|
+"""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Conflict, Gone
+from fiber_operator.logs import about
+
+HELD_SHARE = 2 / 3
+"""Of the duration, how long a renewal lets the holder act."""
+RENEW_SHARE = 1 / 3
+RETRY_SHARE = 1 / 8
+
+log = logging.getLogger(__name__)
+
+
+class NotHolder(Exception):
+    """This operator does not hold the Lease (any more) and may not change anything."""
+
+
+class Guard:
+    """Gets and keeps the Lease.  ``on_change`` is called with whether this operator may act."""
+
+    def __init__(
+        self,
+        cluster: Cluster,
+        *,
+        namespace: str,
+        name: str,
+        identity: str,
+        seconds: float,
+        on_change: Callable[[bool], None] = lambda held: None,
+        clock: Callable[[], float] | None = None,
+        wall_clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._cluster = cluster
+        self._namespace = namespace
+        self._name = name
+        self._identity = identity
+        self._seconds = seconds
+        self._on_change = on_change
+        self._clock = clock or asyncio.get_running_loop().time
+        self._wall_clock = wall_clock
+        self._until = float("-inf")
+        self._told = False
+        self._lease: Body | None = None
+        self._seen: tuple[object, ...] = ()
+        self._seen_at = 0.0
+        self._resigned = False
+        self.why = "the Lease was not read yet"
+        """Why this operator does not act; empty while it does."""
+
+    @property
+    def held(self) -> bool:
+        """Whether this operator may act now."""
+        return self._clock() < self._until
+
+    def require(self) -> None:
+        """Raise NotHolder unless this operator may act now."""
+        if not self.held:
+            raise NotHolder(f"this operator does not hold the Lease {self._name}: {self.why}")
+
+    async def run(self) -> None:
+        """Get the Lease and renew it until cancelled."""
+        while True:
+            await self._step()
+            self._tell()
+            share = RENEW_SHARE if self.held and not self.why else RETRY_SHARE
+            pause = share * self._seconds
+            if self.held:
+                # Not beyond the moment at which it lapses, so that it is told of in time.
+                pause = min(pause, max(self._until - self._clock(), 0.0) + 0.001)
+            await asyncio.sleep(pause)
+
+    def resign(self) -> None:
+        """Act no more from now on.  The Lease stays until ``release``, so that what is under way
+        can end before another operator begins."""
+        self._resigned = True
+        self._lose("this operator is stopping")
+
+    async def release(self) -> None:
+        """Let another operator begin at once, if the API server can be had.  After ``resign``."""
+        try:
+            lease = await self._read()
+            if _spec(lease).get("holderIdentity") == self._identity:
+                await self._write(lease, holder="")
+        except ApiError as error:
+            log.warning("the Lease could not be released: %s", error)
+
+    async def _step(self) -> None:
+        started = self._clock()
+        try:
+            if self._lease is None or not self.held:
+                self._lease = await self._read()
+            if self._may_take(self._lease):
+                self._lease = await self._write(self._lease, holder=self._identity)
+                if not self._resigned:
+                    self._until, self.why = started + HELD_SHARE * self._seconds, ""
+        except Conflict:
+            # Somebody else has written it: read it before anything else is done.
+            self._lose("another operator wrote the Lease")
+        except ApiError as error:
+            # The time that the last renewal gave goes on; after that, ``held`` is false.
+            self.why = str(error)
+
+    async def _read(self) -> Body | None:
+        try:
+            return await self._cluster.read(LEASES, self._namespace, self._name)
+        except Gone:
+            return None
+
+    def _may_take(self, lease: Body | None) -> bool:
+        spec = _spec(lease)
+        holder = spec.get("holderIdentity") or ""
+        if holder in ("", self._identity):
+            return True
+        now, seen = self._clock(), (holder, spec.get("renewTime"), spec.get("leaseTransitions"))
+        if seen != self._seen:
+            self._seen, self._seen_at = seen, now
+        patience = spec.get("leaseDurationSeconds")
+        if not isinstance(patience, int) or patience <= 0:
+            patience = int(self._seconds)
+        if now - self._seen_at >= patience:
+            return True
+        self._lose(f"{holder} holds it")
+        return False
+
+    async def _write(self, lease: Body | None, *, holder: str) -> Body:
+        spec = _spec(lease)
+        now = datetime.datetime.fromtimestamp(self._wall_clock(), datetime.UTC)
+        stamp = now.isoformat(timespec="microseconds").replace("+00:00", "Z")
+        fresh = (spec.get("holderIdentity") or "") != self._identity
+        transitions = spec.get("leaseTransitions")
+        turns = transitions if isinstance(transitions, int) else 0
+        body: Body = {
+            "apiVersion": "coordination.k8s.io/v1",
+            "kind": "Lease",
+            "metadata": {"name": self._name, "namespace": self._namespace},
+            "spec": {
+                "holderIdentity": holder,
+                "leaseDurationSeconds": int(self._seconds) if holder else 1,
+                "acquireTime": stamp if fresh else spec.get("acquireTime", stamp),
+                "renewTime": stamp,
+                "leaseTransitions": turns + 1 if fresh and lease is not None else turns,
+            },
+        }
+        if lease is None:
+            return await self._cluster.create(LEASES, self._namespace, body)
+        body["metadata"]["resourceVersion"] = lease["metadata"]["resourceVersion"]
+        return await self._cluster.replace(LEASES, self._namespace, self._name, body)
+
+    def _lose(self, why: str) -> None:
+        self._until, self._lease, self.why = float("-inf"), None, why
+
+    def _tell(self) -> None:
+        if self.held == self._told:
+            return
+        self._told = self.held
+        if self._told:
+            log.info("this operator acts now", extra=about(reason="LeaseHeld"))
+        else:
+            log.warning("this operator acts no more: %s", self.why, extra=about(reason="LeaseLost"))
+        self._on_change(self._told)
+
+
+def _spec(lease: Body | None) -> dict[str, Any]:
+    spec = lease.get("spec") if lease is not None else None
+    return spec if isinstance(spec, dict) else {}

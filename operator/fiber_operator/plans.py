@@ -1,0 +1,152 @@
+"""What goes into ``reconcile.plan`` beside the pool and its pods, and what comes out of it.
+
+Values only, all frozen: the controller fills in a ``Memory`` from what it saw of the cluster and
+does what a ``Plan`` says.  The times are unix seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from fiber_api.names import Reason
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """The API server's last refusal to create a pod, or to accept one in a dry run.
+
+    The controller makes one at the first 403, 422 or 400 and forgets it when a pod is created.
+    """
+
+    template_hash: str
+    """``manifests.template_hash`` of the pool that it refused."""
+    status: int
+    """403 (quota, policy, rights), else 422 or 400 (the pod is no valid pod)."""
+    message: str
+    """The API server's own words."""
+    at: float
+    count: int = 1
+    """How often in a row, this one included: the next attempt waits longer each time."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Why a pod cannot be made at all: an object of the pool that could not be had.
+
+    ``reason`` is ``Reason.NAME_TAKEN``, ``INVALID_CREDENTIALS``, ``FORBIDDEN`` or
+    ``API_UNAVAILABLE``; ``message`` says what, why and what to do and is shown as it is.
+    """
+
+    reason: Reason
+    message: str
+    terminal: bool = False
+    """Whether waiting cannot help."""
+
+
+@dataclass(frozen=True)
+class Master:
+    """What the operator's own monotonic clock says of the master's Lease.
+
+    ``masters.py`` makes one for each pool whose ``spec.master.leaseName`` is set, anew for each
+    epoch.  After a restart of the operator ``alive`` is None until the Lease is seen to change
+    (True) or a whole duration passes without a change (False).  A Lease that does not exist is one
+    that does not change.
+    """
+
+    alive: bool | None = None
+    holder: str = ""
+    """``spec.holderIdentity`` of the Lease, for messages; may be empty."""
+    missing: bool = False
+    """There is no Lease of that name, or no right to read it."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What the operator knows of a pool beside its resource and its pods.
+
+    A fresh ``Memory()`` after a restart of the operator is always right, only less informed.
+    """
+
+    address: str | None = None
+    """``host:port`` of the pool's Service.  Nothing is created while it is None."""
+    obstacles: tuple[Obstacle, ...] = ()
+    accepted: str | None = None
+    """The template hash that passed the server-side dry run in this process."""
+    refusal: Refusal | None = None
+    master: Master = field(default_factory=Master)
+    deleted: frozenset[str] = frozenset()
+    """Names of pods that this process asked to delete, so that their end is not taken for
+    somebody else's doing.  Names that are not in the list any more may be dropped."""
+    warnings: Mapping[str, str] = field(default_factory=dict)
+    """Pod name -> the newest event about it, as ``Reason: message``, where that is a Warning, of
+    the pods that ``Plan.inspect`` asked about."""
+
+
+@dataclass(frozen=True)
+class Deletion:
+    """One pod to delete, with preconditions that make it a no-op where the plan is out of date.
+
+    404 means that it is done.  409 means that the pod changed since: plan again.
+    """
+
+    name: str
+    uid: str
+    """Always a precondition."""
+    resource_version: str | None
+    """A precondition where set: the pod must not have become Ready meanwhile."""
+    reason: Reason
+    grace: int | None = None
+    """``gracePeriodSeconds``; None leaves the pod's own."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """A Kubernetes event on the pool.  The planner emits one at a transition, never per look."""
+
+    type: str
+    """``Normal`` or ``Warning``."""
+    reason: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to do now, in this order:
+
+    0. if ``delete_pool``, delete the FiberPool, with its uid and the resourceVersion that the plan
+       was made from as preconditions, and do nothing else: a master that comes back in this very
+       moment writes the spec and wins;
+    1. write ``status``, if it is not None: what it counts must be safe before the pods that were
+       counted are deleted;
+    2. delete ``delete``;
+    3. if ``dry_run``, send ``manifests.pod(...)`` with ``dryRun=All`` and
+       ``fieldValidation=Strict``, without which a misspelt field is dropped in silence; then plan
+       again with the outcome in ``Memory.accepted`` or ``Memory.refusal``;
+    4. create ``create`` pods in slow-start batches 1, 2, 4 ... ``batch_limit``, and stop at the
+       first 403 or 422, which becomes ``Memory.refusal``;
+    5. emit ``events``.
+
+    A step that fails ends the rest; the next plan is as right as this one.
+    """
+
+    delete_pool: bool = False
+    create: int = 0
+    batch_limit: int = 1
+    delete: tuple[Deletion, ...] = ()
+    dry_run: bool = False
+    template_hash: str = ""
+    """The revision that is wanted; the label of new pods."""
+    status: Mapping[str, Any] | None = None
+    """The whole of ``status`` if it differs from what the pool has, else None.  For a merge patch
+    on the status subresource: a field that is to go away is None in it, lists are whole."""
+    events: tuple[Event, ...] = ()
+    inspect: tuple[str, ...] = ()
+    """Names of pods, one at most, that have a node and yet no running container for some seconds,
+    and whose status does not say why.  What the kubelet is stuck at (a volume whose Secret is
+    missing, a network that fails) stands in the pod's events alone: read those with its
+    ``involvedObject.uid``.  If the newest is a Warning, it goes into ``Memory.warnings``; one that
+    is followed by a Normal event, as when an image is being pulled at last, is over."""
+    again: float | None = None
+    """Plan again at this time at the latest, though nothing has happened."""

@@ -1,0 +1,324 @@
+"""What one pod is, in the few words that the planner needs.
+
+A pod comes as the JSON of the API, where any field may be missing or nonsense; a ``PodView`` is
+always whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from fiber_api.names import ANNOTATION_DELETION_COST, LABEL_TEMPLATE_HASH
+from fiber_operator.documents import items, mapping, seconds, text, whole
+
+BRIEF = 10.0
+"""Seconds.  A worker that ends sooner never did its job, whatever its exit code."""
+
+LONGEST_MESSAGE = 1000
+"""Characters that are kept of what the cluster says, its end: there the cause of a traceback is."""
+
+
+class State(StrEnum):
+    """Where a pod is in its life.  ``TERMINATING`` and ``ENDED`` pods are not live."""
+
+    PENDING = "Pending"
+    """Its worker container does not run yet."""
+    STARTING = "Starting"
+    """The container runs; the pod was never seen Ready."""
+    READY = "Ready"
+    NOT_READY = "NotReady"
+    """It was Ready and is not now: its node is silent, or a probe fails."""
+    TERMINATING = "Terminating"
+    """Somebody asked to delete it."""
+    ENDED = "Ended"
+    """Phase Failed or Succeeded, or its worker container has ended for good."""
+
+
+class Trouble(StrEnum):
+    """What is wrong with a pod, by what follows from it."""
+
+    DISRUPTED = "Disrupted"
+    """The cluster ended it: replaced at once, not counted."""
+    COMPLETED = "Completed"
+    """The worker ended with exit code 0 after a while: replaced at once, not counted."""
+    APPLICATION = "Application"
+    """The worker failed, or ended at once: counted, and replaced after a while."""
+    CANNOT_START = "CannotStart"
+    """Image or configuration; the kubelet retries, so the pod is kept."""
+    UNSCHEDULABLE = "Unschedulable"
+    """No node takes it now; the scheduler retries, so the pod is kept."""
+
+
+@dataclass(frozen=True)
+class PodView:
+    """One pod.  Times are unix seconds as the cluster wrote them; 0.0 where it wrote none."""
+
+    name: str
+    uid: str
+    resource_version: str
+    owner: str
+    """The uid of the controller that owns it; empty if none does."""
+    created: float
+    template_hash: str
+    state: State
+    since: float
+    """When it came into this state, as far as the cluster says."""
+    was_ready: bool = False
+    """Whether the pod is or was Ready, as far as its conditions tell."""
+    trouble: Trouble | None = None
+    reason: str = ""
+    """The cluster's own word for the trouble: ``ErrImagePull``, ``OOMKilled``, ``Evicted``."""
+    message: str = ""
+    """The cluster's own words: the kubelet's, the scheduler's, or the worker's last lines."""
+    exit_code: int | None = None
+    ran: float = 0.0
+    """Seconds that the worker container ran, once it has ended."""
+    scheduled: bool = False
+    """It has a node."""
+    lingers: bool = False
+    """The worker has ended but other containers of the pod still run."""
+    deletion_cost: int = 0
+
+    @property
+    def live(self) -> bool:
+        """Whether it counts as a replica."""
+        return self.state not in (State.TERMINATING, State.ENDED)
+
+
+def observe(pod: Mapping[str, Any], container: str) -> PodView:
+    """What ``pod`` is, judged by its container of that name.  Never raises."""
+    return _Observation(pod, container).view()
+
+
+# The kubelet's words for a container that waits though nothing is on its way.  It goes on trying.
+_CANNOT_START = frozenset(
+    {
+        "CrashLoopBackOff",  # only a restartable init container can have it in our pods
+        "CreateContainerConfigError",
+        "CreateContainerError",
+        "ErrImageNeverPull",
+        "ErrImagePull",
+        "ImageInspectError",
+        "ImagePullBackOff",
+        "InvalidImageName",
+        "PostStartHookError",
+        "PreCreateHookError",
+        "PreStartHookError",
+        "RegistryUnavailable",
+        "RunContainerError",
+        "SignatureValidationFailed",
+    }
+)
+
+# The cluster's words for a pod that it ended or turned away for reasons of its own.
+_DISRUPTIONS = frozenset(
+    {
+        "Evicted",
+        "NodeLost",
+        "NodeShutdown",
+        "Preempting",
+        "Shutdown",
+        "Terminated",  # by a node that shuts down in good order
+    }
+)
+
+# A runtime that lost sight of a container, as when its node was restarted, makes up an exit code.
+_LOST_CONTAINERS = frozenset({"ContainerStatusUnknown", "Unknown"})
+
+
+class _Observation:
+    """One look at one pod."""
+
+    def __init__(self, pod: Mapping[str, Any], container: str) -> None:
+        self._meta = mapping(pod, "metadata")
+        self._status = mapping(pod, "status")
+        self._conditions = {
+            text(condition.get("type")): condition
+            for condition in items(self._status.get("conditions"))
+        }
+        statuses = {text(s.get("name")): s for s in items(self._status.get("containerStatuses"))}
+        self._state = mapping(statuses.get(container), "state")
+        self._others = [s for name, s in statuses.items() if name != container]
+        self._init = list(items(self._status.get("initContainerStatuses")))
+        self._scheduled = bool(text(mapping(pod, "spec").get("nodeName")))
+        self._phase = text(self._status.get("phase"))
+        self._created = seconds(self._meta.get("creationTimestamp"))
+
+    def view(self) -> PodView:
+        """All of it."""
+        state = self._life()
+        trouble, reason, message = self._trouble(state)
+        end = self._ending()
+        exit_code = end.get("exitCode")
+        return PodView(
+            name=text(self._meta.get("name")),
+            uid=text(self._meta.get("uid")),
+            resource_version=text(self._meta.get("resourceVersion")),
+            owner=self._owner(),
+            created=self._created,
+            template_hash=text(mapping(self._meta, "labels").get(LABEL_TEMPLATE_HASH)),
+            state=state,
+            since=self._since(state),
+            was_ready=self._was_ready(),
+            trouble=trouble,
+            reason=reason,
+            message=_shorten(message),
+            exit_code=whole(exit_code) if isinstance(exit_code, int) else None,
+            ran=self._ran(),
+            scheduled=self._scheduled,
+            lingers=state is State.ENDED and self._phase not in ("Failed", "Succeeded"),
+            deletion_cost=self._deletion_cost(),
+        )
+
+    # Where it is in its life
+
+    def _life(self) -> State:
+        if self._meta.get("deletionTimestamp"):
+            return State.TERMINATING
+        if self._phase in ("Failed", "Succeeded") or mapping(self._state, "terminated"):
+            return State.ENDED
+        if self._ready():
+            return State.READY
+        if not isinstance(self._state.get("running"), Mapping):
+            return State.PENDING
+        return State.NOT_READY if self._was_ready() else State.STARTING
+
+    def _ready(self) -> bool:
+        return self._condition("Ready").get("status") == "True"
+
+    def _was_ready(self) -> bool:
+        # The kubelet writes "not Ready" when it takes the pod, before any container runs; a later
+        # change to "not Ready" means that the pod was Ready between.
+        if self._ready():
+            return True
+        started = seconds(mapping(self._state, "running").get("startedAt"))
+        return 0 < started < seconds(self._condition("Ready").get("lastTransitionTime"))
+
+    def _since(self, state: State) -> float:
+        if state is State.TERMINATING:
+            return seconds(self._meta.get("deletionTimestamp")) or self._created
+        if state is State.ENDED:
+            ended = seconds(self._ending().get("finishedAt"))
+            return ended or self._changed("Ready") or self._created
+        if state in (State.READY, State.NOT_READY):
+            return self._changed("Ready") or self._created
+        if state is State.STARTING:
+            started = seconds(mapping(self._state, "running").get("startedAt"))
+            return started or self._created
+        return self._created
+
+    def _ending(self) -> Mapping[str, Any]:
+        """How the worker ended or, if it never ran, the init container that was to blame."""
+        own = mapping(self._state, "terminated")
+        if own:
+            return own
+        ends = (mapping(status, "state", "terminated") for status in self._init)
+        return next((end for end in ends if whole(end.get("exitCode"))), {})
+
+    def _ran(self) -> float:
+        end = mapping(self._state, "terminated")
+        start, finish = seconds(end.get("startedAt")), seconds(end.get("finishedAt"))
+        return max(0.0, finish - start) if start else 0.0
+
+    # What is wrong with it
+
+    def _trouble(self, state: State) -> tuple[Trouble | None, str, str]:
+        if state is State.ENDED:
+            return self._why_ended()
+        if state is State.PENDING:
+            return self._why_pending()
+        if state is State.NOT_READY:
+            condition = self._condition("Ready")
+            return None, text(condition.get("reason")), text(condition.get("message"))
+        if state is State.TERMINATING and self._disruption():
+            return Trouble.DISRUPTED, *self._disruption_words()
+        return None, "", ""
+
+    def _why_pending(self) -> tuple[Trouble | None, str, str]:
+        for status in self._containers():
+            waiting = mapping(status, "state", "waiting")
+            if (reason := text(waiting.get("reason"))) in _CANNOT_START:
+                return Trouble.CANNOT_START, reason, text(waiting.get("message"))
+        scheduled = self._condition("PodScheduled")
+        if scheduled.get("status") == "False" and not self._scheduled:
+            reason = text(scheduled.get("reason")) or "Unschedulable"
+            return Trouble.UNSCHEDULABLE, reason, text(scheduled.get("message"))
+        return None, "", ""
+
+    def _why_ended(self) -> tuple[Trouble, str, str]:
+        end = self._ending()
+        reason, message = text(self._status.get("reason")), text(self._status.get("message"))
+        if self._exceeded_own_limit():
+            return Trouble.APPLICATION, reason, message
+        lost = text(end.get("reason")) in _LOST_CONTAINERS
+        if self._disruption() or reason in _DISRUPTIONS or lost:
+            return Trouble.DISRUPTED, *self._disruption_words()
+        if reason and not end:
+            # The node turned it away (OutOfcpu, UnexpectedAdmissionError, ...).  The next one may
+            # fare the same, so these are replaced with back-off.
+            return Trouble.APPLICATION, reason, message
+        return self._by_exit_code(end)
+
+    def _by_exit_code(self, end: Mapping[str, Any]) -> tuple[Trouble, str, str]:
+        # An ended pod without any exit code was deleted with its node's records.
+        if not end and self._phase != "Succeeded":
+            return Trouble.DISRUPTED, "", text(self._status.get("message"))
+        message = text(end.get("message"))
+        if self._status.get("reason") == "DeadlineExceeded":
+            reason, by_order = "DeadlineExceeded", True  # the template's activeDeadlineSeconds
+        else:
+            reason, by_order = text(end.get("reason")), whole(end.get("exitCode")) == 0
+        if by_order and self._ran() >= BRIEF:
+            return Trouble.COMPLETED, reason or "Completed", message
+        return Trouble.APPLICATION, reason or "Error", message
+
+    def _exceeded_own_limit(self) -> bool:
+        # Eviction for what the pod itself did: the next one would do it again.
+        message = text(self._status.get("message"))
+        return (
+            self._status.get("reason") == "Evicted"
+            and not self._disruption()
+            and ("exceeds the" in message or "exceeded its" in message)
+        )
+
+    def _disruption(self) -> bool:
+        return self._condition("DisruptionTarget").get("status") == "True"
+
+    def _disruption_words(self) -> tuple[str, str]:
+        condition = self._condition("DisruptionTarget")
+        reason = text(self._status.get("reason")) or text(condition.get("reason"))
+        message = text(self._status.get("message")) or text(condition.get("message"))
+        end = self._ending()
+        return reason or text(end.get("reason")), message or text(end.get("message"))
+
+    # Fields
+
+    def _condition(self, kind: str) -> Mapping[str, Any]:
+        return self._conditions.get(kind, {})
+
+    def _changed(self, kind: str) -> float:
+        return seconds(self._condition(kind).get("lastTransitionTime"))
+
+    def _containers(self) -> Iterator[Mapping[str, Any]]:
+        yield {"state": self._state}
+        yield from self._init
+        yield from self._others
+
+    def _owner(self) -> str:
+        owners = items(self._meta.get("ownerReferences"))
+        return next((text(o.get("uid")) for o in owners if o.get("controller") is True), "")
+
+    def _deletion_cost(self) -> int:
+        cost = text(mapping(self._meta, "annotations").get(ANNOTATION_DELETION_COST))
+        try:
+            return int(cost or "0")
+        except ValueError:
+            return 0  # Kubernetes ignores it too
+
+
+def _shorten(message: str) -> str:
+    message = message.strip()
+    return message if len(message) <= LONGEST_MESSAGE else "..." + message[-LONGEST_MESSAGE:]

@@ -1,0 +1,216 @@
+"""The body of a worker pod: the user's template, and what Fiber adds where it says nothing.
+
+What the user's template says wins, field by field, and what it says in a way that makes no sense
+is passed on: the API server's complaint about it is better than one of ours.  Only these are not
+the template's to say: the name, the owner, Fiber's labels, no finalizer, and ``restartPolicy:
+Never``.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from fiber_api import names
+from fiber_api.v1alpha1 import FiberPool, Master
+from fiber_operator.documents import items, mapping, text
+from fiber_operator.revisions import template_hash
+
+NODE_LOST_SECONDS = 60
+"""How long a pod stays bound to a node that is silent.  Kubernetes' own default is five minutes; a
+worker's tasks are given to others after seconds, and the pool should not lack it for longer."""
+
+_NODE_LOST = ("node.kubernetes.io/not-ready", "node.kubernetes.io/unreachable")
+_EVICTION = "NoExecute"
+
+_LOST_GRACE: int = Master.model_fields["lost_grace_seconds"].default
+
+_TMP = "/tmp"
+_TMP_VOLUME = "fiber-tmp"
+
+
+def owner_reference(pool: FiberPool) -> dict[str, Any]:
+    """Ties an object's life to the pool's."""
+    return {
+        "apiVersion": names.API_VERSION,
+        "kind": names.KIND,
+        "name": pool.metadata.name,
+        "uid": pool.metadata.uid,
+        "controller": True,
+        # True needs the right to change the pool's finalizers, on clusters that check it, and
+        # would let a pod that cannot end hold up the end of the pool.
+        "blockOwnerDeletion": False,
+    }
+
+
+def pod(pool: FiberPool, name: str, address: str) -> dict[str, Any]:
+    """One worker pod.  ``address`` is ``host:port`` of the pool's Service."""
+    template = copy.deepcopy(pool.spec.template)
+    spec = dict(mapping(template, "spec"))
+    spec["restartPolicy"] = "Never"
+    _default(spec, "automountServiceAccountToken", False)
+    # Else each worker gets variables for each Service of the namespace, two of every pool.
+    _default(spec, "enableServiceLinks", False)
+    spec["tolerations"] = _tolerations(spec.get("tolerations"))
+    _secure(spec)
+    for container in _containers(spec, "containers"):
+        if container.get("name") == pool.spec.worker_container:
+            _equip(pool, spec, container, name, address)
+    return {
+        "apiVersion": "v1",
+        "kind": "Pod",
+        "metadata": _metadata(pool, mapping(template, "metadata"), name),
+        "spec": spec,
+    }
+
+
+def _metadata(pool: FiberPool, template: Mapping[str, Any], name: str) -> dict[str, Any]:
+    master = pool.spec.master
+    metadata = {
+        "name": name,
+        "namespace": pool.metadata.namespace,
+        "labels": {
+            **mapping(template, "labels"),
+            names.LABEL_POOL: pool.metadata.name,
+            names.LABEL_POOL_UID: pool.metadata.uid,
+            names.LABEL_TEMPLATE_HASH: template_hash(pool),
+            names.LABEL_EPOCH: str(master.epoch if master else 0),
+            names.LABEL_MANAGED_BY: names.OPERATOR_MANAGER,
+        },
+        "ownerReferences": [owner_reference(pool)],
+    }
+    if annotations := mapping(template, "annotations"):
+        metadata["annotations"] = dict(annotations)
+    return metadata
+
+
+def _tolerations(own: object) -> object:
+    if own is not None and not isinstance(own, list):
+        return own
+    listed = list(own or ())
+    # A toleration without a key is one of every key, and so with the effect.
+    keys = {text(t.get("key")) for t in items(listed) if text(t.get("effect")) in ("", _EVICTION)}
+    if "" in keys:
+        return listed
+    return listed + [
+        {
+            "key": key,
+            "operator": "Exists",
+            "effect": _EVICTION,
+            "tolerationSeconds": NODE_LOST_SECONDS,
+        }
+        for key in _NODE_LOST
+        if key not in keys
+    ]
+
+
+# Security: what the "restricted" level of Kubernetes' pod security standards asks for.
+
+
+def _secure(spec: dict[str, Any]) -> None:
+    context = _default(spec, "securityContext", {})
+    if not isinstance(context, dict):
+        return
+    if context.get("runAsUser") != 0:
+        _default(context, "runAsNonRoot", True)
+    _default(context, "seccompProfile", {"type": "RuntimeDefault"})
+    for kind in ("initContainers", "containers"):
+        for container in _containers(spec, kind):
+            _secure_container(container, root_is_welcome=context.get("runAsNonRoot") is not True)
+
+
+def _secure_container(container: dict[str, Any], *, root_is_welcome: bool) -> None:
+    context = _default(container, "securityContext", {})
+    if not isinstance(context, dict) or context.get("privileged"):
+        return
+    if context.get("runAsUser") == 0:
+        # The kubelet would refuse it for the pod's runAsNonRoot.
+        _default(context, "runAsNonRoot", False)
+    non_root = context.get("runAsNonRoot")
+    root = root_is_welcome if non_root is None else not non_root
+    added = mapping(context, "capabilities").get("add")
+    if not (isinstance(added, list) and {"SYS_ADMIN", "CAP_SYS_ADMIN"}.intersection(added)):
+        _default(context, "allowPrivilegeEscalation", False)  # invalid beside that capability
+    if not root:
+        _default(context, "capabilities", {"drop": ["ALL"]})
+
+
+# The worker's container
+
+
+def _equip(
+    pool: FiberPool, spec: dict[str, Any], container: dict[str, Any], name: str, address: str
+) -> None:
+    _default(container, "terminationMessagePolicy", "FallbackToLogsOnError")
+    _add_environment(pool, container, name, address)
+    projected = {
+        "defaultMode": 0o444,  # by any user that the image runs as; no other container has it
+        "sources": [
+            {
+                "secret": {
+                    "name": names.secret_name(pool.metadata.name),
+                    "items": [{"key": k, "path": path} for k, path in names.AGENT_FILES.items()],
+                }
+            }
+        ],
+    }
+    volume = {"name": names.CREDENTIALS_VOLUME, "projected": projected}
+    _mount(spec, container, volume, names.CREDENTIALS_DIRECTORY, read_only=True)
+    if mapping(container, "securityContext").get("readOnlyRootFilesystem") is True:
+        # The agent's sockets are in /tmp, and Python's temporary files.  Where the root can be
+        # written to, the image's own /tmp does, with what the image may have put there.
+        _mount(spec, container, {"name": _TMP_VOLUME, "emptyDir": {}}, _TMP, read_only=False)
+
+
+def _add_environment(pool: FiberPool, container: dict[str, Any], name: str, address: str) -> None:
+    own = container.get("env")
+    if own is not None and not isinstance(own, list):
+        return
+    master = pool.spec.master
+    grace = master.lost_grace_seconds if master else _LOST_GRACE
+    ours = {
+        names.ENV_NAME: name,
+        names.ENV_ADDRESS: address,
+        names.ENV_CREDENTIALS: names.CREDENTIALS_DIRECTORY,
+        names.ENV_POOL: pool.metadata.name,
+        names.ENV_NAMESPACE: pool.metadata.namespace,
+        names.ENV_PROCESSES: str(pool.spec.processes_per_pod),
+        names.ENV_LOST_GRACE: str(grace),
+    }
+    taken = {text(variable.get("name")) for variable in items(own)}
+    # Ours first, so that the user's may refer to them.
+    added = [{"name": key, "value": value} for key, value in ours.items() if key not in taken]
+    container["env"] = added + list(own or ())
+
+
+def _mount(
+    spec: dict[str, Any],
+    container: dict[str, Any],
+    volume: dict[str, Any],
+    path: str,
+    *,
+    read_only: bool,
+) -> None:
+    """Mount a volume, unless the template has one of that name or mounts something there."""
+    volumes, mounts = spec.get("volumes") or [], container.get("volumeMounts") or []
+    if not isinstance(volumes, list) or not isinstance(mounts, list):
+        return
+    if any(text(m.get("mountPath")).rstrip("/") == path for m in items(mounts)):
+        return
+    if all(v.get("name") != volume["name"] for v in items(volumes)):
+        spec["volumes"] = [*volumes, volume]
+    mount = {"name": volume["name"], "mountPath": path, "readOnly": read_only}
+    container["volumeMounts"] = [*mounts, mount]
+
+
+def _default(document: dict[str, Any], key: str, value: Any) -> Any:
+    """Set a field that is absent or null, which is the same to the API server."""
+    if document.get(key) is None:
+        document[key] = value
+    return document[key]
+
+
+def _containers(spec: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
+    listed = spec.get(kind)
+    return [c for c in listed if isinstance(c, dict)] if isinstance(listed, list) else []

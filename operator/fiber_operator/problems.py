@@ -1,0 +1,97 @@
+"""What is wrong with a pool, worst first, as a person reads it and the SDK raises it."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections.abc import Iterator
+
+from fiber_api import names
+from fiber_api.names import Reason
+from fiber_api.v1alpha1 import FiberPool, Problem
+from fiber_operator import wording
+from fiber_operator.failed_pods import failed_pods
+from fiber_operator.situation import Situation
+from fiber_operator.starting_pods import pods_not_ready_any_more, pods_that_do_not_start
+
+_WORKER_NAME = re.compile(f"[0-9a-f]{{{names.POD_SUFFIX_LENGTH}}}")
+
+
+def find(situation: Situation) -> tuple[Problem, ...]:
+    """Worst first, one of a kind, at most ten."""
+    kinds: dict[str, Problem] = {}
+    for problem in _all(situation):
+        kinds.setdefault(problem.reason, problem)
+    ranked = sorted(
+        kinds.values(), key=lambda p: (not p.terminal, p.severity != "Error", -p.count, p.reason)
+    )
+    return tuple(ranked[: names.MAX_PROBLEMS])
+
+
+def _all(situation: Situation) -> Iterator[Problem]:
+    yield from _obstacles(situation)
+    yield from _refusals(situation)
+    yield from failed_pods(situation)
+    yield from pods_that_do_not_start(situation)
+    yield from pods_not_ready_any_more(situation)
+    yield from _masters(situation)
+    yield from _releases(situation)
+
+
+def _obstacles(situation: Situation) -> Iterator[Problem]:
+    for obstacle in situation.memory.obstacles:
+        yield situation.problem(obstacle.reason, obstacle.message, terminal=obstacle.terminal)
+
+
+def _refusals(situation: Situation) -> Iterator[Problem]:
+    refused = situation.memory.refusal
+    if refused is None or refused.template_hash != situation.template_hash:
+        return
+    reason = refusal_reason(refused.status, refused.message)
+    if situation.wants_more or reason == Reason.INVALID_TEMPLATE:
+        yield situation.problem(
+            reason,
+            wording.refusal(reason, refused),
+            terminal=reason != Reason.QUOTA_EXCEEDED,
+        )
+
+
+def refusal_reason(status: int, message: str) -> Reason:
+    """Which problem a refusal is."""
+    if status != 403:
+        return Reason.INVALID_TEMPLATE
+    return Reason.QUOTA_EXCEEDED if "exceeded quota" in message else Reason.FORBIDDEN
+
+
+def _masters(situation: Situation) -> Iterator[Problem]:
+    pool, memory, attachment = situation.pool, situation.memory, situation.attachment
+    if attachment.lost_since is not None:
+        message = wording.master_lost(pool, attachment.lost_since, memory.master.holder)
+        yield situation.problem(Reason.MASTER_LOST, message)
+    if pool.spec.master and memory.address and _families_differ(pool, memory.address):
+        message = wording.wrong_family(pool, memory.address)
+        yield situation.problem(Reason.INVALID_SPEC, message, terminal=True)
+
+
+def _families_differ(pool: FiberPool, address: str) -> bool:
+    assert pool.spec.master is not None
+    host = address.rpartition(":")[0].strip("[]")
+    try:
+        service = ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return service.version != ipaddress.ip_address(pool.spec.master.host).version
+
+
+def _releases(situation: Situation) -> Iterator[Problem]:
+    prefix = f"{situation.pool.metadata.name}-"
+    foreign = [
+        name
+        for name in situation.pool.spec.scale_down.release
+        if not (name.startswith(prefix) and _WORKER_NAME.fullmatch(name.removeprefix(prefix)))
+    ]
+    if foreign:
+        message = wording.foreign_releases(situation.pool, foreign)
+        yield situation.problem(
+            Reason.INVALID_RELEASE, message, severity="Warning", count=len(foreign)
+        )

@@ -1,0 +1,192 @@
+"""The parts of the operator, put together.
+
+::
+
+    handlers ──► queue ──► controller ──► cluster
+    resync  ────►  ▲          │  ▲            ▲
+    masters ───────┘          ▼  │            │ permit
+                          reconcile.plan    guard (Lease)
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from fiber_operator.cluster import Cluster, load_configuration
+from fiber_operator.controller import Controller
+from fiber_operator.creation import Creator, Draw, draw_suffix
+from fiber_operator.events import Recorder
+from fiber_operator.handlers import Configure, Watcher
+from fiber_operator.health import Health
+from fiber_operator.lease import Guard
+from fiber_operator.logs import about
+from fiber_operator.masters import Masters
+from fiber_operator.metrics import Metrics
+from fiber_operator.resync import Resync
+from fiber_operator.server import serving
+from fiber_operator.settings import Settings
+from fiber_operator.worker import Key, Queue, Turn
+
+DRAIN = 5.0
+"""Seconds that a call under way may take to end when the operator is to stop."""
+
+log = logging.getLogger(__name__)
+
+
+class Part(Protocol):
+    """What runs until it is cancelled."""
+
+    async def run(self) -> None: ...
+
+
+class Program:
+    """One operator.  ``watches`` makes what calls ``notice``."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        configure: Configure = load_configuration,
+        watches: Callable[..., Part] = Watcher,
+        now: Callable[[], float] = time.time,
+        draw: Draw = draw_suffix,
+    ) -> None:
+        self._settings = settings
+        self._configure = configure
+        self._watches = watches
+        self._now = now
+        self._draw = draw
+        self._watched_before = False
+        self.metrics = Metrics()
+        self.port = 0
+        """Where /healthz is served, once it is."""
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Operate until ``stop``; then end what is under way and give up the Lease."""
+        settings = self._settings
+        async with contextlib.AsyncExitStack() as stack:
+            self._build(
+                await self._open(stack, settings.connections, permit=self._require),
+                # Its own, so that no queue of other calls keeps the Lease from being renewed.
+                await self._open(stack, 2),
+            )
+            self.port = await stack.enter_async_context(
+                serving(
+                    settings.host,
+                    settings.port,
+                    alive=self.health.alive,
+                    ready=self.health.ready,
+                    metrics=self.metrics,
+                )
+            )
+            where = ", ".join(settings.namespaces) or "all namespaces"
+            log.info("operating in %s as %s", where, settings.identity)
+            await self._operate(stop)
+        log.info("stopped")
+
+    async def _open(
+        self,
+        stack: contextlib.AsyncExitStack,
+        connections: int,
+        permit: Callable[[], None] = lambda: None,
+    ) -> Cluster:
+        cluster = Cluster(
+            await self._configure(),
+            connections=connections,
+            permit=permit,
+            observe=self.metrics.requested,
+        )
+        stack.push_async_callback(cluster.close)
+        return cluster
+
+    def _build(self, cluster: Cluster, lease_cluster: Cluster) -> None:
+        settings, clock = self._settings, asyncio.get_running_loop().time
+        self.guard = Guard(
+            lease_cluster,
+            namespace=settings.namespace,
+            name=settings.lease,
+            identity=settings.identity,
+            seconds=settings.lease_seconds,
+            on_change=self._lease_changed,
+            wall_clock=self._now,
+        )
+        self.queue = Queue(self._look, concurrency=settings.concurrency)
+        self.masters = Masters(cluster, lambda key: self.queue.add(key, urgent=True))
+        self.controller = Controller(
+            cluster,
+            masters=self.masters,
+            recorder=Recorder(cluster, self._now, settings.identity),
+            metrics=self.metrics,
+            creator=Creator(cluster, self._draw),
+            now=self._now,
+        )
+        self.resync = Resync(
+            cluster,
+            self.queue,
+            namespaces=settings.namespaces,
+            seconds=settings.resync_seconds,
+            on_success=lambda: self.metrics.resynced(self._now()),
+        )
+        self.health = Health(self.guard, self.queue, self.resync, clock)
+        self.metrics.watch_queue(self.queue.statistics, lambda: self.guard.held)
+
+    async def _operate(self, stop: asyncio.Event) -> None:
+        watches = self._watches(
+            self.notice,
+            configure=self._configure,
+            namespaces=self._settings.namespaces,
+            gate=self.resync.answered,
+            on_start=self._watching,
+        )
+        parts: list[Part] = [self.guard, self.masters, self.queue, self.resync, watches]
+        tasks = [asyncio.ensure_future(part.run()) for part in parts]
+        stopped = asyncio.ensure_future(stop.wait())
+        try:
+            await asyncio.wait([*tasks, stopped], return_when=asyncio.FIRST_COMPLETED)
+            self.guard.resign()
+            await self.queue.drain(DRAIN)
+        finally:
+            for task in (*tasks, stopped):
+                task.cancel()
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        await self.guard.release()
+        for result in results:
+            if isinstance(result, Exception):
+                raise result
+
+    def notice(self, key: Key, uid: str, generation: int | None) -> None:
+        """Something happened to a pool (``generation``: to the resource itself) or its pods."""
+        if not all(key):
+            return  # labelled by somebody who is not us
+        self.metrics.watched("pods" if generation is None else "fiberpools")
+        if generation is None:
+            self.queue.add(key)
+        elif self.controller.is_news(key, uid, generation):
+            self.queue.add(key, urgent=True)
+
+    async def _look(self, key: Key) -> Turn:
+        return await self.controller.look(key) if self.guard.held else Turn()
+
+    def _require(self) -> None:
+        self.guard.require()
+
+    def _watching(self, running: bool) -> None:
+        if running and self._watched_before:
+            self.metrics.watch_restarted()
+        self._watched_before = True
+        self.health.watching = running
+
+    def _lease_changed(self, held: bool) -> None:
+        self.controller.forget()
+        if held:
+            # What happened while another operator acted was not looked at.
+            self.resync.poke()
+            for key in self.queue.known():
+                self.queue.add(key)
+        else:
+            log.warning("pools wait until the Lease is held again", extra=about(reason="LeaseLost"))

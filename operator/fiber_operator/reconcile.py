@@ -1,0 +1,328 @@
+"""The only place where it is decided which pods are created and deleted.
+
+::
+
+    pool, pods, memory, now
+      │
+      ├─ attachment   is a master there, alive, lost for good?
+      ├─ scaling      who goes: released, suspended, outdated, too many, ended and looked at
+      ├─ failures     who failed since the last look; how long to wait for it
+      ├─ scaling      who comes: as many as are missing, a few of a template that never worked
+      ├─ problems     what is wrong
+      └─ status       what to say of all that, and transitions what to announce
+
+What with and without a master
+------------------------------
+While a master is attached (``spec.master`` is set and its Lease is not known to have been expired
+for longer than its grace) a Ready worker may be at work.  Under ``ReleasedOnly`` it is deleted
+only when released; an outdated one is then replaced by the next creation.  With no master, or one
+that is lost for good, no worker is at work: lowering ``replicas`` takes any, and outdated ones are
+replaced by themselves, a quarter at a time.  ``suspend`` and ``Recreate`` are a person's order and
+stop for nobody.
+
+A master that is lost keeps everything it has until its grace is over; nothing new is created for
+it, unless ``onLost`` is ``Retain``.  Then ``Delete`` deletes the FiberPool, ``ScaleToMin`` wants
+``minReplicas``, ``Retain`` wants what ``replicas`` says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fiber_api.names import Reason
+from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
+from fiber_operator import failures, problems, revisions, scaling, status, wording
+from fiber_operator.attachment import judge
+from fiber_operator.conditions import Counts, Outlook
+from fiber_operator.plans import Deletion, Event, Memory, Plan
+from fiber_operator.pods import PodView, State, Trouble
+from fiber_operator.situation import SECOND_LOOK, Situation
+from fiber_operator.transitions import Change, events
+
+STUCK = 5.0
+"""Seconds after which a pod's events are looked at, if its status does not say why it waits."""
+
+QUOTA_WAIT = 30.0
+"""The longest wait until a full quota is tried again: it is freed without a sign."""
+
+_ENDED: Mapping[Trouble | None, Reason] = {
+    Trouble.COMPLETED: Reason.COMPLETED,
+    Trouble.DISRUPTED: Reason.DISRUPTED,
+}
+
+
+def plan(pool: FiberPool, pods: Sequence[PodView], memory: Memory, now: float) -> Plan:
+    """What to do so that the cluster gets nearer to what ``pool`` says.
+
+    ``pods`` are all pods with the label of the pool's uid, from a fresh list; those that another
+    controller owns are ignored.  Pure and total: the same arguments give an equal plan, and
+    nothing that can stand in ``pods`` or in the pool's status makes it raise.
+    """
+    own = sorted(
+        (p for p in pods if p.owner == pool.metadata.uid and p.name and p.uid),
+        key=lambda pod: (pod.created, pod.name),
+    )
+    return _Planner(pool, own, memory, now).plan()
+
+
+def plan_unreadable(
+    document: Mapping[str, Any], pods: Sequence[PodView], errors: Sequence[str], now: float
+) -> Plan:
+    """The plan for a pool whose spec the operator cannot read: say so, touch no pod.
+
+    ``document`` is the resource's JSON, ``errors`` what is wrong, each naming its field.
+    """
+    return Plan(status=status.describe_unreadable(document, pods, errors, now))
+
+
+class _Planner:
+    """One plan.  Everything is worked out from its arguments alone."""
+
+    def __init__(
+        self, pool: FiberPool, pods: Sequence[PodView], memory: Memory, now: float
+    ) -> None:
+        self._pool, self._spec = pool, pool.spec
+        self._pods, self._memory, self._now = pods, memory, now
+        self._hash = revisions.template_hash(pool)
+        self._attachment = judge(pool, memory.master, now)
+        self._ends = pool.metadata.deletion_timestamp is not None
+        self._live = [pod for pod in pods if pod.live]
+        self._ended = [pod for pod in pods if pod.state is State.ENDED]
+        self._late = self._not_ready_in_time()
+        self._desired = self._wanted()
+        self._account = self._count()
+        self._record = self._account.record
+        self._refused = self._refused_until()
+        self._may_create = self._can_make_pods()
+        self._deletions: dict[str, Deletion] = {}
+
+    def plan(self) -> Plan:
+        """The whole of it."""
+        master = self._spec.master
+        if master and self._attachment.gone and master.on_lost == "Delete" and not self._ends:
+            return self._delete_pool()
+        if not self._ends:
+            self._delete()
+        dry_run = self._may_create and not self._accepted and not self._spec.suspend
+        create, trial_ends = self._creations()
+        found = problems.find(self._situation())
+        after = self._status(found, create)
+        document = status.patch(self._pool, after)
+        if dry_run and not self._deletions and not self._account.news:
+            document = None  # the outcome follows at once, and is what is worth telling
+        change = Change(self._pool.status, after, self._account, create, self._in_order())
+        return Plan(
+            create=create,
+            batch_limit=self._spec.scale_up.max_in_flight,
+            delete=self._in_order(),
+            dry_run=dry_run,
+            template_hash=self._hash,
+            status=document,
+            events=tuple(events(change, told=document is not None)),
+            inspect=tuple(p.name for p in self._silent() if self._now >= p.created + STUCK)[:1],
+            again=self._again(found, trial_ends),
+        )
+
+    def _delete_pool(self) -> Plan:
+        assert self._attachment.lost_since is not None
+        message = wording.master_lost(
+            self._pool, self._attachment.lost_since, self._memory.master.holder
+        )
+        event = Event("Warning", Reason.MASTER_LOST, message)
+        return Plan(delete_pool=True, template_hash=self._hash, events=(event,))
+
+    # What is so
+
+    def _not_ready_in_time(self) -> list[PodView]:
+        """Workers that run and do not get Ready: they failed, only that they do not end."""
+        if self._ends or self._spec.suspend:
+            return []
+        limit = self._now - self._spec.failure_policy.startup_timeout_seconds
+        return [pod for pod in self._live if pod.state is State.STARTING and pod.since <= limit]
+
+    def _count(self) -> failures.Account:
+        expected = self._memory.deleted.union(self._spec.scale_down.release)
+        if self._ends or self._spec.suspend:
+            expected = expected.union(pod.name for pod in self._pods)
+        return failures.account(
+            failures.Record.read(self._pool.status, self._now),
+            self._pods,
+            expected=expected,
+            late={pod.name for pod in self._late},
+            desired=self._desired,
+            template_hash=self._hash,
+            spec_hash=revisions.spec_hash(self._pool),
+            policy=self._spec.failure_policy,
+            seed=self._pool.metadata.uid,
+            now=self._now,
+        )
+
+    def _wanted(self) -> int:
+        master, attachment = self._spec.master, self._attachment
+        if self._spec.suspend:
+            return 0
+        if master is None or master.on_lost != "ScaleToMin" or not attachment.grace_is_over:
+            return self._pool.wanted
+        floor = self._spec.min_replicas
+        # Not yet confirmed by this process: keep what there is.
+        return floor if attachment.gone else min(self._pool.wanted, max(floor, len(self._live)))
+
+    @property
+    def _accepted(self) -> bool:
+        """The API server takes pods of this template, or did."""
+        return self._hash in (self._memory.accepted, self._record.proven)
+
+    def _refused_until(self) -> float | None:
+        refused = self._memory.refusal
+        if refused is None or refused.template_hash != self._hash:
+            return None
+        wait = failures.delay(self._spec.failure_policy, refused.count, self._pool.metadata.uid)
+        if problems.refusal_reason(refused.status, refused.message) == Reason.QUOTA_EXCEEDED:
+            wait = min(wait, QUOTA_WAIT)
+        return refused.at + wait
+
+    def _can_make_pods(self) -> bool:
+        memory, policy = self._memory, self._spec.failure_policy
+        return not (
+            self._ends
+            or memory.address is None
+            or memory.obstacles
+            or self._is_orphaned()
+            or self._record.exhausted(policy)
+            or self._record.waits_until(policy, self._now) is not None
+            or (self._refused is not None and self._now < self._refused)
+        )
+
+    def _is_orphaned(self) -> bool:
+        """Its master is lost and what follows from that has not happened yet."""
+        master, attachment = self._spec.master, self._attachment
+        if master is None or master.on_lost == "Retain":
+            return False
+        return attachment.alive is False and not attachment.gone
+
+    # Who goes
+
+    def _delete(self) -> None:
+        spec, attached = self._spec, self._attachment.attached
+        if spec.suspend:
+            self._take(self._live + self._ended, Reason.SUSPENDED)
+        release = set(spec.scale_down.release)
+        self._take([p for p in self._live + self._ended if p.name in release], Reason.RELEASED)
+        self._take(self._late, Reason.STARTUP_TIMEOUT, guarded=True)
+        if self._accepted and self._may_create:
+            self._take(self._outdated(), Reason.REPLACED, guarded=attached)
+        free = spec.scale_down.policy == "Any" or not attached
+        excess = scaling.excess_to_delete(
+            self._remaining,
+            len(self._remaining) - self._desired,
+            template_hash=self._hash,
+            free_choice=free,
+        )
+        self._take(excess, Reason.SCALED_DOWN, guarded=not free)
+        for pod in scaling.ended_to_delete(self._ended, self._record.counted):
+            self._take([pod], _ENDED.get(pod.trouble, Reason.CONTAINER_FAILED))
+
+    def _outdated(self) -> list[PodView]:
+        return scaling.outdated_to_replace(
+            self._remaining,
+            template_hash=self._hash,
+            strategy=self._spec.update.strategy,
+            attached=self._attachment.attached,
+            desired=self._desired,
+        )
+
+    def _take(self, pods: Sequence[PodView], reason: Reason, *, guarded: bool = False) -> None:
+        for pod in pods:
+            version = pod.resource_version if guarded and not pod.was_ready else None
+            self._deletions.setdefault(
+                pod.name, Deletion(pod.name, pod.uid, version or None, reason)
+            )
+
+    def _in_order(self) -> tuple[Deletion, ...]:
+        return tuple(self._deletions.values())
+
+    @property
+    def _remaining(self) -> list[PodView]:
+        return [pod for pod in self._live if pod.name not in self._deletions]
+
+    # Who comes
+
+    def _creations(self) -> tuple[int, float | None]:
+        """How many now, and when more may follow if that is not all."""
+        missing = self._desired - len(self._remaining)
+        if missing <= 0 or not self._may_create or not self._accepted:
+            return 0, None
+        current = [pod for pod in self._remaining if pod.template_hash == self._hash]
+        trial = scaling.trial(current, proven=self._record.proven == self._hash, now=self._now)
+        if trial.limit is None:
+            return missing, None
+        return max(0, min(missing, trial.limit - len(current))), trial.again
+
+    # What to say
+
+    def _situation(self) -> Situation:
+        return Situation(
+            pool=self._pool,
+            live=self._remaining,
+            ended=self._ended,
+            account=self._account,
+            attachment=self._attachment,
+            memory=self._memory,
+            template_hash=self._hash,
+            wants_more=len(self._remaining) < self._desired,
+            now=self._now,
+        )
+
+    def _status(self, found: tuple[Problem, ...], create: int) -> FiberPoolStatus:
+        missing = self._desired - len(self._remaining)
+        waits = self._record.waits_until(self._spec.failure_policy, self._now)
+        outlook = Outlook(
+            Counts.of(self._pods, self._desired, self._hash),
+            found,
+            self._attachment,
+            create=create,
+            delete=len(self._live) - len(self._remaining),
+            waits_until=waits if missing > 0 else None,
+            draining=0 if self._ends else max(0, -missing),
+            replacing=self._to_be_replaced(),
+        )
+        return status.describe(
+            self._pool,
+            outlook,
+            self._record,
+            address=self._memory.address,
+            template_hash=self._hash,
+            now=self._now,
+        )
+
+    def _to_be_replaced(self) -> int:
+        if self._spec.update.strategy == "OnDelete":
+            return 0
+        return sum(pod.template_hash != self._hash for pod in self._live)
+
+    def _silent(self) -> list[PodView]:
+        """Pods with a node that do not get Ready and whose status does not say why."""
+        return [p for p in self._remaining if not p.was_ready and p.scheduled and not p.trouble]
+
+    def _next_inspection(self, pod: PodView) -> float:
+        """Less and less often: a large image can take long."""
+        age = STUCK
+        while pod.created + age <= self._now:
+            age *= 2
+        return pod.created + age
+
+    def _again(self, found: Sequence[Problem], trial_ends: float | None) -> float | None:
+        timeout = self._spec.failure_policy.startup_timeout_seconds
+        times = [
+            trial_ends,
+            self._account.again,
+            self._attachment.due,
+            self._refused,
+            self._record.waits_until(self._spec.failure_policy, self._now),
+            *(self._next_inspection(pod) for pod in self._silent()[:1]),
+            *(pod.created + timeout for pod in self._remaining if not pod.was_ready),
+            *(pod.since + timeout for pod in self._remaining if pod.state is State.STARTING),
+            *(p.since + SECOND_LOOK for p in found if p.severity == "Warning" and p.since),
+        ]
+        return min((time for time in times if time is not None and time > self._now), default=None)

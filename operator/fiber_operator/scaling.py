@@ -1,0 +1,127 @@
+"""Which pods go, and how many come.
+
+Who may be taken depends on who could be working.  While a master is attached, only it knows which
+of its workers are idle: under ``ReleasedOnly`` the operator takes what the master has released and
+what was never Ready, nothing else.  Without a master nobody works, and it may take any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from fiber_operator.pods import PodView, State, Trouble
+
+CANARIES = 3
+"""Pods that try out a template that never worked."""
+
+PATIENCE = 10.0
+"""Seconds after which a canary without bad news is good news."""
+
+
+def outdated_to_replace(
+    live: Sequence[PodView],
+    *,
+    template_hash: str,
+    strategy: str,
+    attached: bool,
+    desired: int,
+) -> list[PodView]:
+    """Pods of an older template that go now.
+
+    ``OnDelete``: none.  ``Recreate``: all, at work or not.  ``OnIdle``: those that were never
+    Ready.  The others are at work while a master is attached; it sees ``updatedReplicas`` and
+    releases them when they are idle.  Without one they are replaced a quarter at a time, so that
+    a template that does not work costs no more than a quarter of a warm pool.
+    """
+    outdated = [pod for pod in live if pod.template_hash != template_hash]
+    if strategy == "OnDelete":
+        return []
+    if strategy == "Recreate":
+        return outdated
+    fresh = [pod for pod in outdated if not pod.was_ready]
+    if attached:
+        return fresh
+    unready = [pod for pod in outdated if pod.was_ready and pod.state is not State.READY]
+    ready = [pod for pod in outdated if pod.state is State.READY]
+    missing = desired - sum(pod.state is State.READY for pod in live)
+    spare = max(0, max(1, desired // 4) - max(0, missing))
+    return fresh + unready + expendable(ready, template_hash)[:spare]
+
+
+def expendable(pods: Sequence[PodView], template_hash: str) -> list[PodView]:
+    """The order in which policy ``Any`` takes pods.
+
+    Pending, then outdated, then not ready, then of the lowest deletion cost, then the newest.
+    """
+    return sorted(
+        pods,
+        key=lambda pod: (
+            pod.state is not State.PENDING,
+            pod.template_hash == template_hash,
+            pod.state is State.READY,
+            pod.deletion_cost,
+            -pod.created,
+            pod.name,
+        ),
+    )
+
+
+def excess_to_delete(
+    live: Sequence[PodView], excess: int, *, template_hash: str, free_choice: bool
+) -> list[PodView]:
+    """Pods that go because fewer are wanted; may be fewer than ``excess``."""
+    if free_choice:
+        candidates = expendable(live, template_hash)
+    else:
+        never_ready = (pod for pod in live if not pod.was_ready)
+        candidates = sorted(never_ready, key=lambda pod: (-pod.created, pod.name))
+    return candidates[: max(0, excess)]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How many pods of a template may be there now."""
+
+    limit: int | None = None
+    """None: as many as are wanted."""
+    again: float | None = None
+    """When patience ends."""
+
+
+def trial(current: Sequence[PodView], *, proven: bool, now: float) -> Trial:
+    """Whether a template, of which ``current`` are the live pods, is still being tried out.
+
+    A pod that no node takes ends the trial: a cluster autoscaler must see the whole demand.
+    """
+    if proven:
+        return Trial()
+    if any(pod.trouble is Trouble.CANNOT_START for pod in current):
+        return Trial(CANARIES)
+    if any(pod.trouble is Trouble.UNSCHEDULABLE for pod in current):
+        return Trial()
+    if not current:
+        return Trial(CANARIES)
+    due = min(pod.created for pod in current) + PATIENCE
+    return Trial() if now >= due else Trial(CANARIES, due)
+
+
+KEPT = 3
+"""Failed pods that are kept for ``kubectl logs``."""
+
+
+def ended_to_delete(ended: Sequence[PodView], counted: Collection[str]) -> list[PodView]:
+    """Ended pods that are of no more use: all that are not among the last that failed.
+
+    A pod whose other containers go on is not kept: it would hold its resources.
+    """
+    failed = sorted(
+        (p for p in ended if p.trouble is Trouble.APPLICATION and not p.lingers),
+        key=lambda pod: (pod.since, pod.name),
+    )
+    kept = {pod.name for pod in failed[-KEPT:]}
+    return [pod for pod in ended if pod.name not in kept and _settled(pod, counted)]
+
+
+def _settled(pod: PodView, counted: Collection[str]) -> bool:
+    return pod.trouble not in (Trouble.APPLICATION, Trouble.DISRUPTED) or pod.name in counted

@@ -1,0 +1,76 @@
+"""What problems are found in, and how one is put together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from fiber_api.v1alpha1 import FiberPool, Problem
+from fiber_operator.attachment import Attachment
+from fiber_operator.failures import Account
+from fiber_operator.plans import Memory
+from fiber_operator.pods import PodView
+
+SECOND_LOOK = 30.0
+"""Seconds after which what may pass by itself has not."""
+
+Severity = Literal["Error", "Warning"]
+
+
+@dataclass(frozen=True)
+class Situation:
+    """All that there may be to complain about."""
+
+    pool: FiberPool
+    live: Sequence[PodView]
+    ended: Sequence[PodView]
+    account: Account
+    attachment: Attachment
+    memory: Memory
+    template_hash: str
+    wants_more: bool
+    """Pods are missing, whether or not they may be created now."""
+    now: float
+
+    def previous(self, reason: str) -> Problem | None:
+        """The problem of that kind that the status shows."""
+        problems = self.pool.status.problems
+        return next((problem for problem in problems if problem.reason == reason), None)
+
+    def severity(self, reason: str, *, again: bool = False) -> Severity:
+        """Of what may pass by itself: a warning at first, an error if it is seen ``again``."""
+        before = self.previous(reason)
+        lasted = before and before.since and self.now - before.since >= SECOND_LOOK
+        was_error = before is not None and before.severity == "Error"
+        return "Error" if again or lasted or was_error else "Warning"
+
+    def example(self, reason: str, pods: Iterable[PodView]) -> PodView:
+        """The pod to name: the one that was named before, else the oldest."""
+        before = self.previous(reason)
+        named = before.pod if before else None
+        return min(pods, key=lambda pod: (pod.name != named, pod.created, pod.name))
+
+    def problem(
+        self,
+        reason: str,
+        message: str,
+        *,
+        severity: Severity = "Error",
+        terminal: bool = False,
+        count: int = 1,
+        pod: str | None = None,
+    ) -> Problem:
+        """A problem, since when it is there."""
+        before = self.previous(reason)
+        since = before.since if before else None
+        return Problem(
+            reason=reason,
+            severity=severity,
+            terminal=terminal,
+            count=count,
+            since=since or float(math.floor(self.now)),
+            pod=pod,
+            message=message,
+        )

@@ -1,0 +1,224 @@
+"""``python -m fiber_operator.smoke MANIFEST``: does this cluster turn a FiberPool into workers?
+
+What ``helm test`` runs.  Makes the FiberPool of MANIFEST (a JSON document), waits until it is ready
+and deletes it, also when it is interrupted.  The pool's name belongs to the test: what an earlier
+one left under it is deleted first.  Exits with 0, or with 1 and a sentence that says what is wrong.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
+
+from fiber_api.names import CRD_NAME, ConditionType
+from fiber_operator.cluster import (
+    POOLS,
+    ApiError,
+    Cluster,
+    Conflict,
+    Gone,
+    Unavailable,
+    load_configuration,
+)
+
+PATIENCE = 240.0
+"""Seconds for the worker to become ready: less than `helm test` itself waits by default."""
+TOLERANCE = 30.0
+"""Seconds that the pool may be degraded: a registry may fail once, but not all the time."""
+PAUSE = 0.5
+"""Seconds between two looks at the pool."""
+
+UNSEEN = "the operator has not looked at the pool yet"
+
+Pool = Mapping[str, Any]
+
+
+class Failed(Exception):
+    """The pool did not become ready; the message says why and what to do."""
+
+
+class Smoke:
+    """One test; ``say`` is told what happens, in lines."""
+
+    def __init__(
+        self,
+        cluster: Cluster,
+        manifest: dict[str, Any],
+        say: Callable[[str], None],
+        *,
+        patience: float = PATIENCE,
+        tolerance: float = TOLERANCE,
+        pause: float = PAUSE,
+    ) -> None:
+        self._cluster = cluster
+        self._manifest = manifest
+        self._namespace: str = manifest["metadata"]["namespace"]
+        self._name: str = manifest["metadata"]["name"]
+        self._say = say
+        self._patience = patience
+        self._tolerance = tolerance
+        self._pause = pause
+        self._last = "nothing"
+
+    async def run(self) -> None:
+        """Make the pool, wait, delete it.  Raises Failed."""
+        await self._in_time(self._remove(), "an earlier test's pool could not be deleted")
+        try:
+            await self._in_time(self._create(), "the pool could not be made")
+            self._say(f"made the FiberPool {self._name} in namespace {self._namespace}")
+            await self._in_time(self._until_ready(), "its worker did not become ready")
+        finally:
+            await self._in_time(self._remove(), "the pool could not be deleted")
+        self._say("deleted it: this cluster runs FiberPools")
+
+    async def _in_time(self, step: Coroutine[Any, Any, None], otherwise: str) -> None:
+        try:
+            async with asyncio.timeout(self._patience):
+                await step
+        except TimeoutError:
+            why = f"{otherwise} in {self._patience:g} s. Last seen: {self._last}"
+            if self._last == UNSEEN:
+                why += (
+                    f". It does not run, or does not watch the namespace {self._namespace}: see "
+                    "the operator's log"
+                )
+            raise Failed(why) from None
+
+    async def _create(self) -> None:
+        while True:
+            try:
+                await self._cluster.create(POOLS, self._namespace, self._manifest)
+            except Gone as error:
+                raise Failed(
+                    f"{error}. Either the namespace {self._namespace} or the resource type "
+                    f"{CRD_NAME} does not exist; the chart installs the latter with "
+                    "crds.install=true."
+                ) from error
+            except Conflict:
+                return  # An earlier attempt was carried out, though its answer was lost.
+            except Unavailable as error:
+                await self._wait(str(error))
+            except ApiError as error:
+                raise Failed(f"the API server refuses the pool: {error}") from error
+            else:
+                return
+
+    async def _until_ready(self) -> None:
+        clock = asyncio.get_running_loop().time
+        well = clock()
+        while True:
+            pool = await self._read()
+            if pool is None:
+                raise Failed("somebody else deleted the pool while its worker started; try again")
+            if is_ready(pool):
+                self._say("its worker is ready")
+                return
+            if not is_degraded(pool):
+                well = clock()
+            if hopeless(pool) or clock() - well > self._tolerance:
+                raise Failed(f"its worker does not start. {problems(pool)}")
+            await self._wait(state(pool), problems(pool))
+
+    async def _remove(self) -> None:
+        while (pool := await self._read()) is not None:
+            if "deletionTimestamp" not in pool["metadata"]:
+                try:
+                    await self._cluster.delete(
+                        POOLS, self._namespace, self._name, uid=pool["metadata"]["uid"]
+                    )
+                except (Gone, Conflict):
+                    continue  # Somebody was quicker: look again.
+                except Unavailable as error:
+                    self._last = str(error)
+            await self._wait("the pool is being deleted")
+
+    async def _read(self) -> Pool | None:
+        while True:
+            try:
+                return await self._cluster.read(POOLS, self._namespace, self._name)
+            except Gone:
+                return None
+            except Unavailable as error:
+                await self._wait(str(error))
+            except ApiError as error:
+                raise Failed(f"the API server does not show the pool: {error}") from error
+
+    async def _wait(self, seen: str, details: str = "") -> None:
+        """Let time pass; the details are told when what is seen changes, not each time they do."""
+        if seen != self._last:
+            self._last = seen
+            self._say(f"{seen}. {details}" if details else seen)
+        await asyncio.sleep(self._pause)
+
+
+def is_ready(pool: Pool) -> bool:
+    """Whether the operator says so of the spec that the pool has now."""
+    return _is_true(pool, ConditionType.READY)
+
+
+def is_degraded(pool: Pool) -> bool:
+    """Whether something is wrong, though it may pass."""
+    return _is_true(pool, ConditionType.DEGRADED)
+
+
+def hopeless(pool: Pool) -> bool:
+    """Whether there is a problem that waiting cannot help."""
+    return any(problem.get("terminal") for problem in _problems(pool))
+
+
+def state(pool: Pool) -> str:
+    """How far the pool is, in a few words."""
+    status = pool.get("status")
+    if not status:
+        return UNSEEN
+    reasons = ", ".join(str(problem.get("reason")) for problem in _problems(pool))
+    return f"{status.get('phase')}" + (f": {reasons}" if reasons else "")
+
+
+def problems(pool: Pool) -> str:
+    """What is wrong and what to do, in the operator's words."""
+    return " ".join(str(problem.get("message")) for problem in _problems(pool))
+
+
+def _is_true(pool: Pool, kind: ConditionType) -> bool:
+    status = pool.get("status") or {}
+    return status.get("observedGeneration") == pool["metadata"].get("generation") and any(
+        condition.get("type") == kind and condition.get("status") == "True"
+        for condition in status.get("conditions") or []
+    )
+
+
+def _problems(pool: Pool) -> list[dict[str, Any]]:
+    return (pool.get("status") or {}).get("problems") or []
+
+
+async def _main(manifest: dict[str, Any]) -> None:
+    loop, task = asyncio.get_running_loop(), asyncio.current_task()
+    assert task is not None
+    # Kubernetes' way to interrupt; asyncio.run does the same for Ctrl-C.
+    loop.add_signal_handler(signal.SIGTERM, task.cancel)
+    cluster = Cluster(await load_configuration(), connections=1)
+    try:
+        await Smoke(cluster, manifest, lambda line: print(line, flush=True)).run()
+    finally:
+        await cluster.close()
+
+
+def main() -> None:
+    """Run the test of the manifest on the command line."""
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m fiber_operator.smoke MANIFEST (a FiberPool as a JSON document)")
+    try:
+        asyncio.run(_main(json.loads(sys.argv[1])))
+    except Failed as failure:
+        sys.exit(f"failed: {failure}")
+    except asyncio.CancelledError:
+        sys.exit("interrupted; the pool was deleted")
+
+
+if __name__ == "__main__":
+    main()

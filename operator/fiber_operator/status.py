@@ -1,0 +1,113 @@
+"""The status document.  Equal input gives an equal document, with no time that moves by itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fiber_api import names
+from fiber_api.names import ConditionType, Phase, Reason
+from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
+from fiber_operator import manifests
+from fiber_operator.conditions import Counts, Finding, Outlook, Truth, conditions, dated, phase
+from fiber_operator.documents import mapping, whole
+from fiber_operator.failures import Record
+from fiber_operator.pods import PodView
+
+
+def describe(
+    pool: FiberPool,
+    outlook: Outlook,
+    record: Record,
+    *,
+    address: str | None,
+    template_hash: str,
+    now: float,
+) -> FiberPoolStatus:
+    """The status that ``pool`` should have."""
+    before, counts, master = pool.status, outlook.counts, pool.spec.master
+    found = conditions(pool, outlook, now)
+    epoch = master.epoch if master else 0
+    return FiberPoolStatus(
+        observed_generation=pool.metadata.generation,
+        phase=phase(pool, found, outlook),
+        desired_replicas=counts.desired,
+        replicas=counts.live,
+        ready_replicas=counts.ready,
+        pending_replicas=counts.pending,
+        terminating_replicas=counts.terminating,
+        updated_replicas=counts.updated,
+        selector=manifests.selector(pool),
+        endpoint=f"{names.ENDPOINT_SCHEME}://{address}" if address else before.endpoint,
+        master=names.address_of(master.host, master.port) if master else None,
+        master_epoch=max(epoch, before.master_epoch or 0) or None,
+        credentials_secret=names.secret_name(pool.metadata.name),
+        template_hash=template_hash,
+        proven_template_hash=record.proven,
+        failures=record.failures(),
+        problems=outlook.problems,
+        conditions=found,
+    )
+
+
+def patch(pool: FiberPool, status: FiberPoolStatus) -> dict[str, Any] | None:
+    """What to write, whole, with None for what is to go; None if the pool says so already.
+
+    What could not be read in the old status is not known to be right and is written over.
+    """
+    if status == pool.status and not pool.unread:
+        return None
+    return status.model_dump(mode="json", by_alias=True)
+
+
+def describe_unreadable(
+    document: Mapping[str, Any], pods: Sequence[PodView], errors: Sequence[str], now: float
+) -> dict[str, Any] | None:
+    """The status of a pool whose spec cannot be understood: what it was, and what is wrong."""
+    before, unread = FiberPoolStatus.salvage(document.get("status") or {})
+    message = (
+        f"The operator cannot read this FiberPool: {'; '.join(errors)}. Correct what is named; "
+        "until then nothing is created or deleted."
+    )
+    generation = whole(mapping(document, "metadata").get("generation"))
+    kept = [c for c in before.conditions if c.type not in _TOLD]
+    told = [
+        dated(
+            Finding(kind, truth, Reason.INVALID_SPEC, message),
+            next((c for c in before.conditions if c.type == kind), None),
+            generation,
+            now,
+        )
+        for kind, truth in _TOLD.items()
+    ]
+    counts = Counts.of(pods, before.desired_replicas or 0, before.template_hash or "")
+    known = next((p for p in before.problems if p.reason == Reason.INVALID_SPEC), None)
+    problem = Problem(
+        reason=Reason.INVALID_SPEC,
+        severity="Error",
+        terminal=True,
+        since=(known.since if known else None) or float(math.floor(now)),
+        message=message,
+    )
+    after = before.model_copy(
+        update={
+            "observed_generation": generation,
+            "phase": Phase.FAILED,
+            "replicas": counts.live,
+            "ready_replicas": counts.ready,
+            "pending_replicas": counts.pending,
+            "terminating_replicas": counts.terminating,
+            "problems": (problem,),
+            "conditions": (*told, *kept),
+        }
+    )
+    if after == before and not unread:
+        return None
+    return after.model_dump(mode="json", by_alias=True)
+
+
+_TOLD: Mapping[ConditionType, Truth] = {
+    ConditionType.ACCEPTED: "False",
+    ConditionType.DEGRADED: "True",
+}

@@ -1,0 +1,94 @@
+"""The events of a plan: what it does, and what was not so when the status was last written."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from fiber_api.names import ConditionType, Reason
+from fiber_api.v1alpha1 import FiberPoolStatus
+from fiber_operator import wording
+from fiber_operator.failures import Account
+from fiber_operator.plans import Deletion, Event
+
+
+@dataclass(frozen=True)
+class Change:
+    """From one status to the next, and what is done between."""
+
+    before: FiberPoolStatus
+    after: FiberPoolStatus
+    account: Account
+    create: int
+    delete: Sequence[Deletion]
+
+
+def events(change: Change, *, told: bool) -> Iterator[Event]:
+    """What is done first; then, if the new status is ``told``, what is new in it."""
+    yield from _actions(change)
+    if told:
+        yield from _disruptions(change)
+        yield from _problems(change)
+        yield from _masters(change)
+
+
+_DELETIONS = {
+    Reason.RELEASED: "Deleting {n} that the master released",
+    Reason.SCALED_DOWN: "Deleting {n}: fewer are wanted",
+    Reason.REPLACED: "Deleting {n} of an older template",
+    Reason.COMPLETED: "Deleting {n} that had ended with exit code 0",
+    Reason.SUSPENDED: "Deleting {n}: the pool is suspended",
+}
+
+
+def _actions(change: Change) -> Iterator[Event]:
+    reasons = Counter(deletion.reason for deletion in change.delete)
+    for reason, said in _DELETIONS.items():
+        if number := reasons[reason]:
+            yield Event("Normal", reason, said.format(n=_workers(number)))
+    if change.create:
+        there, wanted = change.after.replicas, change.after.desired_replicas
+        message = f"Creating {_workers(change.create)}; {there} of {wanted} were there"
+        yield Event("Normal", Reason.SCALED_UP, message)
+
+
+def _disruptions(change: Change) -> Iterator[Event]:
+    disrupted = change.account.disrupted
+    if not disrupted:
+        return
+    pod = disrupted[-1]
+    others = f" and {len(disrupted) - 1} more" if len(disrupted) > 1 else ""
+    words = " ".join(filter(None, (pod.reason, pod.message))) or "somebody deleted it"
+    message = f"{pod.name}{others} ended through no fault of its own{wording.quoted(words)}"
+    yield Event("Normal", Reason.DISRUPTED, f"{message}. A new one takes its place at once")
+
+
+def _problems(change: Change) -> Iterator[Event]:
+    known = {(problem.reason, problem.severity) for problem in change.before.problems}
+    failed = {pod.name for pod in change.account.failed}
+    for problem in change.after.problems:
+        if (problem.reason, problem.severity) not in known or problem.pod in failed:
+            yield Event("Warning", problem.reason, problem.message)
+    if _degraded(change.before) == "True" and _degraded(change.after) == "False":
+        yield Event("Normal", Reason.RECOVERED, "What was wrong with the pool is so no more")
+
+
+def _masters(change: Change) -> Iterator[Event]:
+    before, after = change.before, change.after
+    if (before.master, before.master_epoch) == (after.master, after.master_epoch):
+        return
+    if after.master:
+        message = f"Workers dial the master at {after.master}, epoch {after.master_epoch}"
+    else:
+        message = "The master has left; the workers wait for the next"
+    yield Event("Normal", Reason.MASTER_CHANGED, message)
+
+
+def _degraded(status: FiberPoolStatus) -> str:
+    found = (c.status for c in status.conditions if c.type == ConditionType.DEGRADED)
+    return next(found, "Unknown")
+
+
+def _workers(number: int) -> str:
+    return "1 worker" if number == 1 else f"{number} workers"

@@ -1,0 +1,274 @@
+"""What problems say: what happened, in the cluster's own words; why; what to do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from fiber_api import names
+from fiber_api.names import Reason
+from fiber_api.times import format_time
+from fiber_api.v1alpha1 import FiberPool
+from fiber_operator.documents import items, mapping, text
+from fiber_operator.failures import Record
+from fiber_operator.plans import Refusal
+from fiber_operator.pods import PodView
+
+_SIGNALS = {4: "SIGILL", 6: "SIGABRT", 7: "SIGBUS", 8: "SIGFPE", 9: "SIGKILL", 11: "SIGSEGV"}
+_SIGNALS |= {1: "SIGHUP", 2: "SIGINT", 15: "SIGTERM"}
+
+
+def quoted(words: str) -> str:
+    """The cluster's words as the end of a clause."""
+    words = words.strip().rstrip(".")
+    return f": {words}" if words else ""
+
+
+# -- Pods that do not start
+
+_NOT_STARTING: Mapping[Reason, tuple[str, str]] = {
+    Reason.INVALID_IMAGE_NAME: (
+        "has an image name that is none",
+        "Correct the image in spec.template.",
+    ),
+    Reason.IMAGE_NEVER_PULL: (
+        "has an image that is not on its node, and imagePullPolicy Never forbids to fetch it",
+        "Load the image onto every node, or change imagePullPolicy in spec.template.",
+    ),
+    Reason.IMAGE_PULL_ERROR: (
+        "cannot get its image",
+        "If the image, its tag or the imagePullSecrets in spec.template are wrong, correct them; "
+        "if the registry is to blame, wait: the kubelet tries again by itself.",
+    ),
+    Reason.CONTAINER_CONFIG_ERROR: (
+        "has a container that cannot be configured",
+        "Create the Secret, ConfigMap or key that is missing, upon which the kubelet goes on by "
+        "itself, or correct spec.template.",
+    ),
+    Reason.CONTAINER_ERROR: (
+        "has a container that cannot be created",
+        "Correct spec.template if it is to blame; the kubelet tries again by itself.",
+    ),
+    Reason.RUN_CONTAINER_ERROR: (
+        "has a container that cannot be run",
+        "Correct the command in spec.template, or the image.",
+    ),
+    Reason.CONTAINER_FAILED: (
+        "has an init container that fails again and again",
+        "Look at its log with kubectl logs --container, and correct spec.template.",
+    ),
+}
+
+_ROOT = (
+    "Workers do not run as root unless the template says so. Give the image a numeric USER, or "
+    "set securityContext.runAsUser in spec.template, or runAsNonRoot: false there if it must be "
+    "root."
+)
+
+
+def not_starting(reason: Reason, pod: PodView) -> str:
+    """A pod that the kubelet cannot start."""
+    what, remedy = _NOT_STARTING[reason]
+    if wants_root(pod):
+        remedy = _ROOT
+    return f"{pod.name} {what}{quoted(_said(pod))}. {remedy}"
+
+
+def _said(pod: PodView) -> str:
+    return ": ".join(filter(None, (pod.reason, pod.message)))
+
+
+def wants_root(pod: PodView) -> bool:
+    """Whether it cannot start because it would be root."""
+    return "runAsNonRoot" in pod.message or "non-root" in pod.message
+
+
+def unschedulable(pod: PodView) -> str:
+    """A pod that no node takes."""
+    if pod.reason == "SchedulingGated":
+        return (
+            f"{pod.name} is held back by a scheduling gate{quoted(pod.message)}. What has set "
+            "schedulingGates, a queue for instance, must lift them."
+        )
+    return (
+        f"No node takes {pod.name}{quoted(pod.message)}. Add nodes, or wait for a cluster "
+        "autoscaler to do so, or ask for less in spec.template: resources, nodeSelector, affinity."
+    )
+
+
+def stuck(pod: PodView, warning: str) -> str:
+    """A pod whose status does not say why it does not start, and what its events say."""
+    return (
+        f"{pod.name} has a node but does not start{quoted(warning)}. Correct what is named "
+        "there; the kubelet goes on by itself."
+    )
+
+
+def late(pod: PodView, seconds: int) -> str:
+    """A pod that takes too long to start."""
+    return (
+        f"{pod.name} did not become ready in {seconds} s (failurePolicy.startupTimeoutSeconds). "
+        f"See what it waits for with kubectl describe pod {pod.name}, or allow it more time."
+    )
+
+
+def not_ready(pod: PodView) -> str:
+    """A pod that was ready."""
+    return (
+        f"{pod.name} was ready and is not any more{quoted(pod.message or pod.reason)}. If its "
+        "node is silent it is replaced when Kubernetes gives the node up; else see "
+        f"kubectl describe pod {pod.name}."
+    )
+
+
+# -- Pods that fail
+
+
+def failure(pool: FiberPool, record: Record, reason: Reason, pod: PodView) -> str:
+    """How a worker failed, when the next one comes, and its last lines."""
+    due = record.next_create_time
+    wait = f" No other is created before {format_time(due)}." if due else ""
+    own = pod.message and not _ended_by_node(pod) and reason != Reason.RUN_CONTAINER_ERROR
+    lines = f" Its last lines:\n{pod.message}" if own else ""
+    return f"{_ending(pool, reason, pod)}{wait}{lines}"
+
+
+def _ending(pool: FiberPool, reason: Reason, pod: PodView) -> str:
+    if reason == Reason.STARTUP_TIMEOUT:
+        return late(pod, pool.spec.failure_policy.startup_timeout_seconds)
+    if reason == Reason.OOM_KILLED:
+        limit = _memory_limit(pool)
+        return (
+            f"{pod.name} ran out of memory{f' (its limit is {limit})' if limit else ''} and was "
+            "killed. Raise resources.limits.memory in spec.template, or let a worker hold less."
+        )
+    if reason == Reason.COMPLETED:
+        return (
+            f"{pod.name} ended at once with exit code 0, without having worked. The container "
+            f"{pool.spec.worker_container!r} must run python -m fiber.agent: correct its command "
+            "in spec.template."
+        )
+    if reason == Reason.RUN_CONTAINER_ERROR:
+        return (
+            f"{pod.name} could not be run{quoted(_said(pod))}. Correct the command in "
+            "spec.template, or the image."
+        )
+    if _ended_by_node(pod):
+        return (
+            f"{pod.name} failed{quoted(_said(pod))}. See kubectl describe pod {pod.name}; correct "
+            "spec.template if it asks for what a node cannot give."
+        )
+    return f"{pod.name} {_exit(pod)}. See kubectl logs {pod.name} while the pod is kept."
+
+
+def _ended_by_node(pod: PodView) -> bool:
+    """Whether the message is the node's, not the worker's."""
+    return pod.exit_code is None or pod.reason == "Evicted"
+
+
+def _exit(pod: PodView) -> str:
+    code = pod.exit_code or 0
+    signal = _SIGNALS.get(code - 128)
+    cause = f"exited with code {code}" + (f" ({signal})" if signal else "")
+    after = f" after {pod.ran:.0f} s" if pod.ran else ""
+    special = "" if pod.reason in ("Error", "") else f", {pod.reason}"
+    return f"{cause}{after}{special}"
+
+
+def _memory_limit(pool: FiberPool) -> str:
+    containers = items(mapping(pool.spec.template, "spec").get("containers"))
+    limits: list[Any] = [
+        mapping(container, "resources", "limits").get("memory")
+        for container in containers
+        if container.get("name") == pool.spec.worker_container
+    ]
+    return text(limits[0]) if limits else ""
+
+
+def limit_exceeded(pool: FiberPool, record: Record, last: str) -> str:
+    """Nothing more is created."""
+    limit = pool.spec.failure_policy.backoff_limit
+    return (
+        f"{record.consecutive} failures in a row are more than failurePolicy.backoffLimit allows "
+        f"({limit}): no more workers are created until the spec changes. Correct the cause and "
+        "spec.template, or set spec.suspend and unset it to try again as it is. The last one: "
+        f"{last}"
+    )
+
+
+# -- What the API server refuses
+
+
+def refusal(reason: Reason, refused: Refusal) -> str:
+    """A pod that the API server does not take."""
+    what, remedy = _REFUSALS[reason]
+    # The pod that it names never was, and is called differently at each attempt.
+    words = _OF_THE_POD.sub("", refused.message)
+    return f"{what}{quoted(words)}. {remedy}"
+
+
+_OF_THE_POD = re.compile(r'^pods? "[^"]*" is (forbidden|invalid): ', re.IGNORECASE)
+
+
+_REFUSALS: Mapping[Reason, tuple[str, str]] = {
+    Reason.INVALID_TEMPLATE: (
+        "The API server refuses pods of this template",
+        "Correct spec.template; the running workers stay as they are.",
+    ),
+    Reason.QUOTA_EXCEEDED: (
+        "A quota of the namespace allows no more workers",
+        "Lower replicas or what a worker asks for, or raise the ResourceQuota; the operator tries "
+        "again by itself.",
+    ),
+    Reason.FORBIDDEN: (
+        "The API server forbids pods of this template",
+        "Correct what it names: the spec.template, the policy of the namespace, or the rights of "
+        "the operator. The running workers stay as they are.",
+    ),
+}
+
+
+# -- The pool
+
+
+def master_lost(pool: FiberPool, since: float, holder: str) -> str:
+    """A Lease that is not renewed."""
+    master = pool.spec.master
+    assert master is not None
+    who = f" by {holder}" if holder else ""
+    end = format_time(since + master.lost_grace_seconds)
+    return (
+        f"The Lease {master.lease_name} was not renewed{who} for {master.lease_duration_seconds} "
+        f"s: the master at {names.address_of(master.host, master.port)} (epoch {master.epoch}) "
+        f"has ended or cannot reach the API server. {_FATE[master.on_lost].format(end=end)} "
+        "Start it again to go on with this pool."
+    )
+
+
+_FATE = {
+    "Delete": "onLost is Delete: the pool is deleted at {end} unless it comes back.",
+    "ScaleToMin": "onLost is ScaleToMin: the pool goes back to minReplicas at {end} unless it "
+    "comes back.",
+    "Retain": "onLost is Retain: the workers stay and wait.",
+}
+
+
+def wrong_family(pool: FiberPool, address: str) -> str:
+    """A master that the Service cannot lead to."""
+    master = pool.spec.master
+    assert master is not None
+    return (
+        f"The master's address {master.host} and the pool's Service ({address}) are not of the "
+        "same IP family, so that no worker can reach the master. Let the master listen at an "
+        "address of the Service's family and write that in spec.master.host."
+    )
+
+
+def foreign_releases(pool: FiberPool, foreign: list[str]) -> str:
+    """Names that can be no pods of the pool."""
+    return (
+        f"spec.scaleDown.release names what is no worker of this pool: {', '.join(foreign[:3])}. "
+        "Nothing is deleted for these. Workers are called "
+        f"{pool.metadata.name}-<{names.POD_SUFFIX_LENGTH} hexadecimal digits>."
+    )

@@ -1,0 +1,238 @@
+"""The queue between what happens and who looks at it: each pool at most once in it.
+
+However many events name a pool, it waits in the queue once and is worked on by one task at a time;
+what is added meanwhile makes one more turn afterwards.  Three things space the turns of one pool:
+
+* after a turn it rests as long as the turn's result says, whatever happens;
+* events of pods wait until ``GAP`` seconds after the last turn, so that a thousand events of a
+  pool that is growing are a few turns;
+* a turn that failed is repeated after a while that doubles each time.
+
+Runs in one event loop and reads its clock; nothing here is called from another thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+import logging
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from fiber_operator.logs import about
+
+GAP = 0.5
+"""Seconds between turns that only pods' events asked for: they show in the status within a second,
+and a pool that grows by fifty pods a second costs two lists a second."""
+FIRST_BACKOFF = 0.5
+LONGEST_BACKOFF = 30.0
+LONGEST_BLOCK = 1.0
+"""Seconds for which a failure keeps even new events out."""
+
+log = logging.getLogger(__name__)
+
+
+class Key(NamedTuple):
+    """A pool's place; who has the name may change."""
+
+    namespace: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What came out of one look at a pool."""
+
+    again: float | None = None
+    """Look again after this many seconds though nothing happens."""
+    rest: float = 0.0
+    """Do not look again for this many seconds whatever happens."""
+    failed: bool = False
+    """Look again soon, and later each time."""
+    forget: bool = False
+    """There is no such pool."""
+
+
+@dataclass
+class _Entry:
+    due: float | None = None
+    """When it wants its turn; None: it does not wait."""
+    finished: float = -1e9
+    blocked: float = -1e9
+    """No turn before this time."""
+    failures: int = 0
+    running: float | None = None
+    """Since when."""
+    rush: bool = False
+    """Whether what was added while it ran is urgent."""
+    order: int = -1
+    """Of its place in the heap; places of other orders are void."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """The queue at one moment."""
+
+    waiting: int
+    """Pools whose turn is due and that wait for a free task."""
+    running: int
+    known: int
+    longest_wait: float
+    """Seconds that the one that waits longest is overdue."""
+    longest_run: float
+    """Seconds that the longest turn takes so far."""
+    since_last_end: float
+    """Seconds since a turn ended, or since the queue was made."""
+
+
+class Queue:
+    """Gives each pool its turns.  ``turn`` is awaited once at a time for a pool."""
+
+    def __init__(self, turn: Callable[[Key], Awaitable[Turn]], *, concurrency: int) -> None:
+        self._turn = turn
+        self._concurrency = concurrency
+        self._entries: dict[Key, _Entry] = {}
+        self._heap: list[tuple[float, int, Key]] = []
+        self._orders = itertools.count()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._wake = asyncio.Event()
+        self._last_end = self._now()
+
+    def add(self, key: Key, *, delay: float = 0.0, urgent: bool = False) -> None:
+        """Give ``key`` a turn: after ``delay`` seconds, ``GAP`` after its last, or if urgent now.
+
+        A turn that it waits for already is brought forward if need be, never put off.
+        """
+        now = self._now()
+        entry = self._entries.setdefault(key, _Entry())
+        due = max(now + delay, entry.blocked)
+        if not urgent:
+            due = max(due, entry.finished + GAP)
+        elif entry.running is not None:
+            entry.rush = True
+        if entry.due is None or due < entry.due:
+            self._place(key, entry, due)
+
+    async def run(self) -> None:
+        """Give turns until cancelled; then end those under way."""
+        try:
+            while True:
+                self._wake.clear()
+                self._start_due()
+                await self._sleep()
+        finally:
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def drain(self, grace: float) -> None:
+        """Start no turn any more and give those under way ``grace`` seconds to end."""
+        self._concurrency = 0
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=grace)
+
+    async def idle(self) -> None:
+        """Wait until no turn is under way or due.  Turns in the future do not count."""
+        while self._tasks or self.statistics().waiting:
+            await asyncio.wait(self._tasks) if self._tasks else await asyncio.sleep(0)
+
+    def statistics(self) -> Statistics:
+        """The queue now."""
+        now = self._now()
+        overdue = [
+            now - entry.due
+            for entry in self._entries.values()
+            if entry.due is not None and entry.due <= now and entry.running is None
+        ]
+        runs = [
+            now - entry.running for entry in self._entries.values() if entry.running is not None
+        ]
+        return Statistics(
+            waiting=len(overdue),
+            running=len(runs),
+            known=len(self._entries),
+            longest_wait=max(overdue, default=0.0),
+            longest_run=max(runs, default=0.0),
+            since_last_end=now - self._last_end,
+        )
+
+    def known(self) -> list[Key]:
+        """Every pool that was added and not found to be gone."""
+        return list(self._entries)
+
+    def _now(self) -> float:
+        return asyncio.get_running_loop().time()
+
+    def _place(self, key: Key, entry: _Entry, due: float) -> None:
+        entry.due, entry.order = due, next(self._orders)
+        if entry.running is None:
+            heapq.heappush(self._heap, (due, entry.order, key))
+            self._wake.set()
+
+    def _next(self) -> tuple[float, Key] | None:
+        """The first place in the heap that is not void."""
+        while self._heap:
+            due, order, key = self._heap[0]
+            entry = self._entries.get(key)
+            if entry is not None and entry.order == order:
+                return due, key
+            heapq.heappop(self._heap)
+        return None
+
+    def _start_due(self) -> None:
+        now = self._now()
+        while len(self._tasks) < self._concurrency and (first := self._next()):
+            due, key = first
+            if due > now:
+                return
+            heapq.heappop(self._heap)
+            entry = self._entries[key]
+            entry.due, entry.order, entry.running, entry.rush = None, -1, now, False
+            task = asyncio.create_task(self._take(key, entry), name=f"turn of {key}")
+            self._tasks.add(task)
+            task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        self._wake.set()
+
+    async def _sleep(self) -> None:
+        first = self._next() if len(self._tasks) < self._concurrency else None
+        timeout = None if first is None else max(0.0, first[0] - self._now())
+        try:
+            async with asyncio.timeout(timeout):
+                await self._wake.wait()
+        except TimeoutError:
+            pass  # the first one in the heap is due
+
+    async def _take(self, key: Key, entry: _Entry) -> None:
+        try:
+            turn = await self._turn(key)
+        except Exception:
+            # A fault of this program must not end it: other pools work, and this one may again.
+            log.exception("a turn failed", extra=about(*key, reason="InternalError"))
+            turn = Turn(failed=True)
+        finally:
+            entry.running, entry.finished = None, self._now()
+            self._last_end = entry.finished
+        self._settle(key, entry, turn)
+
+    def _settle(self, key: Key, entry: _Entry, turn: Turn) -> None:
+        now = entry.finished
+        wanted = entry.due is not None  # added while it ran
+        if turn.forget and not wanted:
+            del self._entries[key]
+            return
+        entry.failures = entry.failures + 1 if turn.failed else 0
+        entry.blocked = now + turn.rest
+        again = turn.again
+        if turn.failed:
+            again = min(LONGEST_BACKOFF, FIRST_BACKOFF * 2 ** min(entry.failures - 1, 10))
+            entry.blocked = max(entry.blocked, now + min(again, LONGEST_BLOCK))
+        if entry.due is not None:
+            rested = entry.blocked if entry.rush else max(entry.blocked, now + GAP)
+            self._place(key, entry, max(entry.due, rested))
+        if again is not None:
+            self.add(key, delay=again, urgent=True)

@@ -1,0 +1,79 @@
+"""Sending back what was defined in a ``__main__`` that travels by value.
+
+What a notebook, ``python -c`` or a script defines reaches workers that cannot import it by value,
+through cloudpickle.  It must not come back so: the program would get copies of its own classes,
+which ``isinstance`` and ``except`` do not know.  So classes and functions of ``__main__`` go back
+by name, and the program finds its own.
+"""
+
+from __future__ import annotations
+
+import io
+import operator
+import pickle
+import sys
+from collections import ChainMap
+from collections.abc import Callable
+from multiprocessing.reduction import ForkingPickler
+from types import FunctionType
+from typing import Any, ClassVar, cast
+
+
+def dumps(
+    obj: Any,
+    protocol: int | None = None,
+    buffer_callback: Callable[[pickle.PickleBuffer], Any] | None = None,
+) -> bytes:
+    """Pickle ``obj`` for the program whose ``__main__`` came here by value."""
+    file = io.BytesIO()
+    _pickler()(file, protocol or pickle.DEFAULT_PROTOCOL, buffer_callback=buffer_callback).dump(obj)
+    return file.getvalue()
+
+
+def find(name: str, mark: str | None) -> Any:
+    """What ``__main__`` calls ``name``.
+
+    Here, or in a process between here and there, it may have come by value itself: then it is what
+    cloudpickle knows by ``mark``.
+    """
+    if mark is not None and (known := _marked().get(mark)) is not None:
+        return known
+    try:
+        return operator.attrgetter(name)(sys.modules["__main__"])
+    except AttributeError:
+        raise AttributeError(
+            f"a task returned or raised an object of __main__.{name}, which this program does not "
+            "have: define it where the pool is, or in a module that both can import"
+        ) from None
+
+
+def _pickler() -> Any:
+    import cloudpickle
+
+    class ByName(cloudpickle.Pickler):  # type: ignore[misc]
+        dispatch_table: ClassVar[Any] = ChainMap(
+            cast("Any", ForkingPickler)._extra_reducers, cloudpickle.Pickler.dispatch_table
+        )
+
+        def reducer_override(self, obj: Any) -> Any:
+            if isinstance(obj, type | FunctionType) and obj.__module__ == "__main__":
+                mark = _mark(obj)
+                if mark is not None or "<" not in obj.__qualname__:
+                    return find, (obj.__qualname__, mark)
+            return super().reducer_override(obj)
+
+    return ByName
+
+
+def _mark(obj: Any) -> str | None:
+    """What cloudpickle calls a class that came by value, in every process that it came through."""
+    from cloudpickle import cloudpickle
+
+    marks = getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_CLASS", {})
+    return marks.get(obj) if isinstance(obj, type) else None
+
+
+def _marked() -> Any:
+    from cloudpickle import cloudpickle
+
+    return getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_ID", {})

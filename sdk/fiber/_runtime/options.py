@@ -1,0 +1,100 @@
+"""What a person may pass as the options of a pool: checked once, and named when it is wrong."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Sequence
+from typing import Any
+
+from fiber import config, cpu
+
+LARGEST_CHUNK = 2**32 - 1
+"""What a message can say; more than anybody has."""
+
+
+def whole(name: str, value: Any) -> int:
+    """``value`` as an int.  True and False are none."""
+    if isinstance(value, bool) or not hasattr(type(value), "__index__"):
+        raise TypeError(f"{name} must be a whole number, not {value!r}")
+    return operator.index(value)
+
+
+def seconds(name: str, value: Any) -> float | None:
+    """``value`` as a number of seconds; None, as is infinity, for no limit."""
+    if value is None:
+        return None
+    kind = type(value)
+    if kind is bool or not (hasattr(kind, "__float__") or hasattr(kind, "__index__")):
+        raise TypeError(f"{name} must be a number of seconds or None, not {value!r}")
+    number = float(value)
+    if not number > 0:
+        raise ValueError(f"{name} must be a number of seconds above 0, not {value!r}")
+    return None if number == math.inf else number
+
+
+def sizes(processes: int | None, low: int | None, high: int | None) -> tuple[int, int]:
+    """Smallest and largest number of workers."""
+    if low is None and high is None:
+        count = cpu.cpu_count() if processes is None else whole("processes", processes)
+        if count < 1:
+            raise ValueError("Number of processes must be at least 1")
+        return count, count
+    if processes is not None:
+        raise ValueError(
+            "processes= is a fixed number of workers: give it, or min_workers= and max_workers="
+        )
+    low = 1 if low is None else whole("min_workers", low)
+    high = max(low, cpu.cpu_count()) if high is None else whole("max_workers", high)
+    if not 0 <= low <= high or high < 1:
+        raise ValueError(
+            f"min_workers={low} and max_workers={high}: expected 0 <= min_workers <= max_workers, "
+            "and max_workers >= 1"
+        )
+    return low, high
+
+
+def max_tasks(value: Any) -> int | None:
+    """Tasks that a worker may run."""
+    if value is not None and (not isinstance(value, int) or value <= 0):
+        raise ValueError(f"maxtasksperchild must be a positive int or None, not {value!r}")
+    return value
+
+
+def retries(value: Any) -> int:
+    """Times that a task may run again; None: as configured."""
+    if value is None:
+        return config.current().retries
+    count = whole("retries", value)
+    if count < 0:
+        raise ValueError(f"retries must be a whole number of at least 0, not {value!r}")
+    return count
+
+
+def exceptions(
+    wanted: type[BaseException] | Sequence[type[BaseException]],
+) -> tuple[type[BaseException], ...]:
+    """Classes of exceptions, from one or several."""
+    classes: tuple[Any, ...] = (wanted,) if isinstance(wanted, type) else tuple(wanted)
+    for cls in classes:
+        if not (isinstance(cls, type) and issubclass(cls, BaseException)):
+            raise TypeError(f"retry_exceptions must be exception classes, not {cls!r}")
+    return classes
+
+
+def chunksize(value: Any) -> int:
+    """Items that travel together."""
+    size = whole("chunksize", value)
+    if size < 1:
+        raise ValueError(f"Chunksize must be 1+, not {value!r}")
+    return min(size, LARGEST_CHUNK)
+
+
+def buffersize(value: Any) -> int | None:
+    """Items to read ahead."""
+    if value is None:
+        return None
+    size = whole("buffersize", value)
+    if size < 1:
+        raise ValueError(f"buffersize must be 1+, not {value!r}")
+    return size

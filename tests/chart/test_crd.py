@@ -1,0 +1,36 @@
+"""The resource type: made from the models, upgraded with the release, never removed by it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from chart.helm import Helm, is_hook, kinds, named
+
+GENERATED = Path(__file__).resolve().parents[2] / "crds" / "fiberpools.yaml"
+
+
+@pytest.fixture
+def generated() -> dict[str, Any]:
+    document: dict[str, Any] = yaml.safe_load(GENERATED.read_text(encoding="utf-8"))
+    return document
+
+
+def test_it_is_the_generated_one(helm: Helm, generated: dict[str, Any]) -> None:
+    rendered = named(helm.render(), "CustomResourceDefinition")
+    assert rendered["metadata"]["name"] == generated["metadata"]["name"]
+    assert rendered["spec"] == generated["spec"]
+
+
+def test_an_upgrade_brings_it_up_to_date_and_nothing_removes_it(helm: Helm) -> None:
+    """Helm leaves alone what is in a folder crds, and removes what has no such policy."""
+    rendered = named(helm.render(), "CustomResourceDefinition")
+    assert rendered["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
+    assert not is_hook(rendered)
+
+
+def test_it_can_be_left_to_others(helm: Helm) -> None:
+    assert "CustomResourceDefinition" not in kinds(helm.render({"crds": {"install": False}}))

@@ -1,0 +1,173 @@
+"""The operator's pod: hardened, probed, one at a time, and set up as its values say."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+import fiber
+from chart.helm import Helm, Manifest, is_hook, named
+from chart.test_scope import environment
+from fiber_api.names import MAX_POOL_NAME
+from fiber_operator.settings import Settings
+
+
+def pod_spec(manifests: list[Manifest]) -> dict[str, Any]:
+    spec: dict[str, Any] = named(manifests, "Deployment")["spec"]["template"]["spec"]
+    return spec
+
+
+def images(manifests: list[Manifest]) -> set[str]:
+    """The images of the operator and of the helm test; they are one."""
+    test = named([manifest for manifest in manifests if is_hook(manifest)], "Pod")["spec"]
+    return {spec["containers"][0]["image"] for spec in (pod_spec(manifests), test)}
+
+
+def test_two_never_run_at_once(helm: Helm) -> None:
+    spec = named(helm.render(), "Deployment")["spec"]
+    assert spec["replicas"] == 1
+    assert spec["strategy"] == {"type": "Recreate"}
+
+
+def test_every_pod_passes_the_restricted_standard(helm: Helm) -> None:
+    manifests = helm.render()
+    for spec in (pod_spec(manifests), named(manifests, "Pod")["spec"]):
+        assert spec["securityContext"] == {
+            "runAsNonRoot": True,
+            "seccompProfile": {"type": "RuntimeDefault"},
+        }
+        (container,) = spec["containers"]
+        assert container["securityContext"] == {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        }
+        assert container["volumeMounts"] == [{"name": "tmp", "mountPath": "/tmp"}]
+        assert "sizeLimit" in spec["volumes"][0]["emptyDir"]
+        assert container["resources"]["limits"]["memory"]
+
+
+def test_probes_ask_the_port_where_the_operator_listens(helm: Helm) -> None:
+    manifests = helm.render({"metrics": {"port": 9000}})
+    (container,) = pod_spec(manifests)["containers"]
+    assert Settings.from_environment(environment(manifests)).port == 9000
+    assert container["ports"] == [{"name": "metrics", "containerPort": 9000, "protocol": "TCP"}]
+    probes = ("startup", "liveness", "readiness")
+    paths = {probe: container[f"{probe}Probe"]["httpGet"] for probe in probes}
+    assert paths == {
+        "startup": {"path": "/healthz", "port": "metrics"},
+        "liveness": {"path": "/healthz", "port": "metrics"},
+        "readiness": {"path": "/readyz", "port": "metrics"},
+    }
+    assert named(manifests, "Service")["spec"]["ports"][0]["targetPort"] == "metrics"
+
+
+def test_the_chart_says_no_other_settings_than_the_operator_would_choose(helm: Helm) -> None:
+    """The defaults of the two are written down in two places, and agree."""
+    chosen = Settings.from_environment(environment(helm.render()))
+    own = Settings()
+    for name in (
+        "namespaces",
+        "host",
+        "port",
+        "lease_seconds",
+        "resync_seconds",
+        "concurrency",
+        "connections",
+        "log_level",
+        "log_format",
+    ):
+        assert getattr(chosen, name) == getattr(own, name)
+
+
+def test_every_setting_arrives(helm: Helm) -> None:
+    values = {
+        "logLevel": "DEBUG",
+        "logFormat": "text",
+        "resyncSeconds": 30,
+        "concurrency": 3,
+        "connections": 5,
+        "leaseSeconds": 20,
+    }
+    settings = Settings.from_environment(environment(helm.render({"operator": values})))
+    assert (settings.log_level, settings.log_format) == ("DEBUG", "text")
+    assert (settings.resync_seconds, settings.lease_seconds) == (30, 20)
+    assert (settings.concurrency, settings.connections) == (3, 5)
+
+
+def test_the_version_is_the_projects(helm: Helm) -> None:
+    assert images(helm.render()) == {f"fiber-operator:{fiber.__version__}"}
+
+
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [
+        ({"tag": "1.2"}, "fiber-operator:1.2"),
+        ({"repository": "r.example:5000/x/f", "tag": "1"}, "r.example:5000/x/f:1"),
+        ({"digest": "sha256:" + "a" * 64, "tag": "1.2"}, "fiber-operator@sha256:" + "a" * 64),
+    ],
+)
+def test_images_by_tag_and_by_digest(helm: Helm, image: dict[str, str], expected: str) -> None:
+    assert images(helm.render({"image": image})) == {expected}
+
+
+def test_where_pods_run_holds_for_the_test_too(helm: Helm) -> None:
+    placement = {
+        "nodeSelector": {"disk": "ssd"},
+        "tolerations": [{"key": "dedicated", "operator": "Exists"}],
+        "imagePullSecrets": [{"name": "registry"}],
+        "affinity": {
+            "nodeAffinity": {
+                "requiredDuringSchedulingIgnoredDuringExecution": {
+                    "nodeSelectorTerms": [
+                        {"matchExpressions": [{"key": "zone", "operator": "In", "values": ["a"]}]}
+                    ]
+                }
+            }
+        },
+    }
+    manifests = helm.render({**placement, "priorityClassName": "high"})
+    for spec in (pod_spec(manifests), named(manifests, "Pod")["spec"]):
+        assert {name: spec[name] for name in placement} == placement
+    assert pod_spec(manifests)["priorityClassName"] == "high"
+
+
+def test_labels_follow_the_conventions(helm: Helm) -> None:
+    manifests = helm.render({"commonLabels": {"team": "rl"}, "podLabels": {"mesh": "off"}})
+    for manifest in manifests:
+        labels = manifest["metadata"]["labels"]
+        assert labels["app.kubernetes.io/instance"] == "fiber"
+        assert labels["app.kubernetes.io/managed-by"] == "Helm"
+        assert labels["team"] == "rl"
+    deployment = named(manifests, "Deployment")["spec"]
+    pod_labels = deployment["template"]["metadata"]["labels"]
+    assert deployment["selector"]["matchLabels"].items() <= pod_labels.items()
+    assert pod_labels["mesh"] == "off"
+    test_labels = named(manifests, "Pod")["metadata"]["labels"]
+    assert not deployment["selector"]["matchLabels"].items() <= test_labels.items()
+
+
+@pytest.mark.parametrize(
+    ("release", "expected"),
+    [
+        ("fiber", "fiber-fiber-operator"),
+        ("fiber-operator", "fiber-operator"),
+        ("x" * 53, "x" * 44),
+    ],
+)
+def test_names_fit(helm: Helm, release: str, expected: str) -> None:
+    manifests = helm.render(release=release)
+    assert named(manifests, "Deployment")["metadata"]["name"] == expected
+    names = [str(manifest["metadata"]["name"]) for manifest in manifests]
+    assert max(len(name.rpartition(":")[2]) for name in names) <= 63
+    pool = json.loads(named(manifests, "Pod")["spec"]["containers"][0]["args"][0])
+    assert len(pool["metadata"]["name"]) <= MAX_POOL_NAME
+
+
+def test_a_name_of_ones_own(helm: Helm) -> None:
+    manifests = helm.render({"fullnameOverride": "mine", "nameOverride": "other"})
+    deployment = named(manifests, "Deployment")
+    assert deployment["metadata"]["name"] == "mine"
+    assert deployment["spec"]["selector"]["matchLabels"]["app.kubernetes.io/name"] == "other"

@@ -1,0 +1,199 @@
+"""Alerts and panels ask for metrics and labels that the operator exports."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from chart.helm import CHART, NAMESPACE, Helm, Manifest, kinds, named
+from fiber_operator.metrics import Metrics, PoolSample
+from fiber_operator.worker import Key, Statistics
+
+ON: dict[str, Any] = {
+    "metrics": {
+        "serviceMonitor": {"create": True, "labels": {"release": "prometheus"}},
+        "prometheusRule": {"create": True},
+        "dashboard": {"create": True},
+    }
+}
+# What Prometheus itself adds.
+TARGET_LABELS = {"namespace", "job", "instance", "le"}
+
+
+@functools.cache
+def exported() -> dict[str, set[str]]:
+    """Each series that an operator exports, with its labels."""
+    metrics = Metrics()
+    empty = Statistics(**{field.name: 0 for field in dataclasses.fields(Statistics)})
+    metrics.watch_queue(lambda: empty, lambda: True)
+    metrics.pools[Key("ns", "a")] = PoolSample(1, {"ready": 1}, {"Unschedulable": 1}, 1, 1)
+    metrics.reconciled("ok", 0.1)
+    metrics.requested("get", "pods", "200", 0.1)
+    metrics.created(1)
+    metrics.deleted("Released")
+    metrics.watched("pods")
+    metrics.watch_restarted()
+    series: dict[str, set[str]] = {}
+    for family in text_string_to_metric_families(metrics.render().decode()):
+        for sample in family.samples:
+            series.setdefault(sample.name, set()).update(sample.labels)
+    return series
+
+
+def dashboard() -> dict[str, Any]:
+    text = (CHART / "files" / "dashboard.json").read_text(encoding="utf-8")
+    document: dict[str, Any] = json.loads(text)
+    return document
+
+
+def queries() -> list[str]:
+    """Every query of every panel."""
+    panels = [panel for panel in dashboard()["panels"] if panel["type"] != "row"]
+    return [target["expr"] for panel in panels for target in panel["targets"]]
+
+
+def alerts(manifests: list[Manifest]) -> dict[str, dict[str, Any]]:
+    (group,) = named(manifests, "PrometheusRule")["spec"]["groups"]
+    return {rule["alert"]: rule for rule in group["rules"]}
+
+
+def asked(query: str) -> Iterator[tuple[str, str]]:
+    """The series of a query, each with the text of its selector."""
+    for found in re.finditer(r"\b((?:fiber|process)_\w+)(\{[^}]*\})?", query):
+        yield found[1], found[2] or ""
+
+
+def labels(query: str) -> set[str]:
+    """The labels that a query selects or groups by."""
+    grouped = re.findall(r"(?:by|on) \(([^)]*)\)", query)
+    selected = re.findall(r"(\w+)(?:=~|!~|!=|=)\"", query)
+    return {label.strip() for group in grouped for label in group.split(",")} | set(selected)
+
+
+def check(query: str) -> None:
+    """The series and labels of the query exist."""
+    series = exported()
+    found = [name for name, _ in asked(query)]
+    assert found, query
+    assert set(found) <= series.keys(), query
+    assert labels(query) <= set().union(*(series[name] for name in found)) | TARGET_LABELS, query
+
+
+def test_panels_ask_for_what_is_exported() -> None:
+    for query in queries():
+        check(query)
+
+
+def test_everything_that_is_exported_has_a_panel() -> None:
+    shown = {name.removesuffix("_bucket") for query in queries() for name, _ in asked(query)}
+    # The client adds to each counter when it began.
+    ours = {name for name in exported() if re.match(r"fiber_(?!.*_created$)", name)}
+    suffix = re.compile(r"_(bucket|sum|count)$")
+    assert {suffix.sub("", name) for name in ours} - shown == set()
+
+
+def test_panels_are_laid_out_and_numbered() -> None:
+    panels = dashboard()["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    cells = [
+        (x, y)
+        for panel in panels
+        for x in range(panel["gridPos"]["x"], panel["gridPos"]["x"] + panel["gridPos"]["w"])
+        for y in range(panel["gridPos"]["y"], panel["gridPos"]["y"] + panel["gridPos"]["h"])
+    ]
+    assert len(set(cells)) == len(cells)
+    assert max(x for x, _ in cells) < 24
+    assert all(panel.get("description") for panel in panels if panel["type"] != "row")
+
+
+def test_the_config_map_holds_the_dashboard(helm: Helm) -> None:
+    config = named(helm.render(ON), "ConfigMap")
+    assert config["metadata"]["labels"]["grafana_dashboard"] == "1"
+    assert json.loads(config["data"]["fiber-operator.json"]) == dashboard()
+
+
+def test_alerts_ask_for_what_is_exported(helm: Helm) -> None:
+    for rule in alerts(helm.render(ON)).values():
+        check(rule["expr"])
+
+
+def test_alerts_look_where_the_service_monitor_puts_the_metrics(helm: Helm) -> None:
+    manifests = helm.render(ON)
+    job = named(manifests, "Service")["metadata"]["name"]
+    for rule in alerts(manifests).values():
+        assert all(f'job="{job}"' in selector for _, selector in asked(rule["expr"]))
+    down = alerts(manifests)["FiberOperatorDown"]["expr"]
+    selector = f'namespace="{NAMESPACE}",job="{job}"'
+    assert down == f"absent(fiber_operator_lease_held{{{selector}}} == 1)"
+
+
+def test_alerts_say_what_to_do_and_are_explained(helm: Helm) -> None:
+    readme = (CHART / "README.md").read_text(encoding="utf-8")
+    for name, rule in alerts(helm.render(ON)).items():
+        assert "kubectl --namespace" in rule["annotations"]["description"]
+        assert rule["labels"]["severity"] in ("warning", "critical")
+        assert rule["for"]
+        assert f"`{name}`" in readme
+
+
+def test_the_pool_alert_names_the_pool(helm: Helm) -> None:
+    rule = alerts(helm.render(ON))["FiberPoolDegraded"]
+    assert (
+        "{{ $labels.namespace }} describe fiberpool {{ $labels.pool }}"
+        in (rule["annotations"]["description"])
+    )
+
+
+def test_the_service_monitor_finds_the_service(helm: Helm) -> None:
+    manifests = helm.render(ON)
+    monitor = named(manifests, "ServiceMonitor")
+    service = named(manifests, "Service")
+    assert monitor["metadata"]["labels"]["release"] == "prometheus"
+    wanted = monitor["spec"]["selector"]["matchLabels"].items()
+    assert wanted <= service["metadata"]["labels"].items()
+    (endpoint,) = monitor["spec"]["endpoints"]
+    assert endpoint["port"] == service["spec"]["ports"][0]["name"]
+    assert endpoint["honorLabels"] is True
+
+
+def test_the_service_finds_the_operator_and_not_the_test(helm: Helm) -> None:
+    manifests = helm.render()
+    selector = named(manifests, "Service")["spec"]["selector"].items()
+    operator = named(manifests, "Deployment")["spec"]["template"]["metadata"]["labels"]
+    assert selector <= operator.items()
+    assert not selector <= named(manifests, "Pod")["metadata"]["labels"].items()
+
+
+def test_none_of_it_is_there_unless_asked_for(helm: Helm) -> None:
+    usual = kinds(helm.render())
+    assert set(usual).isdisjoint({"ServiceMonitor", "PrometheusRule", "ConfigMap"})
+    assert "Service" not in kinds(helm.render({"metrics": {"service": {"create": False}}}))
+
+
+@pytest.mark.parametrize("peers", [[], [{"podSelector": {"matchLabels": {"app": "prometheus"}}}]])
+def test_the_network_policy_leaves_only_what_the_operator_needs(
+    helm: Helm, peers: list[dict[str, Any]]
+) -> None:
+    api = {"cidrs": ["10.0.0.1/32"], "ports": [6443]}
+    values = {"networkPolicy": {"create": True, "metricsFrom": peers, "apiServer": api}}
+    manifests = helm.render(values)
+    spec = named(manifests, "NetworkPolicy")["spec"]
+    operator = named(manifests, "Deployment")["spec"]["template"]["metadata"]["labels"]
+    assert spec["podSelector"]["matchLabels"].items() <= operator.items()
+    assert sorted(spec["policyTypes"]) == ["Egress", "Ingress"]
+    (incoming,) = spec["ingress"]
+    assert incoming["ports"] == [{"port": "metrics", "protocol": "TCP"}]
+    assert incoming.get("from", []) == peers
+    to_api, to_dns = spec["egress"]
+    assert to_api == {
+        "ports": [{"port": 6443, "protocol": "TCP"}],
+        "to": [{"ipBlock": {"cidr": "10.0.0.1/32"}}],
+    }
+    assert {entry["port"] for entry in to_dns["ports"]} == {53}

@@ -1,0 +1,55 @@
+"""What a person reads after the installation can be done as it stands there."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+import yaml
+
+import fiber
+from chart.helm import NAMESPACE, Helm, named
+
+TWO: dict[str, Any] = {"scope": "namespaced", "namespaces": ["team-a", "team-b"]}
+
+
+def pasted(notes: str) -> dict[str, Any]:
+    """The manifest between the lines that a shell reads as a document."""
+    found = re.search(r"^kubectl apply -f - <<'END'\n(.*?)^END$", notes, re.M | re.S)
+    assert found, notes
+    manifest: dict[str, Any] = yaml.safe_load(found[1])
+    return manifest
+
+
+@pytest.mark.parametrize(
+    ("values", "namespace"), [({}, NAMESPACE), (TWO, "team-a")], ids=["cluster", "two"]
+)
+def test_the_manifest_is_for_a_namespace_that_is_watched(
+    helm: Helm, values: dict[str, Any], namespace: str
+) -> None:
+    manifest = pasted(helm.notes(values))
+    assert (manifest["kind"], manifest["metadata"]["name"]) == ("FiberPool", "first")
+    assert manifest["metadata"]["namespace"] == namespace
+    (worker,) = manifest["spec"]["template"]["spec"]["containers"]
+    assert worker["image"] == f"fiber-worker:{fiber.__version__}"
+    assert f"kubectl --namespace {namespace} get fiberpools --watch" in helm.notes(values)
+
+
+def test_the_commands_name_what_is_installed(helm: Helm) -> None:
+    notes = helm.notes()
+    name = named(helm.render(), "Deployment")["metadata"]["name"]
+    assert f"kubectl --namespace {NAMESPACE} logs deployment/{name}" in notes
+    assert f"helm test fiber --namespace {NAMESPACE} --logs" in notes
+
+
+def test_it_says_what_is_watched(helm: Helm) -> None:
+    assert helm.notes().startswith("The Fiber operator watches all namespaces.")
+    assert "watches the namespaces team-a, team-b, and no other." in helm.notes(TWO)
+
+
+def test_it_says_what_was_left_to_others(helm: Helm) -> None:
+    notes = helm.notes({"rbac": {"create": False}, "crds": {"install": False}})
+    assert "gives ServiceAccount fiber-fiber-operator the" in notes
+    assert "kubectl get crd fiberpools.fiber.dev" in notes
+    assert "helm test" not in notes

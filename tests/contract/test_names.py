@@ -1,0 +1,120 @@
+"""What things are called, and how long that may get."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fiber_api import names
+
+POOLS = st.from_regex(rf"\A{names.POOL_NAME_PATTERN}\Z").filter(
+    lambda name: len(name) <= names.MAX_POOL_NAME
+)
+LABEL = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
+SERVICE = re.compile(r"[a-z]([-a-z0-9]*[a-z0-9])?")
+SUFFIXES = st.text("0123456789abcdef", min_size=10, max_size=10)
+
+
+@settings(deadline=None)
+@given(POOLS, SUFFIXES)
+def test_every_name_made_from_a_pools_is_one_that_kubernetes_takes(pool: str, suffix: str) -> None:
+    assert names.check_pool_name(pool) == pool
+    for name in (
+        names.pod_name(pool, suffix),
+        names.endpoint_slice_name(pool),
+        names.secret_name(pool),
+        names.master_lease_name(pool),
+        pool,
+    ):
+        assert LABEL.fullmatch(name)
+        assert len(name) <= 63
+    assert SERVICE.fullmatch(names.service_name(pool))
+    assert len(names.service_name(pool)) <= 63
+
+
+@settings(deadline=None)
+@given(POOLS, st.from_regex(r"\A[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?\Z"))
+def test_the_names_in_certificates_are_dns_names(pool: str, namespace: str) -> None:
+    for name in (names.server_name(pool, namespace), names.agent_server_name(pool, namespace)):
+        assert len(name) <= 253
+        assert all(LABEL.fullmatch(label) and len(label) <= 63 for label in name.split("."))
+
+
+def test_the_longest_names() -> None:
+    pool = "p" * names.MAX_POOL_NAME
+    assert len(names.pod_name(pool, "0" * 10)) == 61
+    assert len(names.service_name(pool)) == 57
+    assert len(names.secret_name(pool)) == 54
+    assert len(names.server_name(pool, "n" * 63)) == 127
+
+
+@pytest.mark.parametrize("pool", ["", "E", "3d", "-a", "a-", "a.b", "a_b", "ä", "a\n", "a/b"])
+def test_a_name_that_no_service_could_have_is_refused(pool: str) -> None:
+    with pytest.raises(names.InvalidName, match="cannot be the name of a pool"):
+        names.check_pool_name(pool)
+
+
+def test_a_name_that_is_too_long_is_refused_and_told_by_how_much() -> None:
+    with pytest.raises(names.InvalidName, match="has 51 characters, more than 50"):
+        names.check_pool_name("p" * 51)
+
+
+@pytest.mark.parametrize(
+    "suffix", ["", "0" * 9, "0" * 11, "ABCDEF0123", "0123456789\n", "xyzxyzxyzx"]
+)
+def test_a_pods_name_ends_with_hexadecimal_digits(suffix: str) -> None:
+    with pytest.raises(names.InvalidName, match="10 hexadecimal digits"):
+        names.pod_name("es", suffix)
+
+
+def test_pools_of_different_names_share_no_object() -> None:
+    # "a" and "a-master": neither's pods, Service or Secret is called as one of the other's.
+    made = [names.service_name, names.secret_name]
+    assert len({make(pool) for pool in ("a", "a-master", "a-tls") for make in made}) == 6
+
+
+@pytest.mark.parametrize(
+    ("host", "address"),
+    [("10.96.1.2", "10.96.1.2:7070"), ("fd00::1", "[fd00::1]:7070")],
+)
+def test_addresses(host: str, address: str) -> None:
+    assert names.address_of(host, names.MASTER_PORT) == address
+    assert names.endpoint_of(host, names.MASTER_PORT) == f"tls+tcp://{address}"
+
+
+def test_the_version_has_one_spelling() -> None:
+    assert f"{names.GROUP}/{names.VERSION}" == names.API_VERSION
+    assert f"{names.PLURAL}.{names.GROUP}" == names.CRD_NAME
+
+
+def test_reasons_are_single_words_in_camel_case() -> None:
+    for kind in (names.Reason, names.Phase, names.ConditionType):
+        assert all(re.fullmatch(r"[A-Z][A-Za-z]+", member) for member in kind)
+
+
+def test_agents_get_nothing_of_the_masters() -> None:
+    assert not {names.KEY_MASTER_CERTIFICATE, names.KEY_MASTER_KEY} & set(names.AGENT_FILES)
+    assert sorted(names.AGENT_FILES.values()) == sorted(names.MASTER_FILES.values())
+
+
+def test_names_need_the_standard_library_alone() -> None:
+    program = (
+        "import sys\n"
+        "import fiber_api.names, fiber_api.times, fiber_api.certificates\n"
+        "heavy = {'pydantic', 'yaml', 'kubernetes', 'kopf', 'cryptography', 'fiber'}\n"
+        "print(*heavy & set(sys.modules))\n"
+    )
+    path = os.pathsep.join(entry for entry in sys.path if entry)
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.stdout, done.stderr) == ("\n", "")

@@ -1,0 +1,294 @@
+"""A small Kubernetes API in this process: real HTTP and JSON, watches included, and its faults.
+
+Clients cannot tell it from an API server as far as the operator goes.  ``calls`` says what was
+asked; ``faults`` are used up one by one; ``after`` is told of each call once it was carried out
+and before it is answered, which is where a test ends the client to see what a restart makes of it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import Any
+
+from aiohttp import web
+
+from fakes.store import KINDS, Body, Change, Failure, Store, line, matches
+
+BOOKMARK_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class Call:
+    """One request: what RBAC would be asked."""
+
+    verb: str
+    plural: str
+    namespace: str | None = None
+    name: str = ""
+    subresource: str = ""
+    dry_run: bool = False
+
+
+@dataclass
+class Fault:
+    """What goes wrong with the next ``times`` calls of this kind, after ``skip`` good ones."""
+
+    verb: str = ""
+    plural: str = ""
+    status: int = 0
+    """An answer with this status; 0: the connection ends without an answer."""
+    reason: str = "InternalError"
+    message: str = "this is a test"
+    retry_after: float | None = None
+    text: str | None = None
+    """This instead of JSON, with status 200 unless ``status`` is set."""
+    carried_out: bool = False
+    """The call is carried out all the same."""
+    late: float = 0.0
+    """Seconds before anything happens; with nothing else set, nothing goes wrong then."""
+    times: float = 1
+    skip: int = 0
+
+    def strikes(self, call: Call) -> bool:
+        if (
+            self.times <= 0
+            or self.verb not in ("", call.verb)
+            or self.plural not in ("", call.plural)
+        ):
+            return False
+        if self.skip:
+            self.skip -= 1
+            return False
+        self.times -= 1
+        return True
+
+
+class KubernetesApi:
+    """Serves ``store`` on a port of 127.0.0.1."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self.calls: list[Call] = []
+        self.faults: list[Fault] = []
+        self.after: Callable[[Call], None] = lambda call: None
+        self.watch_delay = 0.0
+        """Seconds between a change and its event."""
+        self.silent = False
+        """Watches that are open bring nothing any more, not even bookmarks, and do not end."""
+        self.down = False
+        """Every connection is reset, as with an API server that is gone."""
+        self.port = 0
+        self._watches: set[asyncio.Task[Any]] = set()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    @contextlib.asynccontextmanager
+    async def serving(self) -> AsyncIterator[KubernetesApi]:
+        application = web.Application(client_max_size=2**24)
+        application.router.add_route("*", "/{path:.*}", self._serve)
+        runner = web.AppRunner(application, access_log=None, shutdown_timeout=0.1)
+        await runner.setup()
+        site = web.TCPSite(runner, "127.0.0.1", self.port)
+        await site.start()
+        self.port = runner.addresses[0][1]
+        try:
+            yield self
+        finally:
+            self.drop_watches()
+            await runner.cleanup()
+
+    def drop_watches(self) -> None:
+        """End each watch in the middle, without a word."""
+        for task in list(self._watches):
+            task.cancel()
+
+    def count(self, verb: str, plural: str) -> int:
+        return sum(call.verb == verb and call.plural == plural for call in self.calls)
+
+    async def _serve(self, request: web.Request) -> web.StreamResponse:
+        if not self._answers():
+            return _reset(request)
+        found = discovery(request.path)
+        if found is not None:
+            return web.json_response(found)
+        call = _parse(request)
+        if call is None:
+            return web.Response(status=404, text="404 page not found")
+        self.calls.append(call)
+        fault = next((fault for fault in self.faults if fault.strikes(call)), None)
+        if fault is not None and fault.late:
+            await asyncio.sleep(fault.late)
+        if call.verb == "watch" and (fault is None or _harmless(fault)):
+            return await self._watch(request, call)
+        answer = None
+        if fault is None or fault.carried_out or _harmless(fault):
+            answer = await self._carry_out(request, call)
+            self.after(call)
+        if not self._answers():
+            return _reset(request)
+        if fault is None or _harmless(fault):
+            assert answer is not None
+            return answer
+        return _faulty(request, fault)
+
+    async def _carry_out(self, request: web.Request, call: Call) -> web.StreamResponse:
+        body = json.loads(await request.read() or b"{}")
+        try:
+            return web.json_response(self._perform(request, call, body))
+        except Failure as failure:
+            return web.json_response(failure.body(), status=failure.status)
+
+    def _perform(self, request: web.Request, call: Call, body: Body) -> Body:
+        where = (call.plural, call.namespace or "", call.name)
+        if call.verb == "list":
+            return self._list(request, call)
+        if call.verb == "get":
+            return self.store.get(*where)
+        if call.verb == "create":
+            return self.store.create(*where[:2], body, dry_run=call.dry_run)
+        if call.verb == "update":
+            return self.store.update(*where, body)
+        if call.verb == "patch":
+            return self.store.merge(*where, body, call.subresource)
+        self.store.delete(*where, body)
+        return {"kind": "Status", "apiVersion": "v1", "status": "Success"}
+
+    def _list(self, request: web.Request, call: Call) -> Body:
+        items = self.store.list(call.plural, call.namespace, request.query.get("labelSelector", ""))
+        start = int(request.query.get("continue", "0"))
+        limit = int(request.query.get("limit", "0")) or len(items)
+        rest = str(start + limit) if start + limit < len(items) else ""
+        version, kind = KINDS[call.plural]
+        return {
+            "apiVersion": version,
+            "kind": f"{kind}List",
+            "metadata": {"resourceVersion": self.store.version, "continue": rest},
+            "items": items[start : start + limit],
+        }
+
+    async def _watch(self, request: web.Request, call: Call) -> web.StreamResponse:
+        response = web.StreamResponse(headers={"Content-Type": "application/json"})
+        await response.prepare(request)
+        task = asyncio.ensure_future(self._stream(request, response, call))
+        self._watches.add(task)
+        try:
+            async with asyncio.timeout(float(request.query.get("timeoutSeconds", "300"))):
+                await task
+        except asyncio.CancelledError:
+            if not task.cancelled():
+                raise
+            _reset(request)
+        except (TimeoutError, ConnectionError):
+            pass  # it ends as a watch does
+        finally:
+            task.cancel()
+            self._watches.discard(task)
+        return response
+
+    async def _stream(self, request: web.Request, response: web.StreamResponse, call: Call) -> None:
+        seen = int(request.query.get("resourceVersion") or self.store.version)
+        if seen < self.store.oldest:
+            await response.write(line("ERROR", Failure(410, "Expired", "too old").body()))
+            return
+        selector = request.query.get("labelSelector", "")
+        while True:
+            for change in [change for change in self.store.changes if change.version > seen]:
+                seen = change.version
+                if self._concerns(call, change) and matches(change.object, selector):
+                    await response.write(line(change.type, change.object))
+            if self.store.changes and self.store.changes[-1].version > seen:
+                continue  # it came while the last ones were written
+            try:
+                async with asyncio.timeout(BOOKMARK_SECONDS + self.watch_delay):
+                    await self.store.changed()
+                    await asyncio.sleep(self.watch_delay)
+                if self.silent:
+                    await asyncio.Event().wait()
+            except TimeoutError:
+                mark = {"kind": "Bookmark", "metadata": {"resourceVersion": str(seen)}}
+                await response.write(line("BOOKMARK", mark))
+
+    def _concerns(self, call: Call, change: Change) -> bool:
+        plural, namespace, _ = change.place
+        return plural == call.plural and call.namespace in (None, namespace)
+
+    def _answers(self) -> bool:
+        return not self.down
+
+
+_VERBS = {"POST": "create", "PUT": "update", "PATCH": "patch", "DELETE": "delete"}
+
+
+def _parse(request: web.Request) -> Call | None:
+    parts = request.path.strip("/").split("/")
+    parts = parts[2:] if parts[0] == "api" else parts[3:]
+    namespace = None
+    if len(parts) > 2 and parts[0] == "namespaces":
+        namespace, parts = parts[1], parts[2:]
+    if not parts or parts[0] not in KINDS:
+        return None
+    plural, name, subresource = (*parts, "", "")[:3]
+    verb = _VERBS.get(request.method) or ("get" if name else "list")
+    if request.query.get("watch") == "true":
+        verb = "watch"
+    return Call(verb, plural, namespace, name, subresource, request.query.get("dryRun") == "All")
+
+
+def discovery(path: str) -> Body | None:
+    """What an API server says of itself, or None where the path is about objects."""
+    groups: dict[str, list[str]] = {}
+    for plural, (version, _) in KINDS.items():
+        groups.setdefault(version, []).append(plural)
+    if path == "/version":
+        return {"major": "1", "minor": "34"}
+    if path == "/api":
+        return {"kind": "APIVersions", "versions": ["v1"]}
+    if path == "/apis":
+        return {"kind": "APIGroupList", "groups": [_group(name) for name in groups if "/" in name]}
+    version = path.removeprefix("/apis/").removeprefix("/api/").strip("/")
+    if version not in groups:
+        return None
+    resources = [
+        {
+            "name": plural,
+            "singularName": KINDS[plural][1].lower(),
+            "namespaced": plural not in ("namespaces", "customresourcedefinitions"),
+            "kind": KINDS[plural][1],
+            "verbs": ["create", "delete", "get", "list", "patch", "update", "watch"],
+        }
+        for plural in groups[version]
+    ]
+    return {"kind": "APIResourceList", "groupVersion": version, "resources": resources}
+
+
+def _group(version: str) -> Body:
+    name, short = version.split("/")
+    entry = {"groupVersion": version, "version": short}
+    return {"name": name, "versions": [entry], "preferredVersion": entry}
+
+
+def _harmless(fault: Fault) -> bool:
+    return fault.late > 0 and not fault.status and fault.text is None and not fault.carried_out
+
+
+def _faulty(request: web.Request, fault: Fault) -> web.StreamResponse:
+    if not fault.status and fault.text is None:
+        return _reset(request)
+    headers = {} if fault.retry_after is None else {"Retry-After": str(fault.retry_after)}
+    status = fault.status or 200
+    if fault.text is not None:
+        return web.Response(status=status, text=fault.text, headers=headers)
+    failure = Failure(status, fault.reason, fault.message)
+    return web.json_response(failure.body(), status=status, headers=headers)
+
+
+def _reset(request: web.Request) -> web.StreamResponse:
+    if request.transport is not None:
+        request.transport.abort()
+    return web.Response(status=500)

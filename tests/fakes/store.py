@@ -1,0 +1,261 @@
+"""What the API server of a cluster holds, as far as the operator can tell the difference.
+
+Resource versions, uids, generations, the status subresource, preconditions, label selectors,
+owner references and a history that watches are served from and that can be forgotten (410).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import datetime
+import json
+import uuid
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+Body = dict[str, Any]
+Place = tuple[str, str, str]  # plural, namespace, name
+
+KINDS = {
+    "fiberpools": ("fiber.dev/v1alpha1", "FiberPool"),
+    "pods": ("v1", "Pod"),
+    "services": ("v1", "Service"),
+    "secrets": ("v1", "Secret"),
+    "events": ("v1", "Event"),
+    "namespaces": ("v1", "Namespace"),
+    "endpointslices": ("discovery.k8s.io/v1", "EndpointSlice"),
+    "leases": ("coordination.k8s.io/v1", "Lease"),
+    "customresourcedefinitions": ("apiextensions.k8s.io/v1", "CustomResourceDefinition"),
+}
+WITH_STATUS = {"fiberpools", "pods"}
+EPOCH = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
+
+
+class Failure(Exception):
+    """An answer that is no success."""
+
+    def __init__(self, status: int, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.status, self.reason, self.message = status, reason, message
+
+    def body(self) -> Body:
+        return {
+            "kind": "Status",
+            "apiVersion": "v1",
+            "metadata": {},
+            "status": "Failure",
+            "message": self.message,
+            "reason": self.reason,
+            "code": self.status,
+        }
+
+
+class Change(NamedTuple):
+    """One event of a watch."""
+
+    version: int
+    type: str
+    place: Place
+    object: Body
+
+
+class Store:
+    """The objects.  ``admit`` is asked before a creation and raises Failure to refuse it."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._objects: dict[Place, Body] = {}
+        self._version = 100
+        self._addresses = 0
+        self._bell = asyncio.Event()
+        self.changes: list[Change] = []
+        self.oldest = 0
+        self.admit: Callable[[str, Body], None] = lambda plural, body: None
+        self.created: Callable[[str, Body], None] = lambda plural, body: None
+        self.pods_linger = False
+        """Whether a deleted pod stays, terminating, until ``remove``."""
+        self.collects_garbage = True
+
+    def copy(self, clock: Callable[[], float]) -> Store:
+        """Another store with the same past, whose time goes on from now by ``clock``."""
+        start, now = clock(), self._clock()
+        other = Store(lambda: now + clock() - start)
+        other._objects = copy.deepcopy(self._objects)
+        other._version, other._addresses = self._version, self._addresses
+        other.changes = list(self.changes)
+        return other
+
+    @property
+    def version(self) -> str:
+        return str(self._version)
+
+    def now(self) -> str:
+        """The time as Kubernetes writes it."""
+        moment = EPOCH + datetime.timedelta(seconds=self._clock())
+        return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
+
+    def unix_now(self) -> float:
+        return EPOCH.timestamp() + self._clock()
+
+    # -- What clients do
+
+    def get(self, plural: str, namespace: str, name: str) -> Body:
+        try:
+            return copy.deepcopy(self._objects[plural, namespace, name])
+        except KeyError:
+            raise Failure(404, "NotFound", f'{plural} "{name}" not found') from None
+
+    def list(self, plural: str, namespace: str | None = None, selector: str = "") -> list[Body]:
+        return [
+            copy.deepcopy(body)
+            for (kind, place, _), body in sorted(self._objects.items())
+            if kind == plural and namespace in (None, place) and matches(body, selector)
+        ]
+
+    def create(self, plural: str, namespace: str, body: Body, *, dry_run: bool = False) -> Body:
+        body = copy.deepcopy(body)
+        name = body.get("metadata", {}).get("name")
+        if not isinstance(name, str) or not name:
+            raise Failure(422, "Invalid", "metadata.name: Required value")
+        if (plural, namespace, name) in self._objects:
+            raise Failure(409, "AlreadyExists", f'{plural} "{name}" already exists')
+        self.admit(plural, body)
+        if dry_run:
+            return body
+        metadata = body["metadata"]
+        metadata |= {"namespace": namespace, "uid": str(uuid.uuid4()), "generation": 1}
+        metadata["creationTimestamp"] = self.now()
+        body["apiVersion"], body["kind"] = KINDS[plural]
+        if plural == "fiberpools":
+            body.pop("status", None)
+        if plural == "pods":
+            body["status"] = {"phase": "Pending"}
+        if plural == "services":
+            self._addresses += 1
+            body.setdefault("spec", {}).setdefault("clusterIP", f"10.96.0.{self._addresses}")
+        self._put("ADDED", (plural, namespace, name), body)
+        self.created(plural, copy.deepcopy(body))
+        return self.get(plural, namespace, name)
+
+    def update(self, plural: str, namespace: str, name: str, body: Body) -> Body:
+        current = self.get(plural, namespace, name)
+        asked = body.get("metadata", {}).get("resourceVersion")
+        if asked is not None and asked != current["metadata"]["resourceVersion"]:
+            raise Failure(409, "Conflict", f"{name}: the object has been modified")
+        new = copy.deepcopy(body)
+        new["metadata"] = {**current["metadata"], **new.get("metadata", {})}
+        return self._change(plural, namespace, name, current, new)
+
+    def merge(
+        self, plural: str, namespace: str, name: str, patch: Body, subresource: str = ""
+    ) -> Body:
+        current = self.get(plural, namespace, name)
+        uid = (patch.get("metadata") or {}).get("uid", current["metadata"]["uid"])
+        if uid != current["metadata"]["uid"]:
+            raise Failure(422, "Invalid", "metadata.uid: Invalid value: field is immutable")
+        if subresource:
+            patch = {subresource: patch.get(subresource)}
+        elif plural in WITH_STATUS:
+            patch = {key: value for key, value in patch.items() if key != "status"}
+        return self._change(plural, namespace, name, current, merged(current, patch))
+
+    def delete(self, plural: str, namespace: str, name: str, options: Body | None = None) -> None:
+        current = self.get(plural, namespace, name)
+        options = options or {}
+        for field, wanted in (options.get("preconditions") or {}).items():
+            found = current["metadata"][field]
+            if wanted != found:
+                message = f"Precondition failed: {field} in precondition: {wanted}, found: {found}"
+                raise Failure(409, "Conflict", message)
+        if plural == "pods" and self.pods_linger and options.get("gracePeriodSeconds") != 0:
+            if "deletionTimestamp" not in current["metadata"]:
+                stamp = {"deletionTimestamp": self.now(), "deletionGracePeriodSeconds": 30}
+                self._put(
+                    "MODIFIED", (plural, namespace, name), merged(current, {"metadata": stamp})
+                )
+            return
+        self.remove(plural, namespace, name)
+
+    # -- What the rest of a cluster does
+
+    def remove(self, plural: str, namespace: str, name: str) -> None:
+        """Take the object away, and what it owns."""
+        body = self._objects.pop((plural, namespace, name))
+        self._version += 1
+        body["metadata"]["resourceVersion"] = self.version
+        self._record("DELETED", (plural, namespace, name), body)
+        if self.collects_garbage:
+            self.collect_garbage(body["metadata"]["uid"])
+
+    def collect_garbage(self, uid: str) -> None:
+        for place, body in list(self._objects.items()):
+            owners = body["metadata"].get("ownerReferences") or []
+            if any(owner.get("uid") == uid for owner in owners) and place in self._objects:
+                self.remove(*place)
+
+    def set_status(self, plural: str, namespace: str, name: str, status: Body) -> Body:
+        """Replace the whole status, as a kubelet does."""
+        current = self.get(plural, namespace, name)
+        return self._change(plural, namespace, name, current, {**current, "status": status})
+
+    def forget_history(self) -> None:
+        """Watches from before now get 410 Gone."""
+        self.oldest = self._version
+
+    async def changed(self) -> None:
+        """Wait for the next change."""
+        await self._bell.wait()
+
+    # -- Within
+
+    def _change(self, plural: str, namespace: str, name: str, current: Body, new: Body) -> Body:
+        if new == current:
+            return current
+        if new.get("spec") != current.get("spec"):
+            new["metadata"]["generation"] = current["metadata"].get("generation", 1) + 1
+        self._put("MODIFIED", (plural, namespace, name), new)
+        return self.get(plural, namespace, name)
+
+    def _put(self, type_: str, place: Place, body: Body) -> None:
+        self._version += 1
+        body["metadata"]["resourceVersion"] = self.version
+        self._objects[place] = body
+        self._record(type_, place, body)
+
+    def _record(self, type_: str, place: Place, body: Body) -> None:
+        self.changes.append(Change(self._version, type_, place, copy.deepcopy(body)))
+        self._bell.set()
+        self._bell = asyncio.Event()
+
+
+def merged(target: Any, patch: Any) -> Any:
+    """RFC 7396."""
+    if not isinstance(patch, dict):
+        return copy.deepcopy(patch)
+    result = dict(target) if isinstance(target, dict) else {}
+    for key, value in patch.items():
+        if value is None:
+            result.pop(key, None)
+        else:
+            result[key] = merged(result.get(key), value)
+    return result
+
+
+def matches(body: Body, selector: str) -> bool:
+    """Whether the labels of ``body`` match: ``a=b``, ``a`` or ``!a``, joined by commas."""
+    labels = body["metadata"].get("labels") or {}
+    for term in filter(None, selector.split(",")):
+        key, equals, value = term.partition("=")
+        if equals:
+            fits = labels.get(key) == value.lstrip("=")
+        else:
+            fits = (key.removeprefix("!") in labels) != key.startswith("!")
+        if not fits:
+            return False
+    return True
+
+
+def line(type_: str, body: Body) -> bytes:
+    """One line of a watch."""
+    return json.dumps({"type": type_, "object": body}).encode() + b"\n"

@@ -1,0 +1,171 @@
+"""FiberPools and pods as the API shows them, for the tests of the operator's decisions."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from fiber_api.names import LABEL_TEMPLATE_HASH
+from fiber_api.times import format_time
+from fiber_api.v1alpha1 import FiberPool
+from fiber_operator.plans import Memory, Plan
+from fiber_operator.pods import PodView, observe
+from fiber_operator.revisions import template_hash
+
+NOW = 1_800_000_000.0
+UID = "11111111-2222-3333-4444-555555555555"
+ADDRESS = "10.96.1.2:7070"
+TEMPLATE = {"spec": {"containers": [{"name": "worker", "image": "registry/worker:1"}]}}
+MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+
+Json = dict[str, Any]
+
+
+def pool_document(status: Mapping[str, Any] | None = None, **spec: Any) -> Json:
+    """A pool called ``es``; further arguments are fields of its spec."""
+    return {
+        "apiVersion": "fiber.dev/v1alpha1",
+        "kind": "FiberPool",
+        "metadata": {"name": "es", "namespace": "team", "uid": UID, "generation": 7},
+        "spec": {"template": copy.deepcopy(TEMPLATE), **spec},
+        "status": dict(status or {}),
+    }
+
+
+def make_pool(status: Mapping[str, Any] | None = None, **spec: Any) -> FiberPool:
+    """The same, read."""
+    return FiberPool.read(pool_document(status, **spec))
+
+
+def with_plan(pool: FiberPool, plan: Plan) -> FiberPool:
+    """The pool after the plan's status was written."""
+    if plan.status is None:
+        return pool
+    return FiberPool.read({**pool.model_dump(mode="json", by_alias=True), "status": plan.status})
+
+
+def memory_of(pool: FiberPool, **fields: Any) -> Memory:
+    """An operator that has made the pool's Service and knows that its template is accepted."""
+    known = {"address": ADDRESS, "accepted": template_hash(pool)}
+    return Memory(**{**known, **fields})
+
+
+def name_of(number: int) -> str:
+    """The name of a worker."""
+    return f"es-{number:010x}"
+
+
+def pod_document(number: int = 1, *, age: float = 0.0, template: str = "", **status: Any) -> Json:
+    """A pod that was just created; further arguments are fields of its status."""
+    return {
+        "apiVersion": "v1",
+        "kind": "Pod",
+        "metadata": {
+            "name": name_of(number),
+            "uid": f"uid-{number}",
+            "resourceVersion": str(1000 + number),
+            "creationTimestamp": format_time(NOW - age),
+            "labels": {LABEL_TEMPLATE_HASH: template},
+            "ownerReferences": [{"uid": UID, "controller": True}],
+        },
+        "spec": {},
+        "status": {"phase": "Pending", **status},
+    }
+
+
+def condition(kind: str, status: str, ago: float = 0.0, **fields: str) -> Json:
+    """A condition of a pod."""
+    return {
+        "type": kind,
+        "status": status,
+        "lastTransitionTime": format_time(NOW - ago),
+        **fields,
+    }
+
+
+def running(number: int = 1, *, age: float = 100.0, ready: bool = True, **more: Any) -> Json:
+    """A pod whose worker runs since a second after it was created."""
+    truth = condition("Ready", "True" if ready else "False", age - 1 if ready else age)
+    document = pod_document(
+        number,
+        age=age,
+        phase="Running",
+        conditions=[truth],
+        containerStatuses=[_container(running={"startedAt": format_time(NOW - age + 1)})],
+        **more,
+    )
+    document["spec"]["nodeName"] = "node-1"
+    return document
+
+
+def waiting(number: int, reason: str, message: str = "", *, age: float = 3.0) -> Json:
+    """A pod with a node whose worker container does not run yet."""
+    state = {"waiting": {"reason": reason, "message": message}}
+    document = pod_document(number, age=age, containerStatuses=[_container(**state)])
+    document["spec"]["nodeName"] = "node-1"
+    return document
+
+
+def unschedulable(number: int, message: str = "0/2 nodes are available", age: float = 3.0) -> Json:
+    """A pod that no node takes."""
+    found = condition("PodScheduled", "False", age, reason="Unschedulable", message=message)
+    return pod_document(number, age=age, conditions=[found])
+
+
+def ended(
+    number: int = 1,
+    code: int = 1,
+    *,
+    age: float = 100.0,
+    ran: float = 30.0,
+    ago: float = 0.0,
+    reason: str = "Error",
+    message: str = "",
+    **status: Any,
+) -> Json:
+    """A pod whose worker exited ``ago`` seconds ago."""
+    terminated = {
+        "exitCode": code,
+        "reason": reason,
+        "message": message,
+        "startedAt": format_time(NOW - ago - ran),
+        "finishedAt": format_time(NOW - ago),
+    }
+    phase = "Succeeded" if code == 0 else "Failed"
+    fields = {"phase": phase, "containerStatuses": [_container(terminated=terminated)]}
+    document = pod_document(number, age=max(age, ago + ran), **{**fields, **status})
+    document["spec"]["nodeName"] = "node-1"
+    return document
+
+
+def terminating(document: Json) -> Json:
+    """The same pod after somebody asked to delete it."""
+    document = copy.deepcopy(document)
+    document["metadata"]["deletionTimestamp"] = format_time(NOW + 30)
+    return document
+
+
+def of_template(hash_: str, document: Json) -> Json:
+    """The same pod, made of that template."""
+    document = copy.deepcopy(document)
+    document["metadata"]["labels"][LABEL_TEMPLATE_HASH] = hash_
+    return document
+
+
+def views(pool: FiberPool, *documents: Json) -> list[PodView]:
+    """What the operator sees; pods without a template are of the pool's."""
+    current = template_hash(pool)
+    return [
+        observe(
+            document
+            if document["metadata"]["labels"][LABEL_TEMPLATE_HASH]
+            else of_template(current, document),
+            pool.spec.worker_container,
+        )
+        for document in documents
+    ]
+
+
+def _container(**state: Any) -> Json:
+    return {"name": "worker", "state": state}

@@ -1,0 +1,122 @@
+"""The cluster's processes: they outlive who started them, are found again, and end for good."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cluster import places
+from cluster.daemons import Daemon, all_daemons
+from cluster.shell import ClusterError, wait_for
+
+SLEEP = ("sleep", "300.0625")
+
+
+@pytest.fixture(autouse=True)
+def state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    monkeypatch.setattr(places, "STATE", tmp_path / "state")
+    yield tmp_path / "state"
+    for daemon in all_daemons():
+        daemon.kill()
+
+
+def pid_of(daemon: Daemon) -> int:
+    return int((places.STATE / "daemons" / f"{daemon.name}.pid").read_text())
+
+
+def test_a_daemon_runs_until_it_is_killed() -> None:
+    daemon = Daemon("sleeper")
+    assert not daemon.runs()
+    daemon.start(*SLEEP)
+    assert daemon.runs()
+    assert [found.name for found in all_daemons()] == ["sleeper"]
+    daemon.kill()
+    assert not daemon.runs()
+
+
+def test_starting_it_twice_starts_it_once() -> None:
+    daemon = Daemon("sleeper")
+    daemon.start(*SLEEP)
+    first = pid_of(daemon)
+    daemon.start(*SLEEP)
+    assert pid_of(daemon) == first
+
+
+def test_another_process_finds_it_again() -> None:
+    Daemon("sleeper").start(*SLEEP)
+    assert Daemon("sleeper").runs()
+
+
+def test_it_is_started_again_as_it_was() -> None:
+    daemon = Daemon("sleeper")
+    daemon.start(*SLEEP)
+    first = pid_of(daemon)
+    daemon.kill()
+    Daemon("sleeper").start_again()
+    assert daemon.runs()
+    assert pid_of(daemon) != first
+
+
+def test_its_end_is_noticed_and_quoted() -> None:
+    daemon = Daemon("failing")
+    daemon.start("sh", "-c", "echo 'no such flag'; exit 1")
+    wait_for("its end", lambda: not daemon.runs(), seconds=10)
+    assert re.search(
+        r"failing has ended; the end of .*failing\.log:\nno such flag", daemon.complaint() or ""
+    )
+
+
+def test_a_number_that_is_somebody_elses_by_now_is_not_killed() -> None:
+    daemon = Daemon("sleeper")
+    daemon.start(*SLEEP)
+    daemon.kill()
+    (places.STATE / "daemons" / "sleeper.pid").write_text(str(os.getpid()))
+    assert not daemon.runs()
+    daemon.kill()  # and we are still here
+
+
+def test_what_it_started_ends_with_it() -> None:
+    daemon = Daemon("parent")
+    script = 'sleep 300.125 & echo "child $!"; wait; true'
+    daemon.start("sh", "-c", script)
+    wait_for("the child", lambda: "child" in daemon.log.read_text(), seconds=10)
+    child = int(daemon.log.read_text().split()[1])
+    daemon.kill()
+    wait_for("the end of the child", lambda: not is_alive(child), seconds=10)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def test_it_knows_nothing_of_who_started_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SECRET_OF_THE_TESTS", "yes")
+    daemon = Daemon("printer")
+    daemon.start("env")
+    wait_for("its end", lambda: not daemon.runs(), seconds=10)
+    assert "SECRET_OF_THE_TESTS" not in daemon.log.read_text()
+    assert f"{places.programs()}:" in daemon.log.read_text()
+
+
+def test_it_does_not_hear_our_interrupts() -> None:
+    daemon = Daemon("sleeper")
+    daemon.start(*SLEEP)
+    assert os.getpgid(pid_of(daemon)) == pid_of(daemon) != os.getpgid(0)
+
+
+def test_waiting_ends_with_a_complaint() -> None:
+    with pytest.raises(ClusterError, match="the kettle: it has no water"):
+        wait_for("the kettle", lambda: False, complaint=lambda: "it has no water")
+
+
+def test_waiting_ends_at_the_deadline() -> None:
+    with pytest.raises(ClusterError, match=r"the kettle: not there after 0 s"):
+        wait_for("the kettle", lambda: False, seconds=0)

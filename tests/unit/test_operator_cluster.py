@@ -1,0 +1,259 @@
+"""The door to the API server: every way in which a call can end."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any
+
+import pytest
+from kubernetes.aio.client.configuration import Configuration
+
+from fakes import virtual_time
+from fakes.kubernetes_api import Fault, KubernetesApi
+from fakes.store import Store
+from fiber_operator import cluster
+from fiber_operator.cluster import PODS, SECRETS, Cluster
+
+
+@contextlib.asynccontextmanager
+async def an_api(**options: Any) -> AsyncIterator[tuple[KubernetesApi, Cluster]]:
+    import asyncio
+
+    api = KubernetesApi(Store(asyncio.get_running_loop().time))
+    async with api.serving():
+        door = Cluster(Configuration(host=api.url), connections=4, **options)
+        try:
+            yield api, door
+        finally:
+            await door.close()
+
+
+def with_api(
+    test: Callable[[KubernetesApi, Cluster], Coroutine[Any, Any, None]], **options: Any
+) -> None:
+    async def main() -> None:
+        async with an_api(**options) as (api, door):
+            await test(api, door)
+
+    virtual_time.run(main())
+
+
+def pod(name: str, **labels: str) -> dict[str, Any]:
+    return {"metadata": {"name": name, "labels": labels}, "spec": {}}
+
+
+def names_of(body: dict[str, Any]) -> str:
+    return str(body["metadata"]["name"])
+
+
+def test_objects_are_made_read_changed_and_deleted() -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        made = await door.create(PODS, "here", pod("a"))
+        assert made["metadata"]["uid"]
+        await door.patch(PODS, "here", "a", {"status": {"phase": "Running"}}, "status")
+        assert (await door.read(PODS, "here", "a"))["status"] == {"phase": "Running"}
+        made = await door.read(PODS, "here", "a")
+        made["metadata"]["labels"] = {"new": "yes"}
+        await door.replace(PODS, "here", "a", made)
+        await door.delete(PODS, "here", "a", uid=made["metadata"]["uid"])
+        with pytest.raises(cluster.Gone):
+            await door.read(PODS, "here", "a")
+
+    with_api(test)
+
+
+def test_a_list_has_every_page_and_only_what_is_selected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "PAGE", 3)
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        for number in range(8):
+            api.store.create("pods", "here", pod(f"p{number}", of="us"))
+        api.store.create("pods", "here", pod("other", of="them"))
+        api.store.create("pods", "there", pod("far", of="us"))
+        here = await door.list(PODS, "here", names_of, selector="of=us")
+        assert here == [f"p{number}" for number in range(8)]
+        assert len(await door.list(PODS, None, names_of)) == 10
+        assert api.count("list", "pods") == 3 + 4
+
+    with_api(test)
+
+
+def test_a_dry_run_makes_nothing() -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        await door.create(PODS, "here", pod("a"), dry_run=True)
+        assert api.store.list("pods") == []
+
+    with_api(test)
+
+
+def test_what_changed_is_not_deleted() -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        made = (await door.create(PODS, "here", pod("a")))["metadata"]
+        with pytest.raises(cluster.Conflict):
+            await door.delete(PODS, "here", "a", uid="another")
+        with pytest.raises(cluster.Conflict):
+            await door.delete(PODS, "here", "a", uid=made["uid"], resource_version="1")
+        assert len(api.store.list("pods")) == 1
+
+    with_api(test)
+
+
+@pytest.mark.parametrize(
+    ("status", "error"),
+    [
+        (400, cluster.Invalid),
+        (401, cluster.Unavailable),
+        (403, cluster.Refused),
+        (404, cluster.Gone),
+        (405, cluster.Invalid),
+        (409, cluster.Conflict),
+        (410, cluster.Unavailable),
+        (422, cluster.Invalid),
+        (429, cluster.TooMany),
+        (500, cluster.Unavailable),
+        (503, cluster.Unavailable),
+    ],
+)
+def test_each_status_is_one_error(status: int, error: type[cluster.ApiError]) -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.faults.append(Fault(status=status, reason="Because", message="words of the server"))
+        with pytest.raises(error) as caught:
+            await door.create(PODS, "here", pod("a"))
+        assert type(caught.value) is error
+        assert str(caught.value) == "create pods in here: words of the server"
+        assert (caught.value.status, caught.value.reason) == (status, "Because")
+
+    with_api(test)
+
+
+@pytest.mark.parametrize(("header", "seconds"), [(7, 7.0), (None, 1.0), (1e9, 60.0), (0, 0.1)])
+def test_too_many_requests_says_when_to_come_back(header: float | None, seconds: float) -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.faults.append(Fault(status=429, retry_after=header))
+        with pytest.raises(cluster.TooMany) as caught:
+            await door.read(PODS, "here", "a")
+        assert caught.value.retry_after == seconds
+
+    with_api(test)
+
+
+@pytest.mark.parametrize("text", ["", "<html>", "[]", "null", "3", '{"kind": "Pod"', "\ud83d"])
+@pytest.mark.parametrize("verb", ["get", "list", "create"])
+def test_nonsense_is_no_answer(text: str, verb: str) -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.faults.append(Fault(text=text.encode(errors="replace").decode()))
+        with pytest.raises(cluster.Unavailable):
+            await {
+                "get": lambda: door.read(PODS, "here", "a"),
+                "list": lambda: door.list(PODS, "here", names_of),
+                "create": lambda: door.create(PODS, "here", pod("a")),
+            }[verb]()
+
+    with_api(test)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{}",
+        '{"kind": "PodList", "metadata": {}}',
+        '{"kind": "PodList", "metadata": {}, "items": null}',
+        '{"kind": "PodList", "metadata": {}, "items": [1]}',
+        '{"kind": "PodList", "items": []}',
+        '{"kind": "Status", "metadata": {}, "items": []}',
+    ],
+)
+def test_what_is_no_list_is_not_an_empty_one(text: str) -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.faults.append(Fault(text=text))
+        with pytest.raises(cluster.Unavailable):
+            await door.list(PODS, "here", names_of)
+
+    with_api(test)
+
+
+def test_a_page_not_found_is_not_an_object_gone() -> None:
+    """A proxy, or an API server that does not serve the resource yet."""
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.faults.append(Fault(status=404, text="404 page not found"))
+        with pytest.raises(cluster.Unavailable, match="404 page not found"):
+            await door.read(PODS, "here", "a")
+
+    with_api(test)
+
+
+def test_no_connection_and_no_answer_are_unavailable() -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.faults += [Fault(), Fault(late=1000)]
+        with pytest.raises(cluster.Unavailable):
+            await door.create(PODS, "here", pod("a"))
+        with pytest.raises(cluster.Unavailable, match="no answer in time"):
+            await door.read(PODS, "here", "a")
+
+    with_api(test)
+
+
+def test_no_server_is_unavailable() -> None:
+    async def main() -> None:
+        door = Cluster(Configuration(host="http://127.0.0.1:9"), connections=1)
+        with pytest.raises(cluster.Unavailable):
+            await door.read(PODS, "here", "a")
+        await door.close()
+
+    virtual_time.run(main())
+
+
+def test_nothing_is_changed_without_permission() -> None:
+    def forbid() -> None:
+        raise PermissionError
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        made = api.store.create("pods", "here", pod("a"))
+        assert await door.read(PODS, "here", "a")
+        for write in (
+            door.create(PODS, "here", pod("b")),
+            door.create(PODS, "here", pod("b"), dry_run=True),
+            door.replace(PODS, "here", "a", made),
+            door.patch(PODS, "here", "a", {}),
+            door.delete(PODS, "here", "a", uid=made["metadata"]["uid"]),
+        ):
+            with pytest.raises(PermissionError):
+                await write
+        assert {call.verb for call in api.calls} == {"get"}
+
+    with_api(test, permit=forbid)
+
+
+def test_every_call_is_observed() -> None:
+    seen: list[tuple[str, str, str]] = []
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        await door.list(SECRETS, "here", names_of)
+        api.faults += [Fault(status=409), Fault(), Fault(text="no")]
+        for _ in range(3):
+            with pytest.raises(cluster.ApiError):
+                await door.patch(PODS, "here", "a", {}, "status")
+
+    with_api(
+        test, observe=lambda verb, resource, code, seconds: seen.append((verb, resource, code))
+    )
+    assert seen == [
+        ("list", "secrets", "200"),
+        ("patch", "pods/status", "409"),
+        ("patch", "pods/status", "connection"),
+        ("patch", "pods/status", "garbage"),
+    ]
+
+
+def test_no_more_calls_at_once_than_connections() -> None:
+    """What waits for its turn is not late: only the server's own time counts."""
+    import asyncio
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.faults.append(Fault(late=8, times=12))
+        await asyncio.gather(*(door.create(PODS, "here", pod(f"p{n}")) for n in range(12)))
+        assert asyncio.get_running_loop().time() >= 3 * 8
+
+    with_api(test)

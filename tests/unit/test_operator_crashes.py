@@ -1,0 +1,186 @@
+"""The operator is ended after each call that it makes, and started again.
+
+The call is carried out and its answer is lost, which is the worst moment.  Whatever the operator
+was about, the next one brings the pool where it should be: no pod twice, none forgotten, each
+failure counted once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from fakes import virtual_time
+from fakes.kubernetes_api import Call
+from fakes.store import Store
+from fakes.world import NAMESPACE, World, a_world
+
+MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+
+Step = Callable[[World], Awaitable[None]]
+
+
+async def make(world: World) -> None:
+    world.make_pool(replicas=5, master=MASTER)
+
+
+async def is_made(world: World) -> None:
+    await world.ready(5)
+    assert sorted(created(world)) == sorted(world.names())
+
+
+async def release(world: World) -> None:
+    world.edit(replicas=3, scaleDown={"release": world.names()[:2]})
+
+
+async def is_released(world: World) -> None:
+    await world.ready(3)
+    assert len(created(world)) == 5
+
+
+async def fail(world: World) -> None:
+    world.kubelet.exit(NAMESPACE, world.names()[0], 3)
+
+
+async def is_counted(world: World) -> None:
+    def replaced() -> bool:
+        return world.status().get("readyReplicas") == 5
+
+    await world.until(lambda: world.status().get("failures", {}).get("total", 0) > 0)
+    await world.until(replaced)
+    await world.settled()
+    assert world.status()["failures"]["total"] == 1
+    assert len(created(world)) == 6
+
+
+async def disrupt(world: World) -> None:
+    world.kubelet.evict(NAMESPACE, world.names()[0])
+
+
+async def is_replaced(world: World) -> None:
+    await world.until(lambda: len(created(world)) == 6)
+    await world.ready(5)
+    assert world.status()["failures"]["disrupted"] == 1
+    assert world.status()["failures"]["total"] == 0
+    assert len(created(world)) == 6
+
+
+async def change_template(world: World) -> None:
+    template = {"spec": {"containers": [{"name": "worker", "image": "registry/worker:2"}]}}
+    world.edit(template=template, update={"strategy": "Recreate"})
+
+
+async def is_changed(world: World) -> None:
+    def all_new() -> bool:
+        images = [pod["spec"]["containers"][0]["image"] for pod in world.pods()]
+        return images == ["registry/worker:2"] * 5
+
+    await world.until(all_new)
+    await world.ready(5)
+    assert len(created(world)) == 10
+
+
+async def suspend(world: World) -> None:
+    world.edit(suspend=True)
+
+
+async def is_suspended(world: World) -> None:
+    await world.ready(0)
+    assert world.names() == []
+    assert len(created(world)) == 5
+
+
+async def attach(world: World) -> None:
+    world.edit(master={**MASTER, "host": "10.0.3.8", "port": 41338, "epoch": 2})
+
+
+async def is_attached(world: World) -> None:
+    await world.until(lambda: world.status().get("masterEpoch") == 2)
+    (slice_,) = world.store.list("endpointslices")
+    assert slice_["endpoints"][0]["addresses"] == ["10.0.3.8"]
+    assert slice_["ports"][0]["port"] == 41338
+
+
+async def abandon(world: World) -> None:
+    lost = {"leaseName": "es", "leaseDurationSeconds": 6, "onLost": "Delete"}
+    world.edit(master={**MASTER, **lost, "lostGraceSeconds": 5})
+
+
+async def is_deleted(world: World) -> None:
+    await world.until(lambda: world.store.list("fiberpools") == [])
+    for plural in ("pods", "services", "secrets", "endpointslices"):
+        assert world.store.list(plural, NAMESPACE) == []
+
+
+def created(world: World) -> list[str]:
+    """Every pod that was ever created."""
+    changes = world.store.changes
+    return [c.place[2] for c in changes if c.type == "ADDED" and c.place[0] == "pods"]
+
+
+def belongings(world: World) -> list[int]:
+    return [len(world.store.list(p)) for p in ("services", "secrets", "endpointslices")]
+
+
+async def _five_workers() -> Store:
+    async with a_world() as world:
+        await make(world)
+        await world.ready(5)
+        await world.stop()
+        return world.store
+
+
+async def _crash_after(calls: int, story: tuple[Step, Step], past: Store | None) -> bool:
+    """Play the story with an operator that ends at its ``calls``-th call; whether it did."""
+    async with a_world(past=past) as world:
+        crashed, left = False, calls
+
+        def crash(call: Call) -> None:
+            nonlocal crashed, left
+            # The Lease is renewed all the time, and has tests of its own.
+            left -= call.namespace != "fiber-system"
+            if left == 0 and not crashed:
+                crashed = world.api.down = True
+                world.crash()
+
+        world.api.after = crash
+        await story[0](world)
+        await world.run_out_or(lambda: crashed, story[1])
+        if not crashed:
+            return False
+        await world.kill()
+        world.api.down = False
+        world.start()
+        await story[1](world)
+        assert belongings(world) in ([1, 1, 1], [0, 0, 0])
+        assert world.live_at_most <= 5
+        return True
+
+
+STORIES: dict[str, tuple[bool, tuple[Step, Step]]] = {
+    "scale-up": (False, (make, is_made)),
+    "release": (True, (release, is_released)),
+    "failure": (True, (fail, is_counted)),
+    "eviction": (True, (disrupt, is_replaced)),
+    "template": (True, (change_template, is_changed)),
+    "suspend": (True, (suspend, is_suspended)),
+    "new-master": (True, (attach, is_attached)),
+    "lost-master": (True, (abandon, is_deleted)),
+}
+
+
+@pytest.fixture(scope="module")
+def five_workers() -> Store:
+    return virtual_time.run(_five_workers())
+
+
+@pytest.mark.timeout(100)
+@pytest.mark.parametrize("name", STORIES)
+def test_a_crash_after_any_call_changes_nothing_in_the_end(name: str, five_workers: Store) -> None:
+    has_past, story = STORIES[name]
+    past = five_workers if has_past else None
+    calls = 1
+    while virtual_time.run(_crash_after(calls, story, past)):
+        calls += 1
+    assert calls > 5, "the operator made fewer calls than the story needs"

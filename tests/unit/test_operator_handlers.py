@@ -1,0 +1,316 @@
+"""kopf as the watcher: what it tells, what it outlives, and that it writes nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import itertools
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from fakes import virtual_time
+from fakes.kubernetes_api import Fault
+from fakes.store import Body
+from fakes.world import NAMESPACE, World, a_world, configuration
+from fiber_operator import handlers
+from fiber_operator.cluster import Configuration, load_configuration
+from fiber_operator.handlers import Watcher
+from fiber_operator.program import Program
+from fiber_operator.settings import Settings
+from fiber_operator.worker import Key
+
+ES = Key(NAMESPACE, "es")
+Notice = tuple[Key, str, int | None]
+
+
+class Watching:
+    """kopf in this loop, and what it has told."""
+
+    def __init__(self, world: World, namespaces: tuple[str, ...]) -> None:
+        self.world = world
+        self.api = world.api
+        self.store = world.store
+        self.notices: list[Notice] = []
+        self.starts: list[bool] = []
+        self.gates = 0
+        self.stop = asyncio.Event()
+        self._task = asyncio.ensure_future(
+            handlers.watch(
+                lambda *notice: self.notices.append(notice),
+                configure=self._configure,
+                namespaces=namespaces,
+                gate=self._gate,
+                on_start=self.starts.append,
+                stop=self.stop,
+            )
+        )
+
+    async def _configure(self) -> Configuration:
+        return configuration(self.api)
+
+    async def _gate(self) -> None:
+        self.gates += 1
+
+    async def ended(self) -> None:
+        self.stop.set()
+        await self._task
+
+    async def told(self, *keys: Key, within: float = 600) -> list[Notice]:
+        """Wait until each of ``keys`` is among what was told; what that is, and forget it."""
+        await self.world.until(lambda: {*keys} <= {key for key, _, _ in self.notices}, within)
+        told, self.notices[:] = list(self.notices), []
+        return told
+
+    async def watched(self, times: int = 1) -> None:
+        """Wait until both watches are open, so many times each."""
+        await self.world.until(
+            lambda: (
+                min(self.api.count("watch", "pods"), self.api.count("watch", "fiberpools")) >= times
+            )
+        )
+
+    def pod(self, name: str, namespace: str = NAMESPACE, pool: str = "es") -> Body:
+        labels = {"fiber.dev/pool": pool, "fiber.dev/pool-uid": "1"}
+        body = {"metadata": {"name": name, "labels": labels}, "spec": {}}
+        return self.store.create("pods", namespace, body)
+
+
+@contextlib.asynccontextmanager
+async def watching(*namespaces: str) -> AsyncIterator[Watching]:
+    async with a_world(operator=False) as world:
+        watching = Watching(world, namespaces)
+        try:
+            yield watching
+        finally:
+            await watching.ended()
+
+
+def played(*namespaces: str) -> Callable[[Callable[[Watching], Coroutine[Any, Any, None]]], Any]:
+    def decorate(test: Callable[[Watching], Coroutine[Any, Any, None]]) -> Callable[[], None]:
+        async def main() -> None:
+            async with watching(*namespaces) as kopf:
+                await test(kopf)
+
+        def run() -> None:
+            virtual_time.run(main())
+            gc.collect()  # what was not closed is told now, not in another test
+
+        run.__doc__ = test.__doc__
+        return run
+
+    return decorate
+
+
+@played()
+async def test_pools_and_their_pods_are_told(kopf: Watching) -> None:
+    pool = kopf.world.make_pool()
+    uid = pool["metadata"]["uid"]
+    assert (ES, uid, 1) in await kopf.told(ES)
+    kopf.world.edit(replicas=2)
+    assert (ES, uid, 2) in await kopf.told(ES)
+    kopf.pod("a")
+    assert (ES, "", None) in await kopf.told(ES)
+    kopf.store.delete("pods", NAMESPACE, "a")
+    assert (ES, "", None) in await kopf.told(ES)
+    kopf.store.delete("fiberpools", NAMESPACE, "es")
+    assert (ES, uid, -1) in await kopf.told(ES)
+
+
+@played()
+async def test_what_was_there_before_is_told(kopf: Watching) -> None:
+    kopf.world.make_pool()
+    kopf.pod("a", pool="another")
+    await kopf.told(ES, Key(NAMESPACE, "another"))
+
+
+@played()
+async def test_other_pods_are_not_asked_for(kopf: Watching) -> None:
+    await kopf.watched()
+    kopf.store.create("pods", NAMESPACE, {"metadata": {"name": "stranger"}})
+    kopf.pod("ours")
+    assert {key for key, _, _ in await kopf.told(ES)} == {ES}
+
+
+@played()
+async def test_kopf_writes_nothing(kopf: Watching) -> None:
+    marks = {"kopf.zalando.org/last-handled-configuration": "{nonsense"}
+    kopf.store.create("fiberpools", NAMESPACE, {"metadata": {"name": "es", "annotations": marks}})
+    kopf.pod("a")
+    await kopf.told(ES)
+    kopf.world.edit(replicas=1)
+    await kopf.told(ES)
+    kopf.store.delete("fiberpools", NAMESPACE, "es")
+    await kopf.told(ES)
+    assert {call.verb for call in kopf.api.calls} == {"list", "watch"}
+    assert {call.plural for call in kopf.api.calls} == {"pods", "fiberpools"}
+
+
+@played("one", "two")
+async def test_only_the_given_namespaces_are_asked_for(kopf: Watching) -> None:
+    kopf.pod("a", "one")
+    kopf.pod("b", "two")
+    kopf.pod("c", "three")
+    await kopf.told(Key("one", "es"), Key("two", "es"))
+    assert {call.namespace for call in kopf.api.calls} == {"one", "two"}
+
+
+@played()
+async def test_a_watch_that_breaks_goes_on(kopf: Watching) -> None:
+    kopf.world.make_pool()
+    await kopf.watched()
+    await kopf.told(ES)
+    kopf.api.drop_watches()
+    await kopf.watched(2)
+    kopf.world.edit(replicas=1)
+    await kopf.told(ES)
+    assert kopf.starts == [True]
+
+
+@played()
+async def test_after_410_everything_is_told_anew(kopf: Watching) -> None:
+    kopf.world.make_pool()
+    await kopf.watched()
+    await kopf.told(ES)
+    kopf.world.edit(replicas=1)
+    await kopf.told(ES)
+    kopf.store.forget_history()
+    kopf.api.drop_watches()
+    await kopf.told(ES)
+
+
+@played()
+async def test_a_silent_watch_is_given_up(kopf: Watching) -> None:
+    """A connection that died without a word: no event, no bookmark, no end."""
+    kopf.world.make_pool()
+    await kopf.watched()
+    await kopf.told(ES)
+    kopf.api.silent = True
+    kopf.world.edit(replicas=1)
+    await asyncio.sleep(1)
+    kopf.api.silent = False
+    await kopf.told(ES, within=300)
+
+
+@played()
+async def test_late_events_are_told_late(kopf: Watching) -> None:
+    await kopf.watched()
+    kopf.api.watch_delay = 20
+    kopf.world.make_pool()
+    await kopf.told(ES)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Fault("list", status=500, times=20),
+        Fault("list", status=503, times=20),
+        Fault("list", status=429, retry_after=7, times=5),
+        Fault("list", status=403, reason="Forbidden", times=20),
+        Fault("list", times=20),
+        Fault("watch", status=500, times=10),
+        Fault("watch", times=10),
+    ],
+    ids=lambda fault: f"{fault.verb}-{fault.status}",
+)
+def test_an_api_server_in_trouble_is_waited_for(fault: Fault) -> None:
+    @played()
+    async def test(kopf: Watching) -> None:
+        kopf.api.faults.append(fault)
+        kopf.world.make_pool()
+        await kopf.told(ES)
+        kopf.world.edit(replicas=1)
+        await kopf.told(ES)
+
+    test()
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Fault("watch", text="{nonsense\n"),
+        Fault("watch", text='{"type": "ADDED"}\n'),
+        Fault("watch", text='{"type": "ADDED", "object": {}}\n'),
+        Fault("watch", text='{"type": "ERROR", "object": {"code": 500}}\n'),
+        Fault("watch", status=410, reason="Expired"),
+        Fault("list", text="<html>"),
+        Fault("list", text='{"items": [{}]}'),
+        Fault("list", status=404, reason="NotFound"),
+    ],
+    ids=lambda fault: f"{fault.verb}-{fault.status or fault.text}",
+)
+def test_what_ends_kopf_does_not_end_watching(fault: Fault) -> None:
+    @played()
+    async def test(kopf: Watching) -> None:
+        kopf.api.faults.append(fault)
+        kopf.world.make_pool()
+        await kopf.told(ES)
+        await kopf.watched(2)
+        kopf.world.edit(replicas=1)
+        await kopf.told(ES)
+        assert kopf.gates == len([start for start in kopf.starts if start])
+
+    test()
+
+
+def test_an_expired_login_is_renewed() -> None:
+    @played()
+    async def test(kopf: Watching) -> None:
+        kopf.world.make_pool()
+        await kopf.told(ES)
+        await kopf.watched()
+        kopf.api.faults += [Fault("watch", status=401, reason="Unauthorized", times=1)]
+        kopf.api.drop_watches()
+        await kopf.world.until(lambda: sum(c.verb == "watch" for c in kopf.api.calls) >= 5)
+        kopf.world.edit(replicas=1)
+        await kopf.told(ES)
+
+    test()
+
+
+def test_the_thread_tells_the_loop_that_made_it_and_ends_with_it() -> None:
+    """The whole program with kopf in its thread, in real time."""
+
+    async def main() -> None:
+        async with a_world(operator=False) as world:
+            stop = asyncio.Event()
+
+            async def configure() -> Configuration:
+                return configuration(world.api)
+
+            settings = Settings(host="127.0.0.1", port=0, identity="operator-1")
+            program = Program(settings, configure=configure, now=world.store.unix_now)
+            task = asyncio.ensure_future(program.run(stop))
+            world.make_pool(replicas=2)
+            await world.ready(2, within=10)
+            world.kubelet.evict(NAMESPACE, world.names()[0])
+            await world.until(lambda: world.status()["failures"]["disrupted"] == 1, within=10)
+            stop.set()
+            await task
+
+    asyncio.run(main())
+
+
+def test_a_thread_that_cannot_watch_ends_the_program() -> None:
+    async def main() -> None:
+        def fail() -> None:
+            raise KeyError("a fault of ours")
+
+        watcher = Watcher(
+            lambda *_: None,
+            configure=load_configuration,
+            namespaces=(),
+            gate=fail,  # type: ignore[arg-type]
+            on_start=lambda _: None,
+        )
+        with pytest.raises(KeyError):
+            await watcher.run()
+
+    asyncio.run(main())
+
+
+def test_patience_never_ends() -> None:
+    delays = iter(handlers._Patience())
+    assert max(itertools.islice(delays, 10_000)) == 5

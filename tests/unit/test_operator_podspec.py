@@ -1,0 +1,241 @@
+"""The body of a worker pod: what Fiber adds, and that the user's template wins."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fiber_api import names
+from fiber_operator.podspec import NODE_LOST_SECONDS, pod
+from fiber_operator.revisions import spec_hash, template_hash
+from unit.operator_objects import MASTER, UID, make_pool
+from unit.test_operator_pods import ANYTHING
+
+Json = dict[str, Any]
+
+
+def body_of(spec: Json | None = None, metadata: Json | None = None, **pool: Any) -> Json:
+    """A pod of a pool whose template says this beside its worker container."""
+    containers = [{"name": "worker", "image": "i"}]
+    template = {"metadata": metadata or {}, "spec": {"containers": containers, **(spec or {})}}
+    return pod(make_pool(template=template, **pool), "es-0000000001", "10.96.1.2:7070")
+
+
+def worker_of(container: Json | None = None, **spec: Any) -> Json:
+    """The worker container, of which the template says this."""
+    worker = {"name": "worker", "image": "i", **(container or {})}
+    containers = [{"name": "first", "image": "x"}, worker]
+    found: Json = body_of({"containers": containers, **spec})["spec"]["containers"][1]
+    return found
+
+
+def environment(container: Json) -> dict[str, str]:
+    values = {variable["name"]: variable.get("value", "") for variable in container["env"]}
+    assert len(values) == len(container["env"]), "a variable is there twice"
+    return values
+
+
+def test_a_worker_knows_who_and_where_it_is() -> None:
+    worker = body_of(processesPerPod=8, master={**MASTER, "lostGraceSeconds": 90})["spec"][
+        "containers"
+    ][0]
+    assert environment(worker) == {
+        "FIBER_AGENT_NAME": "es-0000000001",
+        "FIBER_AGENT_ADDRESS": "10.96.1.2:7070",
+        "FIBER_AGENT_CREDENTIALS": names.CREDENTIALS_DIRECTORY,
+        "FIBER_AGENT_POOL": "es",
+        "FIBER_AGENT_NAMESPACE": "team",
+        "FIBER_AGENT_PROCESSES": "8",
+        "FIBER_AGENT_LOST_GRACE": "90",
+    }
+
+
+def test_the_users_environment_wins_and_comes_last() -> None:
+    own = [
+        {"name": "FIBER_AGENT_ADDRESS", "value": "127.0.0.1:1"},
+        {"name": "LOG", "value": "/logs/$(FIBER_AGENT_NAME)"},
+    ]
+    worker = worker_of({"env": own})
+    assert environment(worker)["FIBER_AGENT_ADDRESS"] == "127.0.0.1:1"
+    assert worker["env"][-2:] == own
+    assert "FIBER_AGENT_POOL" in environment(worker)
+
+
+def test_only_the_worker_gets_the_credentials_and_only_the_agents_half() -> None:
+    body = body_of({"containers": [{"name": "x", "image": "i"}, {"name": "worker", "image": "i"}]})
+    other, worker = body["spec"]["containers"]
+    assert "volumeMounts" not in other
+    assert "env" not in other
+    assert worker["volumeMounts"] == [
+        {"name": "fiber-credentials", "mountPath": "/etc/fiber/credentials", "readOnly": True}
+    ]
+    (volume,) = body["spec"]["volumes"]
+    (source,) = volume["projected"]["sources"]
+    assert source["secret"]["name"] == "es-tls"
+    items = {item["key"]: item["path"] for item in source["secret"]["items"]}
+    assert items == names.AGENT_FILES
+    assert not any("master" in key for key in items)
+
+
+def test_a_mount_of_the_users_own_replaces_the_credentials() -> None:
+    mounts = [{"name": "mine", "mountPath": "/etc/fiber/credentials/"}]
+    body = body_of({"containers": [{"name": "worker", "image": "i", "volumeMounts": mounts}]})
+    assert body["spec"]["containers"][0]["volumeMounts"] == mounts
+    assert "volumes" not in body["spec"]
+
+
+def test_a_read_only_root_gets_a_writable_tmp_and_another_does_not() -> None:
+    read_only = {"securityContext": {"readOnlyRootFilesystem": True}}
+    assert {m["mountPath"] for m in worker_of(read_only)["volumeMounts"]} == {
+        "/tmp",
+        "/etc/fiber/credentials",
+    }
+    assert len(worker_of()["volumeMounts"]) == 1
+    own = {**read_only, "volumeMounts": [{"name": "disk", "mountPath": "/tmp"}]}
+    assert [m["name"] for m in worker_of(own)["volumeMounts"]] == ["disk", "fiber-credentials"]
+
+
+def test_a_pod_is_bare_and_ends_for_good() -> None:
+    body = body_of()
+    assert body["spec"]["restartPolicy"] == "Never"
+    assert body["spec"]["automountServiceAccountToken"] is False
+    assert body["spec"]["enableServiceLinks"] is False
+    assert body["spec"]["containers"][0]["terminationMessagePolicy"] == "FallbackToLogsOnError"
+    kept = {"automountServiceAccountToken": True, "enableServiceLinks": True}
+    assert body_of(kept)["spec"].items() >= kept.items()
+    assert worker_of({"terminationMessagePolicy": "File"})["terminationMessagePolicy"] == "File"
+
+
+def test_metadata_is_the_users_but_for_what_makes_it_a_worker() -> None:
+    metadata = {
+        "name": "mine",
+        "namespace": "elsewhere",
+        "finalizers": ["keep"],
+        "ownerReferences": [{"uid": "other"}],
+        "labels": {"team": "rl", names.LABEL_POOL_UID: "stolen"},
+        "annotations": {"note": "n"},
+    }
+    pool = make_pool(master={**MASTER, "epoch": 3})
+    found = body_of(metadata=metadata, master={**MASTER, "epoch": 3})["metadata"]
+    assert (found["name"], found["namespace"]) == ("es-0000000001", "team")
+    assert "finalizers" not in found
+    assert [owner["uid"] for owner in found["ownerReferences"]] == [UID]
+    assert found["labels"]["team"] == "rl"
+    assert found["labels"][names.LABEL_POOL_UID] == UID
+    assert found["labels"][names.LABEL_EPOCH] == "3"
+    assert found["annotations"] == {"note": "n"}
+    plain = pod(pool, "es-0000000001", "a:1")["metadata"]
+    assert plain["labels"][names.LABEL_TEMPLATE_HASH] == template_hash(pool)
+
+
+def test_pods_meet_the_restricted_security_standard() -> None:
+    body = body_of({"initContainers": [{"name": "i", "image": "x"}]})["spec"]
+    assert body["securityContext"] == {
+        "runAsNonRoot": True,
+        "seccompProfile": {"type": "RuntimeDefault"},
+    }
+    for container in (*body["initContainers"], *body["containers"]):
+        assert container["securityContext"] == {
+            "allowPrivilegeEscalation": False,
+            "capabilities": {"drop": ["ALL"]},
+        }
+
+
+def test_what_the_template_says_of_security_wins() -> None:
+    pod_wide = {"runAsUser": 1000, "fsGroup": 5, "seccompProfile": {"type": "Unconfined"}}
+    body = body_of({"securityContext": pod_wide})["spec"]
+    assert body["securityContext"] == {**pod_wide, "runAsNonRoot": True}
+    own = {"allowPrivilegeEscalation": True, "capabilities": {"add": ["NET_ADMIN"]}}
+    assert worker_of({"securityContext": own})["securityContext"] == own
+
+
+@pytest.mark.parametrize(
+    "said",
+    [{"securityContext": {"runAsNonRoot": False}}, {"securityContext": {"runAsUser": 0}}],
+)
+def test_a_template_may_ask_for_root(said: Json) -> None:
+    body = body_of(said)["spec"]
+    assert not body["securityContext"].get("runAsNonRoot")
+    assert "capabilities" not in body["containers"][0]["securityContext"]
+
+
+def test_one_container_may_be_root() -> None:
+    worker = worker_of({"securityContext": {"runAsUser": 0}})
+    assert worker["securityContext"]["runAsNonRoot"] is False
+    assert "capabilities" not in worker["securityContext"]
+
+
+@pytest.mark.parametrize(
+    "own", [{"privileged": True}, {"capabilities": {"add": ["CAP_SYS_ADMIN"]}}]
+)
+def test_nothing_is_added_that_the_api_server_would_refuse_beside(own: Json) -> None:
+    worker = worker_of({"securityContext": own})
+    assert "allowPrivilegeEscalation" not in worker["securityContext"]
+
+
+def tolerated(spec: Json) -> dict[str, Any]:
+    return {
+        t.get("key", ""): t.get("tolerationSeconds") for t in body_of(spec)["spec"]["tolerations"]
+    }
+
+
+def test_a_pod_leaves_a_silent_node_after_a_minute_unless_the_template_says_when() -> None:
+    lost, unready = "node.kubernetes.io/unreachable", "node.kubernetes.io/not-ready"
+    assert tolerated({}) == {lost: NODE_LOST_SECONDS, unready: NODE_LOST_SECONDS}
+    own = [{"key": lost, "operator": "Exists", "effect": "NoExecute", "tolerationSeconds": 9}]
+    assert tolerated({"tolerations": own}) == {lost: 9, unready: NODE_LOST_SECONDS}
+    assert tolerated({"tolerations": [{"operator": "Exists"}]}) == {"": None}
+    gpu = [{"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"}]
+    assert len(tolerated({"tolerations": gpu})) == 3
+
+
+def test_the_template_is_not_changed() -> None:
+    pool = make_pool()
+    before = copy.deepcopy(pool.spec.template)
+    body = pod(pool, "es-0000000001", "a:1")
+    body["spec"]["containers"][0]["env"].clear()
+    assert pool.spec.template == before
+
+
+def test_null_is_the_same_as_nothing_said() -> None:
+    spec = {"securityContext": None, "volumes": None, "tolerations": None}
+    container = {"name": "worker", "image": "i", "env": None, "securityContext": None}
+    assert body_of({**spec, "containers": [container]})["spec"] == body_of()["spec"]
+
+
+FIELDS = ["volumes", "securityContext", "tolerations", "initContainers", "hostNetwork"]
+CONTAINER_FIELDS = ["env", "volumeMounts", "securityContext", "resources", "command"]
+
+
+@given(
+    spec=st.dictionaries(st.sampled_from(FIELDS), ANYTHING),
+    container=st.dictionaries(st.sampled_from(CONTAINER_FIELDS), ANYTHING),
+    metadata=st.dictionaries(st.sampled_from(["labels", "annotations"]), ANYTHING),
+)
+def test_nonsense_is_passed_on(spec: Json, container: Json, metadata: Json) -> None:
+    worker = {"name": "worker", "image": "i", **container}
+    body = body_of({**spec, "containers": [worker]}, metadata)
+    assert body["spec"]["restartPolicy"] == "Never"
+    hidden = spec.get("hostNetwork")
+    assert body["spec"].get("hostNetwork") == hidden or hidden != hidden
+
+
+def test_the_hash_is_of_the_users_words() -> None:
+    template = {"spec": {"containers": [{"image": "i", "name": "worker"}]}}
+    turned = {"spec": {"containers": [{"name": "worker", "image": "i"}]}}
+    first = template_hash(make_pool(template=template))
+    assert template_hash(make_pool(template=turned, replicas=9, master=MASTER)) == first
+    assert template_hash(make_pool(template=template, processesPerPod=2)) != first
+    assert len(first) == 16
+
+
+def test_what_the_sdk_writes_starts_no_new_attempt() -> None:
+    first = spec_hash(make_pool(replicas=1))
+    release = {"release": ["es-0000000001"]}
+    assert spec_hash(make_pool(replicas=2, scaleDown=release, maxReplicas=9)) == first
+    for change in ({"suspend": True}, {"processesPerPod": 2}, {"master": MASTER}):
+        assert spec_hash(make_pool(**change)) != first

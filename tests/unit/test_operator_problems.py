@@ -1,0 +1,290 @@
+"""What a person reads when something is wrong: what, why, what to do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fiber_api.names import Reason
+from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
+from fiber_operator import plans
+from fiber_operator.plans import Obstacle, Refusal
+from fiber_operator.reconcile import plan
+from fiber_operator.revisions import template_hash
+from unit.operator_objects import (
+    MASTER,
+    NOW,
+    condition,
+    ended,
+    make_pool,
+    memory_of,
+    name_of,
+    pod_document,
+    running,
+    unschedulable,
+    views,
+    waiting,
+    with_plan,
+)
+
+Json = dict[str, Any]
+
+
+def status_of(pool: FiberPool, *pods: Json, now: float = NOW, **memory: Any) -> FiberPoolStatus:
+    made = plan(pool, views(pool, *pods), memory_of(pool, **memory), now)
+    return with_plan(pool, made).status
+
+
+def problem(pool: FiberPool, *pods: Json, **more: Any) -> Problem:
+    """The only problem."""
+    (found,) = status_of(pool, *pods, **more).problems
+    return found
+
+
+def then(pool: FiberPool, status: FiberPoolStatus) -> FiberPool:
+    return pool.model_copy(update={"status": status})
+
+
+POOL = make_pool(replicas=1)
+
+
+def test_a_pool_without_problems_says_so() -> None:
+    status = status_of(POOL, running(1))
+    assert status.problems == ()
+    assert status.phase == "Ready"
+
+
+# -- Pods that do not start
+
+
+@pytest.mark.parametrize(
+    ("reason", "named", "terminal"),
+    [
+        ("InvalidImageName", "InvalidImageName", True),
+        ("ErrImageNeverPull", "ErrImageNeverPull", True),
+        ("CreateContainerConfigError", "CreateContainerConfigError", False),
+        ("CreateContainerError", "CreateContainerError", False),
+        ("RunContainerError", "RunContainerError", False),
+        ("PreStartHookError", "CreateContainerError", False),
+    ],
+)
+def test_what_waiting_does_not_mend_is_an_error_at_once(
+    reason: str, named: str, terminal: bool
+) -> None:
+    found = problem(POOL, waiting(1, reason, 'secret "token" not found.'))
+    assert (found.reason, found.severity, found.terminal) == (named, "Error", terminal)
+    assert found.pod == name_of(1)
+    assert f'{reason}: secret "token" not found. ' in found.message
+    assert "spec.template" in found.message
+
+
+def test_an_image_that_would_run_as_root_is_told_how_to_go_on() -> None:
+    kubelet = "container has runAsNonRoot and image will run as root"
+    found = problem(POOL, waiting(1, "CreateContainerConfigError", kubelet))
+    assert found.terminal
+    assert "runAsUser" in found.message
+
+
+def test_an_image_that_cannot_be_pulled_is_a_warning_first() -> None:
+    pull = 'failed to pull "x": manifest unknown'
+    pods = [waiting(1, "ErrImagePull", pull), waiting(2, "ErrImagePull", pull)]
+    pool = make_pool(replicas=3)
+    first = status_of(pool, *pods)
+    (found,) = first.problems
+    assert (found.reason, found.severity, found.count) == ("ImagePullError", "Warning", 2)
+    assert not found.terminal
+    assert "manifest unknown" in found.message
+    second = status_of(then(pool, first), waiting(1, "ImagePullBackOff", "Back-off: " + pull))
+    assert second.problems[0].severity == "Error"
+    assert second.problems[0].since == found.since
+    assert second.phase == "Degraded"
+    lasting = status_of(then(pool, first), *pods, now=NOW + 30)
+    assert lasting.problems[0].severity == "Error"
+    assert status_of(then(pool, second), *pods).problems[0].severity == "Error"
+
+
+def test_the_cause_is_kept_when_the_kubelet_only_says_that_it_waits() -> None:
+    first = status_of(POOL, waiting(1, "ErrImagePull", "manifest unknown"))
+    found = problem(then(POOL, first), waiting(1, "ImagePullBackOff", 'Back-off pulling image "x"'))
+    assert "manifest unknown" in found.message
+
+
+def test_unschedulable_is_a_warning_in_the_schedulers_words_until_it_takes_too_long() -> None:
+    said = "0/2 nodes are available: 2 Insufficient nvidia.com/gpu."
+    pods = [unschedulable(1, said, age=9), unschedulable(2, said, age=8)]
+    pool = make_pool(replicas=2)
+    found = problem(pool, *pods)
+    assert (found.reason, found.severity, found.count) == ("Unschedulable", "Warning", 2)
+    assert said.rstrip(".") in found.message
+    late = problem(pool, *pods, now=NOW + 900)
+    assert (late.severity, late.terminal) == ("Error", False)
+
+
+def test_what_only_events_tell_is_told() -> None:
+    mount = 'FailedMount: MountVolume.SetUp failed for volume "data": secret "token" not found'
+    pod = waiting(1, "ContainerCreating", age=8)
+    found = problem(POOL, pod, warnings={name_of(1): mount})
+    assert (found.reason, found.severity) == ("FailedMount", "Warning")
+    assert 'secret "token" not found' in found.message
+    over = "FailedScheduling: 0/2 nodes are available"
+    assert status_of(POOL, pod, warnings={name_of(1): over}).problems == ()
+
+
+def test_a_pod_that_takes_too_long_is_an_error() -> None:
+    found = problem(POOL, waiting(1, "ContainerCreating", age=900))
+    assert (found.reason, found.severity) == ("StartupTimeout", "Error")
+    assert "900 s" in found.message
+
+
+def test_a_worker_that_is_not_ready_any_more_is_a_warning() -> None:
+    pod = running(1)
+    pod["status"]["conditions"] = [condition("Ready", "False", ago=5, message="node silent")]
+    found = problem(POOL, pod)
+    assert (found.reason, found.severity) == ("NotReady", "Warning")
+    assert "node silent" in found.message
+
+
+# -- Pods that fail
+
+
+def test_a_failed_worker_shows_its_exit_code_and_its_last_lines() -> None:
+    found = problem(POOL, ended(1, code=3, ran=12, message="Traceback:\nKeyError: 'x'"))
+    assert (found.reason, found.severity, found.terminal) == ("ContainerFailed", "Error", False)
+    assert f"{name_of(1)} exited with code 3 after 12 s" in found.message
+    assert found.message.endswith("Traceback:\nKeyError: 'x'")
+
+
+def test_a_signal_is_named() -> None:
+    assert "code 139 (SIGSEGV)" in problem(POOL, ended(1, code=139)).message
+
+
+def test_out_of_memory_names_the_limit() -> None:
+    worker = {"name": "worker", "image": "i", "resources": {"limits": {"memory": "512Mi"}}}
+    pool = make_pool(replicas=1, template={"spec": {"containers": [worker]}})
+    found = problem(pool, ended(1, code=137, reason="OOMKilled"))
+    assert found.reason == "OOMKilled"
+    assert "512Mi" in found.message
+    assert "resources.limits.memory" in found.message
+
+
+def test_a_command_that_is_no_agent_is_recognized() -> None:
+    found = problem(POOL, ended(1, code=0, ran=0, reason="Completed"))
+    assert found.reason == "Completed"
+    assert "python -m fiber.agent" in found.message
+
+
+def test_a_program_that_is_not_in_the_image_is_hopeless() -> None:
+    said = 'exec: "pyton": executable file not found in $PATH'
+    found = problem(POOL, ended(1, code=128, reason="StartError", message=said))
+    assert (found.reason, found.terminal) == ("RunContainerError", True)
+    assert said in found.message
+    busy = problem(POOL, ended(1, code=128, reason="StartError", message="cannot allocate memory"))
+    assert not busy.terminal
+
+
+def test_a_pod_that_a_node_turned_away_shows_the_nodes_words() -> None:
+    found = problem(POOL, pod_document(1, phase="Failed", reason="OutOfcpu", message="no cpu left"))
+    assert "OutOfcpu" in found.message
+    assert "no cpu left" in found.message
+
+
+def test_a_worker_that_took_too_much_disk_shows_the_nodes_words() -> None:
+    evicted = ended(1, code=137)
+    said = 'Usage of EmptyDir volume "x" exceeds the limit "1Gi"'
+    evicted["status"] |= {"reason": "Evicted", "message": said}
+    found = problem(POOL, evicted)
+    assert f"failed: Evicted: {said}" in found.message
+    assert "last lines" not in found.message
+
+
+def test_failures_are_summed_up_while_they_last() -> None:
+    pool = make_pool(replicas=2)
+    first = status_of(pool, ended(1), ended(2))
+    assert first.problems[0].count == 2
+    unchanged = status_of(then(pool, first), ended(1), ended(2), now=NOW + 3)
+    assert unchanged.problems == first.problems
+    gone = status_of(then(pool, first), now=NOW + 3)
+    assert gone.problems == first.problems
+    more = status_of(then(pool, first), ended(1), ended(2), ended(3, ago=-2), now=NOW + 5)
+    assert (more.problems[0].count, more.problems[0].pod) == (3, name_of(3))
+
+
+def test_past_the_limit_the_first_problem_says_what_to_do() -> None:
+    pool = make_pool(replicas=1, failurePolicy={"backoffLimit": 0})
+    status = status_of(pool, ended(1, code=7))
+    limit, cause = status.problems
+    assert (limit.reason, limit.terminal) == ("BackoffLimitExceeded", True)
+    assert "exited with code 7" in limit.message
+    assert "spec.suspend" in limit.message
+    assert cause.reason == "ContainerFailed"
+    assert status.phase == "Failed"
+
+
+# -- The pool
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "reason", "terminal"),
+    [
+        (403, "pods is forbidden: exceeded quota: team, requested: cpu=1", "QuotaExceeded", False),
+        (403, 'violates PodSecurity "restricted:latest"', "Forbidden", True),
+        (422, "spec.containers[0].image: Required value", "InvalidTemplate", True),
+    ],
+)
+def test_a_refusal_is_told_in_the_api_servers_words(
+    code: int, said: str, reason: str, terminal: bool
+) -> None:
+    refused = Refusal(template_hash(POOL), code, said, NOW)
+    status = status_of(POOL, refusal=refused)
+    (found,) = status.problems
+    assert (found.reason, found.terminal, found.severity) == (reason, terminal, "Error")
+    assert said in found.message
+    (accepted,) = (c.status for c in status.conditions if c.type == "Accepted")
+    assert accepted == ("True" if reason == "QuotaExceeded" else "False")
+
+
+def test_a_full_quota_is_no_problem_to_a_pool_that_wants_no_more() -> None:
+    refused = Refusal(template_hash(POOL), 403, "exceeded quota", NOW)
+    assert status_of(POOL, running(1), refusal=refused).problems == ()
+
+
+def test_an_obstacle_is_told_as_it_is() -> None:
+    obstacle = Obstacle(Reason.NAME_TAKEN, "the Service es-master is another's", True)
+    found = problem(POOL, running(1), obstacles=(obstacle,))
+    assert (found.reason, found.message) == ("NameTaken", obstacle.message)
+    assert found.terminal
+
+
+def test_a_lost_master_is_told_with_what_will_follow() -> None:
+    pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"})
+    expired = plans.Master(alive=False, holder="train-0")
+    found = problem(pool, running(1), master=expired)
+    assert found.reason == "MasterLost"
+    for said in ("10.0.3.7:41337", "epoch 1", "train-0", "onLost is Delete"):
+        assert said in found.message
+
+
+def test_a_master_of_the_other_address_family_is_told() -> None:
+    pool = make_pool(replicas=1, master={**MASTER, "host": "fd00::7"})
+    found = problem(pool, running(1))
+    assert (found.reason, found.terminal) == ("InvalidSpec", True)
+    assert "fd00::7" in found.message
+
+
+def test_names_that_are_no_workers_are_told() -> None:
+    release = {"release": [name_of(1), "es-web", "other-0000000001"]}
+    found = problem(make_pool(replicas=1, scaleDown=release), running(2))
+    assert (found.reason, found.severity, found.count) == ("InvalidRelease", "Warning", 2)
+    assert "es-web, other-0000000001" in found.message
+
+
+def test_the_worst_comes_first_and_there_are_ten_at_most() -> None:
+    reasons = ["ErrImagePull", "InvalidImageName", "CreateContainerError", "RunContainerError"]
+    pods = [waiting(number, reason) for number, reason in enumerate(reasons)]
+    warnings = {name_of(number): f"Failed{number}: x" for number in range(20, 30)}
+    silent = [waiting(number, "ContainerCreating", age=8) for number in range(20, 30)]
+    status = status_of(make_pool(replicas=30), *pods, unschedulable(10), *silent, warnings=warnings)
+    assert len(status.problems) == 10
+    found = [problem.reason for problem in status.problems]
+    assert found[:3] == ["InvalidImageName", "CreateContainerError", "RunContainerError"]

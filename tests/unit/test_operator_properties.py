@@ -1,0 +1,381 @@
+"""What holds of every plan, whatever the pool, its pods and its status are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from hypothesis import Phase, assume, example, given, settings
+from hypothesis import strategies as st
+
+from fiber_api.names import Reason
+from fiber_api.times import format_time
+from fiber_api.v1alpha1 import FiberPool, InvalidPool
+from fiber_operator import plans
+from fiber_operator.plans import Memory, Obstacle, Plan, Refusal
+from fiber_operator.pods import PodView, State, Trouble
+from fiber_operator.reconcile import plan, plan_unreadable
+from fiber_operator.revisions import spec_hash, template_hash
+from unit.operator_cluster_model import Model, view
+from unit.operator_objects import ADDRESS, MASTER, NOW, make_pool, name_of, pool_document
+from unit.test_operator_pods import ANYTHING
+
+NO_SHRINKING = (Phase.explicit, Phase.reuse, Phase.generate)
+"""For what takes long: a failure is shown as it was found."""
+
+NUMBERS = st.integers(0, 15)
+TROUBLES: dict[State, list[Trouble | None]] = {
+    State.PENDING: [None, Trouble.CANNOT_START, Trouble.UNSCHEDULABLE],
+    State.STARTING: [None],
+    State.READY: [None],
+    State.NOT_READY: [None],
+    State.TERMINATING: [None, Trouble.DISRUPTED],
+    State.ENDED: [Trouble.APPLICATION, Trouble.COMPLETED, Trouble.DISRUPTED],
+}
+REASONS = ["", "ErrImagePull", "ImagePullBackOff", "OOMKilled", "Evicted", "InvalidImageName"]
+
+
+@st.composite
+def pods_of(draw: st.DrawFn, hash_: str) -> list[PodView]:
+    pods = []
+    for number in draw(st.sets(NUMBERS)):
+        state = draw(st.sampled_from(State))
+        age = draw(st.sampled_from([0, 1, 7, 20, 59, 61, 3000]))
+        pods.append(
+            view(
+                number,
+                state,
+                template_hash=draw(st.sampled_from([hash_, hash_, "older"])),
+                trouble=draw(st.sampled_from(TROUBLES[state])),
+                reason=draw(st.sampled_from(REASONS)),
+                created=NOW - age - draw(st.sampled_from([0, 5])),
+                since=NOW - age,
+                owner=draw(st.sampled_from([view(0, state).owner] * 5 + ["another", ""])),
+                exit_code=draw(st.sampled_from([None, 0, 1, 137])),
+                ran=float(draw(st.sampled_from([0, 5, 100]))),
+                deletion_cost=draw(st.integers(-2, 2)),
+            )
+        )
+    return pods
+
+
+SPECS = st.fixed_dictionaries(
+    {
+        "minReplicas": st.integers(0, 4),
+        "maxReplicas": st.integers(4, 12),
+        "suspend": st.sampled_from([False, False, False, True]),
+        "scaleDown": st.fixed_dictionaries(
+            {
+                "policy": st.sampled_from(["ReleasedOnly", "ReleasedOnly", "Any"]),
+                "release": st.lists(NUMBERS.map(name_of), unique=True, max_size=4),
+            }
+        ),
+        "update": st.fixed_dictionaries(
+            {"strategy": st.sampled_from(["OnIdle", "OnIdle", "Recreate", "OnDelete"])}
+        ),
+    },
+    optional={
+        "replicas": st.integers(0, 16),
+        "master": st.fixed_dictionaries(
+            {
+                **{key: st.just(value) for key, value in MASTER.items()},
+                "onLost": st.sampled_from(["Delete", "ScaleToMin", "Retain"]),
+                "lostGraceSeconds": st.sampled_from([0, 60]),
+            },
+            optional={"leaseName": st.just("es")},
+        ),
+    },
+)
+
+
+@st.composite
+def statuses(draw: st.DrawFn, spec: dict[str, Any]) -> dict[str, Any]:
+    pool = make_pool(**spec)
+    times = st.sampled_from([-100, -5, 0, 4, 100, 10_000]).map(lambda s: format_time(NOW + s))
+    failures = {
+        "consecutive": draw(st.sampled_from([0, 0, 1, 3, 8])),
+        "nextCreateTime": draw(times),
+        "newestCreated": draw(times),
+        "lastTime": draw(times),
+        "counted": draw(st.lists(NUMBERS.map(name_of), max_size=4, unique=True)),
+        "specHash": draw(st.sampled_from([spec_hash(pool), spec_hash(pool), "other"])),
+    }
+    alive = {
+        "type": "MasterAlive",
+        "status": draw(st.sampled_from(["True", "False", "Unknown"])),
+        "lastTransitionTime": draw(times),
+    }
+    proven = draw(st.sampled_from([template_hash(pool), "older", None]))
+    return {"failures": failures, "conditions": [alive], "provenTemplateHash": proven}
+
+
+@st.composite
+def memories(draw: st.DrawFn, hash_: str) -> Memory:
+    refusal = Refusal(hash_, draw(st.sampled_from([403, 422])), "no", NOW - 3)
+    obstacle = Obstacle(Reason.NAME_TAKEN, "taken")
+    return Memory(
+        address=draw(st.sampled_from([ADDRESS] * 4 + [None])),
+        obstacles=draw(st.sampled_from([()] * 4 + [(obstacle,)])),
+        accepted=draw(st.sampled_from([hash_, hash_, "older", None])),
+        refusal=draw(st.sampled_from([None, None, None, refusal])),
+        master=plans.Master(draw(st.sampled_from([None, True, False]))),
+        deleted=frozenset(draw(st.sets(NUMBERS.map(name_of), max_size=3))),
+    )
+
+
+@st.composite
+def cases(
+    draw: st.DrawFn, specs: st.SearchStrategy[dict[str, Any]] = SPECS
+) -> tuple[FiberPool, list[PodView], Memory]:
+    spec = draw(specs)
+    pool = make_pool(draw(statuses(spec)), **spec)
+    hash_ = template_hash(pool)
+    return pool, draw(pods_of(hash_)), draw(memories(hash_))
+
+
+Case = tuple[FiberPool, list[PodView], Memory]
+
+
+def own(pool: FiberPool, pods: list[PodView]) -> dict[str, PodView]:
+    return {pod.name: pod for pod in pods if pod.owner == pool.metadata.uid}
+
+
+def after(pool: FiberPool, made: Plan) -> FiberPool:
+    if made.status is None:
+        return pool
+    return FiberPool.read({**pool.model_dump(mode="json", by_alias=True), "status": made.status})
+
+
+@given(cases())
+def test_only_pods_of_the_pool_are_deleted_and_each_once(case: Case) -> None:
+    pool, pods, memory = case
+    made = plan(pool, pods, memory, NOW)
+    names = [deletion.name for deletion in made.delete]
+    assert len(set(names)) == len(names)
+    known = own(pool, pods)
+    for deletion in made.delete:
+        assert deletion.uid == known[deletion.name].uid
+        assert known[deletion.name].state is not State.TERMINATING
+
+
+def at_work(spec: dict[str, Any]) -> dict[str, Any]:
+    """With a master, whose workers are its own."""
+    strategy = spec["update"]["strategy"].replace("Recreate", "OnIdle")
+    scale_down = {**spec["scaleDown"], "policy": "ReleasedOnly"}
+    changed = {"master": MASTER, "suspend": False, "scaleDown": scale_down}
+    return {**spec, **changed, "update": {"strategy": strategy}}
+
+
+@given(cases(SPECS.map(at_work)))
+def test_a_ready_worker_of_a_master_goes_only_when_released(case: Case) -> None:
+    pool, pods, memory = case
+    spec = pool.spec
+    made = plan(pool, pods, memory, NOW)
+    known = own(pool, pods)
+    for deletion in made.delete:
+        pod = known[deletion.name]
+        if pod.live and pod.name not in spec.scale_down.release:
+            assert not pod.was_ready
+            assert deletion.resource_version == pod.resource_version
+    assert not made.delete_pool
+
+
+@given(cases())
+def test_creation_never_passes_what_is_wanted(case: Case) -> None:
+    pool, pods, memory = case
+    made = plan(pool, pods, memory, NOW)
+    gone = {deletion.name for deletion in made.delete}
+    live = [pod for pod in own(pool, pods).values() if pod.live and pod.name not in gone]
+    assert made.create >= 0
+    if made.create:
+        assert len(live) + made.create <= pool.wanted <= pool.spec.max_replicas
+
+
+@given(cases())
+def test_nothing_is_created_where_something_forbids_it(case: Case) -> None:
+    pool, pods, memory = case
+    made = plan(pool, pods, memory, NOW)
+    if not made.create:
+        return
+    failures = after(pool, made).status.failures
+    assert failures.consecutive <= pool.spec.failure_policy.backoff_limit
+    longest = pool.spec.failure_policy.backoff_max_seconds * 1.1 + 1
+    assert not NOW < (failures.next_create_time or 0) <= NOW + longest
+    assert memory.address
+    assert not memory.obstacles
+    assert not memory.refusal
+    assert not pool.spec.suspend
+    assert not made.dry_run
+    proven = after(pool, made).status.proven_template_hash
+    assert template_hash(pool) in (memory.accepted, proven)
+
+
+@given(cases(), st.randoms(use_true_random=False))
+def test_the_order_of_the_list_makes_no_difference(case: Case, random: Any) -> None:
+    pool, pods, memory = case
+    shuffled = list(pods)
+    random.shuffle(shuffled)
+    assert plan(pool, shuffled, memory, NOW) == plan(pool, pods, memory, NOW)
+
+
+@given(cases())
+def test_a_plan_whose_status_is_written_stays_the_plan(case: Case) -> None:
+    """The operator died after writing the status: the next one does the rest."""
+    pool, pods, memory = case
+    first = plan(pool, pods, memory, NOW)
+    second = plan(after(pool, first), pods, memory, NOW)
+    if first.status is None and not first.dry_run:
+        assert second == first
+    else:
+        assert (second.create, second.delete) == (first.create, first.delete)
+        assert first.dry_run or second.status is None
+
+
+@given(cases())
+def test_nothing_is_planned_twice(case: Case) -> None:
+    pool, pods, memory = case
+    model = Model(
+        document=pool.model_dump(mode="json", by_alias=True),
+        pods={pod.name: pod for pod in pods},
+        memory=memory,
+    )
+    first = model.act()
+    assume(not first.dry_run and not first.delete_pool)
+    second = model.plan()
+    assert second.create == 0
+    assert {d.name for d in second.delete}.isdisjoint(d.name for d in first.delete)
+    assert not any(event.reason == "ScaledUp" for event in second.events)
+
+
+@settings(max_examples=30, deadline=None, phases=NO_SHRINKING)
+@given(cases())
+def test_every_state_settles(case: Case) -> None:
+    pool, pods, memory = case
+    assume(not (pool.spec.master and pool.spec.master.lease_name))
+    model = Model(
+        document=pool.model_dump(mode="json", by_alias=True),
+        pods={pod.name: pod for pod in pods},
+        memory=replace(memory, address=ADDRESS, obstacles=(), refusal=None),
+    )
+    model.document["spec"]["suspend"] = False
+    if model.plan().status and model.pool.status.failures.consecutive > 6:
+        model.document["status"]["failures"]["specHash"] = "the user has corrected something"
+    for _ in range(120):
+        model.act()
+        if pool.spec.master:
+            model.release_what_the_operator_may_not_take()
+        model.pass_time(5)
+    model.document["spec"]["scaleDown"]["release"] = []
+    model.act()
+    settled = model.plan()
+    assert (settled.create, settled.delete, settled.status) == (0, (), None)
+    mine = [pod for pod in model.live if pod.owner == pool.metadata.uid]
+    assert len(mine) == pool.wanted
+    assert all(pod.state is State.READY for pod in mine)
+    status = model.pool.status
+    assert (status.ready_replicas, status.desired_replicas) == (pool.wanted, pool.wanted)
+    if pool.spec.update.strategy != "OnDelete":
+        assert status.updated_replicas == pool.wanted
+        assert status.phase == "Ready"
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    failing=st.integers(1, 6),
+    kills=st.lists(st.sampled_from(["", "before", "status", "delete", "create"]), max_size=40),
+)
+@example(failing=6, kills=["status"] * 40)
+def test_each_failure_is_counted_once_though_the_operator_dies(
+    failing: int, kills: list[str]
+) -> None:
+    model = Model(pool_document(replicas=failing), fails=True)
+    failed: set[str] = set()
+    for kill in [*kills, "", "", ""]:
+        made = model.plan()
+        steps = {"before": 0, "status": 1, "delete": 2, "create": 3}.get(kill, 3)
+        for step in (model.write_status, model.delete, model.create)[:steps]:
+            step(made)
+        if kill:
+            model.restart()
+        model.pass_time()
+        failed |= {pod.name for pod in model.pods.values() if pod.state is State.ENDED}
+    model.write_status(model.plan())
+    assert model.pool.status.failures.total == len(failed)
+
+
+@settings(max_examples=20, deadline=None)
+@given(replicas=st.integers(1, 12), limit=st.integers(0, 4))
+def test_a_template_that_fails_comes_to_an_end(replicas: int, limit: int) -> None:
+    policy = {"backoffBaseSeconds": 1, "backoffMaxSeconds": 8, "backoffLimit": limit}
+    model = Model(pool_document(replicas=replicas, failurePolicy=policy), fails=True)
+    for _ in range(80):
+        model.act()
+        model.pass_time()
+    assert not model.live
+    assert model.created == min(3, replicas) * (limit + 1)
+    assert model.pool.status.problems[0].reason == "BackoffLimitExceeded"
+    assert len(model.pods) <= 3  # kept for their logs
+    model.document["spec"]["template"]["metadata"] = {"labels": {"corrected": "yes"}}
+    model.fails = False
+    for _ in range(40):
+        model.act()
+        model.pass_time()
+    assert model.pool.status.ready_replicas == replicas
+    assert model.pool.status.failures.consecutive == 0
+
+
+@given(
+    junk=ANYTHING,
+    fields=st.dictionaries(
+        st.sampled_from(
+            [
+                "failures",
+                "problems",
+                "conditions",
+                "provenTemplateHash",
+                "endpoint",
+                "masterEpoch",
+                "phase",
+            ]
+        ),
+        ANYTHING,
+    ),
+)
+def test_junk_in_the_status_is_written_over(junk: Any, fields: dict[str, Any]) -> None:
+    for status in (junk, fields, {"failures": fields}, {"conditions": [fields]}):
+        pool = FiberPool.read({**pool_document(replicas=2), "status": status})
+        made = plan(pool, [], Memory(address=ADDRESS, accepted=template_hash(pool)), NOW)
+        assert made.status is not None
+        again = plan(after(pool, made), [], Memory(address=ADDRESS), NOW)
+        assert again.status is None
+
+
+@given(
+    key=st.sampled_from(["spec", "status", "metadata"]),
+    field=st.sampled_from(["replicas", "template", "master", "update", "generation", "problems"]),
+    junk=ANYTHING,
+)
+def test_junk_in_the_spec_deletes_nothing(key: str, field: str, junk: Any) -> None:
+    document = pool_document(replicas=2)
+    document[key][field] = junk
+    pods = [view(number, State.READY) for number in range(4)]
+    errors: tuple[str, ...] = ()
+    try:
+        pool = FiberPool.read(document)
+    except InvalidPool as error:
+        errors = error.errors
+    if not errors:
+        plan(pool, pods, Memory(address=ADDRESS), NOW)
+        return
+    made = plan_unreadable(document, pods, errors, NOW)
+    assert (made.create, made.delete) == (0, ())
+    assert made.status is not None
+    assert made.status["problems"][0]["reason"] == "InvalidSpec"
+    document["status"] = made.status
+    assert plan_unreadable(document, pods, errors, NOW + 5) == Plan()
+
+
+@given(ANYTHING)
+def test_a_document_of_junk_is_unreadable_and_no_more(junk: Any) -> None:
+    document = junk if isinstance(junk, dict) else {"metadata": junk, "status": junk}
+    assert plan_unreadable(document, [], ["all: is wrong"], NOW).delete == ()

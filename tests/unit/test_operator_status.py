@@ -1,0 +1,225 @@
+"""The status document: counts, conditions, phase, and that nothing in it moves by itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
+from fiber_operator import plans
+from fiber_operator.pods import State
+from fiber_operator.reconcile import plan, plan_unreadable
+from fiber_operator.revisions import template_hash
+from unit.operator_cluster_model import view
+from unit.operator_objects import (
+    MASTER,
+    NOW,
+    UID,
+    ended,
+    make_pool,
+    memory_of,
+    of_template,
+    pod_document,
+    pool_document,
+    running,
+    terminating,
+    views,
+    with_plan,
+)
+
+Json = dict[str, Any]
+
+
+def look(pool: FiberPool, *pods: Json, now: float = NOW, **memory: Any) -> plans.Plan:
+    return plan(pool, views(pool, *pods), memory_of(pool, **memory), now)
+
+
+def status_of(pool: FiberPool, *pods: Json, **more: Any) -> FiberPoolStatus:
+    return with_plan(pool, look(pool, *pods, **more)).status
+
+
+def told(status: FiberPoolStatus) -> dict[str, tuple[str, str]]:
+    return {found.type: (found.status, found.reason) for found in status.conditions}
+
+
+def test_what_a_person_and_the_scale_subresource_read() -> None:
+    pool = make_pool(replicas=5, master={**MASTER, "epoch": 3})
+    status = status_of(
+        pool,
+        running(1),
+        of_template("older", running(2)),
+        pod_document(3),
+        terminating(running(4)),
+        ended(5),
+    )
+    counts = (status.desired_replicas, status.replicas, status.ready_replicas)
+    assert counts == (5, 3, 2)
+    counts = (status.pending_replicas, status.terminating_replicas, status.updated_replicas)
+    assert counts == (1, 1, 2)
+    assert status.observed_generation == 7
+    assert status.selector == f"fiber.dev/pool-uid={UID}"
+    assert status.endpoint == "tls+tcp://10.96.1.2:7070"
+    assert (status.master, status.master_epoch) == ("10.0.3.7:41337", 3)
+    assert status.credentials_secret == "es-tls"
+    assert status.template_hash == template_hash(pool)
+
+
+def test_the_highest_epoch_is_remembered_without_a_master() -> None:
+    pool = make_pool({"masterEpoch": 5})
+    status = status_of(pool)
+    assert (status.master, status.master_epoch) == (None, 5)
+
+
+def test_every_condition_is_there_once() -> None:
+    found = told(status_of(make_pool(replicas=1), running(1)))
+    assert found == {
+        "Accepted": ("True", "AsExpected"),
+        "Ready": ("True", "AsExpected"),
+        "Progressing": ("False", "AsExpected"),
+        "Degraded": ("False", "AsExpected"),
+        "MasterAlive": ("Unknown", "NoMaster"),
+        "ScalingLimited": ("False", "WithinBounds"),
+        "Suspended": ("False", "NotSuspended"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("spec", "pods", "ready", "progressing", "phase"),
+    [
+        ({}, [], ("True", "ScaledToZero"), ("False", "AsExpected"), "Ready"),
+        ({"replicas": 2}, [], ("False", "Creating"), ("True", "Creating"), "Scaling"),
+        (
+            {"replicas": 1},
+            [pod_document(1)],
+            ("False", "Starting"),
+            ("True", "Starting"),
+            "Scaling",
+        ),
+        (
+            {"replicas": 1, "suspend": True},
+            [terminating(running(1))],
+            ("False", "Suspended"),
+            ("True", "Deleting"),
+            "Suspended",
+        ),
+        (
+            {"replicas": 1, "master": MASTER},
+            [running(1), running(2)],
+            ("True", "AsExpected"),
+            ("True", "Draining"),
+            "Scaling",
+        ),
+        (
+            {"replicas": 1, "master": MASTER},
+            [of_template("older", running(1))],
+            ("True", "AsExpected"),
+            ("True", "Updating"),
+            "Scaling",
+        ),
+        (
+            {"replicas": 1},
+            [ended(1)],
+            ("False", "ContainerFailed"),
+            ("True", "BackingOff"),
+            "Degraded",
+        ),
+    ],
+)
+def test_readiness_progress_and_phase(
+    spec: Json,
+    pods: list[Json],
+    ready: tuple[str, str],
+    progressing: tuple[str, str],
+    phase: str,
+) -> None:
+    status = status_of(make_pool(**spec), *pods)
+    assert (told(status)["Ready"], told(status)["Progressing"]) == (ready, progressing)
+    assert status.phase == phase
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        ({"replicas": 9, "maxReplicas": 4}, ("True", "AboveMaximum")),
+        ({"replicas": 1, "minReplicas": 2}, ("True", "BelowMinimum")),
+        ({"minReplicas": 2}, ("False", "WithinBounds")),
+    ],
+)
+def test_bounds_that_bind_are_told(spec: Json, expected: tuple[str, str]) -> None:
+    assert told(status_of(make_pool(**spec)))["ScalingLimited"] == expected
+
+
+@pytest.mark.parametrize(
+    ("alive", "expected"),
+    [
+        (True, ("True", "LeaseRenewed")),
+        (False, ("False", "MasterLost")),
+        (None, ("Unknown", "LeaseNotChecked")),
+    ],
+)
+def test_the_master_is_alive_if_its_lease_is(alive: bool | None, expected: tuple[str, str]) -> None:
+    pool = make_pool(master={**MASTER, "leaseName": "es"})
+    status = status_of(pool, master=plans.Master(alive=alive))
+    assert told(status)["MasterAlive"] == expected
+    if alive is not None:
+        again = status_of(pool.model_copy(update={"status": status}), master=plans.Master())
+        assert told(again)["MasterAlive"] == expected
+
+
+def test_a_condition_keeps_its_time_until_its_status_changes() -> None:
+    pool = make_pool(replicas=1)
+    first = with_plan(pool, look(pool, pod_document(1)))
+    second = with_plan(first, look(first, running(1, age=1), now=NOW + 9))
+    times = {found.type: found.last_transition_time for found in second.status.conditions}
+    assert times["Accepted"] == NOW
+    assert times["Ready"] == NOW + 9
+
+
+def test_time_alone_changes_nothing() -> None:
+    pool = make_pool(replicas=3)
+    pods = [running(1), running(2), ended(3)]
+    pool = with_plan(pool, look(pool, *pods))
+    assert look(pool, *pods, now=NOW + 1.5).status is None
+
+
+def test_a_damaged_status_is_written_anew() -> None:
+    document = pool_document(
+        with_plan(make_pool(), look(make_pool())).status.model_dump(mode="json", by_alias=True)
+    )
+    assert look(FiberPool.read(document)).status is None
+    document["status"]["failures"]["total"] = "many"
+    made = look(FiberPool.read(document))
+    assert made.status is not None
+    assert made.status["failures"]["total"] == 0
+
+
+def test_what_is_no_more_is_none_in_the_patch() -> None:
+    pool = make_pool(replicas=1)
+    pool = with_plan(pool, look(pool, ended(1)))
+    assert pool.status.failures.next_create_time
+    document = {**pool_document(replicas=0), "status": pool.status.model_dump(by_alias=True)}
+    made = look(FiberPool.read(document), now=NOW + 100)
+    assert made.status is not None
+    assert made.status["failures"]["nextCreateTime"] is None
+    assert made.status["problems"] == []
+
+
+def test_a_spec_that_cannot_be_read_is_told_and_counts_go_on() -> None:
+    pool = make_pool(replicas=1, master=MASTER)
+    document = pool_document(
+        with_plan(pool, look(pool, running(1))).status.model_dump(mode="json", by_alias=True)
+    )
+    document["spec"]["replicas"] = "three"
+    pods = [*views(pool, running(1)), view(2, State.PENDING)]
+    made = plan_unreadable(document, pods, ["spec.replicas: Input should be an integer"], NOW)
+    assert made.status is not None
+    status = FiberPoolStatus.model_validate(made.status)
+    assert (status.phase, status.replicas, status.endpoint) == (
+        "Failed",
+        2,
+        "tls+tcp://10.96.1.2:7070",
+    )
+    assert "spec.replicas" in status.problems[0].message
+    assert told(status)["Accepted"] == ("False", "InvalidSpec")
+    assert told(status)["Degraded"] == ("True", "InvalidSpec")

@@ -1,0 +1,95 @@
+"""Events tell what is done and what is new; what stays as it is is not told again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fiber_api.v1alpha1 import FiberPool
+from fiber_operator.plans import Plan
+from fiber_operator.reconcile import plan
+from unit.operator_objects import (
+    MASTER,
+    NOW,
+    ended,
+    make_pool,
+    memory_of,
+    name_of,
+    of_template,
+    running,
+    terminating,
+    unschedulable,
+    views,
+    waiting,
+    with_plan,
+)
+
+Json = dict[str, Any]
+
+
+def look(pool: FiberPool, *pods: Json, now: float = NOW) -> tuple[Plan, FiberPool]:
+    made = plan(pool, views(pool, *pods), memory_of(pool), now)
+    return made, with_plan(pool, made)
+
+
+def reasons(made: Plan) -> list[str]:
+    return [str(event.reason) for event in made.events]
+
+
+def test_what_is_done_is_told() -> None:
+    pool = make_pool(replicas=3, master=MASTER, scaleDown={"release": [name_of(1)]})
+    made, _ = look(pool, running(1), of_template("older", waiting(2, "ErrImagePull")), running(3))
+    assert [event.message for event in made.events[:3]] == [
+        "Deleting 1 worker that the master released",
+        "Deleting 1 worker of an older template",
+        "Creating 2 workers; 3 of 3 were there",
+    ]
+
+
+def test_a_problem_is_told_when_it_comes_and_when_it_gets_worse() -> None:
+    pool = make_pool(replicas=1)
+    pod = waiting(1, "ErrImagePull", "manifest unknown")
+    made, pool = look(pool, pod)
+    assert reasons(made) == ["ImagePullError"]
+    assert made.events[0].type == "Warning"
+    made, pool = look(pool, pod, now=NOW + 1)
+    assert made.events == ()
+    made, pool = look(pool, waiting(1, "ImagePullBackOff", "manifest unknown"))
+    assert reasons(made) == ["ImagePullError"]
+    made, pool = look(pool, running(1))
+    assert [(event.type, event.reason) for event in made.events] == [("Normal", "Recovered")]
+
+
+def test_a_warning_that_passes_is_not_a_recovery() -> None:
+    pool = make_pool(replicas=1)
+    _, pool = look(pool, unschedulable(1))
+    made, _ = look(pool, running(1))
+    assert made.events == ()
+
+
+def test_each_failure_is_told_even_if_the_problem_stays() -> None:
+    pool = make_pool(replicas=1)
+    first, pool = look(pool, ended(1))
+    assert reasons(first) == ["ContainerFailed"]
+    again, pool = look(pool, ended(1), now=NOW + 1)
+    assert again.events == ()
+    second, pool = look(pool, ended(1), ended(2, ago=-2), now=NOW + 3)
+    assert reasons(second) == ["ContainerFailed"]
+    assert name_of(2) in second.events[0].message
+
+
+def test_disruptions_are_told_together() -> None:
+    pool = make_pool(replicas=2)
+    made, _ = look(pool, terminating(running(1)), terminating(running(2)))
+    (event,) = (event for event in made.events if event.reason == "Disrupted")
+    assert event.message == (
+        f"{name_of(2)} and 1 more ended through no fault of its own: somebody deleted it. "
+        "A new one takes its place at once"
+    )
+
+
+def test_a_master_that_comes_and_goes_is_told() -> None:
+    _, pool = look(make_pool(replicas=1, master=MASTER), running(1))
+    left = pool.model_copy(update={"spec": pool.spec.model_copy(update={"master": None})})
+    made, _ = look(left, running(1))
+    assert reasons(made) == ["MasterChanged"]
+    assert "has left" in made.events[0].message

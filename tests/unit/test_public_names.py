@@ -1,0 +1,114 @@
+"""Names, where multiprocessing's users look for them."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+import subprocess
+import sys
+from types import ModuleType
+
+import pytest
+
+import fiber
+from fiber import errors
+
+SUBMODULES = [
+    "connection",
+    "context",
+    "dummy",
+    "managers",
+    "pool",
+    "process",
+    "queues",
+    "reduction",
+    "resource_tracker",
+    "shared_memory",
+    "sharedctypes",
+    "spawn",
+    "synchronize",
+    "util",
+]
+
+
+def test_dir_shows_what_there_is_and_nothing_else() -> None:
+    assert dir(fiber) == sorted({*fiber.__all__, *fiber._SUBMODULES, "__version__"})
+    assert {*multiprocessing.__all__, "SUBDEBUG", "SUBWARNING"} <= set(dir(fiber))
+    for name in dir(fiber):
+        assert getattr(fiber, name) is not None
+
+
+@pytest.mark.parametrize("name", sorted(fiber._SUBMODULES))
+def test_submodules_are_attributes_before_anybody_imports_them(name: str) -> None:
+    statement = f"import fiber; print(fiber.{name}.__name__)"
+    done = subprocess.run([sys.executable, "-c", statement], capture_output=True, text=True)
+    assert done.stdout == f"fiber.{name}\n", done.stderr
+
+
+def public_names(module: ModuleType) -> set[str]:
+    """What a submodule of multiprocessing offers: it says so, or defines it."""
+    if said := getattr(module, "__all__", None):
+        return {name for name in said if not name.startswith("_")}
+    return {
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_") and getattr(value, "__module__", None) == module.__name__
+    }
+
+
+@pytest.mark.parametrize("name", SUBMODULES)
+def test_submodules_have_multiprocessings_names(name: str) -> None:
+    theirs = importlib.import_module(f"multiprocessing.{name}")
+    ours = importlib.import_module(f"fiber.{name}")
+    assert {other for other in public_names(theirs) if not hasattr(ours, other)} == set()
+
+
+@pytest.mark.parametrize("name", errors.__all__)
+def test_every_error_but_the_pools_is_at_the_top(name: str) -> None:
+    if name != "MaybeEncodingError":  # multiprocessing has that one in its pool alone
+        assert getattr(fiber, name) is getattr(errors, name)
+    assert f" {name} " in str(errors.__doc__)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "context.ForkContext",
+        "context.ForkServerContext",
+        "context.SpawnContext",
+        "managers.DictProxy",
+        "managers.SyncManager",
+        "shared_memory.ShareableList",
+        "shared_memory.SharedMemory",
+        "synchronize.Barrier",
+        "synchronize.BoundedSemaphore",
+        "synchronize.Condition",
+        "synchronize.Event",
+        "synchronize.Lock",
+        "synchronize.RLock",
+        "synchronize.Semaphore",
+    ],
+)
+def test_classes_serve_in_annotations_and_isinstance(name: str) -> None:
+    module, _, attribute = name.partition(".")
+    cls = getattr(getattr(fiber, module), attribute)
+    assert isinstance(cls | None, type(int | None))
+    assert not isinstance(3, cls)
+
+
+def test_whoever_makes_an_object_that_is_not_there_is_told_what_to_use() -> None:
+    class Own(fiber.synchronize.Lock):
+        pass
+
+    for make in (Own, fiber.synchronize.Lock, fiber.Lock, fiber.get_context("spawn").Lock):
+        with pytest.raises(fiber.NotInFiber, match=r"no Lock yet.*Semaphore\(1\)"):
+            make()
+    with pytest.raises(fiber.NotInFiber, match=r"no SharedMemory yet.*Pipe or Queue"):
+        fiber.shared_memory.SharedMemory(create=True, size=16)
+
+
+@pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
+def test_contexts_are_of_a_class_by_the_name_that_multiprocessing_has(method: str) -> None:
+    ours, theirs = fiber.get_context(method), multiprocessing.get_context(method)
+    assert type(ours).__name__ == type(theirs).__name__
+    assert ours.Process.__name__ == theirs.Process.__name__
