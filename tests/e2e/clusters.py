@@ -1,0 +1,290 @@
+"""The cluster of the end-to-end tests: one that is given, or one that is brought up for them.
+
+In this order:
+
+1. what KUBECONFIG names, whatever it is;
+2. kind, where it is installed and docker runs;
+3. the project's own cluster (tests/cluster): Linux, root, Go;
+4. none, and then the tests are skipped, or fail where CI=true.
+
+A cluster that was up before stays up; one that was brought up for the tests is taken down.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+from cluster import (
+    ability,
+    build,
+    control_plane,
+    fake_nodes,
+    faults,
+    images,
+    lifecycle,
+    places,
+)
+from cluster.shell import ClusterError, output
+
+NODES = 2
+
+
+class NoCluster(Exception):
+    """There is none and none can be made; the message says why, and what would help."""
+
+
+class Cluster:
+    """A cluster with Fiber's images on its nodes, and what tests may do to it.
+
+    A test that asks for what this kind of cluster cannot do is skipped.
+    """
+
+    description: str
+    kubeconfig: Path
+    images: Mapping[str, str]
+    """References of fiber-operator and fiber-worker, as a pod names them."""
+    outside: str | None = None
+    """Where pods reach a program that runs beside the tests; None where they cannot."""
+    node_lost_after: float = 60
+    """Seconds after which a silent node is surely NotReady."""
+
+    def kubectl(self, *arguments: str, check: bool = True) -> str:
+        """What kubectl prints. Raises ClusterError with what it complains about."""
+        command = (find_program("kubectl"), "--kubeconfig", self.kubeconfig)
+        return output(*command, *arguments, check=check, timeout=120)
+
+    def workers(self) -> list[str]:
+        """The nodes on which pods are put, by name."""
+        nodes = json.loads(self.kubectl("get", "nodes", "--output", "json"))["items"]
+        return sorted(node["metadata"]["name"] for node in nodes if not node["spec"].get("taints"))
+
+    @contextlib.contextmanager
+    def cut_off(self, node: str) -> Iterator[None]:
+        """No packet reaches the node or leaves it meanwhile; then it is Ready again."""
+        with self._cut_off(node):
+            yield
+        self._wait_until_ready(node)
+
+    @contextlib.contextmanager
+    def without_kubelet(self, node: str) -> Iterator[None]:
+        """The node's kubelet does not run meanwhile, its containers do; then it is Ready again."""
+        with self._without_kubelet(node):
+            yield
+        self._wait_until_ready(node)
+
+    @contextlib.contextmanager
+    def without_apiserver(self) -> Iterator[None]:
+        """Nobody gets an answer from the API server meanwhile; then it is ready again."""
+        with self._without_apiserver():
+            yield
+        self.kubectl("get", "--raw", "/readyz")
+
+    def fake_nodes(self, count: int) -> None:
+        """Have this many nodes that only pretend to run pods."""
+        self._skip(f"add {count} pretended nodes")
+
+    def close(self) -> None:
+        """Take it down, if it was brought up for the tests."""
+
+    def _cut_off(self, node: str) -> AbstractContextManager[None]:
+        self._skip(f"cut {node} off")
+
+    def _without_kubelet(self, node: str) -> AbstractContextManager[None]:
+        self._skip(f"stop the kubelet of {node}")
+
+    def _without_apiserver(self) -> AbstractContextManager[None]:
+        self._skip("stop the API server")
+
+    def _wait_until_ready(self, node: str) -> None:
+        self.kubectl("wait", "--for=condition=Ready", f"node/{node}", "--timeout=90s")
+
+    def _skip(self, what: str) -> NoReturn:
+        pytest.skip(f"{self.description}: cannot {what}; the cluster of tests/cluster can")
+
+
+class Own(Cluster):
+    """The project's own cluster."""
+
+    outside = places.HOST_IP
+    node_lost_after = control_plane.NODE_LOST_AFTER + 10.0
+
+    def __init__(self) -> None:
+        self.description = "the cluster of tests/cluster"
+        self.kubeconfig = places.KUBECONFIG
+        self._was_up = lifecycle.find() is not None
+        try:
+            lifecycle.up(NODES)
+            self.images = images.bring_images()
+        except BaseException:
+            self.close()
+            raise
+
+    def _cut_off(self, node: str) -> AbstractContextManager[None]:
+        return faults.cut_off(node)
+
+    def _without_kubelet(self, node: str) -> AbstractContextManager[None]:
+        return faults.stopped(f"{node}-kubelet")
+
+    def _without_apiserver(self) -> AbstractContextManager[None]:
+        return faults.stopped(faults.APISERVER)
+
+    def fake_nodes(self, count: int) -> None:
+        fake_nodes.set_count(count)
+
+    def close(self) -> None:
+        if not self._was_up:
+            lifecycle.down()
+
+
+class Kind(Cluster):
+    """Nodes in docker containers."""
+
+    def __init__(self, name: str, kubeconfig: Path, *, made: bool) -> None:
+        self.description = f"the kind cluster {name}"
+        self.kubeconfig = kubeconfig
+        self._name = name
+        self._made = made
+        try:
+            self.outside = _gateway()
+            self.images = images.build_images()
+            for image in images.IMAGES:
+                output("kind", "load", "image-archive", image.archive, "--name", name)
+        except BaseException:
+            self.close()
+            raise
+
+    @classmethod
+    def make(cls, name: str = "fiber-e2e") -> Kind:
+        """Use the kind cluster of this name; make it where there is none."""
+        kubeconfig = images.FOLDER.parent / f"{name}.kubeconfig"
+        kubeconfig.parent.mkdir(parents=True, exist_ok=True)
+        named = ("--name", name, "--kubeconfig", kubeconfig)  # not the user's own kubeconfig
+        made = name not in output("kind", "get", "clusters").split()
+        if made:
+            config = Path(__file__).with_name("kind.yaml")
+            output("kind", "create", "cluster", *named, "--config", config, "--wait", "180s")
+        else:
+            output("kind", "export", "kubeconfig", *named)
+        return cls(name, kubeconfig, made=made)
+
+    @contextlib.contextmanager
+    def _cut_off(self, node: str) -> Iterator[None]:
+        # Rules and not `docker network disconnect`, after which the node has another address.
+        rules = [("INPUT", "-i"), ("OUTPUT", "-o"), ("FORWARD", "-i"), ("FORWARD", "-o")]
+        with contextlib.ExitStack() as undo:
+            for chain, direction in rules:
+                rule = (chain, direction, "eth0", "-j", "DROP")
+                self._inside(node, "iptables", "--wait", "-I", *rule)
+                undo.callback(self._inside, node, "iptables", "--wait", "-D", *rule)
+            yield
+
+    @contextlib.contextmanager
+    def _without_kubelet(self, node: str) -> Iterator[None]:
+        self._inside(node, "systemctl", "stop", "kubelet")
+        try:
+            yield
+        finally:
+            self._inside(node, "systemctl", "start", "kubelet")
+
+    @contextlib.contextmanager
+    def _without_apiserver(self) -> Iterator[None]:
+        node = f"{self._name}-control-plane"
+        output("docker", "pause", node)
+        try:
+            yield
+        finally:
+            output("docker", "unpause", node)
+
+    def close(self) -> None:
+        if self._made:
+            output("kind", "delete", "cluster", "--name", self._name)
+
+    @staticmethod
+    def _inside(node: str, *command: str) -> None:
+        output("docker", "exec", node, *command)
+
+
+class Given(Cluster):
+    """A cluster of somebody else, left as it is but for what the tests install and remove."""
+
+    def __init__(self, kubeconfig: Path, environment: Mapping[str, str]) -> None:
+        self.description = f"the cluster of {kubeconfig}"
+        self.kubeconfig = kubeconfig
+        self.outside = environment.get("FIBER_E2E_OUTSIDE_ADDRESS")
+        self.images = _given_images(environment)
+
+
+def choose(environment: Mapping[str, str] = os.environ) -> Cluster:
+    """The cluster to test on. Raises NoCluster where there is none."""
+    if given := environment.get("KUBECONFIG"):
+        return _given(Path(given), environment)
+    reasons = ["KUBECONFIG is not set"]
+    if lacking := ability.kind_lacks():
+        reasons.append(f"no kind: {lacking}")
+    else:
+        return Kind.make()
+    if obstacles := ability.obstacles():
+        reasons.append(f"no cluster of tests/cluster: {'; '.join(obstacles)}")
+    else:
+        return Own()
+    raise NoCluster(
+        f"there is no Kubernetes cluster to test on. {'. '.join(reasons)}. Set KUBECONFIG to a "
+        "cluster that may be used, or run this where docker and kind are, or as root on Linux "
+        "with Go"
+    )
+
+
+def _given(kubeconfig: Path, environment: Mapping[str, str]) -> Cluster:
+    if not kubeconfig.is_file():
+        raise ClusterError(
+            f"KUBECONFIG is {kubeconfig}, and there is no such file: unset or mend it"
+        )
+    if kubeconfig == places.KUBECONFIG:
+        return Own()
+    command = (find_program("kubectl"), "--kubeconfig", kubeconfig)
+    output(*command, "get", "--raw", "/readyz", timeout=30)
+    context = output(*command, "config", "current-context").strip()
+    if context.startswith("kind-") and not ability.kind_lacks():
+        return Kind(context.removeprefix("kind-"), kubeconfig, made=False)
+    return Given(kubeconfig, environment)
+
+
+def _given_images(environment: Mapping[str, str]) -> dict[str, str]:
+    names = {image.name: _variable(image.name) for image in images.IMAGES}
+    missing = [variable for variable in names.values() if not environment.get(variable)]
+    if missing:
+        raise ClusterError(
+            f"{' and '.join(missing)} must name images that the cluster of KUBECONFIG can pull, "
+            "since tests cannot bring them to its nodes: build them (make images), push them to a "
+            "registry, and set the variables"
+        )
+    return {name: environment[variable] for name, variable in names.items()}
+
+
+def _variable(image: str) -> str:
+    """fiber-operator: FIBER_E2E_OPERATOR_IMAGE."""
+    return f"FIBER_E2E_{image.removeprefix('fiber-').upper()}_IMAGE"
+
+
+def _gateway() -> str:
+    """The host's address in the network of kind's nodes."""
+    template = "{{range .IPAM.Config}}{{.Gateway}} {{end}}"
+    addresses = output("docker", "network", "inspect", "kind", "--format", template).split()
+    return next(address for address in addresses if "." in address)
+
+
+def find_program(name: str) -> str:
+    """kubectl or helm: what is on the PATH, else what was built for our cluster."""
+    if found := shutil.which(name) or shutil.which(name, path=places.programs()):
+        return found
+    build.build(["helm" if name == "helm" else "kubernetes"])
+    return places.program(name)
