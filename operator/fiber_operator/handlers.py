@@ -142,21 +142,7 @@ async def watch(
         started, sessions = loop.time(), list[aiohttp.ClientSession]()
         on_start(True)
         try:
-            await kopf.operator(
-                registry=registry(notice, configure, sessions),
-                settings=kopf_settings(),
-                standalone=True,
-                identity=_IDENTITY,
-                clusterwide=not namespaces,
-                namespaces=tuple(namespaces),
-                stop_flag=stop,
-            )
-        except (Exception, asyncio.CancelledError) as error:
-            task = asyncio.current_task()
-            if isinstance(error, asyncio.CancelledError) and task and task.cancelling():
-                raise
-            # kopf has logged it. Whatever it is, pools must be watched: try again.
-            log.warning("watching ended (%s: %s); it begins anew", type(error).__name__, error)
+            await _run_kopf(registry(notice, configure, sessions), namespaces, stop)
         finally:
             on_start(False)
             # kopf leaves its own open where it ends with an error.
@@ -164,6 +150,51 @@ async def watch(
         pause = FIRST_PAUSE if loop.time() - started > LONGEST_PAUSE else pause
         await _unless(stop, asyncio.sleep(pause))
         pause = min(2 * pause, LONGEST_PAUSE)
+
+
+async def _run_kopf(
+    handlers: kopf.OperatorRegistry, namespaces: Collection[str], stop: asyncio.Event
+) -> None:
+    """Run kopf until it ends for whatever reason, and end what it leaves behind.
+
+    kopf can lose a cancellation: one that comes while a watch ends by itself.  It then waits for
+    that watch for ever, so it is given some time from when it begins to end.
+    """
+    ending = asyncio.Event()
+
+    @kopf.on.cleanup(registry=handlers)
+    async def cleanup(**_: Any) -> None:
+        ending.set()
+
+    before = asyncio.all_tasks()
+    operator = asyncio.ensure_future(
+        kopf.operator(
+            registry=handlers,
+            settings=kopf_settings(),
+            standalone=True,
+            clusterwide=not namespaces,
+            namespaces=tuple(namespaces),
+            stop_flag=stop,
+        )
+    )
+    signs = [asyncio.ensure_future(event.wait()) for event in (ending, stop)]
+    try:
+        await asyncio.wait([operator, *signs], return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait([operator], timeout=END_WAIT / 2)
+    finally:
+        await _end_tasks(asyncio.all_tasks() - before)
+    if not stop.is_set():
+        # kopf has logged it. Whatever it is, pools must be watched: try again.
+        error = None if operator.cancelled() else operator.exception()
+        log.warning("watching ended (%r); it begins anew", error)
+
+
+async def _end_tasks(tasks: set[asyncio.Task[Any]]) -> None:
+    for _ in range(10):
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            _, tasks = await asyncio.wait(tasks, timeout=END_WAIT / 10)
 
 
 async def _unless(stop: asyncio.Event, awaitable: Awaitable[None]) -> None:

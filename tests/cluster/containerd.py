@@ -28,5 +28,9 @@ class Containerd:
         """Import the images of an OCI or docker archive."""
         output(*self._ctr("images", "import", str(archive)))
 
+    def kill(self, container: str) -> None:
+        """SIGKILL to the first process of a container: the others of its pid namespace follow."""
+        output(*self._ctr("tasks", "kill", "--signal", "SIGKILL", container))
+
     def _ctr(self, *arguments: str) -> tuple[str | Path, ...]:
         return ("ctr", "--address", self.socket, "--namespace", "k8s.io", *arguments)

@@ -19,7 +19,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import pytest
 
@@ -88,6 +88,12 @@ class Cluster:
             yield
         self.kubectl("get", "--raw", "/readyz")
 
+    def kill(self, pod: Mapping[str, Any], container: str) -> None:
+        """SIGKILL to a container of the pod, which is a document of the API."""
+        statuses = {status["name"]: status for status in pod["status"]["containerStatuses"]}
+        container_id = statuses[container]["containerID"].removeprefix("containerd://")
+        self._kill(pod["spec"]["nodeName"], container_id)
+
     def fake_nodes(self, count: int) -> None:
         """Have this many nodes that only pretend to run pods."""
         self._skip(f"add {count} pretended nodes")
@@ -103,6 +109,9 @@ class Cluster:
 
     def _without_apiserver(self) -> AbstractContextManager[None]:
         self._skip("stop the API server")
+
+    def _kill(self, node: str, container_id: str) -> None:
+        self._skip(f"kill a container on {node}")
 
     def _wait_until_ready(self, node: str) -> None:
         self.kubectl("wait", "--for=condition=Ready", f"node/{node}", "--timeout=90s")
@@ -133,6 +142,9 @@ class Own(Cluster):
 
     def _without_kubelet(self, node: str) -> AbstractContextManager[None]:
         return faults.stopped(f"{node}-kubelet")
+
+    def _kill(self, node: str, container_id: str) -> None:
+        faults.kill_container(node, container_id)
 
     def _without_apiserver(self) -> AbstractContextManager[None]:
         return faults.stopped(faults.APISERVER)
@@ -207,6 +219,10 @@ class Kind(Cluster):
     def close(self) -> None:
         if self._made:
             output("kind", "delete", "cluster", "--name", self._name)
+
+    def _kill(self, node: str, container_id: str) -> None:
+        kill = ("tasks", "kill", "--signal", "SIGKILL", container_id)
+        self._inside(node, "ctr", "--namespace", "k8s.io", *kill)
 
     @staticmethod
     def _inside(node: str, *command: str) -> None:

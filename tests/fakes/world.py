@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 from fakes.kubelet import Kubelet
-from fakes.kubernetes_api import KubernetesApi
+from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fiber_api.certificates import make_pool_certificates
 from fiber_operator.cluster import Configuration
@@ -46,6 +46,7 @@ class Feed:
         self._notice = notice
         self._gate = options["gate"]
         self._on_start = options["on_start"]
+        self._namespaces = options["namespaces"]
 
     async def run(self) -> None:
         await self._gate()
@@ -54,9 +55,9 @@ class Feed:
         while True:
             changes = self._world.store.changes
             for change in changes[seen:]:
-                if self._world.deaf:
-                    continue
                 plural, namespace, name = change.place
+                if self._world.deaf or namespace not in (self._namespaces or [namespace]):
+                    continue
                 metadata = change.object["metadata"]
                 if plural == "fiberpools":
                     generation = -1 if change.type == "DELETED" else metadata["generation"]
@@ -168,6 +169,12 @@ class World:
 
     def names(self, namespace: str = NAMESPACE) -> list[str]:
         return [pod["metadata"]["name"] for pod in self.pods(namespace)]
+
+    def slow(self, verb: str, plural: str, seconds: float) -> Fault:
+        """From now on such calls take so long."""
+        fault = Fault(verb, plural, late=seconds, times=float("inf"))
+        self.api.faults.append(fault)
+        return fault
 
     # -- Waiting
 

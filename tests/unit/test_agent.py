@@ -175,7 +175,7 @@ def test_one_that_was_killed_before_it_was_born_is_gone_at_once(own: Agent, tmp_
     writer = os.open(gate, os.O_WRONLY)  # returns once the import has begun
     child.signal(signal.SIGKILL)
     report = observer.wait_for_exit()
-    assert report.reason == "killed by SIGKILL before it had started"
+    assert report.reason == "killed by SIGKILL"
     assert child.pid is None
     os.close(writer)
     # The zygote goes on, and the next child is not given what was its.

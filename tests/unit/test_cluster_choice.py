@@ -121,6 +121,19 @@ def test_what_a_cluster_cannot_do_skips_the_test(
         pass
 
 
+def test_a_container_is_killed_where_that_can_be_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    killed: list[tuple[str, str]] = []
+    monkeypatch.setattr("cluster.faults.kill_container", lambda *what: killed.append(what))
+    statuses = [{"name": "operator", "containerID": "containerd://1234"}]
+    pod = {"spec": {"nodeName": "node-1"}, "status": {"containerStatuses": statuses}}
+    Own().kill(pod, "operator")
+    assert killed == [("node-1", "1234")]
+    some = Cluster()
+    some.description = "the cluster of my boss"
+    with pytest.raises(pytest.skip.Exception, match="cannot kill a container on node-1"):
+        some.kill(pod, "operator")
+
+
 # Whether our own can run; the functions that the other tests replace, themselves.
 
 OBSTACLES = ability.obstacles

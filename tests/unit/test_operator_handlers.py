@@ -176,6 +176,7 @@ async def test_after_410_everything_is_told_anew(kopf: Watching) -> None:
     await kopf.told(ES)
     kopf.world.edit(replicas=1)
     await kopf.told(ES)
+    kopf.store.create("secrets", NAMESPACE, {"metadata": {"name": "unrelated"}})
     kopf.store.forget_history()
     kopf.api.drop_watches()
     await kopf.told(ES)

@@ -113,7 +113,7 @@ class Agent:
         """It was killed before it was born, and its zygote may be busy for long: it is gone now."""
         if child.pid is None and child.id in self._children:
             self._forsaken[child.id], child.slot = child.slot, None
-            self._gone(child, -signal.SIGKILL, "killed by SIGKILL before it had started")
+            self._gone(child, -signal.SIGKILL, describe(-signal.SIGKILL))
 
     def _heard_of_forsaken(self, link: ZygoteLink, answer: tuple[Any, ...]) -> None:
         if answer[0] == zygote.STARTED:
