@@ -94,7 +94,7 @@ class Creator:
                 pace.batch = 1
                 break
             count -= size
-            pace.batch = min(2 * size, limit)
+            pace.batch = min(2 * size, limit) if count else 1
         return done
 
     def name(self, pool: str) -> str:

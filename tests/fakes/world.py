@@ -214,6 +214,14 @@ class World:
         else:
             await task
 
+    async def until_settled(self, pods: int, name: str = "es") -> None:
+        """``ready``, whichever operator is at work."""
+        task, self._task = self._task, None
+        try:
+            await self.ready(pods, name)
+        finally:
+            self._task = task
+
     async def settled(self, seconds: float = 5.0) -> None:
         """Let that much time pass."""
         await asyncio.sleep(seconds)
