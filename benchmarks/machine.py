@@ -31,7 +31,7 @@ def about(
         "processor": _field("/proc/cpuinfo", "model name"),
         "memory": in_words(int(_field("/proc/meminfo", "MemTotal").split()[0]) * 1024, "B"),
         "load": round(os.getloadavg()[0], 2),
-        "system": f"{platform.system()} {platform.release()}",
+        "system": f"{platform.system()} {'.'.join(platform.release().split('.')[:2])}",
         "python": platform.python_version(),
         "versions": {name: version for name in (*names, *_ALWAYS) if (version := _version(name))},
     }
