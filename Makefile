@@ -4,10 +4,13 @@ PYTHON ?=
 BACKEND ?= local
 VENV := .venv
 BIN := $(VENV)/bin
+# Side by side: a file's tests stay together, since what they share is made once for it.
+FAST_TESTS := tests/contract tests/simulation tests/unit
+FAST := $(BIN)/python -m pytest -q -n auto --dist loadfile $(FAST_TESTS)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast e2e lint bench conformance crds images cluster cluster-down clean
+.PHONY: help demo test test-fast e2e lint bench bench-operator conformance crds images cluster cluster-down clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -19,11 +22,12 @@ demo: $(VENV)/.with-rl
 ## make test          every test, those on a real cluster included
 test: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(CLUSTER) prepare
-	$(BIN)/python -m pytest
+	$(FAST)
+	$(BIN)/python -m pytest $(addprefix --ignore=,$(FAST_TESTS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation
 test-fast: $(VENV)/.with-dev
-	$(BIN)/python -m pytest -q tests/unit tests/contract tests/simulation
+	$(FAST)
 
 ## make e2e           the operator and its chart on a real cluster: KUBECONFIG, kind or our own
 e2e: $(VENV)/.with-dev
@@ -40,6 +44,10 @@ lint: $(VENV)/.with-dev
 ## make bench         every measure beside the installed peers; writes docs/benchmarks
 bench: $(VENV)/.with-bench
 	$(BIN)/python -m benchmarks
+
+## make bench-operator  FiberPools beside ReplicaSets at thousands of pretended pods (root, Go)
+bench-operator: $(VENV)/.with-dev
+	PYTHONPATH=tests $(BIN)/python -m benchmarks.operator_scale --set-up
 
 ## make conformance   CPython's own multiprocessing tests (BACKEND=local or loopback)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite

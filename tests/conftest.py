@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from leaks import Snapshot, Watch, shut_down_runtime
 
@@ -36,6 +37,9 @@ def pytest_configure() -> None:
     # A shell without job control starts what it puts in the background with interrupts ignored,
     # and every program that a test starts would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    # The same examples in every run; how long one takes says more about the machine.
+    settings.register_profile("tests", derandomize=True, deadline=None)
+    settings.load_profile("tests")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
