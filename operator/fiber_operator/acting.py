@@ -47,7 +47,7 @@ class State:
     warnings: dict[str, str] = field(default_factory=dict)
     pace: Pace = field(default_factory=Pace)
     generation: int = -1
-    """Of the pool at the last look that succeeded."""
+    """Of the pool at the last look that did not fail, the one under way included."""
 
     @property
     def address(self) -> str | None:

@@ -51,7 +51,7 @@ T = TypeVar("T")
 Observer = Callable[[str, str, str, float], None]
 """Told of each call: verb, resource, HTTP status or what went wrong, seconds."""
 
-PAGE = 500
+PAGE = 200
 """Objects in one answer to a list: of 1,000 pods with a page of JSON each, only half in memory."""
 
 READ_TIMEOUT = 30.0
@@ -158,7 +158,7 @@ class Cluster:
 
     async def read(self, resource: Resource, namespace: str, name: str) -> Body:
         """The object as it is now, not as a cache had it."""
-        return await self._call("get", resource, namespace, name)
+        return _object(await self._call("get", resource, namespace, name), name)
 
     async def list(
         self,
@@ -188,19 +188,21 @@ class Cluster:
     ) -> Body:
         """Create the object; the answer is what it became."""
         query = {"dryRun": "All"} if dry_run else {}
-        return await self._call("create", resource, namespace, query=query, body=body)
+        answer = await self._call("create", resource, namespace, query=query, body=body)
+        return _object(answer, body["metadata"]["name"])
 
     async def replace(self, resource: Resource, namespace: str, name: str, body: Body) -> Body:
         """Replace the object; Conflict if ``metadata.resourceVersion`` is not its current one."""
-        return await self._call("update", resource, namespace, name, body=body)
+        return _object(await self._call("update", resource, namespace, name, body=body), name)
 
     async def patch(
         self, resource: Resource, namespace: str, name: str, patch: Body, subresource: str = ""
     ) -> Body:
         """A JSON merge patch: None removes a field, a list replaces the list."""
-        return await self._call(
+        answer = await self._call(
             "patch", resource, namespace, name, subresource=subresource, body=patch
         )
+        return _object(answer, name)
 
     async def delete(
         self,
@@ -263,18 +265,18 @@ class Cluster:
         headers = {"Accept": "application/json"}
         if body is not None:
             headers["Content-Type"] = _MERGE_PATCH if verb == "patch" else "application/json"
-        request = await self._client.param_serialize(
+        # Without the body: it is JSON already and need not be walked through for models.
+        method, url, headers, _, _ = await self._client.param_serialize(
             _METHODS[verb],
             path,
             query_params=[(key, value) for key, value in query.items() if value],
             header_params=headers,
-            body=body,
             auth_settings=["BearerToken"],
         )
         timeout = aiohttp.ClientTimeout(
             total=WRITE_TIMEOUT if verb in _WRITES else READ_TIMEOUT, sock_connect=CONNECT_TIMEOUT
         )
-        response = await self._client.call_api(*request, _request_timeout=timeout)
+        response = await self._client.call_api(method, url, headers, body, _request_timeout=timeout)
         data = await response.read()
         return response.status, response.headers, data
 
@@ -328,6 +330,14 @@ def _items(page: Body, what: str) -> tuple[list[Body], str]:
     ):
         raise Unavailable("the answer is no list of objects", what=what)
     return items, str(metadata.get("continue") or "")
+
+
+def _object(answer: Body, name: str) -> Body:
+    """``answer`` if it is the object of that name: what is none must not be taken for one."""
+    metadata = answer.get("metadata")
+    if not isinstance(metadata, dict) or metadata.get("name") != name:
+        raise Unavailable(f"the answer is not the object {name}")
+    return answer
 
 
 def _answer(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Body:

@@ -96,22 +96,32 @@ class Controller:
             self._drop(key)
             return Turn(forget=True)
         uid = text(mapping(document, "metadata").get("uid"))
-        if not uid or mapping(document, "metadata").get("name") != key.name:
-            raise Unavailable("the answer is not the pool", what=f"get fiberpools {key.name}")
+        if not uid:
+            raise Unavailable("the answer has no uid", what=f"get fiberpools {key.name}")
         state = self._states.get(key)
         if state is None or state.uid != uid:
             state = self._states[key] = State(uid)
+        # Events about this very spec, our own status among them, are no news while this look lasts.
+        state.generation = whole(mapping(document, "metadata").get("generation"))
+        try:
+            turn = await self._look_at(key, document, state)
+        except BaseException:
+            state.generation = -1
+            raise
+        if turn.failed:
+            state.generation = -1
+        return turn
+
+    async def _look_at(self, key: Key, document: Body, state: State) -> Turn:
         try:
             pool = FiberPool.read(document)
         except InvalidPool as error:
-            turn = await self._look_at_unreadable(key, document, state, error)
-        else:
-            turn = await self._look_at(key, document, pool, state)
-        if not turn.failed:
-            state.generation = whole(mapping(document, "metadata").get("generation"))
-        return turn
+            return await self._look_at_unreadable(key, document, state, error)
+        return await self._look_at_readable(key, document, pool, state)
 
-    async def _look_at(self, key: Key, document: Body, pool: FiberPool, state: State) -> Turn:
+    async def _look_at_readable(
+        self, key: Key, document: Body, pool: FiberPool, state: State
+    ) -> Turn:
         if pool.unread:
             complaint = "; ".join(pool.unread)
             log.warning("the status was damaged: %s", complaint, extra=about(*key, uid=state.uid))

@@ -13,6 +13,7 @@ is started again, once the pools can be listed.
 from __future__ import annotations
 
 import asyncio
+import collections
 import functools
 import logging
 import threading
@@ -110,10 +111,10 @@ def kopf_settings() -> kopf.OperatorSettings:
     settings.watching.client_timeout = 300
     settings.watching.connect_timeout = 5
     settings.watching.inactivity_timeout = 90
-    settings.watching.chunk_size = 500
+    settings.watching.chunk_size = 100
     settings.watching.label_selectors["v1", "pods"] = names.LABEL_POOL_UID
     # A handler of ours takes no time, and a task for each of a thousand pods is memory.
-    settings.queueing.idle_timeout = 0.5
+    settings.queueing.idle_timeout = 0.05
     settings.queueing.exit_timeout = 0.5
     settings.process.ultimate_exiting_timeout = None
     return settings
@@ -171,6 +172,7 @@ async def _run_kopf(
         kopf.operator(
             registry=handlers,
             settings=kopf_settings(),
+            identity=_IDENTITY,
             standalone=True,
             clusterwide=not namespaces,
             namespaces=tuple(namespaces),
@@ -228,6 +230,7 @@ class Watcher:
         self._namespaces = namespaces
         self._gate = gate
         self._on_start = on_start
+        self._untold: collections.deque[tuple[Any, ...]] = collections.deque()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop = asyncio.Event()
         self._stopping = threading.Event()
@@ -265,13 +268,23 @@ class Watcher:
 
     async def _watch(self) -> None:
         await watch(
-            functools.partial(self._call, self._notice),
+            self._tell,
             configure=self._configure,
             namespaces=self._namespaces,
             gate=self._pass_gate,
             on_start=functools.partial(self._call, self._on_start),
             stop=self._stop,
         )
+
+    def _tell(self, *notice: Any) -> None:
+        self._untold.append(notice)
+        # Waking the other loop costs more than what is told: once for all that it has not seen.
+        if len(self._untold) == 1:
+            self._call(self._pass_on)
+
+    def _pass_on(self) -> None:
+        while self._untold:
+            self._notice(*self._untold.popleft())
 
     def _call(self, function: Callable[..., None], *arguments: object) -> None:
         try:

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Conflict, Gone
+from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Conflict, Gone, Unavailable
 from fiber_operator.logs import about
 
 HELD_SHARE = 2 / 3
@@ -160,7 +160,11 @@ class Guard:
         }
         if lease is None:
             return await self._cluster.create(LEASES, self._namespace, body)
-        body["metadata"]["resourceVersion"] = lease["metadata"]["resourceVersion"]
+        version = lease["metadata"].get("resourceVersion")
+        if not version:
+            # Without it another's Lease could be written over.
+            raise Unavailable("the Lease has no resourceVersion")
+        body["metadata"]["resourceVersion"] = version
         return await self._cluster.replace(LEASES, self._namespace, self._name, body)
 
     def _lose(self, why: str) -> None:

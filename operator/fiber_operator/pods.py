@@ -79,7 +79,7 @@ class PodView:
     scheduled: bool = False
     """It has a node."""
     lingers: bool = False
-    """The worker has ended but other containers of the pod still run."""
+    """The worker has ended but other containers of the pod have not."""
     deletion_cost: int = 0
 
     @property
@@ -169,7 +169,7 @@ class _Observation:
             exit_code=whole(exit_code) if isinstance(exit_code, int) else None,
             ran=self._ran(),
             scheduled=self._scheduled,
-            lingers=state is State.ENDED and self._phase not in ("Failed", "Succeeded"),
+            lingers=state is State.ENDED and self._others_go_on(),
             deletion_cost=self._deletion_cost(),
         )
 
@@ -222,6 +222,11 @@ class _Observation:
         end = mapping(self._state, "terminated")
         start, finish = seconds(end.get("startedAt")), seconds(end.get("finishedAt"))
         return max(0.0, finish - start) if start else 0.0
+
+    def _others_go_on(self) -> bool:
+        # For up to a second after the last container's end the kubelet leaves the phase as it was.
+        over = all(mapping(status, "state", "terminated") for status in self._others)
+        return not over and self._phase not in ("Failed", "Succeeded")
 
     # What is wrong with it
 

@@ -133,11 +133,6 @@ class Queue:
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=grace)
 
-    async def idle(self) -> None:
-        """Wait until no turn is under way or due.  Turns in the future do not count."""
-        while self._tasks or self.statistics().waiting:
-            await asyncio.wait(self._tasks) if self._tasks else await asyncio.sleep(0)
-
     def statistics(self) -> Statistics:
         """The queue now."""
         now = self._now()

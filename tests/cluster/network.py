@@ -83,6 +83,9 @@ def is_plugged_in(index: int) -> bool:
 
 def remove() -> None:
     """Take away every namespace of a node, and the bridge; nothing happens without them."""
+    for cable in Path("/sys/class/net").glob(places.link_prefix() + "*"):
+        # A namespace ends some time after its name; its cable must not be there when it comes back.
+        output("ip", "link", "delete", cable.name, check=False)
     for name in namespaces():
         output("ip", "netns", "delete", name, check=False)
     if _has_link(places.BRIDGE):

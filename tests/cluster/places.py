@@ -86,12 +86,16 @@ def namespace_prefix() -> str:
 
 def namespace(index: int) -> str:
     """The network namespace of a node."""
-    return f"fiber-{node_name(index)}"
+    return f"{namespace_prefix()}{index}"
+
+
+def link_prefix() -> str:
+    return "fveth"
 
 
 def link(index: int) -> str:
     """The bridge's end of a node's cable."""
-    return f"fveth{index}"
+    return f"{link_prefix()}{index}"
 
 
 def socket(index: int) -> Path:

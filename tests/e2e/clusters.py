@@ -33,7 +33,7 @@ from cluster import (
     lifecycle,
     places,
 )
-from cluster.shell import ClusterError, output
+from cluster.shell import ClusterError, output, wait_for
 
 NODES = 2
 
@@ -115,6 +115,8 @@ class Cluster:
 
     def _wait_until_ready(self, node: str) -> None:
         self.kubectl("wait", "--for=condition=Ready", f"node/{node}", "--timeout=90s")
+        # Its taints go a moment later, and until then no pod is put there.
+        wait_for(f"{node} without taints", lambda: node in self.workers(), seconds=30)
 
     def _skip(self, what: str) -> NoReturn:
         pytest.skip(f"{self.description}: cannot {what}; the cluster of tests/cluster can")

@@ -80,7 +80,11 @@ def test_no_go_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_missing_packages_are_named_once() -> None:
-    wanted = {"no-such-program": "first", "another-one": "first", "sh": "second"}
+    wanted: dict[str | Path, str] = {
+        "no-such-program": "first",
+        "another-one": "first",
+        "sh": "second",
+    }
     assert packages.missing(wanted) == ["first"]
 
 

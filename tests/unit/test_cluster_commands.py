@@ -33,7 +33,7 @@ def test_the_readme_has_every_command() -> None:
 def test_up_prints_lines_for_a_shell(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
+    asked: list[object] = []
     monkeypatch.setattr(lifecycle, "up", asked.append)
     out = printed(capsys, "up", "--nodes", "3")
     assert asked == [3]
@@ -73,7 +73,7 @@ def test_status_tells_what_does_not_run(
 def test_faults_are_commands(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
+    asked: list[object] = []
     monkeypatch.setattr(faults, command, asked.append)
     printed(capsys, command, "node-1")
     assert asked == ["node-1"]

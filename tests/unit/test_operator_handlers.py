@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
 import pytest
+from kopf._core.intents.causes import Activity
 
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
@@ -271,6 +272,20 @@ def test_an_expired_login_is_renewed() -> None:
     test()
 
 
+def test_a_user_without_a_name_can_watch(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nameless() -> str:
+        raise KeyError("getpwuid(): uid not found: 65532")
+
+    @played()
+    async def test(kopf: Watching) -> None:
+        kopf.world.make_pool()
+        await kopf.told(ES)
+        assert kopf.starts == [True]
+
+    monkeypatch.setattr("getpass.getuser", nameless)
+    test()
+
+
 def test_the_thread_tells_the_loop_that_made_it_and_ends_with_it() -> None:
     """The whole program with kopf in its thread, in real time."""
 
@@ -310,6 +325,35 @@ def test_a_thread_that_cannot_watch_ends_the_program() -> None:
             await watcher.run()
 
     asyncio.run(main())
+
+
+def test_a_kopf_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It begins to end, and loses the first cancellations of what it waits for."""
+    runs = 0
+
+    async def stubborn(**options: Any) -> None:
+        nonlocal runs
+        runs += 1
+        handler = next(
+            iter(options["registry"]._activities.get_handlers(activity=Activity.CLEANUP))
+        )
+        if runs == 1:
+            await handler.fn()
+        for _ in range(3):
+            try:
+                await asyncio.Event().wait()
+            except asyncio.CancelledError:
+                if runs > 1:
+                    raise
+
+    monkeypatch.setattr(handlers.kopf, "operator", stubborn)
+
+    @played()
+    async def test(kopf: Watching) -> None:
+        await kopf.world.until(lambda: runs == 2, within=30)
+        assert kopf.starts == [True, False, True]
+
+    test()
 
 
 def test_patience_never_ends() -> None:

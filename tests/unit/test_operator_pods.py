@@ -170,6 +170,18 @@ def test_a_worker_has_ended_even_if_its_sidecar_goes_on() -> None:
     assert pod.lingers
 
 
+def test_a_pod_does_not_linger_because_its_phase_is_late() -> None:
+    # Kubernetes tells of a container's end up to a second before the pod's phase is Failed.
+    document = ended(code=1, phase="Running")
+    assert not look(document).lingers
+    end = {"exitCode": 0, "reason": "Completed"}
+    document["status"]["containerStatuses"].append({"name": "x", "state": {"terminated": end}})
+    assert not look(document).lingers
+    state = {"waiting": {"reason": "ImagePullBackOff"}}
+    document["status"]["containerStatuses"].append({"name": "y", "state": state})
+    assert look(document).lingers
+
+
 def test_the_judged_container_is_the_one_that_is_named() -> None:
     document = running()
     end = {"exitCode": 1, "reason": "Error"}
