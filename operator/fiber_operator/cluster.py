@@ -1,15 +1,5 @@
 """The only door to the API server.  JSON documents go in and come out; nothing is cached.
 
-What can go wrong is one of these, so that a caller says what it does about it::
-
-    ApiError
-    ├── Gone         404  not there (any more)
-    ├── Conflict     409  the name is taken, or a precondition does not hold
-    ├── Refused      403  quota, policy, or no right
-    ├── Invalid      400, 422 and the rest of 4xx  asking again will not help
-    └── Unavailable  the answer is not known: 5xx, no connection, too late, nonsense
-        └── TooMany  429  not now; ``retry_after`` says when
-
 A call that ends in ``Unavailable`` may have been carried out.  Nothing is tried again in here:
 whoever asks plans anew, which is safer than a repeated request that was right a minute ago.
 """
@@ -17,11 +7,10 @@ whoever asks plans anew, which is safer than a repeated request that was right a
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import aiohttp
 from kubernetes.aio import config
@@ -30,9 +19,23 @@ from kubernetes.aio.client.configuration import Configuration
 from kubernetes.aio.client.rest import RESTClientObject
 
 from fiber_api import names
+from fiber_operator.answers import (
+    ApiError,
+    Body,
+    Conflict,
+    Gone,
+    Invalid,
+    Refused,
+    TooMany,
+    Unavailable,
+    document_of,
+    items_of,
+    object_of,
+)
 
 __all__ = [
     "ApiError",
+    "Body",
     "Cluster",
     "Configuration",
     "Conflict",
@@ -46,22 +49,20 @@ __all__ = [
     "open_session",
 ]
 
-Body = dict[str, Any]
 T = TypeVar("T")
 Observer = Callable[[str, str, str, float], None]
 """Told of each call: verb, resource, HTTP status or what went wrong, seconds."""
 
 PAGE = 200
-"""Objects in one answer to a list: of 1,000 pods with a page of JSON each, only half in memory."""
+"""Objects in one answer to a list.  A pod is some 10 kB of JSON and five times that once it is
+parsed; more of them at once would be most of this process's memory."""
 
 READ_TIMEOUT = 30.0
 WRITE_TIMEOUT = 10.0
 """Shorter, so that no write of an operator that lost its Lease is under way for long."""
 CONNECT_TIMEOUT = 5.0
-LONGEST_RETRY_AFTER = 60.0
 
 _MERGE_PATCH = "application/merge-patch+json"
-_MESSAGE_LIMIT = 2000
 
 
 class Resource(NamedTuple):
@@ -85,46 +86,6 @@ SECRETS = Resource("", "v1", "secrets")
 EVENTS = Resource("", "v1", "events")
 SLICES = Resource("discovery.k8s.io", "v1", "endpointslices")
 LEASES = Resource("coordination.k8s.io", "v1", "leases")
-
-
-class ApiError(Exception):
-    """A call that did not succeed.  ``str`` says what was asked and what came back."""
-
-    def __init__(self, message: str, *, what: str = "", status: int = 0, reason: str = "") -> None:
-        super().__init__(f"{what}: {message}" if what else message)
-        self.message = message
-        """The API server's own words."""
-        self.status = status
-        self.reason = reason
-        """The API server's word for the error, ``AlreadyExists`` for example."""
-
-
-class Gone(ApiError):
-    """There is no such object."""
-
-
-class Conflict(ApiError):
-    """The name is taken, or the object is not the one that was meant."""
-
-
-class Refused(ApiError):
-    """A quota, a policy or a missing right forbids it."""
-
-
-class Invalid(ApiError):
-    """The API server cannot accept this, now or later."""
-
-
-class Unavailable(ApiError):
-    """It is not known whether the call was carried out."""
-
-
-class TooMany(Unavailable):
-    """The API server asks to come back after ``retry_after`` seconds."""
-
-    def __init__(self, message: str, *, retry_after: float, **about: Any) -> None:
-        super().__init__(message, **about)
-        self.retry_after = retry_after
 
 
 class Cluster:
@@ -158,7 +119,7 @@ class Cluster:
 
     async def read(self, resource: Resource, namespace: str, name: str) -> Body:
         """The object as it is now, not as a cache had it."""
-        return _object(await self._call("get", resource, namespace, name), name)
+        return object_of(await self._call("get", resource, namespace, name), name)
 
     async def list(
         self,
@@ -177,7 +138,7 @@ class Cluster:
         query = {"limit": str(PAGE), "labelSelector": selector, "fieldSelector": fields}
         while True:
             page = await self._call("list", resource, namespace, query=query)
-            items, more = _items(page, f"list {resource.plural}")
+            items, more = items_of(page, f"list {resource.plural}")
             kept += [keep(item) for item in items]
             if not more:
                 return kept
@@ -189,11 +150,11 @@ class Cluster:
         """Create the object; the answer is what it became."""
         query = {"dryRun": "All"} if dry_run else {}
         answer = await self._call("create", resource, namespace, query=query, body=body)
-        return _object(answer, body["metadata"]["name"])
+        return object_of(answer, body["metadata"]["name"])
 
     async def replace(self, resource: Resource, namespace: str, name: str, body: Body) -> Body:
         """Replace the object; Conflict if ``metadata.resourceVersion`` is not its current one."""
-        return _object(await self._call("update", resource, namespace, name, body=body), name)
+        return object_of(await self._call("update", resource, namespace, name, body=body), name)
 
     async def patch(
         self, resource: Resource, namespace: str, name: str, patch: Body, subresource: str = ""
@@ -202,7 +163,7 @@ class Cluster:
         answer = await self._call(
             "patch", resource, namespace, name, subresource=subresource, body=patch
         )
-        return _object(answer, name)
+        return object_of(answer, name)
 
     async def delete(
         self,
@@ -248,7 +209,7 @@ class Cluster:
             try:
                 status, headers, data = await self._send(verb, path, query or {}, body)
                 code = str(status)
-                return _answer(status, headers, data, what)
+                return document_of(status, headers, data, what)
             except (TimeoutError, aiohttp.ClientError, OSError) as error:
                 # A TimeoutError says nothing of its own.
                 code = "timeout" if isinstance(error, TimeoutError) else "connection"
@@ -314,68 +275,3 @@ async def open_session(configuration: Configuration) -> aiohttp.ClientSession:
         headers={"Authorization": token} if token else None,
         proxy=configuration.proxy,
     )
-
-
-def _items(page: Body, what: str) -> tuple[list[Body], str]:
-    """The items of a list and how to go on.
-
-    Strict, because a list that is taken for empty by mistake makes the operator create pods.
-    """
-    items, metadata = page.get("items"), page.get("metadata")
-    if (
-        not str(page.get("kind", "")).endswith("List")
-        or not isinstance(items, list)
-        or not isinstance(metadata, dict)
-        or not all(isinstance(item, dict) for item in items)
-    ):
-        raise Unavailable("the answer is no list of objects", what=what)
-    return items, str(metadata.get("continue") or "")
-
-
-def _object(answer: Body, name: str) -> Body:
-    """``answer`` if it is the object of that name: what is none must not be taken for one."""
-    metadata = answer.get("metadata")
-    if not isinstance(metadata, dict) or metadata.get("name") != name:
-        raise Unavailable(f"the answer is not the object {name}")
-    return answer
-
-
-def _answer(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Body:
-    """The document in an answer; what is no success is raised."""
-    try:
-        body = json.loads(data)
-    except ValueError:
-        body = None
-    if 200 <= status < 300:
-        if isinstance(body, dict):
-            return body
-        raise Unavailable(f"the answer is no JSON object: {_excerpt(data)}", what=what)
-    raise _error(status, headers, body if isinstance(body, dict) else {}, data, what)
-
-
-def _error(status: int, headers: Mapping[str, str], body: Body, data: bytes, what: str) -> ApiError:
-    message = str(body.get("message") or "") or _excerpt(data) or f"HTTP status {status}"
-    about: dict[str, Any] = {
-        "what": what,
-        "status": status,
-        "reason": str(body.get("reason") or ""),
-    }
-    message = message[:_MESSAGE_LIMIT]
-    if status == 429:
-        return TooMany(message, retry_after=_retry_after(headers), **about)
-    # Without a Status it was not the API server that answered but something on the way to it.
-    if status >= 500 or status in (401, 408, 410) or body.get("kind") != "Status":
-        return Unavailable(message, **about)
-    return {404: Gone, 409: Conflict, 403: Refused}.get(status, Invalid)(message, **about)
-
-
-def _retry_after(headers: Mapping[str, str]) -> float:
-    try:
-        seconds = float(headers.get("Retry-After", ""))
-    except ValueError:
-        return 1.0
-    return min(max(seconds, 0.1), LONGEST_RETRY_AFTER) if seconds == seconds else 1.0
-
-
-def _excerpt(data: bytes) -> str:
-    return data[:200].decode(errors="replace").strip()

@@ -73,6 +73,8 @@ class KubernetesApi:
     def __init__(self, store: Store) -> None:
         self.store = store
         self.calls: list[Call] = []
+        self.tokens: list[str] = []
+        """Who asked, as far as a client says."""
         self.faults: list[Fault] = []
         self.after: Callable[[Call], None] = lambda call: None
         self.watch_delay = 0.0
@@ -121,6 +123,7 @@ class KubernetesApi:
         if call is None:
             return web.Response(status=404, text="404 page not found")
         self.calls.append(call)
+        self.tokens += request.headers.getall("Authorization", [])
         fault = next((fault for fault in self.faults if fault.strikes(call)), None)
         if fault is not None and fault.late:
             await asyncio.sleep(fault.late)

@@ -7,7 +7,6 @@ owner references and a history that watches are served from and that can be forg
 from __future__ import annotations
 
 import asyncio
-import copy
 import datetime
 import json
 import uuid
@@ -61,7 +60,10 @@ class Change(NamedTuple):
 
 
 class Store:
-    """The objects.  ``admit`` is asked before a creation and raises Failure to refuse it."""
+    """The objects.  What it returns is its own: nobody may change it, and it never does.
+
+    ``admit`` is asked before a creation and raises Failure to refuse it.
+    """
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -81,7 +83,7 @@ class Store:
         """Another store with the same past, whose time goes on from now by ``clock``."""
         start, now = clock(), self._clock()
         other = Store(lambda: now + clock() - start)
-        other._objects = copy.deepcopy(self._objects)
+        other._objects = dict(self._objects)
         other._version, other._addresses = self._version, self._addresses
         other.changes = list(self.changes)
         return other
@@ -102,20 +104,21 @@ class Store:
 
     def get(self, plural: str, namespace: str, name: str) -> Body:
         try:
-            return copy.deepcopy(self._objects[plural, namespace, name])
+            return self._objects[plural, namespace, name]
         except KeyError:
             raise Failure(404, "NotFound", f'{plural} "{name}" not found') from None
 
     def list(self, plural: str, namespace: str | None = None, selector: str = "") -> list[Body]:
         return [
-            copy.deepcopy(body)
+            body
             for (kind, place, _), body in sorted(self._objects.items())
             if kind == plural and namespace in (None, place) and matches(body, selector)
         ]
 
     def create(self, plural: str, namespace: str, body: Body, *, dry_run: bool = False) -> Body:
-        body = copy.deepcopy(body)
-        name = body.get("metadata", {}).get("name")
+        metadata = dict(body.get("metadata") or {})
+        body = {**body, "metadata": metadata}
+        name = metadata.get("name")
         if not isinstance(name, str) or not name:
             raise Failure(422, "Invalid", "metadata.name: Required value")
         if (plural, namespace, name) in self._objects:
@@ -123,7 +126,6 @@ class Store:
         self.admit(plural, body)
         if dry_run:
             return body
-        metadata = body["metadata"]
         metadata |= {"namespace": namespace, "uid": str(uuid.uuid4()), "generation": 1}
         metadata["creationTimestamp"] = self.now()
         body["apiVersion"], body["kind"] = KINDS[plural]
@@ -133,9 +135,9 @@ class Store:
             body["status"] = {"phase": "Pending"}
         if plural == "services":
             self._addresses += 1
-            body.setdefault("spec", {}).setdefault("clusterIP", f"10.96.0.{self._addresses}")
+            body["spec"] = {"clusterIP": f"10.96.0.{self._addresses}", **body.get("spec", {})}
         self._put("ADDED", (plural, namespace, name), body)
-        self.created(plural, copy.deepcopy(body))
+        self.created(plural, body)
         return self.get(plural, namespace, name)
 
     def update(self, plural: str, namespace: str, name: str, body: Body) -> Body:
@@ -143,8 +145,7 @@ class Store:
         asked = body.get("metadata", {}).get("resourceVersion")
         if asked is not None and asked != current["metadata"]["resourceVersion"]:
             raise Failure(409, "Conflict", f"{name}: the object has been modified")
-        new = copy.deepcopy(body)
-        new["metadata"] = {**current["metadata"], **new.get("metadata", {})}
+        new = {**body, "metadata": {**current["metadata"], **body.get("metadata", {})}}
         return self._change(plural, namespace, name, current, new)
 
     def merge(
@@ -183,8 +184,7 @@ class Store:
         """Take the object away, and what it owns."""
         body = self._objects.pop((plural, namespace, name))
         self._version += 1
-        body["metadata"]["resourceVersion"] = self.version
-        self._record("DELETED", (plural, namespace, name), body)
+        self._record("DELETED", (plural, namespace, name), self._stamped(body))
         if self.collects_garbage:
             self.collect_garbage(body["metadata"]["uid"])
 
@@ -213,18 +213,21 @@ class Store:
         if new == current:
             return current
         if new.get("spec") != current.get("spec"):
-            new["metadata"]["generation"] = current["metadata"].get("generation", 1) + 1
+            generation = current["metadata"].get("generation", 1) + 1
+            new = {**new, "metadata": {**new["metadata"], "generation": generation}}
         self._put("MODIFIED", (plural, namespace, name), new)
         return self.get(plural, namespace, name)
 
     def _put(self, type_: str, place: Place, body: Body) -> None:
         self._version += 1
-        body["metadata"]["resourceVersion"] = self.version
-        self._objects[place] = body
-        self._record(type_, place, body)
+        self._objects[place] = self._stamped(body)
+        self._record(type_, place, self._objects[place])
+
+    def _stamped(self, body: Body) -> Body:
+        return {**body, "metadata": {**body["metadata"], "resourceVersion": self.version}}
 
     def _record(self, type_: str, place: Place, body: Body) -> None:
-        self.changes.append(Change(self._version, type_, place, copy.deepcopy(body)))
+        self.changes.append(Change(self._version, type_, place, body))
         self._bell.set()
         self._bell = asyncio.Event()
 
@@ -232,7 +235,7 @@ class Store:
 def merged(target: Any, patch: Any) -> Any:
     """RFC 7396."""
     if not isinstance(patch, dict):
-        return copy.deepcopy(patch)
+        return patch
     result = dict(target) if isinstance(target, dict) else {}
     for key, value in patch.items():
         if value is None:

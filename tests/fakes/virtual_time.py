@@ -1,20 +1,24 @@
 """An event loop whose clock stands still while anything happens and leaps over the rest.
 
 A minute in which nothing happens takes no time, so tests of timeouts, back-off and resync need no
-sleep.  Real sockets within the process work: what was sent is on its way in the kernel for less
-than ``IN_FLIGHT``, and only when nothing came for that long does the clock leap to the next timer.
+sleep.  Real sockets within the process work: the clock leaps to the next timer only when nothing
+is to be read and no socket has sent what the other side's kernel has not confirmed.
 """
 
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import selectors
+import struct
+import termios
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-IN_FLIGHT = 0.002
+IN_FLIGHT = 0.001
+"""Seconds within which what was sent arrives, or its confirmation does."""
 STUCK = 5.0
 
 
@@ -25,8 +29,7 @@ class _Selector(selectors.EpollSelector):
         ready = super().select(0)
         if ready or (timeout is not None and timeout <= 0):
             return ready
-        ready = super().select(IN_FLIGHT)
-        if ready:
+        if self._in_flight() and (ready := super().select(IN_FLIGHT)):
             return ready
         if timeout is None:
             ready = super().select(STUCK)
@@ -35,6 +38,18 @@ class _Selector(selectors.EpollSelector):
             return ready
         self.now += timeout
         return []
+
+    def _in_flight(self) -> bool:
+        keys = self.get_map().values()
+        return any(key.events & selectors.EVENT_WRITE or _unconfirmed(key.fd) for key in keys)
+
+
+def _unconfirmed(descriptor: int) -> int:
+    try:
+        found = fcntl.ioctl(descriptor, termios.TIOCOUTQ, b"\0\0\0\0")
+    except OSError:
+        return 0  # one that listens, or no socket
+    return int(struct.unpack("i", found)[0])
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):

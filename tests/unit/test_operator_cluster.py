@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
 from typing import Any
 
 import pytest
 from kubernetes.aio.client.configuration import Configuration
+from kubernetes.aio.config import incluster_config
 
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Store
+from fakes.world import configuration
+from fiber_api.certificates import make_pool_certificates
 from fiber_operator import cluster
 from fiber_operator.cluster import PODS, SECRETS, Cluster
 
 
 @contextlib.asynccontextmanager
 async def an_api(**options: Any) -> AsyncIterator[tuple[KubernetesApi, Cluster]]:
-    import asyncio
-
     api = KubernetesApi(Store(asyncio.get_running_loop().time))
     async with api.serving():
-        door = Cluster(Configuration(host=api.url), connections=4, **options)
+        door = Cluster(configuration(api), connections=4, **options)
         try:
             yield api, door
         finally:
@@ -143,12 +146,30 @@ def test_too_many_requests_says_when_to_come_back(header: float | None, seconds:
 def test_nonsense_is_no_answer(text: str, verb: str) -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault(text=text.encode(errors="replace").decode()))
+        calls: dict[str, Callable[[], Coroutine[Any, Any, object]]] = {
+            "get": lambda: door.read(PODS, "here", "a"),
+            "list": lambda: door.list(PODS, "here", names_of),
+            "create": lambda: door.create(PODS, "here", pod("a")),
+        }
         with pytest.raises(cluster.Unavailable):
-            await {
-                "get": lambda: door.read(PODS, "here", "a"),
-                "list": lambda: door.list(PODS, "here", names_of),
-                "create": lambda: door.create(PODS, "here", pod("a")),
-            }[verb]()
+            await calls[verb]()
+
+    with_api(test)
+
+
+@pytest.mark.parametrize("text", ["{}", '{"metadata": {}}', '{"metadata": {"name": "b"}}'])
+def test_what_is_not_the_object_is_no_answer(text: str) -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.store.create("pods", "here", pod("a"))
+        api.faults.append(Fault(text=text, times=4))
+        for call in (
+            door.read(PODS, "here", "a"),
+            door.create(PODS, "here", pod("a")),
+            door.replace(PODS, "here", "a", pod("a")),
+            door.patch(PODS, "here", "a", {}),
+        ):
+            with pytest.raises(cluster.Unavailable, match="not the object a"):
+                await call
 
     with_api(test)
 
@@ -249,11 +270,46 @@ def test_every_call_is_observed() -> None:
 
 def test_no_more_calls_at_once_than_connections() -> None:
     """What waits for its turn is not late: only the server's own time counts."""
-    import asyncio
 
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault(late=8, times=12))
         await asyncio.gather(*(door.create(PODS, "here", pod(f"p{n}")) for n in range(12)))
         assert asyncio.get_running_loop().time() >= 3 * 8
+
+    with_api(test)
+
+
+# -- Logging in
+
+
+def test_a_pod_logs_in_with_its_own_account(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "token").write_text("first")
+    (tmp_path / "ca.crt").write_text(make_pool_certificates("any", "any").authority)
+    monkeypatch.setattr(incluster_config, "SERVICE_TOKEN_FILENAME", str(tmp_path / "token"))
+    monkeypatch.setattr(incluster_config, "SERVICE_CERT_FILENAME", str(tmp_path / "ca.crt"))
+    monkeypatch.delenv("KUBECONFIG", raising=False)
+    monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "fd00::1")
+    monkeypatch.setenv("KUBERNETES_SERVICE_PORT", "443")
+
+    async def main() -> None:
+        configuration = await cluster.load_configuration()
+        assert configuration.host == "https://[fd00::1]:443"
+        async with await cluster.open_session(configuration) as session:
+            assert session.headers["Authorization"] == "bearer first"
+
+    asyncio.run(main())
+
+
+def test_a_token_that_was_renewed_is_used() -> None:
+    """Each call is logged in with what the configuration says at that time."""
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.store.create("pods", "here", pod("a"))
+        for token in ("first", "second"):
+            door._client.configuration.api_key["BearerToken"] = f"Bearer {token}"
+            await door.read(PODS, "here", "a")
+        assert api.tokens == ["Bearer first", "Bearer second"]
 
     with_api(test)

@@ -9,6 +9,7 @@ import itertools
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
+import kopf
 import pytest
 from kopf._core.intents.causes import Activity
 
@@ -346,7 +347,7 @@ def test_a_kopf_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> N
                 if runs > 1:
                     raise
 
-    monkeypatch.setattr(handlers.kopf, "operator", stubborn)
+    monkeypatch.setattr(kopf, "operator", stubborn)
 
     @played()
     async def test(kopf: Watching) -> None:

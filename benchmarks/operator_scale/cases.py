@@ -1,0 +1,143 @@
+"""What is compared: pools and ReplicaSets of the same pods, in the same numbers.
+
+Plain data and decisions on it; nothing here talks to a cluster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from fiber_api import names
+
+Body = dict[str, Any]
+
+FAKE_KEY, FAKE_VALUE = "kwok.x-k8s.io/node", "fake"
+_LABEL = f"{names.GROUP}/benchmark-set"
+
+
+@dataclass(frozen=True)
+class Case:
+    """So many objects with so many pods each, `rounds` times if nothing else is asked for.
+
+    `limit`: seconds that each step of a trial may take.
+    """
+
+    name: str
+    title: str
+    objects: int
+    size: int
+    rounds: int
+    limit: float
+
+    @property
+    def pods(self) -> int:
+        """All of them."""
+        return self.objects * self.size
+
+
+CASES = {
+    case.name: case
+    for case in (
+        Case("1000", "1,000 pods", 1, 1000, rounds=3, limit=120),
+        Case("100x10", "100 times 10 pods", 100, 10, rounds=2, limit=120),
+        # The last, as what the operator's memory grew to does not shrink by itself.
+        Case("5000", "5,000 pods", 1, 5000, rounds=1, limit=400),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One of the two that make pods. `group` is the API's path before the namespace."""
+
+    name: str
+    label: str
+    colour: str
+    group: str
+    resource: str
+    manifest: Callable[[str, int], Body]
+
+    def collection(self, namespace: str) -> str:
+        """The path of all of them in a namespace."""
+        return f"{self.group}/namespaces/{namespace}/{self.resource}"
+
+
+def pod_template() -> Body:
+    """A pod that lands on a pretended node, where its image is never pulled."""
+    return {
+        "metadata": {"labels": {_LABEL: "pods"}},
+        "spec": {
+            "nodeSelector": {FAKE_KEY: FAKE_VALUE},
+            "tolerations": [{"key": FAKE_KEY, "value": FAKE_VALUE, "effect": "NoSchedule"}],
+            "containers": [
+                {
+                    "name": names.WORKER_CONTAINER,
+                    "image": "pretended.invalid/worker:1",
+                    "resources": {"requests": {"cpu": "10m", "memory": "16Mi"}},
+                }
+            ],
+        },
+    }
+
+
+def _pool(name: str, replicas: int) -> Body:
+    return {
+        "apiVersion": names.API_VERSION,
+        "kind": names.KIND,
+        "metadata": {"name": name},
+        "spec": {
+            "replicas": replicas,
+            "maxReplicas": replicas,
+            "scaleDown": {"policy": "Any"},
+            "template": pod_template(),
+        },
+    }
+
+
+def _replica_set(name: str, replicas: int) -> Body:
+    template = pod_template()
+    template["metadata"]["labels"] = {_LABEL: name}
+    return {
+        "apiVersion": "apps/v1",
+        "kind": "ReplicaSet",
+        "metadata": {"name": name},
+        "spec": {
+            "replicas": replicas,
+            "selector": {"matchLabels": {_LABEL: name}},
+            "template": template,
+        },
+    }
+
+
+FIBER = Subject(
+    "fiber",
+    "FiberPool",
+    "#d62728",
+    f"/apis/{names.API_VERSION}",
+    names.PLURAL,
+    _pool,
+)
+REPLICA_SET = Subject(
+    "replicaset", "ReplicaSet", "#1f77b4", "/apis/apps/v1", "replicasets", _replica_set
+)
+SUBJECTS = (FIBER, REPLICA_SET)
+
+
+def in_turn(turn: int) -> tuple[Subject, ...]:
+    """Both, the one or the other first, so that neither always finds the cluster as it likes."""
+    return SUBJECTS if turn % 2 == 0 else SUBJECTS[::-1]
+
+
+def ready(body: Body) -> int:
+    """How many ready pods the object's own status tells of."""
+    return int(body.get("status", {}).get("readyReplicas") or 0)
+
+
+def is_settled(body: Body, replicas: int) -> bool:
+    """Whether its own status says that so many are there, are ready, and that this is all."""
+    status = body.get("status", {})
+    counts = {int(status.get(name) or 0) for name in ("replicas", "readyReplicas")}
+    seen = status.get("observedGeneration") == body["metadata"]["generation"]
+    return seen and counts == {replicas}

@@ -1,0 +1,117 @@
+"""What must be in the cluster before anything is measured, and the operator that is there."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from benchmarks.operator_scale import counters
+from benchmarks.operator_scale.cases import FAKE_KEY, FAKE_VALUE, Body
+from benchmarks.operator_scale.results import Curve
+
+from e2e.kube import Kube, Refused, path_of
+from e2e.pools import is_ready
+from fiber_api import names
+
+MEMORY = "process_resident_memory_bytes"
+PROCESSOR = "process_cpu_seconds_total"
+_STARTED = "process_start_time_seconds"
+_SELECTOR = "app.kubernetes.io/component=operator,app.kubernetes.io/part-of=fiber"
+_PAUSE = 0.5
+"""Seconds between two looks at the operator's memory."""
+
+
+class CannotMeasure(Exception):
+    """The message says what is missing, why it is needed, and what to do."""
+
+
+class Operator:
+    """The cluster's one operator."""
+
+    def __init__(self, kube: Kube, pod: Body) -> None:
+        self._kube = kube
+        self._pod = pod
+
+    @property
+    def image(self) -> str:
+        """What it runs."""
+        containers = self._pod["spec"]["containers"]
+        return str(next(c["image"] for c in containers if c["name"] == "operator"))
+
+    def page(self) -> str:
+        """Its metrics now."""
+        metadata = self._pod["metadata"]
+        place = f"{metadata['name']}:metrics"
+        return self._kube.text(path_of("pods", metadata["namespace"], place, "proxy/metrics"))
+
+    def born(self, page: str) -> float:
+        """Tells a process from the one that took its place."""
+        return counters.value(page, _STARTED)
+
+    @contextlib.contextmanager
+    def memory(self, since: float) -> Iterator[Curve]:
+        """Its resident memory while this lasts, by a clock that stood at 0 at `since`."""
+        curve: Curve = []
+        ended = threading.Event()
+        thread = threading.Thread(target=self._watch, args=(curve, since, ended), daemon=True)
+        thread.start()
+        try:
+            yield curve
+        finally:
+            ended.set()
+            thread.join()
+
+    def _watch(self, curve: Curve, since: float, ended: threading.Event) -> None:
+        while not ended.wait(_PAUSE):
+            try:
+                size = counters.value(self.page(), MEMORY)
+            except (OSError, http.client.HTTPException, Refused, KeyError):
+                continue  # that it was away shows at the end: another process has its place
+            curve.append([time.monotonic() - since, size])
+
+
+def find_operator(kube: Kube) -> Operator:
+    """The operator, which must be there, be alone and be ready."""
+    if kube.get(path_of("customresourcedefinitions", name=names.CRD_NAME)) is None:
+        raise CannotMeasure(
+            f"the cluster does not know FiberPools (no {names.CRD_NAME}): install the chart "
+            "(helm install fiber charts/fiber-operator), or let --set-up do it"
+        )
+    pods = [pod for pod in kube.items("/api/v1/pods", labelSelector=_SELECTOR) if is_ready(pod)]
+    if not pods:
+        raise CannotMeasure(
+            f"no ready pod of the operator is in the cluster (labels {_SELECTOR}): install the "
+            "chart (helm install fiber charts/fiber-operator), or let --set-up do it; where it is "
+            "installed, its pod's log says why it is not ready"
+        )
+    if len(pods) > 1:
+        places = ", ".join(f"{p['metadata']['namespace']}/{p['metadata']['name']}" for p in pods)
+        raise CannotMeasure(
+            f"there is more than one operator ({places}), and it could be either that makes the "
+            "pods: uninstall all releases but one"
+        )
+    return Operator(kube, pods[0])
+
+
+def check_nodes(kube: Kube, pods: int) -> int:
+    """How many pretended nodes there are; together they must take so many pods."""
+    nodes = kube.items("/api/v1/nodes", labelSelector=f"{FAKE_KEY}={FAKE_VALUE}")
+    room = sum(int(node["status"]["allocatable"]["pods"]) for node in nodes if is_ready(node))
+    if room < pods:
+        found = f"{len(nodes)} pretended nodes with room for {room:,}" if nodes else "none"
+        raise CannotMeasure(
+            f"{pods:,} pods need nodes that only pretend to run them (KWOK's, with label and taint "
+            f"{FAKE_KEY}={FAKE_VALUE}), and there is {found}: PYTHONPATH=tests python -m cluster "
+            f"fake-nodes {-(-pods // 500)} makes them on the cluster of tests/cluster"
+        )
+    return len(nodes)
+
+
+def server_version(kube: Kube) -> str:
+    """The API server's."""
+    found: dict[str, Any] = kube.call("GET", "/version")
+    return str(found["gitVersion"])

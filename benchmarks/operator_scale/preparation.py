@@ -1,0 +1,85 @@
+"""`--set-up`: the cluster of tests/cluster with pretended nodes and the operator, for one run.
+
+What was there before is used and stays; what was made here goes at the end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from benchmarks.operator_scale.installed import CannotMeasure
+
+from cluster import ability, build, fake_nodes, images, lifecycle, places
+from cluster.kubectl import ready_nodes
+from e2e.kube import Kube, path_of
+from e2e.release import Release, crd_owner
+from fiber_api import names
+
+_NODES = 2
+_RELEASE = "fiber-bench"
+# The chart's own defaults where the end-to-end tests have others.
+_VALUES = {"operator": {"leaseSeconds": 15}}
+
+
+def kubeconfig() -> Path:
+    """What KUBECONFIG names."""
+    given = os.environ.get("KUBECONFIG")
+    if not given:
+        raise CannotMeasure(
+            "KUBECONFIG is not set, so there is no cluster to measure on: set it, or let --set-up "
+            "bring up the cluster of tests/cluster (root, Linux, Go)"
+        )
+    if not Path(given).is_file():
+        raise CannotMeasure(f"KUBECONFIG is {given}, and there is no such file: unset or mend it")
+    return Path(given)
+
+
+@contextlib.contextmanager
+def own_cluster(fakes: int) -> Iterator[Path]:
+    """Our cluster with so many pretended nodes; gives its KUBECONFIG."""
+    given = os.environ.get("KUBECONFIG")
+    if given and Path(given) != places.KUBECONFIG:
+        raise CannotMeasure(
+            f"--set-up is for the cluster of tests/cluster, and KUBECONFIG names another ({given}):"
+            " unset it, or install the chart there and run this without --set-up"
+        )
+    if obstacles := ability.obstacles():
+        raise CannotMeasure(
+            f"the cluster of tests/cluster cannot run here: {'; '.join(obstacles)}. Set KUBECONFIG "
+            "to a cluster that has the operator and KWOK's nodes, and run this without --set-up"
+        )
+    build.build(["kwok"])
+    was_up = lifecycle.find() is not None
+    before = 0
+    try:
+        lifecycle.up(_NODES)
+        before = ready_nodes(f"{fake_nodes.KEY}={fake_nodes.VALUE}")
+        fake_nodes.set_count(max(fakes, before))
+        yield places.KUBECONFIG
+    finally:
+        if was_up:
+            fake_nodes.set_count(before)
+        else:
+            lifecycle.down()
+
+
+@contextlib.contextmanager
+def operator(kube: Kube) -> Iterator[None]:
+    """The operator of this checkout, unless the cluster has one already."""
+    owner = crd_owner(kube)
+    if owner is not None and owner != f"{_RELEASE}/{_RELEASE}":
+        yield  # whether it runs is found out by who looks for it
+        return
+    with tempfile.TemporaryDirectory() as home:
+        release = Release(kube, _RELEASE, _RELEASE, images.bring_images(), Path(home))
+        try:
+            release.install(_VALUES)
+            yield
+        finally:
+            release.uninstall()
+            kube.delete(path_of("customresourcedefinitions", name=names.CRD_NAME))
+            kube.delete(path_of("namespaces", name=_RELEASE))

@@ -1,0 +1,254 @@
+"""From results to the page, its picture and the file with every sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.operator_scale import picture, results
+from benchmarks.operator_scale.cases import CASES, FIBER, REPLICA_SET, SUBJECTS, Case
+from benchmarks.operator_scale.counters import STATUS_WRITES
+from benchmarks.operator_scale.results import MEGA, STEPS, OperatorUse, Result, Trial
+from benchmarks.report import table
+from benchmarks.samples import Summary, in_words, summary, times
+
+RESULTS = "operator.json"
+PAGE = "operator.md"
+PICTURE = "operator.png"
+NOTES = "operator-notes.md"
+
+BUDGET_CASE = "1000"
+MOST_TIMES = 1.2
+MOST_MEMORY = 150 * MEGA
+
+Words = Callable[[float], str]
+
+_TITLE = "The operator at thousands of pods"
+_FEW = 0.005
+"""Requests per pod; what is less is not shown."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A budget and what was measured."""
+
+    what: str
+    measured: str
+    bound: str
+    verdict: str
+
+
+def write(folder: Path, known: Mapping[str, Result]) -> None:
+    """All three, and the cases in their order."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ordered = {name: known[name] for name in CASES if name in known}
+    results.save(folder / RESULTS, ordered)
+    picture.draw(ordered, folder / PICTURE)
+    text = page(ordered, notes=(folder / NOTES).exists())
+    (folder / PAGE).write_text(text, encoding="utf-8")
+
+
+def budgets(known: Mapping[str, Result]) -> list[Line]:
+    """The operator's budgets of the design."""
+    result = known.get(BUDGET_CASE, Result({}))
+    ratio = result.ratio(FIBER.name, REPLICA_SET.name, "settled")
+    peak = result.peak()
+    pods = CASES[BUDGET_CASE].title
+    return [
+        _line(
+            f"{pods} settled, against a ReplicaSet of as many",
+            ratio.median if ratio else None,
+            MOST_TIMES,
+            times,
+        ),
+        _line(
+            f"the operator's memory with {pods}, at its peak",
+            peak,
+            MOST_MEMORY,
+            lambda size: in_words(size, "B"),
+        ),
+    ]
+
+
+def _line(what: str, value: float | None, bound: float, words: Words) -> Line:
+    if value is None:
+        return Line(what, "—", f"< {words(bound)}", "not measured")
+    verdict = "met" if value < bound else f"missed by {(value / bound - 1) * 100:,.1f} %"
+    return Line(what, words(value), f"< {words(bound)}", verdict)
+
+
+def page(known: Mapping[str, Result], *, notes: bool) -> str:
+    """The page of these results."""
+    parts = [
+        "<!-- Written by benchmarks/operator_scale from operator.json; changes made by hand are "
+        "lost. -->",
+        f"# {_TITLE}",
+        _ABOUT,
+        f"Why it is as it is, and what was tried: [notes]({NOTES})." if notes else "",
+        f"![{_TITLE}]({PICTURE})",
+        "## Budgets",
+        table(
+            ("what", "measured", "budget", "verdict"),
+            [(b.what, b.measured, b.bound, b.verdict) for b in budgets(known)],
+        ),
+        "## Time",
+        _TIME,
+        table(("pods", "until", "FiberPool", "ReplicaSet", "ratio"), _steps(known)),
+        "## What the operator needs",
+        _NEEDS,
+        table(
+            ("pods", "memory: before", "peak", "after", "CPU until settled", "a pod", "in all"),
+            _uses(known),
+        ),
+        "## Its requests until settled",
+        "Pods made, pools read, statuses written: all that it asked of the API server, by verb and "
+        "resource. In the median trial, and for each pod.",
+        table(("pods", "request", "number", "for each pod"), _requests(known)),
+        "## Writes at the API server until settled",
+        "By everybody: who makes the pods, the scheduler, the pretended nodes; without heartbeats. "
+        "For each pod, in the median trial.",
+        table(("pods", "who makes them", "all", "the most frequent"), _writes(known)),
+        "## Made on",
+        *_origins(known),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+_ABOUT = (
+    "One FiberPool of 1,000 pods and one of 5,000, and 100 of 10 pods each, beside ReplicaSets of "
+    "the same sizes with the same pod template, on nodes that only pretend to run pods (KWOK). "
+    "The API server, etcd, the scheduler and the operator are real, and all of them share the "
+    "machine's processors: it is the ratio that counts. `make bench-operator` writes this page."
+)
+_TIME = (
+    "A round measures both, one after the other, in an order that alternates; each has a "
+    "namespace of its own, and the next one begins when nothing is left of it. Medians of the "
+    "rounds; the ratio is taken within each round. What is settled, an object's own status says: "
+    "it is about this spec, and as many pods are ready as are wanted. Pods are counted ten times a "
+    "second. A deleted object's pods are removed by Kubernetes' garbage collector for both."
+)
+_NEEDS = (
+    "Of the operator's own metrics: resident memory, looked at twice a second, and processor "
+    "time. Medians, but the peak is the greatest of all rounds. Before: when the trial begins; "
+    "after: when all of its pods are gone. What a Python process took once it seldom gives back, "
+    "so cases that ran earlier show in what is there before."
+)
+
+
+def _rows(known: Mapping[str, Result]) -> Iterator[tuple[Case, Result]]:
+    return ((CASES[name], result) for name, result in known.items())
+
+
+def _steps(known: Mapping[str, Result]) -> Iterator[tuple[str, ...]]:
+    for case, result in _rows(known):
+        title = case.title
+        for step, meaning in STEPS.items():
+            both = [_seconds(result.step(subject.name, step)) for subject in SUBJECTS]
+            ratio = result.ratio(FIBER.name, REPLICA_SET.name, step)
+            yield title, meaning, *both, _ratio(ratio)
+            title = ""
+
+
+def _seconds(found: Summary | None) -> str:
+    return f"{found.median:.1f} s" if found else "—"
+
+
+def _ratio(found: Summary | None) -> str:
+    if not found:
+        return "—"
+    if found.rounds == 1:
+        return times(found.median)
+    return f"{times(found.median)} ({times(found.least)} to {times(found.greatest)})"
+
+
+def _uses(known: Mapping[str, Result]) -> Iterator[tuple[str, ...]]:
+    for case, result in _rows(known):
+        uses = [trial.operator for trial in result.of(FIBER.name) if trial.operator]
+        peak = result.peak()
+        if peak is None:
+            continue
+        busy = _median(use.seconds_until_settled for use in uses)
+        yield (
+            case.title,
+            in_words(_median(use.memory_before for use in uses), "B"),
+            in_words(peak, "B"),
+            in_words(_median(use.memory_after for use in uses), "B"),
+            f"{busy:.1f} s",
+            in_words(busy / case.pods, "s"),
+            f"{_median(use.seconds for use in uses):.1f} s",
+        )
+
+
+def _requests(known: Mapping[str, Result]) -> Iterator[tuple[str, ...]]:
+    for case, result in _rows(known):
+        use = _middle(result)
+        if use is None:
+            continue
+        requests = use.requests_until_settled
+        shown = {
+            name: number
+            for name, number in requests.items()
+            if number / case.pods >= _FEW or name == STATUS_WRITES
+        }
+        rest = sum(requests.values()) - sum(shown.values())
+        rows = {"all": sum(requests.values()), **shown}
+        title = case.title
+        for name, number in {**rows, **({"others": rest} if rest else {})}.items():
+            yield title, name, f"{number:,.0f}", f"{number / case.pods:.3f}"
+            title = ""
+
+
+def _writes(known: Mapping[str, Result]) -> Iterator[tuple[str, ...]]:
+    for case, result in _rows(known):
+        title = case.title
+        for subject in SUBJECTS:
+            trial = _middle_trial(result.of(subject.name))
+            if trial is None:
+                continue
+            most = list(trial.writes.items())[:6]
+            said = ", ".join(f"{name} {number / case.pods:.2f}" for name, number in most)
+            yield title, subject.label, f"{sum(trial.writes.values()) / case.pods:.2f}", said
+            title = ""
+
+
+def _median(values: Iterable[float]) -> float:
+    found = summary(list(values))
+    assert found is not None, "there is a value for each trial"
+    return found.median
+
+
+def _middle_trial(trials: list[Trial]) -> Trial | None:
+    ordered = sorted(trials, key=lambda trial: trial.steps["settled"])
+    return ordered[len(ordered) // 2] if ordered else None
+
+
+def _middle(result: Result) -> OperatorUse | None:
+    trial = _middle_trial(result.of(FIBER.name))
+    return trial.operator if trial else None
+
+
+def _origins(known: Mapping[str, Result]) -> Iterator[str]:
+    """Where and when; cases that were measured by the same command share a table."""
+    made: dict[str, list[str]] = {}
+    for case, result in _rows(known):
+        about = {name: value for name, value in result.about.items() if name != "rounds"}
+        rounds = result.about["rounds"]
+        said = f"{case.title} ({rounds} round{'s' if rounds > 1 else ''})"
+        made.setdefault(table(("", ""), _origin(about)), []).append(said)
+    for text, cases in made.items():
+        yield f"{'; '.join(cases)}:"
+        yield text
+
+
+def _origin(about: Mapping[str, object]) -> list[tuple[str, str]]:
+    return [
+        ("machine", f"{about['cores']} cores ({about['processor']}), {about['memory']} of memory"),
+        ("system", f"{about['system']}"),
+        ("Kubernetes", f"{about['kubernetes']}, {about['nodes']} pretended nodes"),
+        ("operator", f"{about['operator']}"),
+        ("Python that measures", f"{about['python']}"),
+        ("date", f"{about['date']}"),
+        ("load before", f"{about['load']} (1 minute average of running processes)"),
+        ("command", f"`{about['command']}`"),
+    ]

@@ -1,0 +1,124 @@
+"""The operator's rights are the calls that it makes: none is missing, and none is to spare.
+
+The operator lives through all that makes it call the API server, in virtual time and with a fake
+one, which takes note.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from chart.helm import NAMESPACE as OWN
+from chart.helm import Helm, allowed, named
+from fakes import virtual_time
+from fakes.kubernetes_api import Call
+from fakes.store import KINDS
+from fakes.world import NAMESPACE, World, a_world, configuration
+from fiber_operator import handlers
+from fiber_operator.cluster import Configuration
+from fiber_operator.events import PAUSE
+
+Right = tuple[str, str, str]
+MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1, "leaseName": "es", "onLost": "Delete"}
+
+
+@pytest.fixture(scope="module")
+def calls() -> list[Call]:
+    """Every call of a life in which everything happens."""
+    made: list[Call] = []
+
+    async def test() -> None:
+        async with a_world(namespace=OWN, resync_seconds=20) as world:
+            stop = asyncio.Event()
+            watching = asyncio.ensure_future(watch(world, stop))
+            for happens in (grows, loses_workers, gets_stuck, meets_masters, is_orphaned):
+                await happens(world)
+            stop.set()
+            await watching
+            made.extend(world.api.calls)
+
+    virtual_time.run(test())
+    return made
+
+
+async def watch(world: World, stop: asyncio.Event) -> None:
+    """What the operator's own thread does."""
+
+    async def configure() -> Configuration:
+        return configuration(world.api)
+
+    async def gate() -> None: ...
+
+    await handlers.watch(
+        lambda *notice: None, configure=configure, namespaces=(), gate=gate, stop=stop
+    )
+
+
+async def grows(world: World) -> None:
+    world.make_pool(minReplicas=2)
+    await world.ready(2)
+
+
+async def loses_workers(world: World) -> None:
+    """Somebody deletes one after the other, which is the same event again."""
+    for _ in range(2):
+        world.store.delete("pods", NAMESPACE, world.names()[0], {})
+        await world.settled(PAUSE + 1)
+        await world.ready(2)
+
+
+async def gets_stuck(world: World) -> None:
+    """A node cannot start a worker, and only an event says why; then it is not wanted any more."""
+    world.kubelet.auto = False
+    world.edit(replicas=3)
+    await world.until(lambda: len(world.names()) == 3)
+    for pod in world.pods():
+        if "nodeName" not in pod["spec"]:
+            world.kubelet.waiting(NAMESPACE, pod["metadata"]["name"], "ContainerCreating")
+    await world.until(lambda: bool(counted(world, "list", "events")))
+    world.edit(replicas=2)
+    await world.until(lambda: len(world.names()) == 2)
+
+
+async def meets_masters(world: World) -> None:
+    """Of one address family and the other, while somebody meddles with the Service."""
+    world.edit(master=MASTER)
+    world.store.merge("services", NAMESPACE, "es-master", {"spec": {"selector": {"app": "x"}}})
+    await world.until(lambda: bool(counted(world, "patch", "services")))
+    world.edit(master={**MASTER, "host": "fd00::7"})
+    await world.until(lambda: bool(counted(world, "delete", "endpointslices")))
+
+
+async def is_orphaned(world: World) -> None:
+    """Nobody renews the Lease."""
+    await world.until(lambda: not world.store.list("fiberpools"), within=600)
+
+
+def counted(world: World, verb: str, plural: str) -> int:
+    return world.api.count(verb, plural)
+
+
+def rights(calls: Iterable[Call], where: Callable[[Call], bool]) -> set[Right]:
+    """What RBAC was asked for."""
+    return {
+        (
+            KINDS[call.plural][0].rpartition("/")[0],
+            f"{call.plural}/{call.subresource}" if call.subresource else call.plural,
+            call.verb,
+        )
+        for call in calls
+        if where(call)
+    }
+
+
+def test_what_it_may_do_to_pools_is_what_it_does(helm: Helm, calls: list[Call]) -> None:
+    role = named(helm.render(), "ClusterRole", f"{OWN}:fiber-fiber-operator")
+    assert rights(calls, lambda call: call.namespace != OWN) == set(allowed(role))
+
+
+def test_what_it_may_do_to_its_lease_is_what_it_does(helm: Helm, calls: list[Call]) -> None:
+    role = named(helm.render(), "Role", "fiber-fiber-operator-lease")
+    assert rights(calls, lambda call: call.namespace == OWN) == set(allowed(role))

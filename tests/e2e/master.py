@@ -1,0 +1,140 @@
+"""A master that gives no work: it attaches to a pool and says who dials in.
+
+A program of its own, which runs beside the tests or, in the worker's image, in the cluster.  It
+takes what it needs from its environment:
+
+``MASTER_POOL``, ``MASTER_NAMESPACE``   the pool
+``MASTER_HOST``                         where the workers can reach it
+``MASTER_API``                          the API server without a login; absent within a pod, which
+                                        has an account
+
+and prints a JSON object a line: ``{"event": "joined", "name": "es-…", "at": 0.4}``.  ``at`` is in
+seconds since just before it wrote itself into the pool.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import signal
+import ssl
+import threading
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+from fiber._transport.credentials import Credentials
+from fiber._transport.link import Link
+from fiber._transport.listener import MasterListener
+from fiber._transport.loop import Loop
+from fiber_api import names
+
+ACCOUNT = Path("/var/run/secrets/kubernetes.io/serviceaccount")
+
+
+class Api:
+    """What a master asks of the API server."""
+
+    def __init__(self, namespace: str, pool: str) -> None:
+        self._token = ""
+        self._context: ssl.SSLContext | None = None
+        self._url = os.environ.get("MASTER_API", "")
+        if not self._url:
+            host, port = (os.environ[f"KUBERNETES_SERVICE_{part}"] for part in ("HOST", "PORT"))
+            self._url = f"https://{names.address_of(host, int(port))}"
+            self._token = (ACCOUNT / "token").read_text()
+            self._context = ssl.create_default_context(cafile=str(ACCOUNT / "ca.crt"))
+        self._secret = f"/api/v1/namespaces/{namespace}/secrets/{names.secret_name(pool)}"
+        self._pool = f"/apis/{names.API_VERSION}/namespaces/{namespace}/{names.PLURAL}/{pool}"
+
+    def credentials(self) -> Credentials:
+        """The master's half."""
+        data = self._call("GET", self._secret)["data"]
+        texts = {key: base64.b64decode(data[key]).decode() for key in names.MASTER_FILES}
+        return Credentials(
+            texts[names.KEY_SERVER_NAME],
+            texts[names.KEY_AUTHORITY],
+            texts[names.KEY_MASTER_CERTIFICATE],
+            texts[names.KEY_MASTER_KEY],
+        )
+
+    def next_epoch(self) -> int:
+        """Above those of all masters before."""
+        pool = self._call("GET", self._pool)
+        there = pool["spec"].get("master", {}).get("epoch", 0)
+        before = pool.get("status", {}).get("masterEpoch", 0)
+        return 1 + int(max(there, before))
+
+    def attach(self, spec: dict[str, Any]) -> None:
+        """Write the part of the spec that is the master's; what it left out goes."""
+        body = {"apiVersion": names.API_VERSION, "kind": names.KIND, "spec": spec}
+        query = f"fieldManager={names.SDK_MANAGER}&force=true"
+        self._call("PATCH", f"{self._pool}?{query}", body)
+
+    def _call(self, method: str, path: str, body: object = None) -> dict[str, Any]:
+        request = urllib.request.Request(self._url + path, method=method)
+        request.add_header("Content-Type", "application/apply-patch+yaml")
+        if self._token:
+            request.add_header("Authorization", f"Bearer {self._token}")
+        request.data = None if body is None else json.dumps(body).encode()
+        with urllib.request.urlopen(request, context=self._context, timeout=30) as answer:
+            document: dict[str, Any] = json.load(answer)
+        return document
+
+
+class Agent:
+    """Hears of one agent."""
+
+    def __init__(self, link: Link, say: Any) -> None:
+        self._name, self._say = link.peer.name, say
+        link.attach(self)
+        say("joined", name=self._name)
+
+    def on_frame(self, frame: object) -> None: ...
+    def on_suspect(self) -> None: ...
+    def on_trusted(self) -> None: ...
+
+    def on_lost(self, reason: str) -> None:
+        self._say("lost", name=self._name, reason=reason)
+
+
+def main() -> None:
+    """Attach, stay until SIGTERM, and detach."""
+    api = Api(os.environ["MASTER_NAMESPACE"], os.environ["MASTER_POOL"])
+    host = os.environ["MASTER_HOST"]
+    started = time.monotonic()
+
+    def say(event: str, **facts: object) -> None:
+        at = round(time.monotonic() - started, 3)
+        print(json.dumps({"event": event, "at": at, **facts}), flush=True)
+
+    loop = Loop()
+    loop.start_thread("master-io")
+    agents: list[Agent] = []
+    listener = MasterListener(
+        loop,
+        names.address_of(host, 0),
+        api.credentials(),
+        on_agent=lambda link: agents.append(Agent(link, say)),
+        on_refused=lambda reason: say("refused", reason=reason),
+    )
+    port = int(listener.address.rpartition(":")[2])
+    epoch = api.next_epoch()
+    started = time.monotonic()
+    api.attach({"master": {"host": host, "port": port, "epoch": epoch}})
+    say("attached", address=listener.address, epoch=epoch)
+    told = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: told.set())
+    told.wait()
+    closed = threading.Event()
+    listener.close("the master ends", then=closed.set)
+    closed.wait(10)
+    api.attach({})
+    say("detached")
+    loop.stop()
+
+
+if __name__ == "__main__":
+    main()

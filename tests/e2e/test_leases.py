@@ -1,0 +1,138 @@
+"""Masters that vanish without a word: told by their Leases, and what becomes of their pools.
+
+The pools lose their masters at the same time, since a Lease takes at least five seconds to expire.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable, Mapping
+
+import pytest
+
+from e2e.kube import MERGE, Body
+from e2e.pools import Pool, says
+from e2e.scene import NotSo, Scene
+from e2e.test_apply import SOMEWHERE, table
+from fiber_api import names
+
+DURATION = 5
+"""The shortest that there is."""
+LATE = DURATION + 2 * DURATION / 3 + 1.0
+"""Seconds after the last renewal until the operator must have noticed: it looks every third."""
+GRACE = 3
+
+Pools = Mapping[str, Pool]
+
+
+@pytest.fixture(scope="module")
+def pools(module_scene: Scene, agent: Body) -> Pools:
+    """One for each fate and one whose master comes back, each with a master that is alive."""
+    fates = {"delete": "Delete", "shrink": "ScaleToMin", "retain": "Retain", "return": "Delete"}
+    pools = {name: Pool(module_scene, name) for name in fates}
+    for name, pool in pools.items():
+        renew(pool, create=True)
+        pool.apply(agent, minReplicas=1)
+        grace = 60 if name == "return" else GRACE
+        pool.attach(replicas=2, master=master_of(pool, fates[name], grace))
+    for pool in pools.values():
+        pool.ready(2)
+    while_renewed(list(pools.values()), lambda: all(map(is_alive, pools.values())))
+    return pools
+
+
+def master_of(pool: Pool, on_lost: str, grace: int) -> Body:
+    return {
+        **SOMEWHERE,
+        "leaseName": pool.name,
+        "leaseDurationSeconds": DURATION,
+        "onLost": on_lost,
+        "lostGraceSeconds": grace,
+    }
+
+
+def renew(pool: Pool, *, create: bool = False) -> None:
+    """What a master that is alive does every few seconds."""
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
+    spec = {"holderIdentity": "master-of-the-test", "renewTime": now.replace("+00:00", "Z")}
+    scene = pool.scene
+    if create:
+        body = {"metadata": {"name": pool.name}, "spec": spec}
+        scene.kube.create(scene.path("leases"), body)
+    else:
+        scene.kube.patch(scene.path("leases", pool.name), {"spec": spec}, MERGE)
+
+
+def while_renewed(pools: list[Pool], condition: Callable[[], bool]) -> None:
+    """Wait for the condition while the masters are alive."""
+    for _ in range(20):
+        for pool in pools:
+            renew(pool)
+        try:
+            pools[0].wait("while the Leases are renewed", condition, seconds=1.0)
+        except NotSo:
+            continue
+        return
+    raise NotSo("it did not become so while the Leases were renewed")
+
+
+def is_alive(pool: Pool) -> bool:
+    return bool(pool.condition("MasterAlive").get("status") == "True")
+
+
+def is_lost(pool: Pool) -> Body:
+    return pool.has_problem("MasterLost", seconds=LATE)
+
+
+def test_a_lost_master_is_told(pools: Pools) -> None:
+    pool = pools["retain"]
+    problem = is_lost(pool)
+    address = names.address_of(SOMEWHERE["host"], SOMEWHERE["port"])
+    words = ("Lease retain", "master-of-the-test", f"{DURATION} s", address, "workers stay")
+    assert says(problem["message"], *words)
+    alive = pool.condition("MasterAlive")
+    assert (alive["status"], alive["reason"]) == ("False", "MasterLost")
+    assert table(pool)["REASON"] == "MasterLost"
+
+
+def test_a_master_that_comes_back_keeps_its_pool(pools: Pools) -> None:
+    pool = pools["return"]
+    before = pool.names
+    is_lost(pool)
+    while_renewed([pool], lambda: is_alive(pool) and not pool.problem("MasterLost"))
+    assert pool.names == before
+    assert pool.status["phase"] == "Ready"
+
+
+def test_delete_deletes_the_pool(pools: Pools) -> None:
+    pool = pools["delete"]
+    pool.wait("the pool is gone", lambda: not pool.body, seconds=LATE + GRACE)
+    pool.wait("its workers too", lambda: not pool.pods)
+    lost = pool.scene.first("fiberpools", _loses(pool))
+    gone = next(m.at for m in pool.scene.moments if m.gone and m.name == pool.name)
+    assert gone - lost > GRACE - 1  # times in the API are whole seconds
+
+
+def test_scale_to_min_keeps_the_least(pools: Pools) -> None:
+    pool = pools["shrink"]
+    pool.wait("one worker", lambda: len(pool.live) == 1, seconds=LATE + GRACE)
+    assert pool.body["spec"]["replicas"] == 2
+    pool.wait("the status", lambda: pool.status.get("desiredReplicas") == 1)
+
+
+def test_retain_keeps_all(pools: Pools) -> None:
+    pool = pools["retain"]
+    is_lost(pool)
+    pool.scene.never("a worker goes", lambda: len(pool.live) != 2, seconds=GRACE)
+    victim = min(pool.names)
+    pool.kubectl("delete", "pod", victim, "--wait=false")
+    pool.wait("it is replaced", lambda: len(pool.names - {victim}) == 2)
+
+
+def _loses(pool: Pool) -> Callable[[Body], bool]:
+    def loses(body: Body) -> bool:
+        conditions = body.get("status", {}).get("conditions", [])
+        lost = any(c["type"] == "MasterAlive" and c["status"] == "False" for c in conditions)
+        return lost and body["metadata"]["name"] == pool.name
+
+    return loses

@@ -1,0 +1,121 @@
+"""A program attaches to a pool that is warm, and every agent dials in."""
+
+from __future__ import annotations
+
+import pytest
+
+from e2e.clusters import Cluster
+from e2e.delays import prompt
+from e2e.kube import Body
+from e2e.masters import Inside, Master, may_use_pools, outside
+from e2e.pools import Pool, is_ready
+from e2e.scene import Scene
+
+
+@pytest.fixture
+def host(cluster: Cluster) -> str:
+    """Where pods reach a program beside the tests."""
+    if cluster.outside is None:
+        pytest.skip(f"{cluster.description}: pods cannot reach a program beside the tests")
+    return cluster.outside
+
+
+def endpoints(scene: Scene, pool: Pool) -> list[tuple[list[str], int]]:
+    """Where the pool's Service leads."""
+    found = scene.now["endpointslices"].get(f"{pool.name}-master", {})
+    ports = [port["port"] for port in found.get("ports") or []]
+    return [
+        (endpoint["addresses"], port) for endpoint in found.get("endpoints") or [] for port in ports
+    ]
+
+
+def follows(pool: Pool, master: Master) -> None:
+    """The slice and the table say where the master is."""
+    host, _, port = master.address.rpartition(":")
+    pool.wait("the endpoint", lambda: endpoints(pool.scene, pool) == [([host], int(port))])
+    pool.wait("the status", lambda: pool.status.get("master") == master.address)
+    assert master.address in pool.kubectl("get", "fiberpool", pool.name)
+
+
+def test_a_master_outside_of_the_cluster(pool: Pool, agent: Body, host: str) -> None:
+    pool.apply(agent, minReplicas=3)
+    workers = pool.ready(3)
+    with outside(pool, host) as first:
+        prompt("agents join the first master", first.is_joined_by(*workers))
+        follows(pool, first)
+        first.kill()
+    with outside(pool, host) as second:
+        prompt("agents join the second master", second.is_joined_by(*workers))
+        assert second.address != first.address
+        follows(pool, second)
+        assert pool.status["masterEpoch"] == 2
+        second.end()
+    pool.wait("nobody at the endpoint", lambda: not endpoints(pool.scene, pool))
+    pool.wait("no master in the status", lambda: "master" not in pool.status)
+    with outside(pool, host) as third:
+        prompt("agents join the third master", third.is_joined_by(*workers))
+    assert sorted(pool.names) == workers
+    assert all(is_ready(pod) for pod in pool.live)
+
+
+def test_a_worker_that_comes_later_joins_too(pool: Pool, agent: Body, host: str) -> None:
+    pool.apply(agent, minReplicas=1)
+    (worker,) = pool.ready(1)
+    with outside(pool, host) as master:
+        master.is_joined_by(worker)
+        pool.scale(2)
+        master.is_joined_by(*pool.ready(2))
+
+
+def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
+    may_use_pools(pool.scene)
+    pool.apply(agent, minReplicas=2)
+    workers = pool.ready(2)
+    first = Inside(pool, image)
+    prompt("agents join the first master", first.is_joined_by(*workers))
+    follows(pool, first)
+    first.kill()
+    second = Inside(pool, image)
+    prompt("agents join the second master", second.is_joined_by(*workers))
+    assert second.address != first.address
+    follows(pool, second)
+    second.end()
+    pool.wait("no master in the status", lambda: "master" not in pool.status)
+    assert sorted(pool.names) == workers
+
+
+def test_each_master_gets_the_agents_of_its_own_pool(scene: Scene, agent: Body, host: str) -> None:
+    es, ppo = Pool(scene, "es"), Pool(scene, "ppo")
+    es.apply(agent, minReplicas=1)
+    ppo.apply(agent, minReplicas=2)
+    with outside(es, host) as first, outside(ppo, host) as second:
+        first.is_joined_by(*es.ready(1))
+        second.is_joined_by(*ppo.ready(2))
+        assert set(first.joined) == es.names
+        assert set(second.joined) == ppo.names
+
+
+def test_the_endpoint_follows_the_master(pool: Pool, agent: Body) -> None:
+    scene = pool.scene
+    pool.apply(agent)
+    pool.wait("an endpoint slice", lambda: scene.now["endpointslices"])
+    assert endpoints(scene, pool) == []
+    moves(pool, {"host": "10.0.3.7", "port": 41337, "epoch": 1})
+    moves(pool, {"host": "10.0.3.8", "port": 5000, "epoch": 2})
+    pool.attach()
+    pool.wait("nobody", lambda: endpoints(scene, pool) == [])
+
+
+def moves(pool: Pool, master: Body) -> None:
+    """Let this be the master; the endpoint follows soon."""
+    scene, there = pool.scene, [([master["host"]], master["port"])]
+    pool.attach(master=master)
+    pool.wait("the endpoint", lambda: endpoints(scene, pool) == there)
+    asked = scene.first("fiberpools", lambda found: _epoch(found) == master["epoch"])
+    moved = [moment.at for moment in scene.moments if moment.resource == "endpointslices"]
+    prompt("the endpoint follows the master", moved[-1] - asked)
+
+
+def _epoch(pool: Body) -> int | None:
+    epoch: int | None = pool["spec"].get("master", {}).get("epoch")
+    return epoch

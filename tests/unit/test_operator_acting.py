@@ -1,0 +1,221 @@
+"""Pieces of acting that a whole operator shows too rarely: creation and events."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from fakes import virtual_time
+from fakes.kubernetes_api import Fault, KubernetesApi
+from fakes.store import Body, Store
+from fakes.world import configuration
+from fiber_operator import events
+from fiber_operator.cluster import Cluster, Conflict, TooMany, Unavailable
+from fiber_operator.creation import ENOUGH, Created, Creator, Pace, draw_suffix
+from fiber_operator.events import Recorder
+from fiber_operator.lease import NotHolder
+from fiber_operator.plans import Event
+from fiber_operator.worker import Key
+
+ES = Key("team", "es")
+
+
+@contextlib.asynccontextmanager
+async def a_cluster(permit: Callable[[], None]) -> AsyncIterator[tuple[KubernetesApi, Cluster]]:
+    api = KubernetesApi(Store(asyncio.get_running_loop().time))
+    async with api.serving():
+        door = Cluster(configuration(api), connections=16, permit=permit)
+        try:
+            yield api, door
+        finally:
+            await door.close()
+
+
+Test = Callable[[KubernetesApi, Cluster], Coroutine[Any, Any, None]]
+
+
+def played(test: Test, permit: Callable[[], None] = lambda: None) -> Callable[[], None]:
+    async def main() -> None:
+        async with a_cluster(permit) as (api, door):
+            await test(api, door)
+
+    return lambda: virtual_time.run(main())
+
+
+def body(name: str) -> Body:
+    return {"metadata": {"name": name}}
+
+
+async def create(door: Cluster, count: int, pace: Pace | None = None, limit: int = 100) -> Created:
+    return await Creator(door).create("es", "team", body, count, limit, pace or Pace())
+
+
+# -- Creation
+
+
+def test_names_are_drawn_at_random() -> None:
+    drawn = {draw_suffix() for _ in range(1000)}
+    assert len(drawn) == 1000
+    assert {len(suffix) for suffix in drawn} == {10}
+
+
+@played
+async def test_all_are_created(api: KubernetesApi, door: Cluster) -> None:
+    pace = Pace()
+    done = await create(door, 100, pace)
+    assert sorted(done.names) == [pod["metadata"]["name"] for pod in api.store.list("pods")]
+    assert len(done.names) == 100
+    assert pace == Pace(batch=1)
+
+
+@pytest.mark.parametrize(("status", "kind"), [(403, "refusal"), (422, "refusal"), (404, "failure")])
+def test_a_refusal_is_the_end(status: int, kind: str) -> None:
+    @played
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.faults.append(Fault("create", "pods", status=status, skip=5, times=100))
+        pace = Pace()
+        done = await create(door, 100, pace)
+        assert len(api.calls) == 1 + 2 + 4
+        assert len(done.names) == 5
+        assert getattr(done, kind).status == status
+        assert pace == Pace(batch=1)
+
+    test()
+
+
+@played
+async def test_a_quota_that_is_counted_at_the_same_time_is_no_refusal(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    message = "Operation cannot be fulfilled on resourcequotas: the object has been modified"
+    api.faults.append(Fault("create", "pods", status=409, reason="Conflict", message=message))
+    pace = Pace()
+    done = await create(door, 3, pace)
+    assert isinstance(done.failure, Conflict)
+    assert done.names == []
+    assert pace.unsure == []
+
+
+@played
+async def test_names_whose_fate_is_unknown_are_used_first(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    api.faults += [Fault("create", "pods", carried_out=True), Fault("create", "pods")]
+    pace = Pace(batch=2)
+    done = await create(door, 4, pace)
+    assert isinstance(done.failure, Unavailable)
+    unsure = list(pace.unsure)
+    assert len(unsure) == 2
+    assert len(api.store.list("pods")) == 1
+    again = await create(door, 4, pace)
+    assert again.names[:2] == unsure
+    assert len(api.store.list("pods")) == 4
+    assert pace.unsure == []
+
+
+@played
+async def test_the_longest_wait_that_was_asked_for_counts(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    api.faults += [Fault("create", "pods", status=429, retry_after=n) for n in (3, 20, 5)]
+    done = await create(door, 10, Pace(batch=4))
+    assert isinstance(done.failure, TooMany)
+    assert done.wait == 20.0
+    assert len(done.names) == 1
+
+
+@played
+async def test_a_long_creation_stops_in_between_and_goes_on(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    api.faults.append(Fault("create", "pods", late=0.4, times=10**6))
+    pace = Pace()
+    done = await create(door, 100, pace)
+    assert done.failure is done.refusal is None
+    assert len(done.names) == 1 + 2 + 4
+    assert pace.batch == 8
+    assert asyncio.get_running_loop().time() < ENOUGH + 0.5
+    assert len((await create(door, 93, pace)).names) == 8 + 16 + 32
+
+
+def test_without_the_lease_nothing_is_created() -> None:
+    def refuse() -> None:
+        raise NotHolder
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        with pytest.raises(NotHolder):
+            await create(door, 10)
+        assert api.calls == []
+
+    played(test, refuse)()
+
+
+# -- Events
+
+
+def recorder(api: KubernetesApi, door: Cluster) -> Recorder:
+    return Recorder(door, api.store.unix_now, "operator-1")
+
+
+@played
+async def test_an_event_that_repeats_is_counted(api: KubernetesApi, door: Cluster) -> None:
+    record, event = recorder(api, door), Event("Warning", "Because", "words")
+    for _ in range(100):
+        await record.record(ES, "uid", event)
+        await asyncio.sleep(1)
+    (found,) = api.store.list("events")
+    assert 60 < found["count"] <= 100
+    assert len(api.calls) <= 1 + 100 / events.PAUSE
+    assert found["lastTimestamp"] > found["firstTimestamp"]
+    await asyncio.sleep(events.WINDOW)
+    await record.record(ES, "uid", event)
+    assert len(api.store.list("events")) == 2
+
+
+@played
+async def test_events_differ_by_pool_reason_and_words(api: KubernetesApi, door: Cluster) -> None:
+    record = recorder(api, door)
+    for uid, reason, message in [
+        ("1", "A", "a"),
+        ("2", "A", "a"),
+        ("1", "B", "a"),
+        ("1", "A", "b"),
+    ]:
+        await record.record(ES, uid, Event("Normal", reason, message))
+    assert len(api.store.list("events")) == 4
+
+
+@pytest.mark.parametrize(
+    "fault", [Fault(status=403), Fault(status=500), Fault(), Fault(text="{}"), Fault(late=60)]
+)
+def test_an_event_that_cannot_be_posted_is_forgotten(fault: Fault) -> None:
+    @played
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        record = recorder(api, door)
+        fault.times = 1
+        api.faults.append(fault)
+        await record.record(ES, "uid", Event("Normal", "A", "a"))
+        assert asyncio.get_running_loop().time() <= 5.1
+        await record.record(ES, "uid", Event("Normal", "A", "a"))
+        assert api.store.list("events") != []
+
+    test()
+
+
+@played
+async def test_a_long_message_is_cut(api: KubernetesApi, door: Cluster) -> None:
+    await recorder(api, door).record(ES, "uid", Event("Normal", "A", "a" * 5000))
+    (found,) = api.store.list("events")
+    assert len(found["message"]) == events.MESSAGE_LIMIT
+
+
+@played
+async def test_memory_of_events_is_bounded(api: KubernetesApi, door: Cluster) -> None:
+    record = recorder(api, door)
+    record._posted.update({("uid", str(n), ""): None for n in range(events.REMEMBERED)})  # type: ignore[misc]
+    await record.record(ES, "uid", Event("Normal", "A", "a"))
+    assert len(record._posted) == events.REMEMBERED

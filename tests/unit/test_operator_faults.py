@@ -1,0 +1,338 @@
+"""The API server fails in every way; pools come out as they should, and no worker is lost by it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from fakes import virtual_time
+from fakes.kubernetes_api import Call, Fault
+from fakes.world import NAMESPACE, World, a_world
+
+MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+
+Test = Callable[[World], Coroutine[Any, Any, None]]
+
+
+def played(test: Test) -> Callable[[], None]:
+    async def main() -> None:
+        async with a_world() as world:
+            await test(world)
+
+    return lambda: virtual_time.run(main())
+
+
+def created(world: World) -> list[str]:
+    return [c.place[2] for c in world.store.changes if c.type == "ADDED" and c.place[0] == "pods"]
+
+
+def deleted(world: World) -> list[str]:
+    return [c.place[2] for c in world.store.changes if c.type == "DELETED" and c.place[0] == "pods"]
+
+
+CALLS = [
+    ("get", "fiberpools"),
+    ("list", "fiberpools"),
+    ("patch", "fiberpools"),
+    ("get", "services"),
+    ("create", "services"),
+    ("create", "secrets"),
+    ("create", "endpointslices"),
+    ("list", "pods"),
+    ("create", "pods"),
+    ("create", "events"),
+    ("create", "leases"),
+]
+WAYS: dict[str, dict[str, Any]] = {
+    "reset": {},
+    "reset-after": {"carried_out": True},
+    "500": {"status": 500},
+    "500-after": {"status": 500, "carried_out": True},
+    "504": {"status": 504},
+    "429": {"status": 429, "retry_after": 3},
+    "401": {"status": 401, "reason": "Unauthorized"},
+    "409": {"status": 409, "reason": "Conflict"},
+    "nonsense": {"text": "<html>"},
+    "nonsense-after": {"text": "{}", "carried_out": True},
+    "slow": {"late": 8},
+    "too-slow": {"late": 40},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_pool_is_made_whatever_fails(way: str) -> None:
+    """Each kind of call fails twice, then works."""
+
+    async def main() -> None:
+        async with a_world(operator=False) as world:
+            world.api.faults = [Fault(*call, times=2, **WAYS[way]) for call in CALLS]
+            world.start()
+            world.make_pool(replicas=5)
+            await world.ready(5, within=3000)
+            await world.settled(100)
+            assert all(fault.times < 2 for fault in world.api.faults)
+            assert len(world.pods()) == len(created(world)) == 5
+            assert [len(world.store.list(p)) for p in ("services", "secrets")] == [1, 1]
+
+    virtual_time.run(main())
+
+
+@pytest.mark.parametrize("way", ["reset-after", "500-after", "nonsense-after", "too-slow"])
+def test_no_pod_is_made_twice_because_an_answer_was_lost(way: str) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.api.faults.append(Fault("create", "pods", times=6, skip=1, **WAYS[way]))
+        world.make_pool(replicas=10)
+        await world.ready(10)
+        await world.settled(100)
+        assert len(created(world)) == 10
+        assert world.live_at_most == 10
+
+    test()
+
+
+@played
+async def test_a_minute_without_api_server_costs_no_worker(world: World) -> None:
+    world.make_pool(replicas=5, master={**MASTER, "leaseName": "es", "leaseDurationSeconds": 30})
+    world.store.create("leases", NAMESPACE, {"metadata": {"name": "es"}})
+    renewing = asyncio.ensure_future(renew(world))
+    await world.ready(5)
+    await world.settled(45)
+    world.api.down = True
+    await world.settled(60)
+    assert world.program.health.alive() == []
+    world.api.down = False
+    await world.settled(120)
+    renewing.cancel()
+    assert deleted(world) == []
+    assert len(created(world)) == 5
+    assert world.status()["phase"] == "Ready"
+    world.edit(replicas=7)
+    await world.ready(7)
+
+
+async def renew(world: World) -> None:
+    """The master of the pool, who can do nothing while the API server is down."""
+    for number in range(10**6):
+        if not world.api.down:
+            spec = {"holderIdentity": "es-1", "renewTime": str(number)}
+            world.store.merge("leases", NAMESPACE, "es", {"spec": spec})
+        await asyncio.sleep(10)
+
+
+@played
+async def test_long_trouble_is_got_over_within_a_minute(world: World) -> None:
+    world.make_pool(replicas=5)
+    await world.ready(5)
+    trouble = [
+        Fault("list", "pods", status=500, times=10**6),
+        Fault("list", "fiberpools", times=10**6),
+    ]
+    world.api.faults += trouble
+    await world.settled(1200)
+    assert world.api.count("list", "pods") < 100
+    for fault in trouble:
+        fault.times = 0
+    world.edit(replicas=7)
+    assert await world.ready(7) < 60
+
+
+@played
+async def test_a_server_that_is_busy_is_left_alone(world: World) -> None:
+    world.make_pool(replicas=5)
+    await world.ready(5)
+    busy = Fault("get", "fiberpools", status=429, retry_after=30, times=10**6)
+    world.api.faults.append(busy)
+    world.api.calls.clear()
+    for replicas in range(6, 60):
+        world.edit(replicas=replicas)
+        await asyncio.sleep(1)
+    assert world.api.count("get", "fiberpools") <= 3
+    busy.times = 0
+    await world.ready(59)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{}",
+        '{"kind": "PodList", "metadata": {}, "items": null}',
+        '{"kind": "Status", "status": "Success", "items": []}',
+        '{"apiVersion": "v1", "items": [], "metadata": {}}',
+    ],
+)
+def test_a_list_that_is_none_makes_no_pods(text: str) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.make_pool(replicas=5)
+        await world.ready(5)
+        fault = Fault("list", "pods", text=text, times=10**6)
+        world.api.faults.append(fault)
+        world.edit(replicas=6)
+        await world.settled(120)
+        fault.times = 0
+        await world.ready(6)
+        assert len(created(world)) == 6
+        assert deleted(world) == []
+
+    test()
+
+
+@pytest.mark.parametrize(
+    "text", ["{}", '{"metadata": {}}', '{"metadata": {"name": "other", "uid": "1"}}']
+)
+def test_an_answer_that_is_not_the_pool_changes_nothing(text: str) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.make_pool(replicas=5)
+        await world.ready(5)
+        world.api.faults.append(Fault("get", "fiberpools", text=text, times=5))
+        world.kubelet.evict(NAMESPACE, world.names()[0])
+        await world.until(lambda: len(created(world)) == 6)
+        await world.ready(5)
+        assert len(created(world)) == 6
+
+    test()
+
+
+@played
+async def test_a_status_that_cannot_be_written_holds_back_what_it_must_tell(world: World) -> None:
+    """A failed pod is deleted only once its failure is safely counted."""
+    world.make_pool(replicas=8, failurePolicy={"backoffBaseSeconds": 1, "backoffLimit": 100})
+    await world.ready(8)
+    unwritable = Fault("patch", "fiberpools", status=500, times=10**6)
+    world.api.faults.append(unwritable)
+    for name in world.names():
+        world.kubelet.exit(NAMESPACE, name, 3)
+    await world.settled(120)
+    assert deleted(world) == []
+    unwritable.times = 0
+    await world.until(lambda: world.status()["failures"]["total"] == 8)
+    await world.ready(8)
+
+
+@played
+async def test_events_that_cannot_be_posted_hold_back_nothing(world: World) -> None:
+    world.api.faults.append(Fault("create", "events", status=403, times=10**6))
+    world.make_pool(replicas=5)
+    assert await world.ready(5) < 5
+
+
+@played
+async def test_rights_that_are_missing_are_told(world: World) -> None:
+    world.api.faults.append(Fault("create", "secrets", status=403, reason="Forbidden", times=10**6))
+    world.make_pool(replicas=5)
+    await world.until(lambda: "Forbidden" in world.reasons())
+    assert "Secret es-tls" in world.status()["problems"][0]["message"]
+    await world.settled(60)
+    assert world.api.count("create", "secrets") < 30
+    world.api.faults.clear()
+    await world.ready(5)
+
+
+@played
+async def test_a_namespace_that_ends_is_no_storm(world: World) -> None:
+    message = "namespace team is being terminated"
+    world.api.faults.append(Fault("create", "pods", status=403, message=message, times=10**6))
+    world.make_pool(replicas=50)
+    await world.settled(120)
+    assert world.api.count("create", "pods") < 30
+
+
+@played
+async def test_a_lost_lease_stops_a_scale_up_at_once(world: World) -> None:
+    world.slow("create", "pods", 0.5)
+    world.make_pool(replicas=300)
+    await world.until(lambda: len(world.pods()) > 10)
+    spec = {"holderIdentity": "another", "leaseDurationSeconds": 15, "renewTime": "now"}
+    world.store.merge("leases", "fiber-system", "fiber-operator", {"spec": spec})
+    await world.until(lambda: not world.program.guard.held)
+    at_loss = len(created(world))
+    assert world.program.health.ready() != []
+    await world.settled(12)
+    under_way = world.program.queue.statistics().running
+    assert under_way == 0
+    assert len(created(world)) - at_loss <= 32, "what was sent is carried out, and no more"
+    await world.ready(300)
+    assert len(created(world)) == 300
+
+
+def test_two_operators_do_the_work_of_one() -> None:
+    async def main() -> None:
+        async with a_world() as world:
+            stop = asyncio.Event()
+            second = world.another(
+                host="127.0.0.1", port=0, identity="operator-2", namespace="fiber-system"
+            )
+            task = asyncio.ensure_future(second.run(stop))
+            world.slow("create", "pods", 0.2)
+            world.make_pool(replicas=60)
+            await world.until(lambda: len(world.pods()) > 20)
+            await world.kill()
+            await world.until_settled(60)
+            assert len(created(world)) == 60
+            assert second.guard.held
+            stop.set()
+            await task
+
+    virtual_time.run(main())
+
+
+@played
+async def test_sigterm_ends_a_scale_up_between_two_calls(world: World) -> None:
+    world.slow("create", "pods", 0.5)
+    world.make_pool(replicas=300)
+    await world.until(lambda: len(world.pods()) > 10)
+    clock = asyncio.get_running_loop().time
+    began, calls = clock(), len(world.api.calls)
+    await world.stop()
+    assert clock() - began < 2
+    made = len(created(world))
+    await asyncio.sleep(10)
+    assert len(created(world)) == made, "nothing was cut off in the middle"
+    late = [call for call in world.api.calls[calls:] if call.plural == "pods"]
+    assert late == []
+    lease = world.store.get("leases", "fiber-system", "fiber-operator")
+    assert lease["spec"]["holderIdentity"] == ""
+    world.api.faults.clear()
+    world.start(identity="operator-2")
+    await world.ready(300)
+    assert len(created(world)) == 300
+
+
+@played
+async def test_a_pool_made_anew_in_the_middle_gets_nothing_of_the_old_ones(world: World) -> None:
+    """Between the operator's read and its writes the pool is replaced by one of the same name."""
+
+    def replace(call: Call) -> None:
+        if (call.verb, call.plural) == ("list", "pods"):
+            world.api.after = lambda call: None
+            world.store.delete("fiberpools", NAMESPACE, "es")
+            world.make_pool(replicas=2)
+
+    world.make_pool(replicas=5)
+    await world.ready(5)
+    world.api.after = replace
+    world.edit(replicas=7)
+    await world.until_settled(2)
+    uid = world.store.get("fiberpools", NAMESPACE, "es")["metadata"]["uid"]
+    assert {pod["metadata"]["labels"]["fiber.dev/pool-uid"] for pod in world.pods()} == {uid}
+    assert world.status()["observedGeneration"] == 1
+
+
+@played
+async def test_a_master_that_comes_back_in_the_last_moment_keeps_its_pool(world: World) -> None:
+    lost = {"leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5, "onLost": "Delete"}
+    world.make_pool(replicas=3, master={**MASTER, **lost})
+    await world.ready(3)
+
+    world.slow("delete", "fiberpools", 1.0)
+    await world.until(lambda: world.api.count("delete", "fiberpools") == 1)
+    world.edit(master={**MASTER, **lost, "epoch": 2})
+    await world.settled(4)
+    assert world.store.list("fiberpools") != []
+    assert len(world.pods()) == 3
+    assert "MasterLost" not in world.reasons()

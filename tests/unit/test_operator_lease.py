@@ -1,0 +1,296 @@
+"""Of several operators one acts, whatever happens to it or to the API server."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from fakes import virtual_time
+from fakes.kubernetes_api import Fault, KubernetesApi
+from fakes.store import Body, Store
+from fakes.world import configuration
+from fiber_operator.cluster import Cluster
+from fiber_operator.lease import Guard, NotHolder
+
+NAMESPACE, NAME, SECONDS = "fiber-system", "fiber-operator", 15
+
+
+class Operators:
+    """Guards of operators that share one Lease."""
+
+    def __init__(self, api: KubernetesApi) -> None:
+        self.api = api
+        self.store = api.store
+        self.told: list[tuple[str, bool]] = []
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._doors: list[Cluster] = []
+
+    def start(self, identity: str, api: KubernetesApi | None = None) -> Guard:
+        door = Cluster(configuration(api or self.api), connections=2)
+        self._doors.append(door)
+        guard = Guard(
+            door,
+            namespace=NAMESPACE,
+            name=NAME,
+            identity=identity,
+            seconds=SECONDS,
+            on_change=lambda held: self.told.append((identity, held)),
+            wall_clock=self.store.unix_now,
+        )
+        self._tasks[identity] = asyncio.ensure_future(guard.run())
+        return guard
+
+    async def kill(self, identity: str) -> None:
+        task = self._tasks.pop(identity)
+        task.cancel()
+        await asyncio.wait([task])
+
+    async def close(self) -> None:
+        for identity in list(self._tasks):
+            await self.kill(identity)
+        for door in self._doors:
+            await door.close()
+
+    def lease(self) -> Body:
+        spec: Body = self.store.get("leases", NAMESPACE, NAME)["spec"]
+        return spec
+
+
+@contextlib.asynccontextmanager
+async def operators() -> AsyncIterator[Operators]:
+    api = KubernetesApi(Store(asyncio.get_running_loop().time))
+    async with api.serving():
+        found = Operators(api)
+        try:
+            yield found
+        finally:
+            await found.close()
+
+
+def played(test: Callable[[Operators], Coroutine[Any, Any, None]]) -> Callable[[], None]:
+    async def main() -> None:
+        async with operators() as found:
+            await test(found)
+
+    return lambda: virtual_time.run(main())
+
+
+def now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+async def until(condition: Callable[[], bool], within: float = 120) -> float:
+    started = now()
+    while not condition():
+        assert now() - started < within, "it did not come to that"
+        await asyncio.sleep(0.25)
+    return now() - started
+
+
+@played
+async def test_the_first_one_acts_at_once_and_goes_on(found: Operators) -> None:
+    guard = found.start("a")
+    await until(lambda: guard.held, 1)
+    guard.require()
+    assert found.lease()["holderIdentity"] == "a"
+    for _ in range(100):
+        await asyncio.sleep(1)
+        assert guard.held
+    assert found.told == [("a", True)]
+    assert found.lease()["leaseTransitions"] == 0
+
+
+@played
+async def test_before_it_is_known_nobody_acts(found: Operators) -> None:
+    found.api.down = True
+    guard = found.start("a")
+    await asyncio.sleep(60)
+    assert not guard.held
+    with pytest.raises(NotHolder, match="does not hold the Lease fiber-operator"):
+        guard.require()
+
+
+@played
+async def test_the_second_one_waits_for_ever(found: Operators) -> None:
+    first = found.start("a")
+    await until(lambda: first.held)
+    second = found.start("b")
+    for _ in range(100):
+        await asyncio.sleep(1)
+        assert (first.held, second.held) == (True, False)
+    assert second.why == "a holds it"
+
+
+@played
+async def test_a_lease_that_is_given_up_is_taken_at_once(found: Operators) -> None:
+    first = found.start("a")
+    await until(lambda: first.held)
+    second = found.start("b")
+    await asyncio.sleep(5)
+    first.resign()
+    assert not first.held
+    await found.kill("a")
+    await first.release()
+    assert await until(lambda: second.held) < 3
+    assert found.lease()["leaseTransitions"] == 1
+
+
+@played
+async def test_the_lease_of_one_that_died_is_taken_when_it_has_run_out(found: Operators) -> None:
+    first = found.start("a")
+    await until(lambda: first.held)
+    second = found.start("b")
+    await asyncio.sleep(7)
+    await found.kill("a")
+    died = now()
+    await until(lambda: second.held)
+    assert SECONDS - 5 <= now() - died <= SECONDS + 3
+    assert not first.held
+
+
+@played
+async def test_a_container_that_was_restarted_goes_on_at_once(found: Operators) -> None:
+    first = found.start("pod-1")
+    await until(lambda: first.held)
+    await found.kill("pod-1")
+    again = found.start("pod-1")
+    assert await until(lambda: again.held) < 1
+
+
+@played
+async def test_who_is_cut_off_stops_before_another_begins(found: Operators) -> None:
+    """The first one reaches no API server any more; the second one does."""
+    way = KubernetesApi(found.store)
+    async with way.serving():
+        first = found.start("a", way)
+        await until(lambda: first.held)
+        second = found.start("b")
+        await asyncio.sleep(20)
+        way.down = True
+        while not second.held:
+            assert now() < 100
+            await asyncio.sleep(0.25)
+            assert not (first.held and second.held)
+        way.down = False
+        await asyncio.sleep(30)
+        assert (first.held, second.held) == (False, True)
+        assert found.told == [("a", True), ("a", False), ("b", True)]
+        await found.kill("a")
+
+
+@played
+async def test_an_outage_of_the_api_server_stops_it_for_as_long(found: Operators) -> None:
+    guard = found.start("a")
+    await until(lambda: guard.held)
+    found.api.down = True
+    assert SECONDS / 3 < await until(lambda: not guard.held) <= SECONDS * 2 / 3 + 0.5
+    await asyncio.sleep(60)
+    found.api.down = False
+    assert await until(lambda: guard.held) < 5
+    assert found.told == [("a", True), ("a", False), ("a", True)]
+
+
+@played
+async def test_a_short_outage_goes_unnoticed(found: Operators) -> None:
+    guard = found.start("a")
+    await until(lambda: guard.held)
+    found.api.faults.append(Fault("update", "leases", status=503, times=2))
+    for _ in range(60):
+        await asyncio.sleep(0.5)
+        assert guard.held
+    assert found.told == [("a", True)]
+
+
+@played
+async def test_a_lease_that_another_took_is_lost_at_once(found: Operators) -> None:
+    guard = found.start("a")
+    await until(lambda: guard.held)
+    stolen = found.lease() | {"holderIdentity": "thief", "leaseTransitions": 7}
+    found.store.merge("leases", NAMESPACE, NAME, {"spec": stolen})
+    assert await until(lambda: not guard.held) <= SECONDS / 3 + 0.5
+    assert await until(lambda: guard.held) <= SECONDS + 3, "the thief never renews it"
+    assert found.lease()["leaseTransitions"] == 8
+
+
+@played
+async def test_two_that_ask_at_once_do_not_both_get_it(found: Operators) -> None:
+    guards = [found.start(name) for name in "abcd"]
+    for _ in range(200):
+        await asyncio.sleep(0.25)
+        assert sum(guard.held for guard in guards) <= 1
+    assert sum(guard.held for guard in guards) == 1
+
+
+@played
+async def test_a_lease_that_is_deleted_is_made_again(found: Operators) -> None:
+    guard = found.start("a")
+    await until(lambda: guard.held)
+    found.store.remove("leases", NAMESPACE, NAME)
+    await asyncio.sleep(30)
+    assert guard.held
+    assert found.lease()["holderIdentity"] == "a"
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [None, {}, {"holderIdentity": None}, {"holderIdentity": "", "leaseTransitions": "many"}],
+)
+def test_a_lease_that_nobody_holds_is_taken(spec: Body | None) -> None:
+    @played
+    async def test(found: Operators) -> None:
+        found.store.create("leases", NAMESPACE, {"metadata": {"name": NAME}, "spec": spec})
+        guard = found.start("a")
+        assert await until(lambda: guard.held) < 1
+
+    test()
+
+
+@pytest.mark.parametrize("duration", [None, "long", 0, -3])
+def test_a_holder_that_says_no_duration_is_given_ours(duration: object) -> None:
+    @played
+    async def test(found: Operators) -> None:
+        spec = {"holderIdentity": "other", "leaseDurationSeconds": duration}
+        found.store.create("leases", NAMESPACE, {"metadata": {"name": NAME}, "spec": spec})
+        guard = found.start("a")
+        assert SECONDS <= await until(lambda: guard.held) <= SECONDS + 3
+
+    test()
+
+
+@played
+async def test_the_clocks_of_others_do_not_count(found: Operators) -> None:
+    """A renewTime that is an hour old, or in the future, says nothing."""
+    for stamp in ("2020-01-01T00:00:00.000000Z", "2099-01-01T00:00:00.000000Z"):
+        spec = {"holderIdentity": "other", "leaseDurationSeconds": 10, "renewTime": stamp}
+        found.store.create("leases", NAMESPACE, {"metadata": {"name": NAME}, "spec": spec})
+        found.start("a")
+        assert 10 <= await until(lambda: found.told == [("a", True)]) <= 13
+        await found.kill("a")
+        found.told.clear()
+        found.store.remove("leases", NAMESPACE, NAME)
+
+
+@played
+async def test_giving_up_what_cannot_be_reached_is_no_error(found: Operators) -> None:
+    guard = found.start("a")
+    await until(lambda: guard.held)
+    guard.resign()
+    await found.kill("a")
+    found.api.down = True
+    await guard.release()
+    found.api.down = False
+    assert found.lease()["holderIdentity"] == "a"
+
+
+@played
+async def test_who_has_resigned_never_acts_again(found: Operators) -> None:
+    guard = found.start("a")
+    await until(lambda: guard.held)
+    guard.resign()
+    for _ in range(60):
+        await asyncio.sleep(1)
+        assert not guard.held

@@ -1,0 +1,262 @@
+"""The queue of pools: each once, one turn at a time, in time."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from fakes import virtual_time
+from fiber_operator import worker
+from fiber_operator.worker import GAP, Key, Queue, Turn
+
+A, B = Key("team", "a"), Key("team", "b")
+
+
+class Turns:
+    """Gives each turn the result that a test set, and writes down when it began."""
+
+    def __init__(self) -> None:
+        self.result: Turn | Exception = Turn()
+        self.lasts = 0.0
+        self.begun: list[tuple[float, Key]] = []
+        self.at_once = self.most_at_once = 0
+
+    async def __call__(self, key: Key) -> Turn:
+        self.begun.append((round(asyncio.get_running_loop().time(), 3), key))
+        self.at_once += 1
+        self.most_at_once = max(self.most_at_once, self.at_once)
+        await asyncio.sleep(self.lasts)
+        self.at_once -= 1
+        if isinstance(self.result, Exception):
+            raise self.result
+        return self.result
+
+    def times(self, key: Key = A) -> list[float]:
+        return [when for when, whose in self.begun if whose == key]
+
+
+@contextlib.asynccontextmanager
+async def a_queue(concurrency: int = 8) -> AsyncIterator[tuple[Queue, Turns]]:
+    turns = Turns()
+    queue = Queue(turns, concurrency=concurrency)
+    task = asyncio.ensure_future(queue.run())
+    try:
+        yield queue, turns
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+
+
+Test = Callable[[Queue, Turns], Coroutine[Any, Any, None]]
+
+
+def played(concurrency: int = 8) -> Callable[[Test], Callable[[], None]]:
+    def decorate(test: Test) -> Callable[[], None]:
+        async def main() -> None:
+            async with a_queue(concurrency) as (queue, turns):
+                await test(queue, turns)
+
+        return lambda: virtual_time.run(main())
+
+    return decorate
+
+
+@played()
+async def test_what_is_added_gets_a_turn_at_once(queue: Queue, turns: Turns) -> None:
+    queue.add(A)
+    await asyncio.sleep(10)
+    assert turns.begun == [(0.0, A)]
+
+
+@played()
+async def test_a_thousand_additions_are_one_turn(queue: Queue, turns: Turns) -> None:
+    for _ in range(1000):
+        queue.add(A)
+    await asyncio.sleep(10)
+    assert turns.begun == [(0.0, A)]
+
+
+@played()
+async def test_additions_during_a_turn_are_one_more(queue: Queue, turns: Turns) -> None:
+    turns.lasts = 3.0
+    queue.add(A)
+    await asyncio.sleep(1)
+    for _ in range(10):
+        queue.add(A)
+    await asyncio.sleep(30)
+    assert turns.times() == [0.0, 3.0 + GAP]
+    assert turns.most_at_once == 1
+
+
+@played()
+async def test_events_wait_for_the_gap_and_urgent_ones_do_not(queue: Queue, turns: Turns) -> None:
+    queue.add(A)
+    await asyncio.sleep(0.1)
+    queue.add(A)
+    await asyncio.sleep(1)
+    assert turns.times() == [0.0, GAP]
+    queue.add(A)
+    await asyncio.sleep(0.1)
+    queue.add(A, urgent=True)
+    await asyncio.sleep(1)
+    assert turns.times()[2:] == [1.1, 1.2]
+
+
+@played()
+async def test_urgent_ones_during_a_turn_follow_at_once(queue: Queue, turns: Turns) -> None:
+    turns.lasts = 2.0
+    queue.add(A)
+    await asyncio.sleep(1)
+    queue.add(A, urgent=True)
+    await asyncio.sleep(10)
+    assert turns.times() == [0.0, 2.0]
+
+
+@played()
+async def test_a_pool_rests_whatever_happens(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(rest=4.0)
+    queue.add(A)
+    await asyncio.sleep(1)
+    queue.add(A, urgent=True)
+    await asyncio.sleep(20)
+    assert turns.times() == [0.0, 4.0]
+
+
+@played()
+async def test_a_turn_may_ask_for_another(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(again=7.0)
+    queue.add(A)
+    await asyncio.sleep(20)
+    assert turns.times() == [0.0, 7.0, 14.0]
+
+
+@played()
+async def test_the_earlier_wish_wins(queue: Queue, turns: Turns) -> None:
+    queue.add(A, delay=100)
+    queue.add(A, delay=5)
+    queue.add(A, delay=50)
+    await asyncio.sleep(200)
+    assert turns.times() == [5.0]
+
+
+@pytest.mark.parametrize("result", [Turn(failed=True), RuntimeError("a fault of ours")], ids=str)
+def test_failures_are_repeated_later_each_time(result: Turn | Exception) -> None:
+    @played()
+    async def test(queue: Queue, turns: Turns) -> None:
+        turns.result = result
+        queue.add(A)
+        await asyncio.sleep(119)
+        assert turns.times() == [0.0, 0.5, 1.5, 3.5, 7.5, 15.5, 31.5, 61.5, 91.5]
+        turns.result = Turn()
+        await asyncio.sleep(10)
+        turns.result = result
+        queue.add(A)
+        await asyncio.sleep(1)
+        assert len(turns.begun) == 12, "after a success the wait begins anew"
+
+    test()
+
+
+@played()
+async def test_an_event_shortens_the_wait_after_a_failure(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(failed=True)
+    queue.add(A)
+    await asyncio.sleep(40)
+    queue.add(A, urgent=True)
+    await asyncio.sleep(0.1)
+    assert turns.times()[-1] == 40.0
+    for _ in range(100):
+        queue.add(A, urgent=True)
+        await asyncio.sleep(0.01)
+    assert len(turns.times()) == 9, "but not without any pause"
+
+
+@played()
+async def test_a_server_that_asks_to_wait_is_obeyed(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(failed=True, rest=20.0)
+    queue.add(A)
+    await asyncio.sleep(1)
+    queue.add(A, urgent=True)
+    await asyncio.sleep(25)
+    assert turns.times() == [0.0, 20.0]
+
+
+@played(concurrency=2)
+async def test_pools_take_turns_side_by_side(queue: Queue, turns: Turns) -> None:
+    turns.lasts = 1.0
+    for number in range(6):
+        queue.add(Key("team", str(number)))
+    await asyncio.sleep(0.5)
+    assert (queue.statistics().running, queue.statistics().waiting) == (2, 4)
+    await asyncio.sleep(10)
+    assert turns.most_at_once == 2
+    assert [when for when, _ in turns.begun] == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
+
+
+@played()
+async def test_a_pool_that_is_gone_is_forgotten(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(forget=True)
+    queue.add(A)
+    await asyncio.sleep(1)
+    assert queue.known() == []
+
+
+@played()
+async def test_a_pool_made_again_meanwhile_is_not_forgotten(queue: Queue, turns: Turns) -> None:
+    turns.result, turns.lasts = Turn(forget=True), 1.0
+    queue.add(A)
+    await asyncio.sleep(0.5)
+    turns.result = Turn(forget=True)
+    queue.add(A, urgent=True)
+    await asyncio.sleep(0.6)
+    assert queue.known() == [A]
+    assert len(turns.begun) == 2
+
+
+@played()
+async def test_statistics_tell_what_waits_and_runs(queue: Queue, turns: Turns) -> None:
+    turns.lasts = 100.0
+    queue.add(A)
+    queue.add(B, delay=50)
+    await asyncio.sleep(10)
+    statistics = queue.statistics()
+    assert (statistics.known, statistics.running, statistics.waiting) == (2, 1, 0)
+    assert (statistics.longest_run, statistics.longest_wait) == (10.0, 0.0)
+    assert statistics.since_last_end == 10.0
+
+
+@played()
+async def test_draining_waits_for_turns_and_begins_none(queue: Queue, turns: Turns) -> None:
+    turns.lasts = 2.0
+    queue.add(A)
+    await asyncio.sleep(1)
+    queue.add(B)
+    queue.add(A)
+    await queue.drain(5)
+    assert asyncio.get_running_loop().time() == pytest.approx(2.0)
+    await asyncio.sleep(10)
+    assert turns.begun == [(0.0, A)]
+
+
+@played()
+async def test_draining_does_not_wait_for_ever(queue: Queue, turns: Turns) -> None:
+    turns.lasts = 1000.0
+    queue.add(A)
+    await asyncio.sleep(1)
+    await queue.drain(5)
+    assert asyncio.get_running_loop().time() == pytest.approx(6.0)
+
+
+@played()
+async def test_an_end_in_the_middle_of_a_turn_leaves_nothing(queue: Queue, turns: Turns) -> None:
+    turns.lasts = 1000.0
+    queue.add(A)
+    await asyncio.sleep(1)
+
+
+def test_the_longest_backoff_is_bounded() -> None:
+    assert worker.FIRST_BACKOFF * 2**10 > worker.LONGEST_BACKOFF
