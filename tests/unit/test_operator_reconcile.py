@@ -318,6 +318,7 @@ def test_the_last_three_failed_pods_are_kept() -> None:
 
 def test_a_failed_pod_whose_sidecar_goes_on_is_not_kept() -> None:
     document = ended(1, phase="Running")
+    document["status"]["containerStatuses"].append({"name": "proxy", "state": {"running": {}}})
     assert gone(plan_of(tried(replicas=0), document)) == names(1)
 
 
