@@ -39,14 +39,20 @@ class Operator:
     @property
     def image(self) -> str:
         """What it runs."""
-        containers = self._pod["spec"]["containers"]
-        return str(next(c["image"] for c in containers if c["name"] == "operator"))
+        return str(self._container["image"])
 
     def page(self) -> str:
         """Its metrics now."""
         metadata = self._pod["metadata"]
-        place = f"{metadata['name']}:metrics"
+        # By number: unlike a Service's, the proxy of a pod knows no names of ports.
+        ports = {port["name"]: port["containerPort"] for port in self._container["ports"]}
+        place = f"{metadata['name']}:{ports['metrics']}"
         return self._kube.text(path_of("pods", metadata["namespace"], place, "proxy/metrics"))
+
+    @property
+    def _container(self) -> Body:
+        containers: list[Body] = self._pod["spec"]["containers"]
+        return next(each for each in containers if each["name"] == "operator")
 
     def born(self, page: str) -> float:
         """Tells a process from the one that took its place."""
@@ -100,9 +106,12 @@ def find_operator(kube: Kube) -> Operator:
 def check_nodes(kube: Kube, pods: int) -> int:
     """How many pretended nodes there are; together they must take so many pods."""
     nodes = kube.items("/api/v1/nodes", labelSelector=f"{FAKE_KEY}={FAKE_VALUE}")
-    room = sum(int(node["status"]["allocatable"]["pods"]) for node in nodes if is_ready(node))
+    fit = [node for node in nodes if is_ready(node)]
+    room = sum(int(node["status"]["allocatable"]["pods"]) for node in fit)
     if room < pods:
-        found = f"{len(nodes)} pretended nodes with room for {room:,}" if nodes else "none"
+        found = (
+            f"room for {room:,} on {len(fit)} that are ready, of {len(nodes)}" if nodes else "none"
+        )
         raise CannotMeasure(
             f"{pods:,} pods need nodes that only pretend to run them (KWOK's, with label and taint "
             f"{FAKE_KEY}={FAKE_VALUE}), and there is {found}: PYTHONPATH=tests python -m cluster "

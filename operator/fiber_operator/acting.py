@@ -21,7 +21,7 @@ from fiber_operator.cluster import (
     Invalid,
     Refused,
 )
-from fiber_operator.creation import Creator, Pace
+from fiber_operator.creation import ENOUGH, Creator, Pace
 from fiber_operator.documents import mapping, text
 from fiber_operator.events import Recorder
 from fiber_operator.logs import about
@@ -29,6 +29,9 @@ from fiber_operator.metrics import Metrics
 from fiber_operator.plans import Deletion, Event, Plan, Refusal
 from fiber_operator.surroundings import Surroundings
 from fiber_operator.worker import Key, Turn
+
+DELETIONS = 50
+"""Pods that are deleted at once."""
 
 log = logging.getLogger(__name__)
 
@@ -140,27 +143,38 @@ class Actor:
         await self._tell(look, look.plan.events)
 
     async def _change_pods(self, look: Look) -> Turn:
-        stale = await self._delete(look.key, look.state, look.plan.delete)
+        deleted, as_planned = await self._delete(look.key, look.state, look.plan.delete)
+        if deleted < len(look.plan.delete):
+            return Turn(again=0.0)
         turn = await self._create(look)
-        return dataclasses.replace(turn, again=0.0) if stale else turn
+        return turn if as_planned else dataclasses.replace(turn, again=0.0)
 
-    async def _delete(self, key: Key, state: State, deletions: Sequence[Deletion]) -> bool:
-        """Delete the pods; True if one was not as the plan had it."""
-        state.deleted |= {deletion.name for deletion in deletions}
-        results = await asyncio.gather(
-            *(self._delete_pod(key.namespace, deletion) for deletion in deletions),
-            return_exceptions=True,
-        )
-        stale = False
-        for deletion, result in zip(deletions, results, strict=True):
-            if isinstance(result, Conflict):
-                state.deleted.discard(deletion.name)
-                stale = True
-            elif isinstance(result, BaseException) and not isinstance(result, Gone):
-                raise result
-            else:
-                self._metrics.deleted(str(deletion.reason))
-        return stale
+    async def _delete(
+        self, key: Key, state: State, deletions: Sequence[Deletion]
+    ) -> tuple[int, bool]:
+        """How many of the pods were seen to, and whether each was as the plan had it.
+
+        Like creation this stops after ``ENOUGH``, so that the status is not out of date for long.
+        """
+        clock = asyncio.get_running_loop().time
+        started, done, as_planned = clock(), 0, True
+        while done < len(deletions) and (not done or clock() - started < ENOUGH):
+            batch = deletions[done : done + DELETIONS]
+            state.deleted |= {deletion.name for deletion in batch}
+            results = await asyncio.gather(
+                *(self._delete_pod(key.namespace, deletion) for deletion in batch),
+                return_exceptions=True,
+            )
+            for deletion, result in zip(batch, results, strict=True):
+                if isinstance(result, Conflict):
+                    state.deleted.discard(deletion.name)
+                    as_planned = False
+                elif isinstance(result, BaseException) and not isinstance(result, Gone):
+                    raise result
+                else:
+                    self._metrics.deleted(str(deletion.reason))
+            done += len(batch)
+        return done, as_planned
 
     async def _delete_pod(self, namespace: str, deletion: Deletion) -> None:
         await self._cluster.delete(

@@ -14,6 +14,8 @@ from fiber_operator.failed_pods import failed_pods
 from fiber_operator.situation import Situation
 from fiber_operator.starting_pods import pods_not_ready_any_more, pods_that_do_not_start
 
+_NAMESPACE_ENDS = "because it is being terminated"
+"""What the API server says where nothing new may be made because the namespace is deleted."""
 _WORKER_NAME = re.compile(f"[0-9a-f]{{{names.POD_SUFFIX_LENGTH}}}")
 
 
@@ -47,6 +49,8 @@ def _refusals(situation: Situation) -> Iterator[Problem]:
     refused = situation.memory.refusal
     if refused is None or refused.template_hash != situation.template_hash:
         return
+    if _NAMESPACE_ENDS in refused.message:
+        return  # its pods went before the pool, which goes next
     reason = refusal_reason(refused.status, refused.message)
     if situation.wants_more or reason == Reason.INVALID_TEMPLATE:
         yield situation.problem(

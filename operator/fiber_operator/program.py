@@ -24,7 +24,6 @@ from fiber_operator.events import Recorder
 from fiber_operator.handlers import Configure, Watcher
 from fiber_operator.health import Health
 from fiber_operator.lease import Guard
-from fiber_operator.logs import about
 from fiber_operator.masters import Masters
 from fiber_operator.metrics import Metrics
 from fiber_operator.resync import Resync
@@ -150,11 +149,14 @@ class Program:
             await asyncio.wait([*tasks, stopped], return_when=asyncio.FIRST_COMPLETED)
             self.guard.resign()
             await self.queue.drain(DRAIN)
+            # Before the watches are waited for: another operator may begin.
+            tasks[0].cancel()
+            await asyncio.wait([tasks[0]])
+            await self.guard.release()
         finally:
             for task in (*tasks, stopped):
                 task.cancel()
             results = await asyncio.gather(*tasks, return_exceptions=True)
-        await self.guard.release()
         for result in results:
             if isinstance(result, Exception):
                 raise result
@@ -188,5 +190,3 @@ class Program:
             self.resync.poke()
             for key in self.queue.known():
                 self.queue.add(key)
-        else:
-            log.warning("pools wait until the Lease is held again", extra=about(reason="LeaseLost"))

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from cluster import build, places
+from cluster.control_plane import NODE_LOST_AFTER
 from cluster.daemons import Daemon
 from cluster.kubectl import kubectl, ready_nodes
 from cluster.shell import wait_for
 
 KEY, VALUE = "kwok.x-k8s.io/node", "fake"
 _SIZE = {"cpu": "64", "memory": "256Gi", "pods": "500"}
-_LEASE = 40
+_LEASE = NODE_LOST_AFTER  # renewed four times as often
 # What the pretended world does by itself, of the stages that KWOK brings along.
 _STAGES = ("node/fast", "node/heartbeat-with-lease", "pod/fast")
 

@@ -67,9 +67,20 @@ class Api:
         before = pool.get("status", {}).get("masterEpoch", 0)
         return 1 + int(max(there, before))
 
-    def attach(self, spec: dict[str, Any]) -> None:
-        """Write the part of the spec that is the master's; what it left out goes."""
-        body = {"apiVersion": names.API_VERSION, "kind": names.KIND, "spec": spec}
+    def attach(self, host: str, port: int, epoch: int) -> None:
+        """Be the pool's master."""
+        self._apply({"spec": {"master": {"host": host, "port": port, "epoch": epoch}}})
+
+    def detach(self, epoch: int) -> None:
+        """Leave the pool without a master, unless it has another one by now."""
+        pool = self._call("GET", self._pool)
+        if pool["spec"].get("master", {}).get("epoch") == epoch:
+            version = pool["metadata"]["resourceVersion"]
+            self._apply({"metadata": {"resourceVersion": version}, "spec": {}})
+
+    def _apply(self, part: dict[str, Any]) -> None:
+        """Write what is the master's part; what is not in it goes."""
+        body = {"apiVersion": names.API_VERSION, "kind": names.KIND, **part}
         query = f"fieldManager={names.SDK_MANAGER}&force=true"
         self._call("PATCH", f"{self._pool}?{query}", body)
 
@@ -123,7 +134,7 @@ def main() -> None:
     port = int(listener.address.rpartition(":")[2])
     epoch = api.next_epoch()
     started = time.monotonic()
-    api.attach({"master": {"host": host, "port": port, "epoch": epoch}})
+    api.attach(host, port, epoch)
     say("attached", address=listener.address, epoch=epoch)
     told = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: told.set())
@@ -131,7 +142,7 @@ def main() -> None:
     closed = threading.Event()
     listener.close("the master ends", then=closed.set)
     closed.wait(10)
-    api.attach({})
+    api.detach(epoch)
     say("detached")
     loop.stop()
 

@@ -9,8 +9,9 @@ from typing import Any
 import yaml
 
 from e2e.delays import prompt
-from e2e.kube import Body
+from e2e.kube import Body, Kube
 from e2e.pools import Pool, is_live, says
+from e2e.release import Release
 from e2e.scene import Scene
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "manifests"
@@ -81,6 +82,13 @@ def test_kubectl_scales_a_warm_pool_between_its_bounds(pool: Pool, agent: Body) 
     two = pool.ready(2)
     pool.scale(9)
     pool.ready(3)
+    scale = pool.scene.kube.get(pool.scene.path("fiberpools", pool.name, "scale"))
+    assert scale is not None
+    assert (scale["spec"]["replicas"], scale["status"]["replicas"]) == (9, 3)
+    selected = pool.kubectl(
+        "get", "pods", "--selector", scale["status"]["selector"], "--no-headers"
+    )
+    assert len(selected.splitlines()) == 3
     limited = pool.condition("ScalingLimited")
     assert (limited["status"], limited["reason"]) == ("True", "AboveMaximum")
     assert says(limited["message"], "9", "maxReplicas", "3")
@@ -158,6 +166,24 @@ def test_a_worker_that_somebody_deletes_is_replaced(pool: Pool, agent: Body) -> 
     asked = scene.first("pods", lambda pod: "deletionTimestamp" in pod["metadata"])
     came = scene.first("pods", lambda pod: pod["metadata"]["name"] == new)
     prompt("a deleted worker is replaced", came - asked)
+
+
+def test_an_evicted_worker_is_replaced(pool: Pool, agent: Body) -> None:
+    scene = pool.scene
+    pool.apply(agent, minReplicas=1)
+    (victim,) = pool.ready(1)
+    scene.kube.create(scene.path("pods", victim, "eviction"), {"metadata": {"name": victim}})
+    pool.wait("another", lambda: pool.ever - {victim})
+    pool.ready(1)
+    failures = pool.status["failures"]
+    assert (failures["disrupted"], failures.get("total", 0)) == (1, 0)
+
+
+def test_kubectl_explains_the_fields(release: Release, kube: Kube) -> None:
+    assert says(kube.kubectl("explain", "fiberpool"), "pool of worker pods", "spec", "status")
+    assert "What becomes of the pool when its master is lost" in kube.kubectl(
+        "explain", "fiberpool.spec.master.onLost"
+    )
 
 
 def test_two_pools_do_not_mix(scene: Scene, agent: Body) -> None:

@@ -40,12 +40,14 @@ def pools(module_scene: Scene, image: str) -> Pools:
         "fails": template(image, "python", "-c", NO_MODEL),
         "ends": template(image, "true"),
         "no-program": template(image, "no-such-program"),
+        "never-ready": template(image, readinessProbe={"exec": {"command": ["false"]}}),
         "as-root": template(image, securityContext={"runAsNonRoot": True, "runAsUser": 0}),
     }
     templates["no-volume"]["spec"]["volumes"] = [VOLUME]
     pools = {name: Pool(module_scene, name) for name in templates}
+    policies = {"never-ready": {**QUICK, "startupTimeoutSeconds": 5}}
     items = [
-        pool.manifest(templates[name], minReplicas=1, failurePolicy=QUICK)
+        pool.manifest(templates[name], minReplicas=1, failurePolicy=policies.get(name, QUICK))
         for name, pool in pools.items()
     ]
     module_scene.kube.apply({"apiVersion": "v1", "kind": "List", "items": items})
@@ -201,6 +203,14 @@ def test_a_program_that_is_not_in_the_image(pools: Pools) -> None:
     words = (problem["pod"], "no-such-program", "Correct the command in spec.template")
     assert says(problem["message"], *words)
     is_told_soon(pool, has_ended, "RunContainerError")
+
+
+def test_a_worker_that_is_never_ready(pools: Pools) -> None:
+    pool = pools["never-ready"]
+    problem = pool.has_problem("StartupTimeout", severity="Error", seconds=60)
+    words = (problem["pod"], "not become ready", "5 s", "startupTimeoutSeconds")
+    assert says(problem["message"], *words)
+    assert pool.status["failures"]["total"] >= 1
 
 
 def test_an_image_that_wants_to_be_root(pools: Pools) -> None:

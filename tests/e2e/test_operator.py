@@ -121,7 +121,7 @@ def test_what_somebody_wrote_into_the_status_does_no_harm(pool: Pool, agent: Bod
         "phase": "Splendid",
         "readyReplicas": 99,
         "endpoint": "nowhere",
-        "failures": {"consecutive": 1, "nextCreateTime": "2099-01-01T00:00:00Z"},
+        "failures": {"total": 99, "nextCreateTime": "2099-01-01T00:00:00Z"},
         "problems": [{"reason": "Whatever", "message": "none"}],
         "conditions": [{"type": "Ready", "status": "Unknown"}],
     }

@@ -151,6 +151,20 @@ def test_a_name_that_is_taken(pool: Pool, agent: Body) -> None:
     pool.ready(1)
 
 
+def test_a_namespace_that_is_deleted(pool: Pool, agent: Body) -> None:
+    scene = pool.scene
+    pool.apply(agent, minReplicas=2).ready(2)
+    scene.kube.delete(path_of("namespaces", name=scene.namespace))
+    scene.wait("the pool is gone", lambda: not pool.body, seconds=60)
+    told = [problem["reason"] for m in scene.moments for problem in _problems(m.object)]
+    assert not told
+
+
+def _problems(body: Body) -> list[Body]:
+    found: list[Body] = body.get("status", {}).get("problems", [])
+    return found
+
+
 def _with_mount(agent: Body) -> Body:
     """A template that no schema can find fault with, and that is no pod all the same."""
     (worker,) = agent["spec"]["containers"]

@@ -245,9 +245,9 @@ class Api:
                 pods = 0 if self.idle else sum(o["spec"]["replicas"] for o in self.objects.values())
                 more = {"remainingItemCount": pods - 1} if pods > 1 else {}
                 return {"items": [{}] * min(pods, 1), "metadata": more}
-            case "GET", "metrics":
-                if path == "/metrics":
-                    return SERVER_PAGE
+            case "GET", "metrics" if path == "/metrics":
+                return SERVER_PAGE
+            case "GET", "metrics" if path == "/api/v1/namespaces/n/pods/o:8080/proxy/metrics":
                 born = next(self._asked) if self.restarts else 0
                 return OPERATOR_PAGE % {"pods": len(self.objects), "born": born}
             case "GET", "default":
@@ -339,7 +339,7 @@ def kube(api: Api) -> Iterator[Fake]:
 
 @pytest.fixture
 def operator(kube: Fake) -> Operator:
-    return Operator(kube, {"metadata": {"name": "o", "namespace": "n"}, "spec": {}})
+    return Operator(kube, pod("o"))
 
 
 @pytest.fixture(autouse=True)
@@ -391,7 +391,15 @@ def test_counters_of_another_process_are_not_used(kube: Fake, api: Api, operator
 def pod(name: str, ready: str = "True") -> dict[str, Any]:
     return {
         "metadata": {"name": name, "namespace": "n"},
-        "spec": {"containers": [{"name": "operator", "image": "i:1"}]},
+        "spec": {
+            "containers": [
+                {
+                    "name": "operator",
+                    "image": "i:1",
+                    "ports": [{"name": "metrics", "containerPort": 8080}],
+                }
+            ]
+        },
         "status": {"conditions": [{"type": "Ready", "status": ready}]},
     }
 
@@ -417,7 +425,7 @@ def test_nodes_must_have_room(kube: Fake, api: Api) -> None:
     with pytest.raises(CannotMeasure, match=r"1,001 pods need .* there is none: .* fake-nodes 3"):
         check_nodes(kube, 1001)
     api.lists["/api/v1/nodes"] = [node, node]
-    with pytest.raises(CannotMeasure, match="2 pretended nodes with room for 1,000"):
+    with pytest.raises(CannotMeasure, match="room for 1,000 on 2 that are ready, of 2"):
         check_nodes(kube, 1001)
     assert check_nodes(kube, 1000) == 2
 

@@ -186,6 +186,21 @@ async def test_released_pods_go_and_no_other(world: World) -> None:
 
 
 @played()
+async def test_the_status_keeps_up_with_a_long_deletion(world: World) -> None:
+    world.make_pool(replicas=400)
+    await world.ready(400)
+    world.slow("delete", "pods", 0.2)
+    world.edit(suspend=True)
+    told = set()
+    while world.pods():
+        await asyncio.sleep(0.5)
+        told.add(world.status()["replicas"])
+    assert len(told) > 2
+    await world.ready(0)
+    assert world.api.count("delete", "pods") == 400
+
+
+@played()
 async def test_a_pod_that_became_ready_meanwhile_stays(world: World) -> None:
     """It was Pending when it was listed, and the master has it now."""
     world.make_pool(replicas=3, master=MASTER)

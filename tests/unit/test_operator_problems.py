@@ -249,6 +249,12 @@ def test_a_full_quota_is_no_problem_to_a_pool_that_wants_no_more() -> None:
     assert status_of(POOL, running(1), refusal=refused).problems == ()
 
 
+def test_a_namespace_that_is_deleted_is_no_problem_of_its_pools() -> None:
+    said = "unable to create new content in namespace team because it is being terminated"
+    refused = Refusal(template_hash(POOL), 403, f'pods "es-1" is forbidden: {said}', NOW)
+    assert status_of(POOL, refusal=refused).problems == ()
+
+
 def test_an_obstacle_is_told_as_it_is() -> None:
     obstacle = Obstacle(Reason.NAME_TAKEN, "the Service es-master is another's", True)
     found = problem(POOL, running(1), obstacles=(obstacle,))
