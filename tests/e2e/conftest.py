@@ -68,7 +68,7 @@ def release(
     pytestconfig: pytest.Config,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Release]:
-    """The operator for all namespaces, ready; what an earlier session left is used or removed."""
+    """The operator for all namespaces, ready; what an earlier session left is removed."""
     owner = crd_owner(kube)
     if owner not in (None, f"{RELEASE}/{RELEASE}"):
         pytest.fail(
@@ -79,6 +79,7 @@ def release(
         )
     release = Release(kube, RELEASE, RELEASE, cluster.images, tmp_path_factory.mktemp("helm"))
     _remove_namespaces(kube)
+    release.uninstall()  # of a session that was killed, perhaps while Helm was at work
     release.install()
     pytestconfig.stash[_RELEASE] = release
     yield release

@@ -18,7 +18,7 @@ from fiber_api import names
 
 DURATION = 5
 """The shortest that there is."""
-LATE = DURATION + 2 * DURATION / 3 + 1.0
+LATE = 3 * DURATION
 """Seconds after the last renewal until the operator must have noticed: it looks every third."""
 GRACE = 3
 
@@ -35,9 +35,8 @@ def pools(module_scene: Scene, agent: Body) -> Pools:
         pool.apply(agent, minReplicas=1)
         grace = 60 if name == "return" else GRACE
         pool.attach(replicas=2, master=master_of(pool, fates[name], grace))
-    for pool in pools.values():
-        pool.ready(2)
-    while_renewed(list(pools.values()), lambda: all(map(is_alive, pools.values())))
+    everyone = list(pools.values())
+    while_renewed(everyone, lambda: all(map(is_ready, everyone)) and all(map(is_alive, everyone)))
     return pools
 
 
@@ -65,7 +64,7 @@ def renew(pool: Pool, *, create: bool = False) -> None:
 
 def while_renewed(pools: list[Pool], condition: Callable[[], bool]) -> None:
     """Wait for the condition while the masters are alive."""
-    for _ in range(20):
+    for _ in range(60):
         for pool in pools:
             renew(pool)
         try:
@@ -74,6 +73,10 @@ def while_renewed(pools: list[Pool], condition: Callable[[], bool]) -> None:
             continue
         return
     raise NotSo("it did not become so while the Leases were renewed")
+
+
+def is_ready(pool: Pool) -> bool:
+    return pool.status.get("readyReplicas") == len(pool.live) == 2
 
 
 def is_alive(pool: Pool) -> bool:

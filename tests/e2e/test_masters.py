@@ -12,11 +12,6 @@ from e2e.pools import Pool, is_ready
 from e2e.scene import Scene
 
 
-AGAIN = 3.0
-"""Seconds in which agents that had a master find the next: each begins its program anew for it,
-all of them on the cores that the test has."""
-
-
 @pytest.fixture
 def host(cluster: Cluster) -> str:
     """Where pods reach a program beside the tests."""
@@ -50,7 +45,7 @@ def test_a_master_outside_of_the_cluster(pool: Pool, agent: Body, host: str) -> 
         follows(pool, first)
         first.kill()
     with outside(pool, host) as second:
-        prompt("agents join the second master", second.is_joined_by(*workers), AGAIN)
+        prompt("agents join the second master", second.is_joined_by(*workers))
         assert second.address != first.address
         follows(pool, second)
         assert pool.status["masterEpoch"] == 2
@@ -58,7 +53,7 @@ def test_a_master_outside_of_the_cluster(pool: Pool, agent: Body, host: str) -> 
     pool.wait("nobody at the endpoint", lambda: not endpoints(pool.scene, pool))
     pool.wait("no master in the status", lambda: "master" not in pool.status)
     with outside(pool, host) as third:
-        prompt("agents join the third master", third.is_joined_by(*workers), AGAIN)
+        prompt("agents join the third master", third.is_joined_by(*workers))
     assert sorted(pool.names) == workers
     assert all(is_ready(pod) for pod in pool.live)
 
@@ -81,7 +76,7 @@ def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
     follows(pool, first)
     first.kill()
     second = Inside(pool, image)
-    prompt("agents join the second master", second.is_joined_by(*workers), AGAIN)
+    prompt("agents join the second master", second.is_joined_by(*workers))
     assert second.address != first.address
     follows(pool, second)
     second.end()
