@@ -6,6 +6,7 @@ tell of a change when it happens.
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import os
@@ -194,7 +195,8 @@ class Stream:
         with self._lock:
             self._closed.set()
             if self._socket is not None:
-                self._socket.shutdown(socket.SHUT_RDWR)
+                with contextlib.suppress(OSError):  # the other side was quicker
+                    self._socket.shutdown(socket.SHUT_RDWR)
         self._thread.join()
 
     def _run(self) -> None:

@@ -123,6 +123,8 @@ class Scene:
             return f"{self.path(resource)}?{query}"
 
         def tell(line: str) -> None:
+            if not line.endswith("\n"):
+                return  # the connection broke in the middle of it
             event = json.loads(line)
             if event["type"] == "ERROR":
                 raise Refused(int(event["object"].get("code", 500)), line)
