@@ -7,6 +7,8 @@ BIN := $(VENV)/bin
 # Side by side: a file's tests stay together, since what they share is made once for it.
 FAST_TESTS := tests/contract tests/simulation tests/unit
 FAST := $(BIN)/python -m pytest -q -n auto --dist loadfile $(FAST_TESTS)
+# Scenarios that cut nodes off and kill the API server, the operator and masters: `make e2e` has them.
+BREAKING := $(addprefix tests/e2e/test_,masters.py nodes.py operator.py)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
@@ -19,17 +21,17 @@ help:
 demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
-## make test          every test, those on a real cluster included
+## make test          every test, but for the scenarios that break parts of a cluster
 test: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(CLUSTER) prepare
 	$(FAST)
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(FAST_TESTS))
+	$(BIN)/python -m pytest $(addprefix --ignore=,$(FAST_TESTS) $(BREAKING))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation
 test-fast: $(VENV)/.with-dev
 	$(FAST)
 
-## make e2e           the operator and its chart on a real cluster: KUBECONFIG, kind or our own
+## make e2e           all scenarios on a real cluster: KUBECONFIG, kind or our own
 e2e: $(VENV)/.with-dev
 	$(CLUSTER) prepare
 	$(BIN)/python -m pytest tests/e2e
