@@ -40,11 +40,16 @@ def _record() -> Path:
 
 
 def find() -> Found | None:
-    """The cluster that was brought up here and not taken down, whether it is whole or not."""
+    """The cluster that was brought up here and not taken down, whether it is whole or not.
+
+    One of which no process runs any more has ended, with its machine or with who started it: what
+    it was in the middle of then is nothing to go on with.
+    """
     try:
-        return Found(**json.loads(_record().read_text()))
+        found = Found(**json.loads(_record().read_text()))
     except (OSError, ValueError, TypeError):
         return None
+    return found if any(daemon.runs() for daemon in all_daemons()) else None
 
 
 def up(count: int) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from cluster import cgroups, fake_nodes, faults, lifecycle, network, places, remains
+from cluster.daemons import Daemon
 from cluster.lifecycle import Found
 from cluster.node import Node
 from cluster.pki import Pair, Pki
@@ -110,6 +111,15 @@ def test_a_daemon_that_is_not_there_is_named() -> None:
         faults.stop("apisever")
 
 
+@pytest.fixture
+def running(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A daemon of the cluster runs, as far as can be seen."""
+    etcd = Daemon("etcd")
+    monkeypatch.setattr(etcd, "runs", lambda: True)
+    monkeypatch.setattr(lifecycle, "all_daemons", lambda: [Daemon("apiserver"), etcd])
+
+
+@pytest.mark.usefixtures("running")
 def test_the_found_cluster_is_the_one_that_was_written() -> None:
     assert lifecycle.find() is None
     found = Found("/home/me/fiber", str(places.cache()), 2)
@@ -118,6 +128,7 @@ def test_the_found_cluster_is_the_one_that_was_written() -> None:
     assert found.description.endswith("2 nodes, from /home/me/fiber")
 
 
+@pytest.mark.usefixtures("running")
 @pytest.mark.parametrize("text", ["", "[]", '{"checkout": 1}', "not json"])
 def test_a_damaged_record_is_no_cluster(text: str) -> None:
     places.STATE.mkdir()
@@ -130,7 +141,7 @@ def whole_network(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network, "is_there", lambda _: True)
 
 
-@pytest.mark.usefixtures("whole_network")
+@pytest.mark.usefixtures("running", "whole_network")
 def test_a_cluster_of_another_checkout_is_used_and_named(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -140,7 +151,7 @@ def test_a_cluster_of_another_checkout_is_used_and_named(
     assert "brought up from /home/me/fiber" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("whole_network")
+@pytest.mark.usefixtures("running", "whole_network")
 def test_a_cluster_of_other_versions_is_left_alone() -> None:
     Found("/home/me/fiber", "/cache/kubernetes-1.20.0", 2).write()
     with pytest.raises(
@@ -149,11 +160,29 @@ def test_a_cluster_of_other_versions_is_left_alone() -> None:
         lifecycle.keep_or_clear()
 
 
-def test_what_a_reboot_left_is_cleared(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def cleared(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """One entry for each time that the cluster was taken down."""
+    times: list[bool] = []
+    monkeypatch.setattr(lifecycle, "take_down", lambda: times.append(True))
+    return times
+
+
+@pytest.mark.usefixtures("running")
+def test_what_a_reboot_left_is_cleared(
+    monkeypatch: pytest.MonkeyPatch, cleared: list[bool]
+) -> None:
     Found("/home/me/fiber", str(places.cache()), 2).write()
-    cleared = []
     monkeypatch.setattr(network, "is_there", lambda _: False)
-    monkeypatch.setattr(lifecycle, "take_down", lambda: cleared.append(True))
+    assert lifecycle.keep_or_clear() is None
+    assert cleared == [True]
+
+
+@pytest.mark.usefixtures("whole_network")
+def test_a_cluster_of_which_nothing_runs_is_cleared(cleared: list[bool]) -> None:
+    """Not gone on with: a benchmark killed in it would still be in its etcd."""
+    Found("/home/me/fiber", str(places.cache()), 2).write()
+    assert lifecycle.find() is None
     assert lifecycle.keep_or_clear() is None
     assert cleared == [True]
 
