@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+import random
 import secrets
+import socket
 import threading
+import time
 from collections.abc import Callable
 
 from fiber._transport import handshake
 from fiber._transport.credentials import Credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
-from fiber._transport.link import Link, Patience, Poller
+from fiber._transport.link import Link, Patience, Poller, Timer
 from fiber._transport.nng import Pipe, Socket, SocketClosed, Unreachable, Untrusted, url_of
 from fiber._transport.session_link import SessionLink
 from fiber._wire.messages import ProtocolError
 from fiber.errors import AuthenticationError, FiberError, LinkError
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 0.5
-"""Seconds between attempts to dial for the first time, growing: a thousand agents that wait for a
-master must neither flood its network nor keep it waiting."""
+"""Seconds from one attempt to dial to the next, growing: a thousand agents that wait for a master
+must neither flood its network nor keep it waiting."""
+
+_CONNECT = 1.0
+"""Seconds for a connection to be taken.  The kernel would then ask again (RFC 6298), more and more
+seldom, and always where a Service led when it asked first: to a pod that is gone, say."""
+
+_GREET = 15.0
+"""Seconds from there to the welcome.  A thousand agents may dial one master at the same time, each
+of which costs it milliseconds; but its host may vanish in the middle and say no more."""
 
 _LONGER = 2
 """How much more patient an agent is than its master."""
@@ -55,39 +66,79 @@ class AgentDialer:
         self._obstacle = "nothing was tried"
         self._over = threading.Event()
         self._url = url_of(address)
-        self._socket = Socket(
-            loop,
-            credentials,
-            dials=True,
-            on_message=self._message,
-            on_gone=Pipe.disconnected,
-            on_pipe=self._introduce,
-        )
+        self._socket = self._open()
         self._deadline = None if timeout is None else loop.call_later(timeout, self._too_late)
-        # A dial that does not block never reports a failure, so the first one gets a thread.
-        threading.Thread(target=self._dial, name="fiber-dial", daemon=True).start()
+        self._greeting: Timer | None = None
+        self._start()
 
     def close(self) -> None:
         """Give up dialling, or drop the link without a farewell.  Calls nobody back."""
         self._loop.call_soon(self._stop)
 
-    def _dial(self) -> None:
-        pause = _PAUSE_MIN
-        while not self._over.is_set():
+    def _open(self) -> Socket:
+        return Socket(
+            self._loop,
+            self._credentials,
+            dials=True,
+            on_message=self._message,
+            on_gone=self._gone,
+            on_pipe=self._introduce,
+        )
+
+    def _start(self, *, pause: float = 0.0) -> None:
+        # A dial that does not block never reports a failure, so it gets a thread.
+        dial = threading.Thread(
+            target=self._dial, args=(self._socket, pause), name="fiber-dial", daemon=True
+        )
+        dial.start()
+
+    def _dial(self, ours: Socket, pause: float) -> None:
+        began = time.monotonic()
+        while not self._pause(began, pause) and ours is self._socket:
+            began = time.monotonic()
             try:
-                self._socket.dial(self._url)
+                _reach(self._address)
+                self._loop.call_soon(self._await_welcome)
+                ours.dial(self._url)
                 self._obstacle = "it took the connection and said nothing"
                 return
-            except Untrusted:
-                self._loop.call_soon(self._distrust)
-                return
+            except Untrusted as error:
+                self._obstacle = str(error)
+                if self._link is None:
+                    self._loop.call_soon(self._distrust)
+                    return
             except SocketClosed:
                 return
             except Unreachable as error:
                 # Nobody there yet, or no way there yet.
                 self._obstacle = str(error)
-            self._over.wait(pause)
-            pause = min(2 * pause, _PAUSE_MAX)
+            pause = min(max(2 * pause, _PAUSE_MIN), _PAUSE_MAX)
+
+    def _pause(self, since: float, seconds: float) -> bool:
+        """Let so much time pass since then, more or less; whether all is over meanwhile."""
+        until = since + seconds * random.uniform(0.5, 1.0)
+        return self._over.wait(max(until - time.monotonic(), 0.0))
+
+    def _await_welcome(self) -> None:
+        self._cancel_greeting()
+        self._greeting = self._loop.call_later(_GREET, self._hang_up)
+
+    def _hang_up(self) -> None:
+        """Drop a connection that came to nothing, in whatever state, and dial anew."""
+        if self._over.is_set():
+            return
+        self._socket.close()
+        try:
+            self._socket = self._open()
+        except FiberError as error:
+            self._fail(error)
+        else:
+            self._start()
+
+    def _gone(self, pipe: Pipe) -> None:
+        pipe.disconnected()
+        if not self._over.is_set():
+            self._start(pause=_PAUSE_MIN)
 
     def _introduce(self, pipe: Pipe) -> None:
         link = self._link
@@ -121,6 +172,7 @@ class AgentDialer:
             link = SessionLink(
                 self._loop, welcome.identity, patience, on_end=lambda _: self._stop()
             )
+        self._cancel_greeting()
         pipe.link = link
         link.connected(pipe, welcome.arrived)
         if self._link is None:
@@ -159,8 +211,24 @@ class AgentDialer:
     def _stop(self) -> None:
         self._over.set()
         self._cancel_deadline()
+        self._cancel_greeting()
         self._socket.close()
 
     def _cancel_deadline(self) -> None:
         if self._deadline is not None:
             self._deadline.cancel()
+
+    def _cancel_greeting(self) -> None:
+        if self._greeting is not None:
+            self._greeting.cancel()
+
+
+def _reach(address: str) -> None:
+    """Raise Unreachable, soon, if no connection can be made at this moment: nng sets no limit."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), _CONNECT).close()
+    except TimeoutError as error:
+        raise Unreachable(f"no answer within {_CONNECT:g} s") from error
+    except OSError as error:
+        raise Unreachable(str(error.strerror or error).lower()) from error

@@ -1,7 +1,7 @@
 """nng over TLS, both sides authenticated.  The only importer of pynng.
 
 The master has one polyamorous Pair1 socket for all its agents, each of which is one pipe of it; an
-agent has a socket of its own that dials the master, and dials again when its pipe breaks.
+agent has a socket of its own with which it dials the master.
 
 What nng does behind one's back, and what follows from it:
 
@@ -11,6 +11,8 @@ What nng does behind one's back, and what follows from it:
   and so an agent that hears nothing hangs up and dials anew.
 * Pipes come and go on nng's threads; their callbacks only leave a note for the loop.
 * A socket does not survive a fork: in the child it is made harmless, not closed.
+* A connection that nng makes waits for as long as the kernel and the peer let it, and nng would
+  make the next one itself: so it is kept from that, and who dials sets the limits.
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ _TURN = 64
 """Messages taken in one turn of the loop, so that a flood leaves others their turn."""
 
 _SEND_TIMEOUT = 1.0
-_REDIAL_MIN, _REDIAL_MAX = 0.1, 0.5
+_NEVER = 2**31 - 1
+"""Milliseconds, and the most that nng can count."""
 
 
 class Untrusted(Exception):
@@ -79,8 +82,8 @@ class Socket:
             recv_buffer_size=_TURN,
             send_buffer_size=_TURN,
             send_timeout=int(_SEND_TIMEOUT * 1000),
-            reconnect_time_min=int(_REDIAL_MIN * 1000),
-            reconnect_time_max=int(_REDIAL_MAX * 1000),
+            reconnect_time_min=_NEVER,
+            reconnect_time_max=_NEVER,
         )
         # The first of these runs before the pipe can bring anything.
         self._nng.add_pre_pipe_connect_cb(self._note)
@@ -111,11 +114,13 @@ class Socket:
         return f"{address.rpartition(':')[0]}:{port}"
 
     def dial(self, url: str) -> None:
-        """Connect, on a thread that may block.  Once it succeeded, nng dials again by itself.
+        """Connect, on a thread that may block, and let go of what was dialled before.
 
         Untrusted, Unreachable (may pass) or SocketClosed (was given up) say why not.
         """
         try:
+            for former in self._nng.dialers:
+                former.close()
             self._nng.dial(url, block=True)
         except pynng.CryptoError as error:
             raise Untrusted(str(error)) from error
@@ -203,7 +208,7 @@ class DialledPipe(Pipe):
     """The agent's side of a connection."""
 
     def doubt(self) -> None:
-        """Hang up; nng dials anew."""
+        """Hang up, whereupon the agent dials anew."""
         self.close()
 
 

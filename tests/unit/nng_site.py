@@ -1,0 +1,156 @@
+"""A master's and agents' ends of links over nng, on one loop, and what they call back."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pynng
+
+from fiber._transport.credentials import Credentials, MasterCredentials
+from fiber._transport.dialer import AgentDialer
+from fiber._transport.handshake import Identity
+from fiber._transport.link import Link, Patience
+from fiber._transport.listener import MasterListener
+from fiber._transport.loop import Loop
+from fiber._transport.session import Frame
+
+# Once used, nng keeps threads and two descriptors for as long as the process lives.  The census of
+# what tests leave behind begins after the collection, and so after this.
+pynng.Pair1().close()
+
+DEADLINE = 10.0
+SHORT = Patience(heartbeat=0.1, suspect_after=0.8, lost_after=2.0)
+
+
+class Notes:
+    """Writes down what a link, a listener or a dialer calls back, and wakes who waits for it."""
+
+    def __init__(self) -> None:
+        self.changed = threading.Condition()
+        self.frames: list[Frame] = []
+        self.events: list[str] = []
+        self.links: list[Link] = []
+        self.refusals: list[str] = []
+        self.errors: list[Exception] = []
+
+    def add(self, notes: list[Any], note: Any) -> None:
+        with self.changed:
+            notes.append(note)
+            self.changed.notify_all()
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        with self.changed:
+            assert self.changed.wait_for(condition, DEADLINE), vars(self)
+
+    def on_frame(self, frame: Frame) -> None:
+        self.add(self.frames, frame)
+
+    def on_suspect(self) -> None:
+        self.add(self.events, "suspect")
+
+    def on_trusted(self) -> None:
+        self.add(self.events, "trusted")
+
+    def on_lost(self, reason: str) -> None:
+        self.add(self.events, f"lost: {reason}")
+
+    def on_link(self, link: Link) -> None:
+        link.attach(self)
+        self.add(self.links, link)
+
+    def on_refused(self, reason: str) -> None:
+        self.add(self.refusals, reason)
+
+    def on_failed(self, error: Exception) -> None:
+        self.add(self.errors, error)
+
+    @property
+    def link(self) -> Link:
+        self.wait(lambda: self.links)
+        return self.links[0]
+
+
+class Site:
+    """A loop with listeners and dialers on it, all closed at the end."""
+
+    def __init__(self, credentials: MasterCredentials) -> None:
+        self.credentials = credentials
+        self.loop = Loop()
+        self.loop.start_thread("test-io")
+        self._closing: list[Callable[[], None]] = []
+
+    def listener(
+        self, address: str = "127.0.0.1:0", patience: Patience = SHORT
+    ) -> tuple[MasterListener, Notes]:
+        notes = Notes()
+        listener = MasterListener(
+            self.loop,
+            address,
+            self.credentials,
+            on_agent=notes.on_link,
+            on_refused=notes.on_refused,
+            patience=patience,
+        )
+        self._closing.append(lambda: self.close(listener, linger=0.1))
+        return listener, notes
+
+    def dialer(
+        self,
+        address: str,
+        *,
+        credentials: Credentials | None = None,
+        identity: Identity | None = None,
+        timeout: float | None = DEADLINE,
+    ) -> tuple[AgentDialer, Notes]:
+        notes = Notes()
+        dialling = AgentDialer(
+            self.loop,
+            address,
+            credentials or self.credentials.agent_half(),
+            identity or Identity.of_this_process("agent-1", host="here"),
+            on_link=notes.on_link,
+            on_failed=notes.on_failed,
+            timeout=timeout,
+        )
+        self._closing.append(dialling.close)
+        return dialling, notes
+
+    def pair(self) -> tuple[Notes, Notes]:
+        listener, master = self.listener()
+        _, agent = self.dialer(listener.address)
+        assert agent.link is not master.link
+        return master, agent
+
+    def on_loop(self, function: Callable[[], Any]) -> Any:
+        done, results = threading.Event(), []
+        self.loop.call_soon(lambda: (results.append(function()), done.set())[0])
+        assert done.wait(DEADLINE)
+        return results[0]
+
+    def close(self, listener: MasterListener, reason: str = "", *, linger: float = 1.0) -> None:
+        closed = threading.Event()
+        listener.close(reason, linger=linger, then=closed.set)
+        assert closed.wait(DEADLINE)
+
+    def end(self) -> None:
+        for close in reversed(self._closing):
+            close()
+        self.loop.stop()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def port_of(address: str) -> int:
+    return int(address.rpartition(":")[2])
+
+
+def break_connections(listener: MasterListener) -> None:
+    for pipe in list(listener._socket._pipes.values()):
+        pipe.close()

@@ -1,0 +1,215 @@
+"""Agents dial, masters listen: who is found, who is trusted, who is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from fiber._transport import dialer
+from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.handshake import Hello, Identity
+from fiber._transport.link import Patience
+from fiber._transport.nng import Socket, url_of
+from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
+from unit.nng_site import Site, free_port, port_of
+
+
+@pytest.fixture(scope="module")
+def credentials() -> MasterCredentials:
+    return make_credentials("test")
+
+
+@pytest.fixture
+def site(credentials: MasterCredentials) -> Iterator[Site]:
+    site = Site(credentials)
+    try:
+        yield site
+    finally:
+        site.end()
+
+
+def test_a_port_in_use_is_named(site: Site) -> None:
+    listener, _ = site.listener()
+    with pytest.raises(LinkError, match=f"cannot listen on {listener.address}: another program"):
+        site.listener(listener.address)
+
+
+@pytest.mark.parametrize("address", ["192.0.2.1:0", "no-such-host.invalid:0"])
+def test_an_address_that_is_not_ours_is_named(site: Site, address: str) -> None:
+    with pytest.raises(LinkError, match=f"cannot listen on {address}"):
+        site.listener(address)
+
+
+@pytest.mark.parametrize("address", ["localhost", ":80", "localhost:http", "localhost:65536"])
+def test_what_is_no_address_is_refused(site: Site, address: str) -> None:
+    with pytest.raises(ConfigError, match="is no address"):
+        site.listener(address)
+    with pytest.raises(ConfigError, match="is no address"):
+        site.dialer(address)
+
+
+def test_a_master_that_comes_later_is_found(site: Site) -> None:
+    address = f"127.0.0.1:{free_port()}"
+    _, agent = site.dialer(address)
+    _, master = site.listener(address)
+    agent.link.send(b"found you")
+    master.wait(lambda: master.frames == [b"found you"])
+
+
+def test_where_nobody_listens_the_dialer_gives_up(site: Site) -> None:
+    address = f"127.0.0.1:{free_port()}"
+    _, agent = site.dialer(address, timeout=0.3)
+    agent.wait(lambda: agent.errors)
+    assert isinstance(agent.errors[0], LinkError)
+    assert f"no master answered at {address} within 0.3 s: connection refused" in str(
+        agent.errors[0]
+    )
+
+
+def test_what_takes_connections_and_says_nothing_is_given_up(site: Site) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        _, agent = site.dialer(address, timeout=0.3)
+        agent.wait(lambda: agent.errors)
+    assert "no master answered" in str(agent.errors[0])
+
+
+@contextlib.contextmanager
+def black_hole() -> Iterator[str]:
+    """An address that answers nothing: what comes in waits for a queue that stays full."""
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as queue:
+        for _ in range(2):
+            waiting = queue.enter_context(socket.socket())
+            waiting.setblocking(False)
+            waiting.connect_ex(full.getsockname())
+        yield f"127.0.0.1:{full.getsockname()[1]}"
+
+
+def test_an_address_without_an_answer_is_soon_asked_again(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel alone would be silent for minutes, and ask where a Service led at first."""
+    monkeypatch.setattr(dialer, "_CONNECT", 0.2)
+    with black_hole() as address:
+        _, agent = site.dialer(address, timeout=0.5)
+        agent.wait(lambda: agent.errors)
+    assert "no answer within 0.2 s" in str(agent.errors[0])
+
+
+@pytest.mark.parametrize("before", ["the first welcome", "another welcome"])
+def test_a_host_that_vanishes_before_the_welcome_is_dialled_anew(
+    site: Site, monkeypatch: pytest.MonkeyPatch, before: str
+) -> None:
+    monkeypatch.setattr(dialer, "_GREET", 0.3)
+    address = f"127.0.0.1:{free_port()}"
+    with contextlib.ExitStack() as held:
+        if before == "another welcome":
+            listener, _ = site.listener(address, Patience())
+            _, agent = site.dialer(address)
+            assert agent.link
+            site.on_loop(listener._socket.close)
+        silent = held.enter_context(socket.create_server(("127.0.0.1", port_of(address))))
+        if before == "the first welcome":
+            _, agent = site.dialer(address, timeout=None)
+        for _ in range(2):  # one to see whether somebody is there, then the one that matters
+            held.enter_context(silent.accept()[0])
+        silent.close()
+        _, master = site.listener(address)
+        if before == "the first welcome":
+            assert agent.link is not master.link
+        else:
+            master.wait(lambda: master.refusals)  # another master: it was reached, that is all
+
+
+@pytest.mark.parametrize("wrong", ["other run", "other name", "the agent's certificate"])
+def test_wrong_credentials_are_an_error_at_once(site: Site, wrong: str) -> None:
+    listener, _ = site.listener()
+    agent_half = site.credentials.agent_half()
+    if wrong == "other run":
+        agent_half = make_credentials("test").agent_half()
+    elif wrong == "other name":
+        agent_half = replace(agent_half, server_name="master.other.fiber")
+    else:
+        foreign = make_credentials("test").agent_half()
+        agent_half = replace(agent_half, certificate=foreign.certificate, key=foreign.key)
+    _, agent = site.dialer(listener.address, credentials=agent_half)
+    agent.wait(lambda: agent.errors)
+    assert isinstance(agent.errors[0], AuthenticationError)
+    assert listener.address in str(agent.errors[0])
+    assert "PRIVATE" not in str(agent.errors[0])
+
+
+def test_an_agent_cannot_pose_as_the_master(site: Site) -> None:
+    half = site.credentials.agent_half()
+    impostor = Site(replace(site.credentials, certificate=half.certificate, key=half.key))
+    try:
+        listener, _ = impostor.listener()
+        _, agent = site.dialer(listener.address, timeout=1)
+        agent.wait(lambda: agent.errors)
+        assert agent.links == []
+    finally:
+        impostor.end()
+
+
+def test_credentials_that_are_no_pem_are_named(site: Site) -> None:
+    broken = replace(site.credentials.agent_half(), key="nonsense")
+    with pytest.raises(AuthenticationError, match=r"credentials for master.test.fiber cannot be"):
+        site.dialer("127.0.0.1:1", credentials=broken)
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "theirs"),
+    [
+        ({"protocol": 99, "fiber": "9.9"}, "Fiber protocol", r"99 \(fiberpool 9.9\)"),
+        ({"python": "3.1.4"}, "Python", "3.1.4"),
+    ],
+)
+def test_another_version_is_refused_and_both_sides_hear_both(
+    site: Site, change: dict[str, Any], what: str, theirs: str
+) -> None:
+    listener, master = site.listener()
+    ours = Identity.of_this_process("agent-1")
+    _, agent = site.dialer(listener.address, identity=replace(ours, **change))
+    agent.wait(lambda: agent.errors)
+    assert isinstance(agent.errors[0], VersionMismatch)
+    master.wait(lambda: master.refusals)
+    of_master = f"{ours.protocol} (fiberpool" if what == "Fiber protocol" else ours.python
+    for text in (str(agent.errors[0]), master.refusals[0]):
+        assert text.startswith(f"{what} version mismatch")
+        assert of_master in text
+        assert theirs.replace("\\", "") in text
+    assert agent.links == master.links == []
+
+
+def test_another_patch_level_of_python_will_do(site: Site) -> None:
+    listener, master = site.listener()
+    ours = Identity.of_this_process("agent-1")
+    minor = ".".join(ours.python.split(".")[:2])
+    _, agent = site.dialer(listener.address, identity=replace(ours, python=f"{minor}.99"))
+    assert agent.link is not master.link
+
+
+def test_who_is_no_agent_is_refused(site: Site) -> None:
+    listener, master = site.listener()
+    stranger = Socket(
+        site.loop,
+        site.credentials.agent_half(),
+        dials=True,
+        on_message=lambda *_: None,
+        on_gone=lambda _: None,
+        on_pipe=lambda pipe: pipe.put(b"GET / HTTP/1.1"),
+    )
+    stranger.dial(url_of(listener.address))
+    master.wait(lambda: master.refusals)
+    site.on_loop(stranger.close)
+    assert "no agent of Fiber" in master.refusals[0]
+
+
+def test_a_greeting_carries_nothing_but_who_and_where() -> None:
+    hello = Hello(Identity.of_this_process("agent-1"), "session", 3, True)
+    assert b"PRIVATE" not in hello.encode()
