@@ -7,8 +7,6 @@ BIN := $(VENV)/bin
 # Side by side: a file's tests stay together, since what they share is made once for it.
 FAST_TESTS := tests/contract tests/simulation tests/unit
 FAST := $(BIN)/python -m pytest -q -n auto --dist loadfile $(FAST_TESTS)
-# Scenarios that cut nodes off and kill the API server, the operator and masters: `make e2e` has them.
-BREAKING := $(addprefix tests/e2e/test_,masters.py nodes.py operator.py)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
@@ -21,11 +19,11 @@ help:
 demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
-## make test          every test, but for the scenarios that break parts of a cluster
+## make test          every test
 test: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(CLUSTER) prepare
 	$(FAST)
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(FAST_TESTS) $(BREAKING))
+	$(BIN)/python -m pytest $(addprefix --ignore=,$(FAST_TESTS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation
 test-fast: $(VENV)/.with-dev

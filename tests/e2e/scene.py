@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
-from e2e.kube import Body, Kube, Refused, Stream, path_of
+from e2e.kube import Body, Failed, Kube, Refused, Stream, path_of
+from fiber_api.names import LABEL_POOL
 
 T = TypeVar("T")
 _LINES = 150
@@ -161,7 +162,11 @@ class Scene:
         for title, arguments in (
             ("pools", ("get", "fiberpools", "--output", "yaml")),
             ("pods", ("get", "pods", "--output", "wide")),
+            ("workers' words", ("logs", "--selector", LABEL_POOL, "--tail=20", "--prefix")),
             ("events", ("get", "events", "--sort-by", "metadata.creationTimestamp")),
         ):
-            lines = self.kube.kubectl(*arguments, *where).splitlines()
-            yield f"{title} in {self.namespace}", "\n".join(lines[-_LINES:])
+            try:
+                said = self.kube.kubectl(*arguments, *where)
+            except Failed as failed:  # a container that never ran has no log
+                said = str(failed)
+            yield f"{title} in {self.namespace}", "\n".join(said.splitlines()[-_LINES:])

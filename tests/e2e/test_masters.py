@@ -10,6 +10,7 @@ from e2e.kube import Body
 from e2e.masters import Inside, Master, may_use_pools, outside
 from e2e.pools import Pool, is_ready
 from e2e.scene import Scene
+from e2e.test_apply import SOMEWHERE
 
 
 @pytest.fixture
@@ -82,6 +83,17 @@ def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
     second.end()
     pool.wait("no master in the status", lambda: "master" not in pool.status)
     assert sorted(pool.names) == workers
+
+
+def test_workers_end_some_time_after_their_master(pool: Pool, agent: Body, host: str) -> None:
+    # Without a Lease nobody but the agents can notice, and those that end make room for new ones.
+    pool.apply(agent, minReplicas=1, master={**SOMEWHERE, "lostGraceSeconds": 1})
+    (worker,) = pool.ready(1)
+    with outside(pool, host) as master:
+        master.is_joined_by(worker)
+    pool.wait("another", lambda: pool.ever - {worker}, seconds=90)
+    assert worker not in pool.ready(1)
+    assert pool.status["failures"].get("total", 0) == 0
 
 
 def test_each_master_gets_the_agents_of_its_own_pool(scene: Scene, agent: Body, host: str) -> None:
