@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import time
 from collections.abc import Callable
 from statistics import median
@@ -19,13 +20,15 @@ ABOUT = """\
 Round trip: this process sends, a process at the other end of a `Pipe()` receives and sends
 back, this process receives and touches every page of what came. From 28 KB (an Atari
 observation) up the message is a NumPy array. The value of a round is the median of its round
-trips. Vector step: one `step` of Gymnasium's AsyncVectorEnv with `shared_memory=False` over
-environments that do nothing; Fiber runs it by
+trips. Where the kernel puts the two processes decides much of it, so it is measured too with both
+held on one processor, and on two. Vector step: one `step` of Gymnasium's AsyncVectorEnv with
+`shared_memory=False` over environments that do nothing; Fiber runs it by
 `fiber.adopt("gymnasium.vector.async_vector_env")`."""
 
 ROUND_TRIP = Metric("round trip", "round trip", "s")
 STEP = Metric("step", "vector step", "s")
 TRIPS = "round trip"
+PLACED = "round trip in a given place"
 STEPS = "vector step"
 
 # Name, bytes (0: an int), round trips.
@@ -36,6 +39,8 @@ MESSAGES = (
     ("1 MB", 1 << 20, 300),
     ("16 MB", 1 << 24, 20),
 )
+_PLACED = ("100 B", "28 KB")
+_PROCESSORS = {"one processor": 1, "two processors": 2}
 _ENVIRONMENTS = {8: 800, 32: 200}
 _PAGE = 4096
 _MODULE = "gymnasium.vector.async_vector_env"
@@ -51,6 +56,13 @@ def cases(size: float) -> list[Case]:
     trips = [
         (TRIPS, name, ROUND_TRIP, {"nbytes": nbytes}, count) for name, nbytes, count in MESSAGES
     ]
+    placed = [
+        (PLACED, f"{name}, {place}", ROUND_TRIP, {"nbytes": nbytes, "processors": number}, count)
+        for name, nbytes, count in MESSAGES
+        if name in _PLACED
+        for place, number in _PROCESSORS.items()
+        if number <= len(os.sched_getaffinity(0))
+    ]
     steps = [
         (STEPS, environments(n), STEP, {"environments": n}, count)
         for n, count in _ENVIRONMENTS.items()
@@ -65,23 +77,37 @@ def cases(size: float) -> list[Case]:
             metrics=(metric,),
             fresh=True,
         )
-        for group, name, metric, params, count in [*trips, *steps]
+        for group, name, metric, params, count in [*trips, *placed, *steps]
     ]
 
 
 def run(
-    bench: Bench, count: int, seconds: float, nbytes: int = 0, environments: int = 0
+    bench: Bench,
+    count: int,
+    seconds: float,
+    nbytes: int = 0,
+    environments: int = 0,
+    processors: int = 0,
 ) -> dict[str, float]:
     """The median of up to `count` round trips or vector steps, as many as fit in `seconds`."""
     if environments:
         return _vector_step(bench, environments, count, seconds)
-    return _round_trip(bench, nbytes, count, seconds)
+    if not processors:
+        return _round_trip(bench, nbytes, count, seconds, None)
+    allowed = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {allowed[0]})
+    try:
+        return _round_trip(bench, nbytes, count, seconds, allowed[processors - 1])
+    finally:
+        os.sched_setaffinity(0, allowed)
 
 
-def _round_trip(bench: Bench, nbytes: int, count: int, seconds: float) -> dict[str, float]:
+def _round_trip(
+    bench: Bench, nbytes: int, count: int, seconds: float, processor: int | None
+) -> dict[str, float]:
     message = 1 if not nbytes else b"x" * nbytes if nbytes < 1000 else ones(nbytes)
     here, there = bench.processes.Pipe()
-    child = bench.processes.Process(target=echo, args=(there,), daemon=True)
+    child = bench.processes.Process(target=echo, args=(there, processor), daemon=True)
     child.start()
     there.close()
 

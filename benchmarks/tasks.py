@@ -33,8 +33,10 @@ def announce(path: str) -> None:
         os.close(fd)
 
 
-def echo(connection: Any) -> None:
-    """Send back what comes until terminated."""
+def echo(connection: Any, processor: int | None = None) -> None:
+    """Send back what comes until terminated, on this processor if one is given."""
+    if processor is not None:
+        os.sched_setaffinity(0, {processor})
     while True:
         connection.send(connection.recv())
 
