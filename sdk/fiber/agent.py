@@ -8,7 +8,8 @@ It takes everything from its environment, nothing from its command line (but ``-
 ``FIBER_AGENT_PARENT``       optional: the pid of a process on this host to end with
 ``FIBER_AGENT_INHERITS``     optional: a directory of that process, to be removed if it is killed
 ``FIBER_AGENT_LOST_GRACE``   optional: serve one master after the other.  Wait for the first for as
-                           long as it takes, for one that was lost for so many seconds
+                           long as it takes, and after one that was lost for so many seconds,
+                           unless that master had said for how many
 ``FIBER_START_TIMEOUT``      seconds to find the master, as for every Fiber process
 
 Exit status 0: the master ended it, or the grace for a lost one is over.  1: it could not join, or
@@ -43,7 +44,7 @@ _NAME = "FIBER_AGENT_NAME"
 _PARENT = "FIBER_AGENT_PARENT"
 _INHERITS = "FIBER_AGENT_INHERITS"
 _LOST_GRACE = "FIBER_AGENT_LOST_GRACE"
-_ORPHANED = "FIBER_AGENT_ORPHANED"  # since when (time.monotonic), from an agent to its next life
+_WAITS_UNTIL = "FIBER_AGENT_WAITS_UNTIL"  # time.monotonic(), from an agent to its next life
 
 _DRAIN_GRACE = 10.0
 """Seconds that children have to end when this process is told to (SIGTERM)."""
@@ -59,7 +60,7 @@ class Main:
         self._environment = dict(os.environ)
         self._name = os.environ.get(_NAME) or f"agent-{os.getpid()}"
         self._lost_grace = _seconds(_LOST_GRACE)
-        self._orphaned = _seconds(_ORPHANED)
+        self._waits_until = _seconds(_WAITS_UNTIL)
         self._parent = _pid(_PARENT)
         self._loop = Loop()
         self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
@@ -71,13 +72,13 @@ class Main:
 
     def run(self) -> int:
         """Serve until the end; the exit status."""
-        dialer = self._dial()
+        self._dialer = self._dial()
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # the program may have blocked some
         signal.signal(signal.SIGTERM, self._on_sigterm)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._end_with_parent()
         self._loop.run()
-        dialer.close()
+        self._dialer.close()
         self._agent.close()
         self._hub.close()
         if self._again:
@@ -99,9 +100,9 @@ class Main:
     def _patience(self) -> float | None:
         if self._lost_grace is None:
             return config.current().start_timeout
-        if self._orphaned is None:
+        if self._waits_until is None:
             return None
-        return max(self._orphaned + self._lost_grace - time.monotonic(), 0.0)
+        return max(self._waits_until - time.monotonic(), 0.0)
 
     def _complain(self, what: object) -> None:
         print(f"fiber agent {self._name}: {what}", file=sys.stderr, flush=True)
@@ -115,7 +116,7 @@ class Main:
         self._complain(error)
         if self._lost_grace is None or not isinstance(error, LinkError):
             self._status = 1
-        elif self._orphaned is None or self._patience():
+        elif self._waits_until is None or self._patience():
             # It was there and refused us: it is ending, or took our name for another's.
             self._again = True
             self._loop.call_later(_REFUSED_PAUSE, self._loop.stop)
@@ -128,9 +129,11 @@ class Main:
             self._complain(reason)
         if self._lost_grace is not None and not self._told_to_end:
             self._again = True
-            self._environment.pop(_ORPHANED, None)
+            self._environment.pop(_WAITS_UNTIL, None)
             if lost:
-                self._environment[_ORPHANED] = str(time.monotonic())
+                told = self._dialer.lost_grace
+                grace = self._lost_grace if told is None else told
+                self._environment[_WAITS_UNTIL] = str(time.monotonic() + grace)
         elif lost:
             self._status = 1
         self._link.close("the agent ended", then=self._loop.stop)

@@ -7,6 +7,7 @@ takes what it needs from its environment:
 ``MASTER_HOST``                         where the workers can reach it
 ``MASTER_API``                          the API server without a login; absent within a pod, which
                                         has an account
+``MASTER_LOST_GRACE``                   its lostGraceSeconds; the default if absent
 
 and prints a JSON object a line: ``{"event": "joined", "name": "es-…", "at": 0.4}``.  ``at`` is in
 seconds since just before it wrote itself into the pool.
@@ -67,9 +68,12 @@ class Api:
         before = pool.get("status", {}).get("masterEpoch", 0)
         return 1 + int(max(there, before))
 
-    def attach(self, host: str, port: int, epoch: int) -> None:
+    def attach(self, host: str, port: int, epoch: int, lost_grace: int | None) -> None:
         """Be the pool's master."""
-        self._apply({"spec": {"master": {"host": host, "port": port, "epoch": epoch}}})
+        master = {"host": host, "port": port, "epoch": epoch}
+        if lost_grace is not None:
+            master["lostGraceSeconds"] = lost_grace
+        self._apply({"spec": {"master": master}})
 
     def detach(self, epoch: int) -> None:
         """Leave the pool without a master, unless it has another one by now."""
@@ -115,6 +119,8 @@ def main() -> None:
     """Attach, stay until SIGTERM, and detach."""
     api = Api(os.environ["MASTER_NAMESPACE"], os.environ["MASTER_POOL"])
     host = os.environ["MASTER_HOST"]
+    grace = os.environ.get("MASTER_LOST_GRACE")
+    lost_grace = None if grace is None else int(grace)
     started = time.monotonic()
 
     def say(event: str, **facts: object) -> None:
@@ -130,11 +136,12 @@ def main() -> None:
         api.credentials(),
         on_agent=lambda link: agents.append(Agent(link, say)),
         on_refused=lambda reason: say("refused", reason=reason),
+        lost_grace=lost_grace,
     )
     port = int(listener.address.rpartition(":")[2])
     epoch = api.next_epoch()
     started = time.monotonic()
-    api.attach(host, port, epoch)
+    api.attach(host, port, epoch, lost_grace)
     say("attached", address=listener.address, epoch=epoch)
     told = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: told.set())

@@ -51,8 +51,9 @@ class Master:
 class Outside(Master):
     """A process beside the tests."""
 
-    def __init__(self, pool: Pool, host: str) -> None:
+    def __init__(self, pool: Pool, host: str, lost_grace: int | None = None) -> None:
         super().__init__(pool)
+        grace = {} if lost_grace is None else {"MASTER_LOST_GRACE": str(lost_grace)}
         self._process = subprocess.Popen(
             [sys.executable, str(PROGRAM)],
             stdout=subprocess.PIPE,
@@ -62,6 +63,7 @@ class Outside(Master):
                 MASTER_POOL=pool.name,
                 MASTER_NAMESPACE=pool.scene.namespace,
                 MASTER_HOST=host,
+                **grace,
             ),
         )
         self._reader = threading.Thread(target=self._read, name="master's words", daemon=True)
@@ -120,9 +122,9 @@ class Inside(Master):
 
 
 @contextmanager
-def outside(pool: Pool, host: str) -> Iterator[Outside]:
+def outside(pool: Pool, host: str, lost_grace: int | None = None) -> Iterator[Outside]:
     """A master beside the tests, killed at the end if it still runs."""
-    master = Outside(pool, host)
+    master = Outside(pool, host, lost_grace)
     try:
         yield master
     finally:

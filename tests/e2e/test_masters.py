@@ -10,7 +10,6 @@ from e2e.kube import Body
 from e2e.masters import Inside, Master, may_use_pools, outside
 from e2e.pools import Pool, is_ready
 from e2e.scene import Scene
-from e2e.test_apply import SOMEWHERE
 
 
 @pytest.fixture
@@ -87,9 +86,9 @@ def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
 
 def test_workers_end_some_time_after_their_master(pool: Pool, agent: Body, host: str) -> None:
     # Without a Lease nobody but the agents can notice, and those that end make room for new ones.
-    pool.apply(agent, minReplicas=1, master={**SOMEWHERE, "lostGraceSeconds": 1})
+    pool.apply(agent, minReplicas=1)  # warm: the worker is older than what the master asks for
     (worker,) = pool.ready(1)
-    with outside(pool, host) as master:
+    with outside(pool, host, lost_grace=1) as master:
         master.is_joined_by(worker)
     pool.wait("another", lambda: pool.ever - {worker}, seconds=90)
     assert worker not in pool.ready(1)

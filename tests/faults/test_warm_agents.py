@@ -61,7 +61,7 @@ MASTER = """
     listener = MasterListener(
         loop, sys.argv[2], pickle.load(open(sys.argv[1], "rb")),
         on_agent=joined, on_refused=lambda reason: None,
-        patience=Patience(0.2, 0.5, 1.0),
+        patience=Patience(0.2, 0.5, 1.0), lost_grace=float(sys.argv[3]) if sys.argv[3:] else None,
     )
     print("listens", flush=True)
     loop.run()
@@ -91,8 +91,8 @@ class Pool:
         }
         return self._launch(AGENT, env={**told, **env})
 
-    def master(self) -> Program:
-        master = self._launch(MASTER, str(self._path), self.address)
+    def master(self, *grace: str) -> Program:
+        master = self._launch(MASTER, str(self._path), self.address, *grace)
         assert master.line() == "listens"
         return master
 
@@ -144,7 +144,28 @@ def test_it_ends_when_no_master_comes_after_a_lost_one(pool: Pool) -> None:
     assert agent.wait() == 0
     assert agent.left() == []
     assert "lost the master" in agent.stderr
-    assert f"no master answered at {pool.address} within 0." in agent.stderr
+    assert f"no master answered at {pool.address} within 0" in agent.stderr
+
+
+def test_a_master_says_how_long_it_is_waited_for(pool: Pool) -> None:
+    """The agent is older than what this master asks of its pool."""
+    agent = pool.agent(grace=600)
+    master = pool.master("0.5")
+    assert master.line() == "joined warm-0"
+    master.kill()
+    assert agent.wait() == 0
+    assert f"no master answered at {pool.address} within 0" in agent.stderr
+
+
+def test_a_longer_grace_of_the_master_holds_too(pool: Pool) -> None:
+    agent = pool.agent(grace=0.1)
+    master = pool.master("600")
+    assert master.line() == "joined warm-0"
+    master.kill()
+    wait_for(lambda: "lost the master" in agent.stderr)
+    with pytest.raises(AssertionError, match="still runs"):
+        agent.wait(1.0)
+    assert pool.master().line() == "joined warm-0"
 
 
 def test_a_master_that_said_goodbye_is_not_lost(pool: Pool) -> None:

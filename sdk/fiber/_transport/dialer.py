@@ -64,6 +64,8 @@ class AgentDialer:
         self._session = secrets.token_hex(16)
         self._link: SessionLink | None = None
         self._obstacle = "nothing was tried"
+        self.lost_grace: float | None = None
+        """What the master says of its loss, once there is a link."""
         self._over = threading.Event()
         self._url = url_of(address)
         self._socket = self._open()
@@ -173,6 +175,7 @@ class AgentDialer:
                 self._loop, welcome.identity, patience, on_end=lambda _: self._stop()
             )
         self._cancel_greeting()
+        self.lost_grace = welcome.lost_grace
         pipe.link = link
         link.connected(pipe, welcome.arrived)
         if self._link is None:

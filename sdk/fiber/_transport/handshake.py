@@ -69,6 +69,9 @@ class Welcome(NamedTuple):
     """How patient the master is: the fields of a ``Patience``."""
     suspect_after: float
     lost_after: float
+    lost_grace: float | None = None
+    """Seconds for which the agent shall wait for another master if this one is lost; None: it knows
+    better, or waits for none."""
 
     def encode(self) -> bytes:
         """The datagram."""
@@ -153,8 +156,15 @@ def _read_hello(identity: Identity, fields: Mapping[str, Any]) -> Hello:
 
 
 def _read_welcome(identity: Identity, fields: Mapping[str, Any]) -> Welcome:
-    patience = (float(fields[name]) for name in ("heartbeat", "suspect_after", "lost_after"))
-    return Welcome(identity, int(fields["arrived"]), *patience)
+    grace = fields.get("lost_grace")
+    return Welcome(
+        identity,
+        int(fields["arrived"]),
+        heartbeat=float(fields["heartbeat"]),
+        suspect_after=float(fields["suspect_after"]),
+        lost_after=float(fields["lost_after"]),
+        lost_grace=None if grace is None else float(grace),
+    )
 
 
 def _read_refusal(identity: Identity, fields: Mapping[str, Any]) -> Refusal:

@@ -21,7 +21,8 @@ class MasterListener:
 
     ``address`` is ``host:port``; port 0 takes a free one, and ``address`` then says which.  The
     callbacks run on the loop's thread: ``on_agent`` must attach an observer to the new link,
-    ``on_refused`` hears why someone who had the right credentials was turned away.
+    ``on_refused`` hears why someone who had the right credentials was turned away.  ``lost_grace``
+    is told to the agents: for so many seconds they wait for another master if this one is lost.
     """
 
     def __init__(
@@ -33,11 +34,13 @@ class MasterListener:
         on_agent: Callable[[Link], None],
         on_refused: Callable[[str], None],
         patience: Patience = DEFAULT_PATIENCE,
+        lost_grace: float | None = None,
     ) -> None:
         self._loop = loop
         self._on_agent = on_agent
         self._on_refused = on_refused
         self._patience = patience
+        self._lost_grace = lost_grace
         self._identity = Identity.of_this_process("the master")
         self._links: dict[str, SessionLink] = {}
         self._closing: list[Callable[[], None]] | None = None
@@ -134,7 +137,8 @@ class MasterListener:
             )
             self._links[hello.session] = link
         pipe.link = link
-        pipe.put(Welcome(self._identity, link.arrived, *self._patience).encode())
+        welcome = Welcome(self._identity, link.arrived, *self._patience, self._lost_grace)
+        pipe.put(welcome.encode())
         link.connected(pipe, hello.arrived)
         if new:
             self._on_agent(link)
