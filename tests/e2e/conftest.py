@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from e2e.clusters import Cluster, NoCluster, choose
-from e2e.delays import measured
+from e2e.delays import complaint, measured
 from e2e.kube import Body, Kube, path_of
 from e2e.pools import Pool, template
 from e2e.release import Release, crd_owner
@@ -89,6 +89,8 @@ def release(
     kube.delete(path_of("namespaces", name=RELEASE))
     if release.refused:
         pytest.fail(f"the operator lacks rights: {sorted(release.refused)}", pytrace=False)
+    if late := complaint():
+        pytest.fail(late, pytrace=False)
 
 
 @pytest.fixture(scope="session")

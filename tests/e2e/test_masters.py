@@ -8,7 +8,7 @@ from e2e.clusters import Cluster
 from e2e.delays import prompt
 from e2e.kube import Body
 from e2e.masters import Inside, Master, may_use_pools, outside
-from e2e.pools import Pool, is_ready
+from e2e.pools import Pool, is_ready, template
 from e2e.scene import Scene
 
 
@@ -56,6 +56,13 @@ def test_a_master_outside_of_the_cluster(pool: Pool, agent: Body, host: str) -> 
         prompt("agents join the third master", third.is_joined_by(*workers))
     assert sorted(pool.names) == workers
     assert all(is_ready(pod) for pod in pool.live)
+
+
+def test_a_worker_that_may_write_nothing_but_tmp(pool: Pool, image: str, host: str) -> None:
+    pool.apply(template(image, securityContext={"readOnlyRootFilesystem": True}), minReplicas=1)
+    (worker,) = pool.ready(1)
+    with outside(pool, host) as master:
+        master.is_joined_by(worker)
 
 
 def test_a_worker_that_comes_later_joins_too(pool: Pool, agent: Body, host: str) -> None:
