@@ -1,11 +1,14 @@
-"""The operator's own Lease: of several operators with one Lease, at most one acts.
+"""A Lease as a guard: of several that ask for it, at most one acts.
 
 Whether somebody else's Lease has run out is judged by this process's monotonic clock, from when it
 last saw the Lease change; clocks of different machines are never compared.  The holder counts its
-own time from before it asked, and stops well before others may begin::
+own time from before it asked.  It begins nothing after two thirds of it, and gives each write only
+as long as it may last, so that none is under way when others may begin::
 
-    asked                            holder stops          others may begin
-      |------------ 2/3 of the duration ---|---- what is under way ends ---|
+    asked                      nothing begins any more    the last write ends    others may begin
+      |------ 2/3 of the duration ------|-----------------------|-------- 1/10 --------|
+
+Program has one for its processes, and claims.py one for each namespace.
 """
 
 from __future__ import annotations
@@ -22,14 +25,19 @@ from fiber_operator.logs import about
 
 HELD_SHARE = 2 / 3
 """Of the duration, how long a renewal lets the holder act."""
+WRITTEN_SHARE = 9 / 10
+"""When its last write has ended; the rest is for clocks that do not run alike."""
 RENEW_SHARE = 1 / 3
 RETRY_SHARE = 1 / 8
+LONGEST_RETRY = 60.0
+TRIES = 2
+"""To give up a Lease."""
 
 log = logging.getLogger(__name__)
 
 
 class NotHolder(Exception):
-    """This operator does not hold the Lease (any more) and may not change anything."""
+    """This operator does not hold a Lease (any more) without which it may not change anything."""
 
 
 class Guard:
@@ -55,7 +63,9 @@ class Guard:
         self._on_change = on_change
         self._clock = clock or asyncio.get_running_loop().time
         self._wall_clock = wall_clock
-        self._until = float("-inf")
+        self._asked = float("-inf")
+        """When it asked for what it holds."""
+        self._failures = 0
         self._told = False
         self._lease: Body | None = None
         self._seen: tuple[object, ...] = ()
@@ -63,27 +73,30 @@ class Guard:
         self._resigned = False
         self.why = "the Lease was not read yet"
         """Why this operator does not act; empty while it does."""
+        self.holder = ""
+        """Who else holds the Lease, as far as is known."""
 
     @property
     def held(self) -> bool:
         """Whether this operator may act now."""
         return self._clock() < self._until
 
-    def require(self) -> None:
-        """Raise NotHolder unless this operator may act now."""
-        if not self.held:
+    @property
+    def _until(self) -> float:
+        return self._asked + HELD_SHARE * self._seconds
+
+    def require(self) -> float:
+        """The seconds that a write may last which begins now; NotHolder if none may begin."""
+        now = self._clock()
+        if now >= self._until:
             raise NotHolder(f"this operator does not hold the Lease {self._name}: {self.why}")
+        return self._asked + WRITTEN_SHARE * self._seconds - now
 
     async def run(self) -> None:
         """Get the Lease and renew it until cancelled."""
         while True:
-            await self._step()
+            pause = await self.step()
             self._tell()
-            share = RENEW_SHARE if self.held and not self.why else RETRY_SHARE
-            pause = share * self._seconds
-            if self.held:
-                # Not beyond the moment at which it lapses, so that it is told of in time.
-                pause = min(pause, max(self._until - self._clock(), 0.0) + 0.001)
             await asyncio.sleep(pause)
 
     def resign(self) -> None:
@@ -97,25 +110,68 @@ class Guard:
         try:
             lease = await self._read()
             if _spec(lease).get("holderIdentity") == self._identity:
-                await self._write(lease, holder="")
+                await self._write(lease, holder="", seconds=1)
         except ApiError as error:
             log.warning("the Lease could not be released: %s", error)
 
-    async def _step(self) -> None:
+    async def linger(self, seconds: int) -> None:
+        """Let another operator begin in so many seconds; one of our identity goes on at once.
+
+        After ``resign``, if the Lease was held until then.
+        """
+        for _ in range(TRIES):
+            try:
+                await self._write(self._lease, holder=self._identity, seconds=seconds)
+            except Unavailable as error:
+                log.info("the Lease in namespace %s is left as it is: %s", self._namespace, error)
+            except ApiError as error:
+                # Not read anew: if another process of this identity wrote it, it counts on it.
+                log.info("the Lease in namespace %s is another's now: %s", self._namespace, error)
+                break
+            else:
+                break
+
+    async def step(self) -> float:
+        """Ask for the Lease, or renew it; returns the seconds until the next step is due."""
         started = self._clock()
         try:
             if self._lease is None or not self.held:
                 self._lease = await self._read()
-            if self._may_take(self._lease):
-                self._lease = await self._write(self._lease, holder=self._identity)
-                if not self._resigned:
-                    self._until, self.why = started + HELD_SHARE * self._seconds, ""
+            try:
+                await self._ask(started)
+            except (Conflict, Gone):
+                # By somebody else, or by us and the answer was lost: what it says now decides.
+                self._lease = await self._read()
+                await self._ask(started)
+            self._failures = 0
         except Conflict:
-            # Somebody else has written it: read it before anything else is done.
             self._lose("another operator wrote the Lease")
         except ApiError as error:
             # The time that the last renewal gave goes on; after that, ``held`` is false.
             self.why = str(error)
+            self._failures += 1
+        return self._pause()
+
+    async def _ask(self, started: float) -> None:
+        if self._may_take(self._lease):
+            self._lease = await self._write(
+                self._lease, holder=self._identity, seconds=int(self._seconds)
+            )
+            self.holder = ""
+            if not self._resigned:
+                self._asked, self.why = started, ""
+
+    def _pause(self) -> float:
+        if self.held and not self.why:
+            pause = RENEW_SHARE * self._seconds
+        elif self._failures:
+            pause = min(RETRY_SHARE * self._seconds, 2.0 ** min(self._failures - 1, 10))
+        else:
+            pause = min(RETRY_SHARE * self._seconds, LONGEST_RETRY)
+        if self.held:
+            # Not beyond the moment at which it lapses, so that it is told of in time.
+            pause = min(pause, max(self._until - self._clock(), 0.0) + 0.001)
+        return pause
 
     async def _read(self) -> Body | None:
         try:
@@ -128,6 +184,7 @@ class Guard:
         holder = spec.get("holderIdentity") or ""
         if holder in ("", self._identity):
             return True
+        self.holder = str(holder)
         now, seen = self._clock(), (holder, spec.get("renewTime"), spec.get("leaseTransitions"))
         if seen != self._seen:
             self._seen, self._seen_at = seen, now
@@ -139,7 +196,7 @@ class Guard:
         self._lose(f"{holder} holds it")
         return False
 
-    async def _write(self, lease: Body | None, *, holder: str) -> Body:
+    async def _write(self, lease: Body | None, *, holder: str, seconds: int) -> Body:
         spec = _spec(lease)
         now = datetime.datetime.fromtimestamp(self._wall_clock(), datetime.UTC)
         stamp = now.isoformat(timespec="microseconds").replace("+00:00", "Z")
@@ -152,7 +209,7 @@ class Guard:
             "metadata": {"name": self._name, "namespace": self._namespace},
             "spec": {
                 "holderIdentity": holder,
-                "leaseDurationSeconds": int(self._seconds) if holder else 1,
+                "leaseDurationSeconds": seconds,
                 "acquireTime": stamp if fresh else spec.get("acquireTime", stamp),
                 "renewTime": stamp,
                 "leaseTransitions": turns + 1 if fresh and lease is not None else turns,
@@ -168,7 +225,7 @@ class Guard:
         return await self._cluster.replace(LEASES, self._namespace, self._name, body)
 
     def _lose(self, why: str) -> None:
-        self._until, self._lease, self.why = float("-inf"), None, why
+        self._asked, self.why = float("-inf"), why
 
     def _tell(self) -> None:
         if self.held == self._told:

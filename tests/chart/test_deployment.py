@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import pytest
@@ -10,8 +11,20 @@ import pytest
 import fiber
 from chart.helm import Helm, Manifest, is_hook, named
 from chart.test_scope import environment
-from fiber_api.names import MAX_POOL_NAME
+from fiber_api.names import check_pool_name
 from fiber_operator.settings import Settings
+
+DNS_LABEL = "[a-z]([-a-z0-9]{0,61}[a-z0-9])?"
+"""What a Service may be called."""
+SOON_GONE: list[dict[str, Any]] = [
+    {
+        "key": f"node.kubernetes.io/{taint}",
+        "operator": "Exists",
+        "effect": "NoExecute",
+        "tolerationSeconds": 30,
+    }
+    for taint in ("not-ready", "unreachable")
+]
 
 
 def pod_spec(manifests: list[Manifest]) -> dict[str, Any]:
@@ -130,8 +143,27 @@ def test_where_pods_run_holds_for_the_test_too(helm: Helm) -> None:
     }
     manifests = helm.render({**placement, "priorityClassName": "high"})
     for spec in (pod_spec(manifests), named(manifests, "Pod")["spec"]):
+        spec["tolerations"] = [entry for entry in spec["tolerations"] if entry not in SOON_GONE]
         assert {name: spec[name] for name in placement} == placement
     assert pod_spec(manifests)["priorityClassName"] == "high"
+
+
+@pytest.mark.parametrize(
+    ("tolerations", "added"),
+    [
+        ([], SOON_GONE),
+        ([{"key": "dedicated", "operator": "Exists"}], SOON_GONE),
+        ([{"key": "node.kubernetes.io/unreachable", "effect": "NoSchedule"}], SOON_GONE),
+        ([{**SOON_GONE[1], "tolerationSeconds": 300}], SOON_GONE[:1]),
+        ([{"key": "node.kubernetes.io/not-ready", "operator": "Exists"}], SOON_GONE[1:]),
+        ([{"operator": "Exists"}], []),
+    ],
+)
+def test_it_leaves_a_lost_node_soon_unless_told_otherwise(
+    helm: Helm, tolerations: list[dict[str, Any]], added: list[dict[str, Any]]
+) -> None:
+    spec = pod_spec(helm.render({"tolerations": tolerations}))
+    assert spec["tolerations"] == [*tolerations, *added]
 
 
 def test_labels_follow_the_conventions(helm: Helm) -> None:
@@ -155,6 +187,9 @@ def test_labels_follow_the_conventions(helm: Helm) -> None:
         ("fiber", "fiber-fiber-operator"),
         ("fiber-operator", "fiber-operator"),
         ("x" * 53, "x" * 44),
+        ("fiber.v1", "fiber-v1-fiber-operator"),
+        ("1.fiber-operator", "fiber-1-fiber-operator"),
+        ("9" * 53, "fiber-" + "9" * 38),
     ],
 )
 def test_names_fit(helm: Helm, release: str, expected: str) -> None:
@@ -162,8 +197,10 @@ def test_names_fit(helm: Helm, release: str, expected: str) -> None:
     assert named(manifests, "Deployment")["metadata"]["name"] == expected
     names = [str(manifest["metadata"]["name"]) for manifest in manifests]
     assert max(len(name.rpartition(":")[2]) for name in names) <= 63
+    assert re.fullmatch(DNS_LABEL, str(named(manifests, "Service")["metadata"]["name"]))
     pool = json.loads(named(manifests, "Pod")["spec"]["containers"][0]["args"][0])
-    assert len(pool["metadata"]["name"]) <= MAX_POOL_NAME
+    assert check_pool_name(pool["metadata"]["name"])
+    assert Settings.from_environment(environment(manifests)).lease == expected
 
 
 def test_a_name_of_ones_own(helm: Helm) -> None:

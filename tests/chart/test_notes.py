@@ -48,6 +48,12 @@ def test_it_says_what_is_watched(helm: Helm) -> None:
     assert "watches the namespaces team-a, team-b, and no other." in helm.notes(TWO)
 
 
+def test_it_says_whose_rights_are_within_reach(helm: Helm) -> None:
+    words = f"Whoever may make FiberPools in {NAMESPACE} may run pods as any ServiceAccount there"
+    assert words in helm.notes({"scope": "namespaced"})
+    assert words not in helm.notes(TWO)
+
+
 def test_it_says_what_was_left_to_others(helm: Helm) -> None:
     notes = helm.notes({"rbac": {"create": False}, "crds": {"install": False}})
     assert "gives ServiceAccount fiber-fiber-operator the" in notes

@@ -135,8 +135,10 @@ def test_roles_for_people_extend_those_of_kubernetes_only_cluster_wide(helm: Hel
         labels = named(manifests, "ClusterRole", name)["metadata"]["labels"]
         return {label.removeprefix(prefix) for label in labels if label.startswith(prefix)}
 
-    assert extends("fiber-user") == {"edit", "admin"}
+    assert extends("fiber-user") == set()
     assert extends("fiber-viewer") == {"view"}
+    manifests = helm.render({**CLUSTER, "userRoles": {"aggregate": True}})
+    assert extends("fiber-user") == {"edit", "admin"}
     roles = [
         (manifest["metadata"]["name"], manifest["metadata"]["namespace"])
         for manifest in helm.render(TWO)

@@ -37,7 +37,7 @@ ALL: dict[str, Any] = {
     "tolerations": [{"key": "dedicated", "operator": "Exists", "effect": "NoSchedule"}],
     "podLabels": {"mesh": "off"},
     "podAnnotations": {"note": "x"},
-    "extraEnv": [{"name": "HTTPS_PROXY", "value": "http://proxy:3128"}],
+    "extraEnv": [{"name": "PYTHONASYNCIODEBUG", "value": "1"}],
 }
 
 
@@ -111,6 +111,9 @@ def test_as_part_of_another_chart(helm: Helm) -> None:
         ({"affinity": {"nodeAfinity": {}}}, "nodeAfinity"),
         ({"tolerations": [{"effect": "Never"}]}, "tolerations"),
         ({"nodeSelector": {"ssd": True}}, "nodeSelector"),
+        ({"commonLabels": {"bad key": "x"}}, "commonLabels.*bad key"),
+        ({"commonLabels": {"example.com/team": "x y"}}, "commonLabels.*team"),
+        ({"podAnnotations": {"a/b/c": "x"}}, "podAnnotations.*a/b/c"),
     ],
 )
 def test_a_wrong_value_is_refused_by_name(helm: Helm, values: dict[str, Any], words: str) -> None:
@@ -133,6 +136,46 @@ def test_a_wrong_value_is_refused_by_name(helm: Helm, values: dict[str, Any], wo
         (
             {"serviceAccount": {"create": False, "name": "own", "annotations": {"a": "b"}}},
             "Annotate it yourself, or set serviceAccount.create=true.",
+        ),
+        (
+            {"metrics": {"service": {"create": False, "annotations": {"a": "b"}}}},
+            "Set metrics.service.create=true, or leave them empty.",
+        ),
+        (
+            {"metrics": {"serviceMonitor": {"labels": {"a": "b"}}}},
+            "Set metrics.serviceMonitor.create=true, or leave them empty.",
+        ),
+        (
+            {"metrics": {"prometheusRule": {"labels": {"a": "b"}}}},
+            "Set metrics.prometheusRule.create=true, or leave them empty.",
+        ),
+        (
+            {"metrics": {"dashboard": {"annotations": {"a": "b"}}}},
+            "Set metrics.dashboard.create=true, or leave them empty.",
+        ),
+        (
+            {"userRoles": {"create": False, "aggregate": True}},
+            "userRoles.aggregate is true, but there is no ClusterRole fiber-user",
+        ),
+        (
+            {"scope": "namespaced", "userRoles": {"aggregate": True}},
+            "userRoles.aggregate is true, but there is no ClusterRole fiber-user",
+        ),
+        (
+            {"resources": {"limits": {"memory": "0.1Gi"}}},
+            "resources.limits.memory is 0.1Gi, but resources.requests.memory is 128Mi",
+        ),
+        (
+            {"resources": {"requests": {"cpu": 1}, "limits": {"cpu": "999m"}}},
+            "resources.limits.cpu is 999m, but resources.requests.cpu is 1",
+        ),
+        (
+            {"extraEnv": [{"name": "https_proxy", "value": "http://proxy:3128"}]},
+            "extraEnv sets https_proxy: the operator calls the API server alone",
+        ),
+        (
+            {"extraEnv": [{"name": "A", "value": ""}, {"name": "A", "value": "1"}]},
+            "extraEnv sets A twice",
         ),
         (
             {"metrics": {"service": {"create": False}, "serviceMonitor": {"create": True}}},
@@ -166,6 +209,14 @@ def test_a_contradiction_is_refused_with_a_sentence(
     with pytest.raises(Refused) as refused:
         helm.render(values)
     assert words in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("asked", "limit"),
+    [("50m", "0.05"), ("128Mi", "1e9"), (1, 1), ("1k", "1Ki"), (0.5, "500m"), ("1G", "1Gi")],
+)
+def test_a_limit_may_be_what_is_requested_or_more(helm: Helm, asked: Any, limit: Any) -> None:
+    helm.render({"resources": {"requests": {"x": asked}, "limits": {"x": limit}}})
 
 
 def test_all_contradictions_are_told_at_once(helm: Helm) -> None:

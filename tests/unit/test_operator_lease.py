@@ -13,7 +13,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
-from fiber_operator.cluster import Cluster
+from fiber_operator.cluster import PODS, Cluster, Unavailable
 from fiber_operator.lease import Guard, NotHolder
 
 NAMESPACE, NAME, SECONDS = "fiber-system", "fiber-operator", 15
@@ -29,7 +29,9 @@ class Operators:
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._doors: list[Cluster] = []
 
-    def start(self, identity: str, api: KubernetesApi | None = None) -> Guard:
+    def start(
+        self, identity: str, api: KubernetesApi | None = None, seconds: float = SECONDS
+    ) -> Guard:
         door = Cluster(configuration(api or self.api), connections=2)
         self._doors.append(door)
         guard = Guard(
@@ -37,7 +39,7 @@ class Operators:
             namespace=NAMESPACE,
             name=NAME,
             identity=identity,
-            seconds=SECONDS,
+            seconds=seconds,
             on_change=lambda held: self.told.append((identity, held)),
             wall_clock=self.store.unix_now,
         )
@@ -294,3 +296,90 @@ async def test_who_has_resigned_never_acts_again(found: Operators) -> None:
     for _ in range(60):
         await asyncio.sleep(1)
         assert not guard.held
+
+
+# -- What was begun under a Lease ends before another may begin
+
+
+@pytest.mark.parametrize("seconds", [6, 15, 60, 3600])
+def test_a_write_has_ended_when_another_may_begin(seconds: int) -> None:
+    """Whenever it begins, counted from when the Lease was asked for."""
+
+    @played
+    async def test(found: Operators) -> None:
+        asked = now()
+        guard = found.start("a", seconds=seconds)
+        await until(lambda: guard.held, 1)
+        await found.kill("a")
+        while guard.held:
+            assert now() < now() + guard.require() < asked + seconds
+            await asyncio.sleep(seconds / 500)
+        assert seconds / 2 < now() - asked < seconds
+
+    test()
+
+
+@played
+async def test_no_write_is_under_way_when_another_begins(found: Operators) -> None:
+    """The holder is cut off, and all that it asks for takes long."""
+    way = KubernetesApi(found.store)
+    async with way.serving():
+        first = found.start("a", way)
+        await until(lambda: first.held)
+        door = Cluster(configuration(way), connections=4, permit=lambda _: first.require())
+        second = found.start("b")
+        way.faults += [
+            Fault("update", "leases", late=600, times=10**6),
+            Fault("create", "pods", late=600, times=10**6),
+        ]
+        while first.held:
+            with pytest.raises(Unavailable):
+                await door.create(PODS, NAMESPACE, {"metadata": {"name": "x"}})
+        last = now()
+        assert not second.held
+        await until(lambda: second.held)
+        assert now() - last > 1
+        await found.kill("a")
+        await door.close()
+
+
+@played
+async def test_an_answer_that_is_lost_is_no_other_operator(found: Operators) -> None:
+    guard = found.start("a")
+    await until(lambda: guard.held)
+    found.api.faults.append(Fault("update", "leases", carried_out=True, times=3))
+    for _ in range(120):
+        await asyncio.sleep(0.5)
+        assert guard.held
+    assert found.told == [("a", True)]
+
+
+@played
+async def test_one_that_lingers_is_waited_for_and_goes_on_at_once(found: Operators) -> None:
+    first = found.start("a")
+    await until(lambda: first.held)
+    second = found.start("b")
+    await asyncio.sleep(5)
+    first.resign()
+    await found.kill("a")
+    await first.linger(60)
+    again = found.start("a")
+    assert await until(lambda: again.held) < 1
+    again.resign()
+    await found.kill("a")
+    found.api.faults.append(Fault("update", "leases", status=503))
+    await again.linger(60)
+    assert 60 <= await until(lambda: second.held) < 65
+
+
+@played
+async def test_one_that_lingers_takes_nothing_from_the_next_process(found: Operators) -> None:
+    """Which counts on all of its time."""
+    first = found.start("a")
+    await until(lambda: first.held)
+    first.resign()
+    await found.kill("a")
+    again = found.start("a")
+    await until(lambda: again.held)
+    await first.linger(1)
+    assert found.lease()["leaseDurationSeconds"] == SECONDS

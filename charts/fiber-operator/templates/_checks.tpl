@@ -22,6 +22,22 @@ contradictions are told at once, each with what, why and what to do.
 {{- $faults = append $faults "metrics.serviceMonitor.create is true, but metrics.service.create is false: a ServiceMonitor finds the operator through its Service, and would find nothing. Set metrics.service.create=true, or metrics.serviceMonitor.create=false." -}}
 {{- end -}}
 
+{{- if and (not .metrics.service.create) .metrics.service.annotations -}}
+{{- $faults = append $faults "metrics.service.annotations is set, but metrics.service.create is false: there is no Service to carry them. Set metrics.service.create=true, or leave them empty." -}}
+{{- end -}}
+
+{{- if and (not .metrics.serviceMonitor.create) .metrics.serviceMonitor.labels -}}
+{{- $faults = append $faults "metrics.serviceMonitor.labels is set, but metrics.serviceMonitor.create is false: nothing would carry them. Set metrics.serviceMonitor.create=true, or leave them empty." -}}
+{{- end -}}
+
+{{- if and (not .metrics.prometheusRule.create) .metrics.prometheusRule.labels -}}
+{{- $faults = append $faults "metrics.prometheusRule.labels is set, but metrics.prometheusRule.create is false: nothing would carry them. Set metrics.prometheusRule.create=true, or leave them empty." -}}
+{{- end -}}
+
+{{- if and (not .metrics.dashboard.create) .metrics.dashboard.annotations -}}
+{{- $faults = append $faults "metrics.dashboard.annotations is set, but metrics.dashboard.create is false: nothing would carry them. Set metrics.dashboard.create=true, or leave them empty." -}}
+{{- end -}}
+
 {{- with .metrics.serviceMonitor -}}
 {{- if gt (int .timeoutSeconds) (int .intervalSeconds) -}}
 {{- $faults = append $faults (printf "metrics.serviceMonitor.timeoutSeconds is %v, but intervalSeconds is %v: Prometheus refuses to wait for an answer until after it has asked again. Lower the one or raise the other." .timeoutSeconds .intervalSeconds) -}}
@@ -44,14 +60,70 @@ contradictions are told at once, each with what, why and what to do.
 {{- end -}}
 {{- end -}}
 
+{{- if and .userRoles.aggregate (or (not .userRoles.create) (ne .scope "cluster")) -}}
+{{- $faults = append $faults "userRoles.aggregate is true, but there is no ClusterRole fiber-user that could extend others: it is made with userRoles.create=true and scope=cluster alone. Set these, or userRoles.aggregate=false and bind the Roles by hand." -}}
+{{- end -}}
+
+{{- range $name, $limit := default dict .resources.limits -}}
+{{- $request := index (default dict $.Values.resources.requests) $name -}}
+{{- if and (not (kindIs "invalid" $request)) (not (kindIs "invalid" $limit)) -}}
+{{- if lt (include "fiber-operator.amount" $limit | float64) (include "fiber-operator.amount" $request | float64) -}}
+{{- $faults = append $faults (printf "resources.limits.%s is %v, but resources.requests.%s is %v: Kubernetes refuses a container that asks for more than it may have. Raise the one or lower the other." $name $limit $name $request) -}}
+{{- end -}}
+{{- end -}}
+{{- end -}}
+
+{{- $names := list -}}
 {{- range .extraEnv -}}
+{{- if has .name $names -}}
+{{- $faults = append $faults (printf "extraEnv sets %s twice: only one of the two would hold. Take one out." .name) -}}
+{{- end -}}
+{{- $names = append $names .name -}}
+{{- if regexMatch "(?i)^(https?|all|no)_proxy$" .name -}}
+{{- $faults = append $faults (printf "extraEnv sets %s: the operator calls the API server alone, and uses no proxy for that. Take it out; a registry's proxy is a matter of the nodes." .name) -}}
+{{- end -}}
 {{- if hasPrefix "FIBER_OPERATOR_" .name -}}
 {{- $faults = append $faults (printf "extraEnv sets %s: the chart derives the operator's settings from scope, operator and metrics, and rights and probes must agree with them. Set the value that stands for it instead." .name) -}}
 {{- end -}}
 {{- end -}}
 
 {{- end -}}
+
+{{- with include "fiber-operator.otherOwner" . -}}
+{{- $faults = append $faults (printf "crds.install is true, but the resource type FiberPool belongs to release %s, which runs and installs it too: each upgrade of the one would undo the other's. Set crds.install=false here; or first there, and then add --take-ownership here." .) -}}
+{{- end -}}
+
 {{- if $faults -}}
 {{- fail (printf "these values contradict each other:\n  - %s" (join "\n  - " $faults)) -}}
+{{- end -}}
+{{- end -}}
+
+{{/* A quantity such as 500m or 1.5Gi, as a plain number. */}}
+{{- define "fiber-operator.amount" -}}
+{{- $text := toString . -}}
+{{- $unit := regexFind "[A-Za-z]+$" $text -}}
+{{- $factors := dict "" 1.0 "m" 0.001 "k" 1e3 "M" 1e6 "G" 1e9 "T" 1e12 "P" 1e15 "E" 1e18 "Ki" 1024.0 "Mi" 1048576.0 "Gi" 1073741824.0 "Ti" 1099511627776.0 "Pi" 1125899906842624.0 "Ei" 1152921504606846976.0 -}}
+{{- printf "%f" (mulf (trimSuffix $unit $text | float64) (index $factors $unit)) -}}
+{{- end -}}
+
+{{/*
+The other release, "namespace/name", that installs the resource type and runs; else nothing. Where there is no cluster to
+ask (helm template) there is none. One that was uninstalled left its mark on the type, but no Deployment.
+*/}}
+{{- define "fiber-operator.otherOwner" -}}
+{{- if .Values.crds.install -}}
+{{- $crd := lookup "apiextensions.k8s.io/v1" "CustomResourceDefinition" "" "fiberpools.fiber.dev" -}}
+{{- $marks := dig "metadata" "annotations" dict $crd -}}
+{{- $name := index $marks "meta.helm.sh/release-name" -}}
+{{- $namespace := index $marks "meta.helm.sh/release-namespace" -}}
+{{- if and $name $namespace (ne (printf "%s/%s" $namespace $name) (printf "%s/%s" .Release.Namespace .Release.Name)) -}}
+{{- range (lookup "apps/v1" "Deployment" $namespace "").items -}}
+{{- $labels := default dict .metadata.labels -}}
+{{- $notes := default dict .metadata.annotations -}}
+{{- if and (eq "operator" (index $labels "app.kubernetes.io/component" | default "")) (eq $name (index $labels "app.kubernetes.io/instance" | default "")) (eq "true" (index $notes "fiber.dev/installs-crds" | default "")) -}}
+{{- printf "%s/%s" $namespace $name -}}
+{{- end -}}
+{{- end -}}
+{{- end -}}
 {{- end -}}
 {{- end -}}

@@ -5,7 +5,8 @@
 
 {{/*
 What every object of the release is called, or begins with. 44 characters leave room for the longest
-suffix, and a name that the release already carries is not repeated.
+suffix, and a name that the release already carries is not repeated. A release may be called fiber.v1 or 1st; a
+Service may not: it takes no dot and begins with a letter.
 */}}
 {{- define "fiber-operator.fullname" -}}
 {{- $name := include "fiber-operator.name" . -}}
@@ -15,12 +16,21 @@ suffix, and a name that the release already carries is not repeated.
 {{- else if contains $name .Release.Name -}}
 {{- $full = .Release.Name -}}
 {{- end -}}
+{{- $full = replace "." "-" $full -}}
+{{- if regexMatch "^[0-9]" $full -}}
+{{- $full = printf "fiber-%s" $full -}}
+{{- end -}}
 {{- $full | trunc 44 | trimSuffix "-" -}}
 {{- end -}}
 
 {{/* Cluster-wide names carry the namespace too: the same release may exist in another one. */}}
 {{- define "fiber-operator.clusterName" -}}
 {{- printf "%s:%s" .Release.Namespace (include "fiber-operator.fullname" .) -}}
+{{- end -}}
+
+{{/* As the operator calls its release, in the Lease of each namespace that it serves. */}}
+{{- define "fiber-operator.releaseName" -}}
+{{- printf "%s/%s" .Release.Namespace (include "fiber-operator.fullname" .) -}}
 {{- end -}}
 
 {{- define "fiber-operator.serviceAccountName" -}}

@@ -65,10 +65,28 @@ nodeSelector:
 affinity:
   {{- toYaml . | nindent 2 }}
 {{- end }}
-{{- with .Values.tolerations }}
-tolerations:
-  {{- toYaml . | nindent 2 }}
-{{- end }}
+{{- end -}}
+
+{{/*
+Taints that the operator's pod tolerates. Kubernetes would leave it on a lost node for five minutes; another pod may come
+much sooner, since the operator's Lease keeps the two apart. Values that speak of these taints themselves win.
+*/}}
+{{- define "fiber-operator.tolerations" -}}
+{{- $tolerations := .Values.tolerations -}}
+{{- range $taint := list "node.kubernetes.io/not-ready" "node.kubernetes.io/unreachable" -}}
+{{- $told := false -}}
+{{- range $.Values.tolerations -}}
+{{- if and (eq $taint (default $taint .key)) (eq "NoExecute" (default "NoExecute" .effect)) -}}
+{{- $told = true -}}
+{{- end -}}
+{{- end -}}
+{{- if not $told -}}
+{{- $tolerations = append $tolerations (dict "key" $taint "operator" "Exists" "effect" "NoExecute" "tolerationSeconds" 30) -}}
+{{- end -}}
+{{- end -}}
+{{- with $tolerations -}}
+{{- toYaml . -}}
+{{- end -}}
 {{- end -}}
 
 {{/*

@@ -3,7 +3,7 @@ Every right that the chart gives, as data: no condition and no loop, so that a t
 calls that the operator makes, both ways.
 
   pools    the operator, in each namespace that it watches
-  own      the operator, in its own namespace: the Lease that keeps two operators from acting at once
+  own      the operator, in its own namespace: the Lease that keeps two of its processes from acting at once
   user     who runs pools: people, and the programs that are masters
   viewer   who looks on
   smoke    the helm test
@@ -30,10 +30,15 @@ pools:
   - apiGroups: [discovery.k8s.io]
     resources: [endpointslices]
     verbs: [create, delete, get, patch]
-  # The Lease that a master renews; the operator only looks at it.
+  # Get: the Lease that a master renews; the operator only looks at it. The name of what is created cannot be restricted.
   - apiGroups: [coordination.k8s.io]
     resources: [leases]
-    verbs: [get]
+    verbs: [create, get]
+  # The Lease that keeps the operators of two releases from acting in one namespace.
+  - apiGroups: [coordination.k8s.io]
+    resources: [leases]
+    resourceNames: [fiberpools.fiber.dev]
+    verbs: [update]
   # List: what the scheduler and the kubelet say of a pod that does not start.
   - apiGroups: [""]
     resources: [events]
