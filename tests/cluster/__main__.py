@@ -1,6 +1,6 @@
 """A real Kubernetes cluster on one Linux machine, without Docker or an image registry.
 
-Kubernetes, Helm and KWOK are built from source once (Go 1.26); the rest comes from Debian
+Kubernetes, etcd, Helm and KWOK are built from source once (Go 1.26); the rest comes from Debian
 packages, which are installed where root and apt-get are. There is one such cluster on a machine.
 Nodes are network namespaces, so that pods of different nodes really cross a network; limits,
 Services, RBAC, logs and exec are the real ones. There is no cluster DNS, no registry, and

@@ -1,4 +1,4 @@
-"""Builds Kubernetes, Helm and KWOK with Go, at the versions that the go.mod files name.
+"""Builds Kubernetes, etcd, Helm and KWOK with Go, at the versions that the go.mod files name.
 
 Minutes the first time; the programs stay in a folder of the user's cache that bears their
 versions, so that every later start and every other checkout finds them there.
@@ -15,6 +15,9 @@ from pathlib import Path
 
 from cluster import places
 from cluster.shell import ClusterError, locked, output, say
+
+_RENAMED = {"server": "etcd"}
+"""What Go would name after the folder of its source, and what everybody calls it."""
 
 
 def build(folders: Iterable[str] = places.MODULES) -> None:
@@ -50,7 +53,7 @@ def _build(folder: str) -> None:
     )
     places.programs().mkdir(exist_ok=True)
     for file in unfinished.iterdir():
-        file.rename(places.programs() / file.name)
+        file.rename(places.programs() / _RENAMED.get(file.name, file.name))
     unfinished.rmdir()
     say(f"built {folder} in {time.monotonic() - began:.0f} s, into {places.programs()}")
 

@@ -44,7 +44,7 @@ def _add_lifecycle(commands: _Commands) -> None:
 
 
 def _add_images(commands: _Commands) -> None:
-    programs = commands.add_parser("build", help="build Kubernetes, Helm and KWOK, start nothing")
+    programs = commands.add_parser("build", help="build the programs, Kubernetes and others")
     programs.set_defaults(run=lambda _: build.build())
     ahead = commands.add_parser("prepare", help="do ahead of the tests what takes them minutes")
     ahead.set_defaults(run=lambda _: preparation.prepare())

@@ -46,9 +46,6 @@ def start_apiserver(pki: Pki) -> None:
         "--secure-port=6443",
         f"--service-cluster-ip-range={places.SERVICE_RANGE}",
         "--authorization-mode=Node,RBAC",
-        # Debian's etcd is too old for lists that are streamed. With the gate on, a watch from
-        # version 0, as KWOK begins each of its own, would be taken for one and refused.
-        "--feature-gates=WatchList=false",
         # The second one is stricter than most clusters: an owner may only be set by who may
         # delete it, so that a missing right of the operator is found.
         "--enable-admission-plugins=NodeRestriction,OwnerReferencesPermissionEnforcement",

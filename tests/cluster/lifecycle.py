@@ -61,7 +61,7 @@ def up(count: int) -> None:
     """
     need_root("start the test cluster")
     packages.need(packages.TO_RUN, "run the test cluster")
-    build.build(["kubernetes", "helm"])
+    build.build(["kubernetes", "etcd", "helm"])
     pause_archive()
     with locked(places.LOCK, _BUSY):
         found = keep_or_clear() or Found(str(places.CHECKOUT), str(places.cache()), count)

@@ -18,7 +18,6 @@ TO_RUN: Mapping[str | Path, str] = {
     "containerd": "containerd",
     "runc": "runc",
     _PLUGINS: "containernetworking-plugins",
-    "etcd": "etcd-server",
     "iptables": "iptables",
     "conntrack": "conntrack",
     "ipset": "ipset",

@@ -28,6 +28,7 @@ MODULES = {
     ),
     "helm": ("helm.sh/helm/v3", ("helm",)),
     "kwok": ("sigs.k8s.io/kwok", ("kwok",)),
+    "etcd": ("go.etcd.io/etcd/server/v3", ("etcd",)),
 }
 
 STATE = Path("/var/lib/fiber-cluster")

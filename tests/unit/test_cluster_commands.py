@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from cluster import commands, faults, images, lifecycle, network, places
+from cluster.daemons import Daemon
 from cluster.lifecycle import Found
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -62,11 +63,14 @@ def test_status_tells_what_does_not_run(
     Found("/home/me/fiber", "/cache/kubernetes-1.34.4", 1).write()
     places.socket(1).parent.mkdir(parents=True)
     (tmp_path / "daemons").mkdir()
-    (tmp_path / "daemons" / "apiserver.json").write_text('["kube-apiserver"]')
+    for name in ("apiserver", "etcd"):
+        (tmp_path / "daemons" / f"{name}.json").write_text("[]")
+    monkeypatch.setattr(Daemon, "runs", lambda daemon: daemon.name == "etcd")
     out = printed(capsys, "status")
     assert "kubernetes-1.34.4, 1 nodes, from /home/me/fiber" in out
     assert "node-1 is cut off" in out
     assert "apiserver: does not run" in out
+    assert "etcd: runs" in out
 
 
 @pytest.mark.parametrize("command", ["cut", "restore", "stop", "start"])
