@@ -47,6 +47,9 @@ CASES = {
     )
 }
 
+WARM_UP = Case("warm-up", "50 pods to warm up", 1, 50, rounds=1, limit=60)
+"""Done first and not kept: connections are open and code is loaded when it counts."""
+
 
 @dataclass(frozen=True)
 class Subject:

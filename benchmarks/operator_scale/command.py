@@ -14,7 +14,7 @@ from typing import Any
 
 from benchmarks import machine
 from benchmarks.operator_scale import preparation, report, results, trial
-from benchmarks.operator_scale.cases import CASES, Case, Subject, in_turn
+from benchmarks.operator_scale.cases import CASES, SUBJECTS, WARM_UP, Case, Subject, in_turn
 from benchmarks.operator_scale.installed import (
     CannotMeasure,
     Operator,
@@ -90,6 +90,9 @@ def _play(
     kube: Kube, operator: Operator, options: argparse.Namespace, about: dict[str, Any]
 ) -> dict[str, Result]:
     found = {}
+    for subject in SUBJECTS:
+        say(f"{WARM_UP.title}, {subject.label}")
+        trial.run(kube, operator, WARM_UP, subject, 0)
     for case in options.cases:
         rounds = options.rounds or case.rounds
         result = found[case.name] = Result({**about, "rounds": rounds})

@@ -47,7 +47,9 @@ def _growth(panel: Any, name: str, result: Result) -> None:
     for subject in SUBJECTS:
         for trial in result.of(subject.name):
             style = {"color": subject.colour, "alpha": 0.85, "linewidth": 1.6}
-            panel.plot(*_until_settled(trial, trial.ready), label=subject.label, **style)
+            panel.step(
+                *_until_settled(trial, trial.ready), where="post", label=subject.label, **style
+            )
             panel.plot(*_until_settled(trial, trial.created), linestyle=":", **style)
     panel.set(title=CASES[name].title, xlim=(0, None), ylim=(0, None))
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
