@@ -25,7 +25,7 @@ from pydantic.alias_generators import to_camel
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from fiber_api.times import format_time, parse_time
+from fiber_api.times import EARLIEST, LATEST, format_time, parse_time
 
 PRESERVE = "x-kubernetes-preserve-unknown-fields"
 """In a schema: fields that it does not name are kept, as they came."""
@@ -109,11 +109,11 @@ def _error(rule: Rule) -> InitErrorDetails:
 
 def _seconds(value: object) -> float:
     # A float is a time that Python wrote, not one that was read.
-    if isinstance(value, float):
-        return value
+    if isinstance(value, float) and EARLIEST <= value <= LATEST:
+        return value // 1
     if not isinstance(value, str):
         raise ValueError("must be a time such as 2026-11-21T14:56:13Z")
-    return parse_time(value)
+    return parse_time(value) // 1
 
 
 Time = Annotated[
@@ -122,7 +122,8 @@ Time = Annotated[
     PlainSerializer(format_time, return_type=str),
     WithJsonSchema({"type": "string", "format": "date-time"}),
 ]
-"""Unix seconds that the API writes as RFC 3339."""
+"""Unix seconds that the API writes as RFC 3339: whole ones, so that what is read is what was
+written."""
 
 
 _WORDS = {

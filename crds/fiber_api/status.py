@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, ValidationError
 
@@ -11,7 +11,8 @@ from fiber_api.model import LIST_AS_MAP, Model, Time, describe
 
 _Path = tuple[int | str, ...]
 
-Count = Annotated[int, Field(ge=0, le=2**31 - 1)]
+MAX_COUNT: Final = 2**31 - 1
+Count = Annotated[int, Field(ge=0, le=MAX_COUNT)]
 ExitCode = Annotated[int, Field(ge=-(2**31), le=2**31 - 1)]
 
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import datetime
 
+EARLIEST = datetime.datetime.min.replace(tzinfo=datetime.UTC).timestamp()
+LATEST = datetime.datetime.max.replace(tzinfo=datetime.UTC, microsecond=0).timestamp()
+"""The first and the last second that can be written."""
+
 
 def parse_time(text: str) -> float:
     """The unix seconds of ``2026-11-21T14:56:13Z`` or its like; else ``ValueError``."""
@@ -11,12 +15,17 @@ def parse_time(text: str) -> float:
         moment = datetime.datetime.fromisoformat(text)
         if moment.tzinfo is None:
             raise ValueError
-        return moment.timestamp()
+        # One of the year 10000 in UTC could be read and never be written.
+        return moment.astimezone(datetime.UTC).timestamp()
     except (ValueError, OverflowError):
         raise ValueError(f"{text!r} is no time such as 2026-11-21T14:56:13Z") from None
 
 
 def format_time(seconds: float) -> str:
-    """The same in the API's words, in UTC, to the second below."""
+    """The same in the API's words, in UTC, to the second below.
+
+    What is before the year 1 or after 9999 is written as the first or the last second between.
+    """
+    seconds = min(max(seconds, EARLIEST), LATEST)
     moment = datetime.datetime.fromtimestamp(seconds // 1, datetime.UTC)
-    return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
+    return moment.isoformat().replace("+00:00", "Z")

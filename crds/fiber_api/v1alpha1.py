@@ -165,7 +165,10 @@ class FailurePolicy(Model):
     backoff_limit: Annotated[int, Field(ge=0, le=10_000)] = 6
     """Failures in a row after which nothing more is created until the spec changes."""
     startup_timeout_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 900
-    """How long a pod may take to become ready before that is a problem in the status."""
+    """How long a worker may take to become ready once its container runs. Then it counts as
+    failed: its pod is deleted, and replaced like that of any other failure. A pod whose container
+    does not run yet is kept, however long that takes; this long after its creation it is an Error
+    in the status that no node takes it, or that it does not start."""
 
 
 class Update(Model):

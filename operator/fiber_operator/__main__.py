@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import signal
@@ -13,6 +14,13 @@ import prometheus_client
 from fiber_operator import logs
 from fiber_operator.program import Program
 from fiber_operator.settings import Settings, SettingsError
+
+GARBAGE = 10_000
+"""New objects after which garbage is looked for."""
+
+DEPTH = 30_000
+"""Kubernetes takes documents that are nested ten thousand deep.  At Python's own limit a single
+such pool would make the list of all pools unreadable."""
 
 log = logging.getLogger("fiber_operator")
 
@@ -33,8 +41,13 @@ def main() -> int:
         print(f"fiber_operator: {error}", file=sys.stderr)
         return 2
     logs.set_up(settings.log_level, settings.log_format)
+    sys.setrecursionlimit(DEPTH)
     # Twice the lines for nothing that anybody asks for. The library types only a part of itself.
     prometheus_client.disable_created_metrics()  # type: ignore[no-untyped-call]
+    # A list of pods is so many new objects that the collector begins many times over, to look at
+    # all that the libraries made: two thirds of the time that parsing took.
+    gc.freeze()
+    gc.set_threshold(GARBAGE)
     try:
         asyncio.run(_operate(settings))
     except Exception:

@@ -57,11 +57,13 @@ class State:
         """Where agents dial, once that is known."""
         return self.surroundings.address if self.surroundings else None
 
-    def refused(self, template_hash: str, error: ApiError, now: float) -> None:
+    def refused(
+        self, template_hash: str, error: ApiError, now: float, *, dry_run: bool = False
+    ) -> None:
         """The API server does not take a pod of this template now."""
         before = self.refusal
         count = before.count + 1 if before and before.template_hash == template_hash else 1
-        self.refusal = Refusal(template_hash, error.status, error.message, now, count)
+        self.refusal = Refusal(template_hash, error.status, error.message, now, count, dry_run)
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,9 @@ class Look:
     """None if the spec cannot be read."""
     state: State
     plan: Plan
+    rested: float = 0.0
+    """When the pool has rested from the list of its pods, by the loop's clock.  No look comes
+    before, so pods may be changed until then."""
 
 
 class Actor:
@@ -100,7 +105,7 @@ class Actor:
         try:
             await self._cluster.create(PODS, pool.metadata.namespace, body, dry_run=True)
         except (Refused, Invalid) as error:
-            state.refused(plan.template_hash, error, self._now())
+            state.refused(plan.template_hash, error, self._now(), dry_run=True)
         except ApiError as error:
             return error
         else:
@@ -143,22 +148,21 @@ class Actor:
         await self._tell(look, look.plan.events)
 
     async def _change_pods(self, look: Look) -> Turn:
-        deleted, as_planned = await self._delete(look.key, look.state, look.plan.delete)
+        deleted, as_planned = await self._delete(look)
         if deleted < len(look.plan.delete):
             return Turn(again=0.0)
         turn = await self._create(look)
         return turn if as_planned else dataclasses.replace(turn, again=0.0)
 
-    async def _delete(
-        self, key: Key, state: State, deletions: Sequence[Deletion]
-    ) -> tuple[int, bool]:
+    async def _delete(self, look: Look) -> tuple[int, bool]:
         """How many of the pods were seen to, and whether each was as the plan had it.
 
-        Like creation this stops after ``ENOUGH``, so that the status is not out of date for long.
+        Like creation this stops after a while, so that the status is not out of date for long.
         """
+        key, state, deletions = look.key, look.state, look.plan.delete
         clock = asyncio.get_running_loop().time
-        started, done, as_planned = clock(), 0, True
-        while done < len(deletions) and (not done or clock() - started < ENOUGH):
+        enough, done, as_planned = clock() + _enough(look), 0, True
+        while done < len(deletions) and (not done or clock() < enough):
             batch = deletions[done : done + DELETIONS]
             state.deleted |= {deletion.name for deletion in batch}
             results = await asyncio.gather(
@@ -193,10 +197,11 @@ class Actor:
         done = await self._creator.create(
             pool.metadata.name,
             pool.metadata.namespace,
-            lambda name: manifests.pod(pool, name, address),
+            manifests.pod_maker(pool, address),
             plan.create,
             plan.batch_limit,
             state.pace,
+            enough=_enough(look),
         )
         if done.names:
             self._metrics.created(len(done.names))
@@ -213,6 +218,11 @@ class Actor:
     async def _tell(self, look: Look, events: Sequence[Event]) -> None:
         for event in events:
             await self._recorder.record(look.key, look.state.uid, event)
+
+
+def _enough(look: Look) -> float:
+    """Seconds that may be spent on pods before the next look."""
+    return max(ENOUGH, look.rested - asyncio.get_running_loop().time())
 
 
 def _some(pods: list[str]) -> str:

@@ -63,20 +63,11 @@ class TooMany(Unavailable):
         self.retry_after = retry_after
 
 
-def items_of(page: Body, what: str) -> tuple[list[Body], str]:
-    """The items of a list and how to go on.
-
-    Strict, because a list that is taken for empty by mistake makes the operator create pods.
-    """
-    items, metadata = page.get("items"), page.get("metadata")
-    if (
-        not str(page.get("kind", "")).endswith("List")
-        or not isinstance(items, list)
-        or not isinstance(metadata, dict)
-        or not all(isinstance(item, dict) for item in items)
-    ):
-        raise Unavailable("the answer is no list of objects", what=what)
-    return items, str(metadata.get("continue") or "")
+def complaint(error: ApiError) -> str:
+    """What went wrong, and what to do where that is known."""
+    if isinstance(error, Refused):
+        return f"{error}. Give the operator's account this right: the chart's roles have it"
+    return str(error)
 
 
 def object_of(answer: Body, name: str) -> Body:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fiber_api.names import ConditionType
 from fiber_api.v1alpha1 import Condition, FiberPool
 from fiber_operator import plans
+from fiber_operator.documents import past
 from fiber_operator.revisions import spec_hash
 
 
@@ -49,7 +50,7 @@ def judge(pool: FiberPool, lease: plans.Master, now: float) -> Attachment:
         alive = before.status == "True"
     if alive is not False:
         return Attachment(attached=True, alive=alive)
-    since = _lost_since(before, now)
+    since = _lost_since(pool, before, now)
     due = since + master.lost_grace_seconds
     if now < due:
         return Attachment(attached=True, alive=False, lost_since=since, due=due)
@@ -57,9 +58,12 @@ def judge(pool: FiberPool, lease: plans.Master, now: float) -> Attachment:
     return Attachment(attached=not gone, alive=False, lost_since=since, gone=gone)
 
 
-def _lost_since(before: Condition | None, now: float) -> float:
-    if before is not None and before.status == "False" and before.last_transition_time:
-        return before.last_transition_time
+def _lost_since(pool: FiberPool, before: Condition | None, now: float) -> float:
+    if before is not None and before.status == "False":
+        known = past(before.last_transition_time, now)
+        # The pool may be deleted for it, so it must be a time at which there was one.
+        if known is not None and known >= (pool.metadata.creation_timestamp or 0.0):
+            return known
     return float(math.floor(now))
 
 

@@ -10,7 +10,7 @@ import asyncio
 import os
 import time
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import aiohttp
 from kubernetes.aio import config
@@ -29,9 +29,9 @@ from fiber_operator.answers import (
     TooMany,
     Unavailable,
     document_of,
-    items_of,
     object_of,
 )
+from fiber_operator.listing import Listing
 
 __all__ = [
     "ApiError",
@@ -41,6 +41,7 @@ __all__ = [
     "Conflict",
     "Gone",
     "Invalid",
+    "Permit",
     "Refused",
     "Resource",
     "TooMany",
@@ -52,14 +53,14 @@ __all__ = [
 T = TypeVar("T")
 Observer = Callable[[str, str, str, float], None]
 """Told of each call: verb, resource, HTTP status or what went wrong, seconds."""
+Permit = Callable[[str], float]
 
-PAGE = 200
-"""Objects in one answer to a list.  A pod is some 10 kB of JSON and five times that once it is
-parsed; more of them at once would be most of this process's memory."""
+AT_ONCE = 200
+"""Objects of a list that are read before others may go on."""
 
 READ_TIMEOUT = 30.0
 WRITE_TIMEOUT = 10.0
-"""Shorter, so that no write of an operator that lost its Lease is under way for long."""
+"""At most: a write has ended before another operator may begin."""
 CONNECT_TIMEOUT = 5.0
 
 _MERGE_PATCH = "application/merge-patch+json"
@@ -91,8 +92,9 @@ LEASES = Resource("coordination.k8s.io", "v1", "leases")
 class Cluster:
     """One API server.
 
-    ``permit`` is called before each call that changes something and raises where this process may
-    not.  ``connections`` bounds the calls under way; further ones wait for their turn.
+    ``permit`` is called with the namespace before each call that changes something.  It returns how
+    many seconds the call may take, and raises where this process may not.  ``connections`` bounds
+    the calls under way; further ones wait for their turn.
     """
 
     def __init__(
@@ -100,7 +102,7 @@ class Cluster:
         configuration: Configuration,
         *,
         connections: int,
-        permit: Callable[[], None] = lambda: None,
+        permit: Permit = lambda namespace: WRITE_TIMEOUT,
         observe: Observer = lambda verb, resource, code, seconds: None,
     ) -> None:
         configuration.connection_pool_maxsize = connections
@@ -132,23 +134,31 @@ class Cluster:
     ) -> list[T]:
         """What ``keep`` makes of each object there is now (``namespace`` None: anywhere).
 
-        The bodies are dropped page by page: a thousand pods are more than should be in memory.
+        In one piece, as the API server answers that, and not a list in pages, from what it has in
+        memory, once it has made sure that this is the newest: it need not read and decode all of
+        a namespace for the few objects that are selected.
         """
         kept: list[T] = []
-        query = {"limit": str(PAGE), "labelSelector": selector, "fieldSelector": fields}
+        query = {"labelSelector": selector, "fieldSelector": fields}
         while True:
-            page = await self._call("list", resource, namespace, query=query)
-            items, more = items_of(page, f"list {resource.plural}")
-            kept += [keep(item) for item in items]
-            if not more:
+            listing = await self._call("list", resource, namespace, query=query, read=_listing)
+            for item in listing:
+                kept.append(keep(item))
+                if len(kept) % AT_ONCE == 0:
+                    await asyncio.sleep(0)
+            if not listing.more():
                 return kept
-            query["continue"] = more
+            query["continue"] = listing.more()
 
     async def create(
         self, resource: Resource, namespace: str, body: Body, *, dry_run: bool = False
     ) -> Body:
-        """Create the object; the answer is what it became."""
-        query = {"dryRun": "All"} if dry_run else {}
+        """Create the object; the answer is what it became.
+
+        A dry run makes nothing and is refused for fields that the API server does not know, which
+        it would else drop in silence.
+        """
+        query = {"dryRun": "All", "fieldValidation": "Strict"} if dry_run else {}
         answer = await self._call("create", resource, namespace, query=query, body=body)
         return object_of(answer, body["metadata"]["name"])
 
@@ -197,19 +207,21 @@ class Cluster:
         subresource: str = "",
         query: Mapping[str, str] | None = None,
         body: Body | None = None,
-    ) -> Body:
+        read: Callable[[int, Mapping[str, str], bytes, str], Any] = document_of,
+    ) -> Any:
         path = resource.path(namespace, name, subresource)
         shown = f"{resource.plural}/{subresource}" if subresource else resource.plural
         what = f"{verb} {shown} {name}".rstrip() + (f" in {namespace}" if namespace else "")
         async with self._turns:
+            seconds = READ_TIMEOUT
             if verb in _WRITES:
-                self._permit()
+                seconds = min(WRITE_TIMEOUT, self._permit(namespace or ""))
             started = time.perf_counter()
             code = "cancelled"
             try:
-                status, headers, data = await self._send(verb, path, query or {}, body)
+                status, headers, data = await self._send(verb, path, query or {}, body, seconds)
                 code = str(status)
-                return document_of(status, headers, data, what)
+                return read(status, headers, data, what)
             except (TimeoutError, aiohttp.ClientError, OSError) as error:
                 # A TimeoutError says nothing of its own.
                 code = "timeout" if isinstance(error, TimeoutError) else "connection"
@@ -221,7 +233,7 @@ class Cluster:
                 self._observe(verb, shown, code, time.perf_counter() - started)
 
     async def _send(
-        self, verb: str, path: str, query: Mapping[str, str], body: Body | None
+        self, verb: str, path: str, query: Mapping[str, str], body: Body | None, seconds: float
     ) -> tuple[int, Mapping[str, str], bytes]:
         headers = {"Accept": "application/json"}
         if body is not None:
@@ -234,12 +246,16 @@ class Cluster:
             header_params=headers,
             auth_settings=["BearerToken"],
         )
-        timeout = aiohttp.ClientTimeout(
-            total=WRITE_TIMEOUT if verb in _WRITES else READ_TIMEOUT, sock_connect=CONNECT_TIMEOUT
-        )
+        timeout = aiohttp.ClientTimeout(total=seconds, sock_connect=CONNECT_TIMEOUT)
         response = await self._client.call_api(method, url, headers, body, _request_timeout=timeout)
         data = await response.read()
         return response.status, response.headers, data
+
+
+def _listing(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Listing:
+    if not 200 <= status < 300:
+        document_of(status, headers, data, what)  # raises what it means
+    return Listing(data, what)
 
 
 _METHODS = {
@@ -266,12 +282,29 @@ async def load_configuration() -> Configuration:
     return configuration
 
 
-async def open_session(configuration: Configuration) -> aiohttp.ClientSession:
-    """A session that is logged in, for whoever has a client of his own."""
+async def open_session(
+    configuration: Configuration, trace: aiohttp.TraceConfig
+) -> aiohttp.ClientSession:
+    """A session that is logged in, for whoever has a client of his own.
+
+    A watch brings the metadata alone, which say whose an object is.
+    """
     token = await configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
     tls = RESTClientObject(configuration).ssl_context
     return aiohttp.ClientSession(
         connector=aiohttp.TCPConnector(limit=0, ssl=tls),
         headers={"Authorization": token} if token else None,
         proxy=configuration.proxy,
+        trace_configs=[trace],
+        middlewares=[_ask_for_metadata],
     )
+
+
+async def _ask_for_metadata(
+    request: aiohttp.ClientRequest, handler: aiohttp.ClientHandlerType
+) -> aiohttp.ClientResponse:
+    # Not of a list: where that is empty the API server has null for its items.
+    if request.url.query.get("watch") == "true":
+        kind = "PartialObjectMetadata;g=meta.k8s.io;v=v1"
+        request.headers["Accept"] = f"application/json;as={kind}"
+    return await handler(request)

@@ -11,6 +11,7 @@ from fiber_api.names import ConditionType, Phase, Reason
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import Condition, FiberPool, Problem
 from fiber_operator.attachment import Attachment
+from fiber_operator.documents import past
 from fiber_operator.pods import PodView, State
 
 Truth = Literal["True", "False", "Unknown"]
@@ -95,7 +96,7 @@ def dated(finding: Finding, before: Condition | None, generation: int, now: floa
     same = before is not None and before.status == finding.status
     since = finding.since
     if since is None and before is not None and same:
-        since = before.last_transition_time
+        since = past(before.last_transition_time, now)
     return Condition(
         type=finding.type,
         status=finding.status,

@@ -27,11 +27,13 @@ from fiber_operator.masters import Masters, Term
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.plans import Memory, Plan
 from fiber_operator.pods import PodView, observe
+from fiber_operator.pods import State as Life
 from fiber_operator.surroundings import Keeper
 from fiber_operator.worker import Key, Turn
 
 LIST_SHARE = 2.0
-"""A pool rests for this many times as long as the list of its pods took."""
+"""A pool rests for this many times as long as the list of its pods took: what it does meanwhile
+is part of that."""
 LONGEST_REST = 10.0
 OBSTRUCTED = 5.0
 """Seconds until a pool that lacks something other than pods is looked at again."""
@@ -127,16 +129,17 @@ class Controller:
             log.warning("the status was damaged: %s", complaint, extra=about(*key, uid=state.uid))
         if pool.metadata.deletion_timestamp is None:
             state.surroundings = await self._keeper.ensure(pool, state.surroundings)
-        pods, rest = await self._pods(key, state, pool.spec.worker_container)
+        pods, rested = await self._pods(key, state, pool.spec.worker_container)
         plan = self._plan(key, pool, pods, state)
         failure = None
         if plan.inspect:
-            state.warnings |= await inspection.warnings(self._cluster, key, plan.inspect, pods)
+            # Not added to: what is not asked about any more may be over.
+            state.warnings = await inspection.warnings(self._cluster, key, plan.inspect, pods)
         if plan.dry_run:
             failure = await self._actor.dry_run(pool, plan, state)
         if plan.inspect or plan.dry_run:
             plan = self._plan(key, pool, pods, state)
-        turn = await self._act(Look(key, document, pool, state, plan), pods, rest)
+        turn = await self._act(Look(key, document, pool, state, plan, rested), pods)
         if failure is not None:
             raise failure
         return turn
@@ -145,12 +148,12 @@ class Controller:
         self, key: Key, document: Body, state: State, error: InvalidPool
     ) -> Turn:
         container = text(mapping(document, "spec").get("workerContainer"))
-        pods, rest = await self._pods(key, state, container or names.WORKER_CONTAINER)
+        pods, rested = await self._pods(key, state, container or names.WORKER_CONTAINER)
         plan = reconcile.plan_unreadable(document, pods, error.errors, self._now())
-        return await self._act(Look(key, document, None, state, plan), pods, rest)
+        return await self._act(Look(key, document, None, state, plan, rested), pods)
 
     async def _pods(self, key: Key, state: State, container: str) -> tuple[list[PodView], float]:
-        """The pool's pods, from a fresh list, and how long to rest for it."""
+        """The pool's pods, from a fresh list, and until when to rest from it."""
         clock = asyncio.get_running_loop().time
         started = clock()
         pods = await self._cluster.list(
@@ -159,12 +162,13 @@ class Controller:
             lambda pod: observe(pod, container),
             selector=f"{names.LABEL_POOL_UID}={state.uid}",
         )
-        rest = min(LIST_SHARE * (clock() - started), LONGEST_REST)
+        ended = clock()
+        rested = ended + min(LIST_SHARE * (ended - started), LONGEST_REST)
         there = {pod.name for pod in pods}
         state.deleted &= there
         state.warnings = {name: text for name, text in state.warnings.items() if name in there}
         state.pace.unsure = [name for name in state.pace.unsure if name not in there]
-        return pods, rest
+        return pods, rested
 
     def _plan(self, key: Key, pool: FiberPool, pods: Sequence[PodView], state: State) -> Plan:
         memory = Memory(
@@ -178,7 +182,7 @@ class Controller:
         )
         return reconcile.plan(pool, pods, memory, self._now())
 
-    async def _act(self, look: Look, pods: Sequence[PodView], rest: float) -> Turn:
+    async def _act(self, look: Look, pods: Sequence[PodView]) -> Turn:
         plan, surroundings = look.plan, look.state.surroundings
         status = mapping(look.document, "status") if plan.status is None else plan.status
         self._metrics.pools[look.key] = PoolSample.of(status, pods)
@@ -187,7 +191,9 @@ class Controller:
         if surroundings is not None and surroundings.obstacles:
             wishes.append(OBSTRUCTED)
         again = min((max(wish, 0.0) for wish in wishes if wish is not None), default=None)
-        return dataclasses.replace(turn, again=again, rest=max(turn.rest, rest))
+        rest = look.rested - asyncio.get_running_loop().time()
+        lull = bool(plan.create or plan.delete) or any(pod.state is not Life.READY for pod in pods)
+        return dataclasses.replace(turn, again=again, rest=max(turn.rest, rest), lull=lull)
 
     def _drop(self, key: Key) -> None:
         self._states.pop(key, None)

@@ -69,16 +69,18 @@ class Creator:
         count: int,
         limit: int,
         pace: Pace,
+        *,
+        enough: float = ENOUGH,
     ) -> Created:
         """Create up to ``count`` pods, ``body(name)`` each.
 
         A batch in which anything fails is the last, and the next time begins with one pod.  Fewer
-        than ``count`` without any failure means that it took ``ENOUGH``: come back soon.
+        than ``count`` without any failure means that it took ``enough`` seconds: come back soon.
         """
         done = Created()
         clock = asyncio.get_running_loop().time
         started = clock()
-        while count > 0 and (not done.names or clock() - started < ENOUGH):
+        while count > 0 and (not done.names or clock() - started < enough):
             size = min(pace.batch, limit, count)
             chosen = [pace.unsure.pop(0) if pace.unsure else self.name(pool) for _ in range(size)]
             results = await asyncio.gather(

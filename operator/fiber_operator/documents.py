@@ -33,6 +33,15 @@ def whole(value: object, default: int = 0) -> int:
     return value if isinstance(value, int) and not isinstance(value, bool) else default
 
 
+SKEW = 60.0
+"""Seconds that the clocks of a cluster may differ by."""
+
+
+def past(time: float | None, now: float) -> float | None:
+    """A time that the operator wrote; None if it has not come yet: then it is none of ours."""
+    return None if time is None or time > now + SKEW else time
+
+
 def seconds(value: object) -> float:
     """The unix time that a timestamp of the API tells; 0.0 where it tells none."""
     try:

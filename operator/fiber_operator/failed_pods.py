@@ -49,8 +49,7 @@ def _last_failure(situation: Situation) -> Problem:
         # The pods are gone; what the status said of them is all that is left.
         kinds = (Reason.STARTUP_TIMEOUT,) if was_late else _FAILURES
         before = next(filter(None, map(situation.previous, kinds)), None)
-        message = f"A worker failed ({record.last_reason}); its pod is gone."
-        return before or situation.problem(kinds[0], message)
+        return before or situation.problem(kinds[0], wording.forgotten_failure(pool, record))
     reason = failure_reason(newest)
     before = situation.previous(reason)
     message = wording.failure(pool, record, reason, newest)

@@ -17,7 +17,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 from fiber_api.names import Reason
+from fiber_api.status import MAX_COUNT
 from fiber_api.v1alpha1 import FailurePolicy, Failures, FiberPoolStatus
+from fiber_operator.documents import past
 from fiber_operator.pods import BRIEF, PodView, State, Trouble
 
 RECOVERY = 60.0
@@ -25,9 +27,6 @@ RECOVERY = 60.0
 
 _JITTER = 0.1
 """How much longer than its due a wait may be, so that pools which fail together come apart."""
-
-_SKEW = 60.0
-"""Seconds that the clocks of a cluster may differ by."""
 
 
 def delay(policy: FailurePolicy, rounds: int, seed: str) -> float:
@@ -69,9 +68,9 @@ class Record:
             kept.disrupted,
             kept.last_exit_code,
             kept.last_reason,
-            _past(kept.last_time, now),
+            past(kept.last_time, now),
             kept.next_create_time,
-            _past(kept.newest_created, now),
+            past(kept.newest_created, now),
             frozenset(kept.counted),
             kept.spec_hash,
             status.proven_template_hash,
@@ -92,14 +91,19 @@ class Record:
             spec_hash=self.spec_hash,
         )
 
-    def waits_until(self, policy: FailurePolicy, now: float) -> float | None:
-        """When the next pod may be created; None for at once.
+    def next_creation(self, policy: FailurePolicy, now: float) -> float | None:
+        """``next_create_time`` if it can be ours.
 
-        A time further away than the policy allows is none of ours.
+        One that is further away than the policy allows is not, nor is one past the limit.
         """
         longest = policy.backoff_max_seconds * (1 + _JITTER) + 1
-        due = self.next_create_time or 0.0
-        return due if now < due <= now + longest else None
+        due = self.next_create_time
+        return None if due is None or due > now + longest or self.exhausted(policy) else due
+
+    def waits_until(self, policy: FailurePolicy, now: float) -> float | None:
+        """When the next pod may be created; None for at once."""
+        due = self.next_creation(policy, now)
+        return due if due is not None and due > now else None
 
     def exhausted(self, policy: FailurePolicy) -> bool:
         """Whether nothing more is created until the user changes something."""
@@ -142,6 +146,7 @@ def account(
     time, which counts as a failure; ``desired`` is how many are wanted.
     """
     record = _begin(record, pods, spec_hash)
+    record = replace(record, next_create_time=record.next_creation(policy, now))
     uncounted = [p for p in pods if p.name not in record.counted and p.name not in expected]
     failed = sorted(
         (p for p in uncounted if _failed(p) or p.name in late), key=lambda p: (p.since, p.name)
@@ -149,8 +154,8 @@ def account(
     disrupted = [p for p in uncounted if p.name not in late and _disrupted(p)]
     record = replace(
         record,
-        total=record.total + len(failed),
-        disrupted=record.disrupted + len(disrupted),
+        total=min(record.total + len(failed), MAX_COUNT),
+        disrupted=min(record.disrupted + len(disrupted), MAX_COUNT),
         counted=record.counted.union(p.name for p in (*failed, *disrupted)),
     )
     if failed:
@@ -160,10 +165,6 @@ def account(
         record, again = replace(record, consecutive=0, next_create_time=None), None
     record = _prove(record, pods, failed, template_hash, now)
     return Account(record, tuple(failed), tuple(disrupted), again)
-
-
-def _past(time: float | None, now: float) -> float | None:
-    return None if time is None or time > now + _SKEW else time
 
 
 def _begin(record: Record, pods: Sequence[PodView], spec_hash: str) -> Record:
@@ -201,7 +202,7 @@ def _fail(
     )
     if record.consecutive and all(pod.created <= (record.newest_created or 0.0) for pod in failed):
         return record
-    rounds = record.consecutive + 1
+    rounds = min(record.consecutive + 1, MAX_COUNT)
     record = replace(record, consecutive=rounds, newest_created=max(pod.created for pod in pods))
     # In whole seconds, so that what is created then is newer than what is there now.
     due = math.ceil(now + delay(policy, rounds, seed))

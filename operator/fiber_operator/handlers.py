@@ -26,10 +26,13 @@ import kopf
 from fiber_api import names
 from fiber_operator.cluster import Configuration, open_session
 from fiber_operator.documents import mapping, text, whole
+from fiber_operator.watches import Answered, tracing
 from fiber_operator.worker import Key
 
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 30.0
+TOGETHER = 0.02
+"""Seconds for which what happens is gathered."""
 END_WAIT = 4.0
 """Seconds for kopf to end; its thread does not keep the process from ending."""
 
@@ -68,7 +71,10 @@ class _NoDiffs(kopf.DiffBaseStorage):
 
 
 def registry(
-    notice: Notice, configure: Configure, sessions: list[aiohttp.ClientSession]
+    notice: Notice,
+    configure: Configure,
+    answered: Answered,
+    sessions: list[aiohttp.ClientSession],
 ) -> kopf.OperatorRegistry:
     """The handlers: each says which pool it is about and returns nothing."""
     handlers = kopf.OperatorRegistry()
@@ -76,7 +82,7 @@ def registry(
     @kopf.on.login(registry=handlers)
     async def login(**_: Any) -> kopf.AiohttpSession:
         configuration = await configure()
-        sessions.append(await open_session(configuration))
+        sessions.append(await open_session(configuration, tracing(answered)))
         return kopf.AiohttpSession(server=str(configuration.host), aiohttp_session=sessions[-1])
 
     @kopf.on.event(names.GROUP, names.VERSION, names.PLURAL, registry=handlers)
@@ -127,12 +133,14 @@ async def watch(
     namespaces: Collection[str],
     gate: Callable[[], Awaitable[None]],
     on_start: Callable[[bool], None] = lambda running: None,
+    answered: Answered = lambda what, error: None,
     stop: asyncio.Event,
 ) -> None:
     """Watch until ``stop``, in a loop that is kopf's.
 
     ``gate`` returns when the API server serves pools: kopf would not notice them later.
-    ``on_start`` is told that watching begins (True) or ends (False).
+    ``on_start`` is told that watching begins (True) or ends (False), ``answered`` of each list
+    and watch.
     """
     pause = FIRST_PAUSE
     loop = asyncio.get_running_loop()
@@ -143,7 +151,8 @@ async def watch(
         started, sessions = loop.time(), list[aiohttp.ClientSession]()
         on_start(True)
         try:
-            await _run_kopf(registry(notice, configure, sessions), namespaces, stop)
+            handlers = registry(notice, configure, answered, sessions)
+            await _run_kopf(handlers, namespaces, stop)
         finally:
             on_start(False)
             # kopf leaves its own open where it ends with an error.
@@ -223,6 +232,7 @@ class Watcher:
         namespaces: Collection[str],
         gate: Callable[[], Coroutine[Any, Any, None]],
         on_start: Callable[[bool], None],
+        answered: Answered = lambda what, error: None,
     ) -> None:
         self._home = asyncio.get_running_loop()
         self._notice = notice
@@ -230,6 +240,7 @@ class Watcher:
         self._namespaces = namespaces
         self._gate = gate
         self._on_start = on_start
+        self._answered = answered
         self._untold: collections.deque[tuple[Any, ...]] = collections.deque()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop = asyncio.Event()
@@ -273,14 +284,15 @@ class Watcher:
             namespaces=self._namespaces,
             gate=self._pass_gate,
             on_start=functools.partial(self._call, self._on_start),
+            answered=functools.partial(self._call, self._answered),
             stop=self._stop,
         )
 
     def _tell(self, *notice: Any) -> None:
         self._untold.append(notice)
-        # Waking the other loop costs more than what is told: once for all that it has not seen.
-        if len(self._untold) == 1:
-            self._call(self._pass_on)
+        # Waking the other loop costs more than what is told: once for all that comes together.
+        if len(self._untold) == 1 and self._loop is not None:
+            self._loop.call_later(TOGETHER, self._call, self._pass_on)
 
     def _pass_on(self) -> None:
         while self._untold:

@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from fiber_operator.claims import Claims
 from fiber_operator.lease import Guard
 from fiber_operator.resync import Resync
+from fiber_operator.watches import Watches
 from fiber_operator.worker import Queue
 
 LATE_TURN = 30.0
@@ -27,10 +29,11 @@ class Health:
     """Both checks.  Each returns what is wrong, a sentence each."""
 
     guard: Guard
+    claims: Claims
     queue: Queue
     resync: Resync
+    watches: Watches
     clock: Callable[[], float]
-    watching: bool = False
 
     def __post_init__(self) -> None:
         self._began = self.clock()
@@ -57,12 +60,12 @@ class Health:
         wrong = list(self.resync.failures.values())
         if not self.guard.held:
             wrong.append(f"this operator does not act: {self.guard.why}")
+        wrong += self.claims.wrong()
         if self.resync.succeeded is None:
             wrong.append("the pools were not listed yet")
         elif now - self.resync.succeeded > MISSED_RESYNCS * self.resync.seconds:
             wrong.append(f"the pools were last listed {now - self.resync.succeeded:.0f} s ago")
-        if not self.watching:
-            wrong.append("nothing is watched: changes are seen late")
+        wrong += self.watches.wrong()
         if statistics.longest_wait > LATE_TURN:
             wrong.append(f"a pool waits for its turn for {statistics.longest_wait:.0f} s")
         return wrong

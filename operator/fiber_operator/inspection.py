@@ -3,32 +3,82 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from fiber_operator.cluster import EVENTS, ApiError, Body, Cluster
-from fiber_operator.documents import text
+from fiber_operator.documents import mapping, seconds, text
 from fiber_operator.pods import PodView
 from fiber_operator.worker import Key
+
+_NO_NEWS = frozenset(
+    {
+        # Said before it had a node.
+        "FailedScheduling",
+        "NotTriggerScaleUp",
+        "Scheduled",
+        "TriggeredScaleUp",
+        # Normal events that go along with a trouble and do not end it.
+        "BackOff",
+        "Killing",
+        "SandboxChanged",
+    }
+)
+"""Reasons of events that say nothing of what a pod with a node waits for."""
+
+
+class _Said(NamedTuple):
+    """One event; the greatest is the newest."""
+
+    second: int
+    """Kubernetes tells most times no better than that."""
+    written: int
+    warning: str
 
 
 async def warnings(
     cluster: Cluster, key: Key, pods: Sequence[str], there: Sequence[PodView]
 ) -> dict[str, str]:
-    """Pod name -> its newest Warning as ``Reason: message``; empty where there is none."""
+    """Pod name -> its newest event as ``Reason: message`` if that is a Warning, else empty.
+
+    A Warning that something newer follows is over: the volume is mounted at last, the image is
+    being pulled.
+    """
     uids = {pod.name: pod.uid for pod in there}
     found = {}
     for name in pods:
         try:
             events = await cluster.list(
-                EVENTS, key.namespace, _warning, fields=f"involvedObject.uid={uids.get(name)}"
+                EVENTS, key.namespace, _said, fields=f"involvedObject.uid={uids.get(name)}"
             )
         except ApiError:
             events = []  # it would only have been an explanation
-        found[name] = max((event for event in events if event), default=("", ""))[1]
+        newest = max((event for event in events if event is not None), default=None)
+        found[name] = newest.warning if newest else ""
     return found
 
 
-def _warning(event: Body) -> tuple[str, str] | None:
-    if event.get("type") != "Warning":
+def _said(event: Body) -> _Said | None:
+    reason = text(event.get("reason"))
+    if reason in _NO_NEWS:
         return None
-    when = text(event.get("lastTimestamp")) or text(event.get("eventTime"))
-    return when, f"{text(event.get('reason'))}: {text(event.get('message'))}"
+    warning = f"{reason}: {text(event.get('message'))}" if event.get("type") == "Warning" else ""
+    return _Said(int(_last_time(event)), _version(event), warning)
+
+
+def _version(event: Body) -> int:
+    """Which of two events of one second was written later."""
+    try:
+        return int(text(mapping(event, "metadata").get("resourceVersion")))
+    except ValueError:
+        return 0
+
+
+def _last_time(event: Body) -> float:
+    """When it happened last: a repeated event is the same object with another time."""
+    stamps = (
+        mapping(event, "series").get("lastObservedTime"),
+        event.get("lastTimestamp"),
+        event.get("eventTime"),
+        mapping(event, "metadata").get("creationTimestamp"),
+    )
+    return next(filter(None, map(seconds, stamps)), 0.0)

@@ -15,13 +15,14 @@ from typing import Any
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, Master
 from fiber_operator.documents import items, mapping, text
-from fiber_operator.podspec import owner_reference, pod
+from fiber_operator.podspec import owner_reference, pod, pod_maker
 from fiber_operator.revisions import template_hash
 
 __all__ = [
     "endpoint_slice",
     "is_ours",
     "pod",
+    "pod_maker",
     "secret",
     "selector",
     "service",

@@ -23,12 +23,15 @@ class Refusal:
     template_hash: str
     """``manifests.template_hash`` of the pool that it refused."""
     status: int
-    """403 (quota, policy, rights), else 422 or 400 (the pod is no valid pod)."""
+    """403 (quota, policy, rights), else 422 (the pod is no valid pod) or 400: in a dry run the
+    template cannot be read as a pod, else a webhook does not want the pod now."""
     message: str
     """The API server's own words."""
     at: float
     count: int = 1
     """How often in a row, this one included: the next attempt waits longer each time."""
+    dry_run: bool = False
+    """Whether it was the dry run that was refused, which judges the template and nothing else."""
 
 
 @dataclass(frozen=True)

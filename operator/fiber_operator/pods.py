@@ -143,6 +143,7 @@ class _Observation:
         self._state = mapping(statuses.get(container), "state")
         self._others = [s for name, s in statuses.items() if name != container]
         self._init = list(items(self._status.get("initContainerStatuses")))
+        self._end = _end(self._state)
         self._scheduled = bool(text(mapping(pod, "spec").get("nodeName")))
         self._phase = text(self._status.get("phase"))
         self._created = seconds(self._meta.get("creationTimestamp"))
@@ -151,8 +152,6 @@ class _Observation:
         """All of it."""
         state = self._life()
         trouble, reason, message = self._trouble(state)
-        end = self._ending()
-        exit_code = end.get("exitCode")
         return PodView(
             name=text(self._meta.get("name")),
             uid=text(self._meta.get("uid")),
@@ -166,7 +165,7 @@ class _Observation:
             trouble=trouble,
             reason=reason,
             message=_shorten(message),
-            exit_code=whole(exit_code) if isinstance(exit_code, int) else None,
+            exit_code=_exit_code(self._ending()),
             ran=self._ran(),
             scheduled=self._scheduled,
             lingers=state is State.ENDED and self._others_go_on(),
@@ -178,7 +177,7 @@ class _Observation:
     def _life(self) -> State:
         if self._meta.get("deletionTimestamp"):
             return State.TERMINATING
-        if self._phase in ("Failed", "Succeeded") or mapping(self._state, "terminated"):
+        if self._phase in ("Failed", "Succeeded") or self._end:
             return State.ENDED
         if self._ready():
             return State.READY
@@ -194,7 +193,10 @@ class _Observation:
         # change to "not Ready" means that the pod was Ready between.
         if self._ready():
             return True
-        started = seconds(mapping(self._state, "running").get("startedAt"))
+        running = self._state.get("running")
+        if isinstance(running, Mapping) and self._condition("Ready").get("status") != "False":
+            return True  # nobody can tell: it must not be taken for one that never worked
+        started = seconds(mapping(running).get("startedAt"))
         return 0 < started < seconds(self._condition("Ready").get("lastTransitionTime"))
 
     def _since(self, state: State) -> float:
@@ -212,20 +214,18 @@ class _Observation:
 
     def _ending(self) -> Mapping[str, Any]:
         """How the worker ended or, if it never ran, the init container that was to blame."""
-        own = mapping(self._state, "terminated")
-        if own:
-            return own
-        ends = (mapping(status, "state", "terminated") for status in self._init)
-        return next((end for end in ends if whole(end.get("exitCode"))), {})
+        if self._end:
+            return self._end
+        ends = (_end(status.get("state")) for status in self._init)
+        return next((end for end in ends if _exit_code(end)), {})
 
     def _ran(self) -> float:
-        end = mapping(self._state, "terminated")
-        start, finish = seconds(end.get("startedAt")), seconds(end.get("finishedAt"))
+        start, finish = seconds(self._end.get("startedAt")), seconds(self._end.get("finishedAt"))
         return max(0.0, finish - start) if start else 0.0
 
     def _others_go_on(self) -> bool:
         # For up to a second after the last container's end the kubelet leaves the phase as it was.
-        over = all(mapping(status, "state", "terminated") for status in self._others)
+        over = all(_end(status.get("state")) for status in self._others)
         return not over and self._phase not in ("Failed", "Succeeded")
 
     # What is wrong with it
@@ -322,6 +322,18 @@ class _Observation:
             return int(cost or "0")
         except ValueError:
             return 0  # Kubernetes ignores it too
+
+
+def _end(state: object) -> Mapping[str, Any]:
+    """How a container ended; empty if it has not, or if nothing says with which exit code."""
+    end = mapping(state, "terminated")
+    return end if _exit_code(end) is not None else {}
+
+
+def _exit_code(end: Mapping[str, Any]) -> int | None:
+    code = end.get("exitCode")
+    known = isinstance(code, int) and not isinstance(code, bool) and abs(code) < 2**31
+    return code if known else None
 
 
 def _shorten(message: str) -> str:

@@ -9,7 +9,7 @@ Never``.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from fiber_api import names
@@ -25,6 +25,28 @@ _NODE_LOST = ("node.kubernetes.io/not-ready", "node.kubernetes.io/unreachable")
 _EVICTION = "NoExecute"
 
 _LOST_GRACE: int = Master.model_fields["lost_grace_seconds"].default
+
+_POD = frozenset({"apiVersion", "kind", "metadata", "spec", "status"})
+_POD_METADATA = frozenset(
+    {
+        "annotations",
+        "creationTimestamp",
+        "deletionGracePeriodSeconds",
+        "deletionTimestamp",
+        "finalizers",
+        "generateName",
+        "generation",
+        "labels",
+        "managedFields",
+        "name",
+        "namespace",
+        "ownerReferences",
+        "resourceVersion",
+        "selfLink",
+        "uid",
+    }
+)
+"""Fields that a pod has.  Any other is passed on too: the API server says that it is misspelt."""
 
 _TMP = "/tmp"
 _TMP_VOLUME = "fiber-tmp"
@@ -46,6 +68,16 @@ def owner_reference(pool: FiberPool) -> dict[str, Any]:
 
 def pod(pool: FiberPool, name: str, address: str) -> dict[str, Any]:
     """One worker pod.  ``address`` is ``host:port`` of the pool's Service."""
+    return pod_maker(pool, address)(name)
+
+
+def pod_maker(pool: FiberPool, address: str) -> Callable[[str], dict[str, Any]]:
+    """Makes worker pods by name: what is costly is done once for all of them."""
+    revision = template_hash(pool)
+    return lambda name: _pod(pool, name, address, revision)
+
+
+def _pod(pool: FiberPool, name: str, address: str, revision: str) -> dict[str, Any]:
     template = copy.deepcopy(pool.spec.template)
     spec = dict(mapping(template, "spec"))
     spec["restartPolicy"] = "Never"
@@ -58,31 +90,39 @@ def pod(pool: FiberPool, name: str, address: str) -> dict[str, Any]:
         if container.get("name") == pool.spec.worker_container:
             _equip(pool, spec, container, name, address)
     return {
+        **_others(template, _POD),
         "apiVersion": "v1",
         "kind": "Pod",
-        "metadata": _metadata(pool, mapping(template, "metadata"), name),
+        "metadata": _metadata(pool, mapping(template, "metadata"), name, revision),
         "spec": spec,
     }
 
 
-def _metadata(pool: FiberPool, template: Mapping[str, Any], name: str) -> dict[str, Any]:
+def _metadata(
+    pool: FiberPool, template: Mapping[str, Any], name: str, revision: str
+) -> dict[str, Any]:
     master = pool.spec.master
     metadata = {
+        **_others(template, _POD_METADATA),
         "name": name,
         "namespace": pool.metadata.namespace,
         "labels": {
             **mapping(template, "labels"),
             names.LABEL_POOL: pool.metadata.name,
             names.LABEL_POOL_UID: pool.metadata.uid,
-            names.LABEL_TEMPLATE_HASH: template_hash(pool),
+            names.LABEL_TEMPLATE_HASH: revision,
             names.LABEL_EPOCH: str(master.epoch if master else 0),
             names.LABEL_MANAGED_BY: names.OPERATOR_MANAGER,
         },
         "ownerReferences": [owner_reference(pool)],
     }
-    if annotations := mapping(template, "annotations"):
-        metadata["annotations"] = dict(annotations)
+    if annotations := template.get("annotations"):
+        metadata["annotations"] = annotations
     return metadata
+
+
+def _others(document: Mapping[str, Any], known: frozenset[str]) -> dict[str, Any]:
+    return {key: value for key, value in document.items() if key not in known}
 
 
 def _tolerations(own: object) -> object:
@@ -130,7 +170,7 @@ def _secure_container(container: dict[str, Any], *, root_is_welcome: bool) -> No
     non_root = context.get("runAsNonRoot")
     root = root_is_welcome if non_root is None else not non_root
     added = mapping(context, "capabilities").get("add")
-    if not (isinstance(added, list) and {"SYS_ADMIN", "CAP_SYS_ADMIN"}.intersection(added)):
+    if not (isinstance(added, list) and any(c in ("SYS_ADMIN", "CAP_SYS_ADMIN") for c in added)):
         _default(context, "allowPrivilegeEscalation", False)  # invalid beside that capability
     if not root:
         _default(context, "capabilities", {"drop": ["ALL"]})

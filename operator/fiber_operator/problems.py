@@ -11,6 +11,7 @@ from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Problem
 from fiber_operator import wording
 from fiber_operator.failed_pods import failed_pods
+from fiber_operator.plans import Refusal
 from fiber_operator.situation import Situation
 from fiber_operator.starting_pods import pods_not_ready_any_more, pods_that_do_not_start
 
@@ -51,20 +52,28 @@ def _refusals(situation: Situation) -> Iterator[Problem]:
         return
     if _NAMESPACE_ENDS in refused.message:
         return  # its pods went before the pool, which goes next
-    reason = refusal_reason(refused.status, refused.message)
+    reason = refusal_reason(refused)
     if situation.wants_more or reason == Reason.INVALID_TEMPLATE:
         yield situation.problem(
             reason,
             wording.refusal(reason, refused),
-            terminal=reason != Reason.QUOTA_EXCEEDED,
+            terminal=reason != Reason.QUOTA_EXCEEDED and not _may_pass(refused),
         )
 
 
-def refusal_reason(status: int, message: str) -> Reason:
+def refusal_reason(refused: Refusal) -> Reason:
     """Which problem a refusal is."""
-    if status != 403:
+    if refused.status != 403 and not _may_pass(refused):
         return Reason.INVALID_TEMPLATE
-    return Reason.QUOTA_EXCEEDED if "exceeded quota" in message else Reason.FORBIDDEN
+    return Reason.QUOTA_EXCEEDED if "exceeded quota" in refused.message else Reason.FORBIDDEN
+
+
+def _may_pass(refused: Refusal) -> bool:
+    """Whether it is not the template that is to blame, which was good in the dry run.
+
+    400 is how admission webhooks refuse what they find wrong at the moment.
+    """
+    return refused.status not in (403, 422) and not refused.dry_run
 
 
 def _masters(situation: Situation) -> Iterator[Problem]:

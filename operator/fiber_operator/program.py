@@ -5,7 +5,8 @@
     handlers ──► queue ──► controller ──► cluster
     resync  ────►  ▲          │  ▲            ▲
     masters ───────┘          ▼  │            │ permit
-                          reconcile.plan    guard (Lease)
+                          reconcile.plan    guard (Lease of the release: this process acts)
+                                            claims (Lease of a namespace: this release serves it)
 """
 
 from __future__ import annotations
@@ -17,7 +18,16 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from fiber_operator.cluster import Cluster, load_configuration
+from fiber_operator.claims import Claims
+from fiber_operator.cluster import (
+    POOLS,
+    WRITE_TIMEOUT,
+    ApiError,
+    Cluster,
+    Gone,
+    Permit,
+    load_configuration,
+)
 from fiber_operator.controller import Controller
 from fiber_operator.creation import Creator, Draw, draw_suffix
 from fiber_operator.events import Recorder
@@ -29,10 +39,13 @@ from fiber_operator.metrics import Metrics
 from fiber_operator.resync import Resync
 from fiber_operator.server import serving
 from fiber_operator.settings import Settings
+from fiber_operator.watches import Watches
 from fiber_operator.worker import Key, Queue, Turn
 
 DRAIN = 5.0
 """Seconds that a call under way may take to end when the operator is to stop."""
+HAND_OVER = 10.0
+"""Seconds that giving up the namespaces may take then."""
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +70,7 @@ class Program:
     ) -> None:
         self._settings = settings
         self._configure = configure
-        self._watches = watches
+        self._watcher = watches
         self._now = now
         self._draw = draw
         self._watched_before = False
@@ -71,8 +84,9 @@ class Program:
         async with contextlib.AsyncExitStack() as stack:
             self._build(
                 await self._open(stack, settings.connections, permit=self._require),
-                # Its own, so that no queue of other calls keeps the Lease from being renewed.
+                # Their own, so that no queue of other calls keeps a Lease from being renewed.
                 await self._open(stack, 2),
+                await self._open(stack, 4),
             )
             self.port = await stack.enter_async_context(
                 serving(
@@ -92,7 +106,7 @@ class Program:
         self,
         stack: contextlib.AsyncExitStack,
         connections: int,
-        permit: Callable[[], None] = lambda: None,
+        permit: Permit = lambda namespace: WRITE_TIMEOUT,
     ) -> Cluster:
         cluster = Cluster(
             await self._configure(),
@@ -103,8 +117,9 @@ class Program:
         stack.push_async_callback(cluster.close)
         return cluster
 
-    def _build(self, cluster: Cluster, lease_cluster: Cluster) -> None:
+    def _build(self, cluster: Cluster, lease_cluster: Cluster, claim_cluster: Cluster) -> None:
         settings, clock = self._settings, asyncio.get_running_loop().time
+        self._cluster = cluster
         self.guard = Guard(
             lease_cluster,
             namespace=settings.namespace,
@@ -115,6 +130,14 @@ class Program:
             wall_clock=self._now,
         )
         self.queue = Queue(self._look, concurrency=settings.concurrency)
+        self.claims = Claims(
+            claim_cluster,
+            release=f"{settings.namespace}/{settings.lease}",
+            namespaces=settings.namespaces,
+            used=lambda: {key.namespace for key in self.queue.known()},
+            on_change=self._claim_changed,
+            wall_clock=self._now,
+        )
         self.masters = Masters(cluster, lambda key: self.queue.add(key, urgent=True))
         self.controller = Controller(
             cluster,
@@ -131,24 +154,36 @@ class Program:
             seconds=settings.resync_seconds,
             on_success=lambda: self.metrics.resynced(self._now()),
         )
-        self.health = Health(self.guard, self.queue, self.resync, clock)
+        self.watches = Watches(settings.namespaces)
+        self.health = Health(self.guard, self.claims, self.queue, self.resync, self.watches, clock)
         self.metrics.watch_queue(self.queue.statistics, lambda: self.guard.held)
 
     async def _operate(self, stop: asyncio.Event) -> None:
-        watches = self._watches(
+        watcher = self._watcher(
             self.notice,
             configure=self._configure,
             namespaces=self._settings.namespaces,
             gate=self.resync.answered,
             on_start=self._watching,
+            answered=self.watches.answered,
         )
-        parts: list[Part] = [self.guard, self.masters, self.queue, self.resync, watches]
+        parts: list[Part] = [
+            self.guard,
+            self.claims,
+            self.masters,
+            self.queue,
+            self.resync,
+            watcher,
+        ]
         tasks = [asyncio.ensure_future(part.run()) for part in parts]
         stopped = asyncio.ensure_future(stop.wait())
         try:
             await asyncio.wait([*tasks, stopped], return_when=asyncio.FIRST_COMPLETED)
+            acting = self.guard.held
             self.guard.resign()
             await self.queue.drain(DRAIN)
+            if acting:
+                await self._release_claims()
             # Before the watches are waited for: another operator may begin.
             tasks[0].cancel()
             await asyncio.wait([tasks[0]])
@@ -172,21 +207,52 @@ class Program:
             self.queue.add(key, urgent=True)
 
     async def _look(self, key: Key) -> Turn:
-        return await self.controller.look(key) if self.guard.held else Turn()
+        if not self.guard.held:
+            return Turn()
+        if self.claims.holds(key.namespace):
+            return await self.controller.look(key)
+        return Turn(forget=self.claims.refused(key.namespace) and await self._is_gone(key))
 
-    def _require(self) -> None:
-        self.guard.require()
+    async def _is_gone(self, key: Key) -> bool:
+        try:
+            await self._cluster.read(POOLS, *key)
+        except Gone:
+            return True
+        except ApiError:
+            pass  # the next turn finds it out
+        return False
+
+    def _require(self, namespace: str) -> float:
+        return min(self.guard.require(), self.claims.require(namespace))
+
+    async def _release_claims(self) -> None:
+        try:
+            async with asyncio.timeout(HAND_OVER):
+                await self.claims.release()
+        except TimeoutError:
+            log.warning("not every namespace was given up in time: other releases wait longer")
 
     def _watching(self, running: bool) -> None:
         if running and self._watched_before:
             self.metrics.watch_restarted()
         self._watched_before = True
-        self.health.watching = running
+        self.watches.started(running)
 
     def _lease_changed(self, held: bool) -> None:
         self.controller.forget()
-        if held:
+        if not held:
+            self.claims.end()
+        else:
+            self.claims.begin()
             # What happened while another operator acted was not looked at.
             self.resync.poke()
             for key in self.queue.known():
                 self.queue.add(key)
+
+    def _claim_changed(self, namespace: str, held: bool) -> None:
+        if not held:
+            # Another operator may act there meanwhile.
+            self.controller.forget()
+        for key in self.queue.known():
+            if key.namespace == namespace:
+                self.queue.add(key, urgent=held)

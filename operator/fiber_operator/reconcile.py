@@ -28,6 +28,7 @@ it, unless ``onLost`` is ``Retain``.  Then ``Delete`` deletes the FiberPool, ``S
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from fiber_api.names import Reason
@@ -83,12 +84,14 @@ class _Planner:
         self, pool: FiberPool, pods: Sequence[PodView], memory: Memory, now: float
     ) -> None:
         self._pool, self._spec = pool, pool.spec
-        self._pods, self._memory, self._now = pods, memory, now
+        self._memory, self._now = memory, now
         self._hash = revisions.template_hash(pool)
+        # Whoever has taken that label away has said nothing against the pod.
+        self._pods = [p if p.template_hash else replace(p, template_hash=self._hash) for p in pods]
         self._attachment = judge(pool, memory.master, now)
         self._ends = pool.metadata.deletion_timestamp is not None
-        self._live = [pod for pod in pods if pod.live]
-        self._ended = [pod for pod in pods if pod.state is State.ENDED]
+        self._live = [pod for pod in self._pods if pod.live]
+        self._ended = [pod for pod in self._pods if pod.state is State.ENDED]
         self._late = self._not_ready_in_time()
         self._desired = self._wanted()
         self._account = self._count()
@@ -178,7 +181,7 @@ class _Planner:
         if refused is None or refused.template_hash != self._hash:
             return None
         wait = failures.delay(self._spec.failure_policy, refused.count, self._pool.metadata.uid)
-        if problems.refusal_reason(refused.status, refused.message) == Reason.QUOTA_EXCEEDED:
+        if problems.refusal_reason(refused) == Reason.QUOTA_EXCEEDED:
             wait = min(wait, QUOTA_WAIT)
         return refused.at + wait
 

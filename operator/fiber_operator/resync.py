@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 
+from fiber_operator.answers import complaint
 from fiber_operator.cluster import POOLS, ApiError, Body, Cluster
 from fiber_operator.documents import mapping, text
 from fiber_operator.logs import about
@@ -78,9 +79,10 @@ class Resync:
         try:
             found = await self._cluster.list(POOLS, namespace, _key)
         except ApiError as error:
-            if self.failures.get(where) != str(error):
-                log.warning("%s", error, extra=about(where, reason=error.reason))
-            self.failures[where] = str(error)
+            failure = complaint(error)
+            if self.failures.get(where) != failure:
+                log.warning("%s", failure, extra=about(where, reason=error.reason))
+            self.failures[where] = failure
             return
         self.failures.pop(where, None)
         self._answered.set()

@@ -7,8 +7,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from fiber_api.status import MAX_COUNT
 from fiber_api.v1alpha1 import FiberPool, Problem
 from fiber_operator.attachment import Attachment
+from fiber_operator.documents import past
 from fiber_operator.failures import Account
 from fiber_operator.plans import Memory
 from fiber_operator.pods import PodView
@@ -36,8 +38,10 @@ class Situation:
 
     def previous(self, reason: str) -> Problem | None:
         """The problem of that kind that the status shows."""
-        problems = self.pool.status.problems
-        return next((problem for problem in problems if problem.reason == reason), None)
+        found = next((p for p in self.pool.status.problems if p.reason == reason), None)
+        if found is None or past(found.since, self.now) is not None:
+            return found
+        return found.model_copy(update={"since": float(math.floor(self.now))})
 
     def severity(self, reason: str, *, again: bool = False) -> Severity:
         """Of what may pass by itself: a warning at first, an error if it is seen ``again``."""
@@ -69,7 +73,7 @@ class Situation:
             reason=reason,
             severity=severity,
             terminal=terminal,
-            count=count,
+            count=min(count, MAX_COUNT),
             since=since or float(math.floor(self.now)),
             pod=pod,
             message=message,

@@ -86,7 +86,7 @@ def _on_their_way(situation: Situation, pods: Sequence[PodView]) -> Iterator[Pro
     for pod in pods:
         warning = situation.memory.warnings.get(pod.name, "")
         reason = warning.partition(":")[0]
-        if reason and reason != "FailedScheduling":  # that one is over: the pod has a node
+        if reason:
             severity = situation.severity(reason)
             message = wording.stuck(pod, warning)
             yield situation.problem(reason, message, severity=severity, pod=pod.name)

@@ -11,7 +11,7 @@ from fiber_api.names import ConditionType, Phase, Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
 from fiber_operator import manifests
 from fiber_operator.conditions import Counts, Finding, Outlook, Truth, conditions, dated, phase
-from fiber_operator.documents import mapping, whole
+from fiber_operator.documents import mapping, past, whole
 from fiber_operator.failures import Record
 from fiber_operator.pods import PodView
 
@@ -87,7 +87,7 @@ def describe_unreadable(
         reason=Reason.INVALID_SPEC,
         severity="Error",
         terminal=True,
-        since=(known.since if known else None) or float(math.floor(now)),
+        since=(past(known.since, now) if known else None) or float(math.floor(now)),
         message=message,
     )
     after = before.model_copy(

@@ -134,6 +134,16 @@ def failure(pool: FiberPool, record: Record, reason: Reason, pod: PodView) -> st
     return f"{_ending(pool, reason, pod)}{wait}{lines}"
 
 
+def forgotten_failure(pool: FiberPool, record: Record) -> str:
+    """A failure of which nothing is left but what the status says, if that."""
+    code = None if record.last_exit_code is None else f"exit code {record.last_exit_code}"
+    known = ", ".join(filter(None, (record.last_reason, code)))
+    return (
+        f"A worker failed{f' ({known})' if known else ''}, and its pod is gone. See the events of "
+        f"the pool with kubectl describe fiberpool {pool.metadata.name}."
+    )
+
+
 def _ending(pool: FiberPool, reason: Reason, pod: PodView) -> str:
     if reason == Reason.STARTUP_TIMEOUT:
         return late(pod, pool.spec.failure_policy.startup_timeout_seconds)
@@ -205,10 +215,23 @@ def refusal(reason: Reason, refused: Refusal) -> str:
     what, remedy = _REFUSALS[reason]
     # The pod that it names never was, and is called differently at each attempt.
     words = _OF_THE_POD.sub("", refused.message)
+    if reason == Reason.INVALID_TEMPLATE and _UNKNOWN in words:
+        words, remedy = words.replace(_UNKNOWN, f"{_UNKNOWN}spec.template."), _MISSPELT
     return f"{what}{quoted(words)}. {remedy}"
 
 
-_OF_THE_POD = re.compile(r'^pods? "[^"]*" is (forbidden|invalid): ', re.IGNORECASE)
+_OF_THE_POD = re.compile(
+    r'^(pods? "[^"]*" is (forbidden|invalid)|Pod in version "v1" cannot be handled as a Pod'
+    r"(: strict decoding error)?): ",
+    re.IGNORECASE,
+)
+
+_UNKNOWN = 'unknown field "'
+
+_MISSPELT = (
+    "A field that the API server does not know has no effect: correct its name or its place, or "
+    "leave it out; the running workers stay as they are."
+)
 
 
 _REFUSALS: Mapping[Reason, tuple[str, str]] = {

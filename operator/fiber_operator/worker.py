@@ -8,6 +8,10 @@ what is added meanwhile makes one more turn afterwards.  Three things space the 
   pool that is growing are a few turns;
 * a turn that failed is repeated after a while that doubles each time.
 
+While a pool changes it is also looked at when the events of its pods cease, though it has not
+rested: what they led to is in the status at once, and not after a rest that began in the middle of
+it.  The next rest is longer by what this one lacked, and is not shortened.
+
 Runs in one event loop and reads its clock; nothing here is called from another thread.
 """
 
@@ -26,6 +30,8 @@ from fiber_operator.logs import about
 GAP = 0.5
 """Seconds between turns that only pods' events asked for: they show in the status within a second,
 and a pool that grows by fifty pods a second costs two lists a second."""
+LULL = 0.15
+"""Seconds without an event after which the events of a pool have ceased."""
 FIRST_BACKOFF = 0.5
 LONGEST_BACKOFF = 30.0
 LONGEST_BLOCK = 1.0
@@ -49,6 +55,8 @@ class Turn:
     """Look again after this many seconds though nothing happens."""
     rest: float = 0.0
     """Do not look again for this many seconds whatever happens."""
+    lull: bool = False
+    """Look again, even before it has rested, when events of its pods have come and cease."""
     failed: bool = False
     """Look again soon, and later each time."""
     forget: bool = False
@@ -59,9 +67,16 @@ class Turn:
 class _Entry:
     due: float | None = None
     """When it wants its turn; None: it does not wait."""
-    finished: float = -1e9
     blocked: float = -1e9
-    """No turn before this time."""
+    """No turn before this time, unless events cease."""
+    rested: float = -1e9
+    """When events of pods bring a turn, at the latest."""
+    lull: bool = False
+    """Whether they bring one before that if they cease."""
+    limit: float | None = None
+    """While it waits for that: when its turn comes though they do not cease."""
+    owed: float = 0.0
+    """What its last rest was shortened by."""
     failures: int = 0
     running: float | None = None
     """Since when."""
@@ -107,11 +122,16 @@ class Queue:
         """
         now = self._now()
         entry = self._entries.setdefault(key, _Entry())
+        if not urgent and entry.lull and entry.running is None:
+            self._await_lull(key, entry, now + delay)
+            return
         due = max(now + delay, entry.blocked)
         if not urgent:
-            due = max(due, entry.finished + GAP)
+            due = max(due, entry.rested)
         elif entry.running is not None:
             entry.rush = True
+        if entry.limit is not None:
+            entry.limit = min(entry.limit, due)
         if entry.due is None or due < entry.due:
             self._place(key, entry, due)
 
@@ -160,6 +180,14 @@ class Queue:
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
 
+    def _await_lull(self, key: Key, entry: _Entry, now: float) -> None:
+        if entry.limit is None:
+            rested = max(now, entry.rested)
+            entry.limit = rested if entry.due is None else min(rested, entry.due)
+        due = min(entry.limit, now + LULL)
+        if due != entry.due:
+            self._place(key, entry, due)
+
     def _place(self, key: Key, entry: _Entry, due: float) -> None:
         entry.due, entry.order = due, next(self._orders)
         if entry.running is None:
@@ -184,7 +212,9 @@ class Queue:
                 return
             heapq.heappop(self._heap)
             entry = self._entries[key]
-            entry.due, entry.order, entry.running, entry.rush = None, -1, now, False
+            entry.owed = max(0.0, entry.rested - now) if entry.limit is not None else 0.0
+            entry.due, entry.limit, entry.order = None, None, -1
+            entry.running, entry.rush, entry.lull = now, False, False
             task = asyncio.create_task(self._take(key, entry), name=f"turn of {key}")
             self._tasks.add(task)
             task.add_done_callback(self._done)
@@ -210,12 +240,10 @@ class Queue:
             log.exception("a turn failed", extra=about(*key, reason="InternalError"))
             turn = Turn(failed=True)
         finally:
-            entry.running, entry.finished = None, self._now()
-            self._last_end = entry.finished
-        self._settle(key, entry, turn)
+            entry.running, self._last_end = None, self._now()
+        self._settle(key, entry, turn, self._last_end)
 
-    def _settle(self, key: Key, entry: _Entry, turn: Turn) -> None:
-        now = entry.finished
+    def _settle(self, key: Key, entry: _Entry, turn: Turn, now: float) -> None:
         wanted = entry.due is not None  # added while it ran
         if turn.forget and not wanted:
             del self._entries[key]
@@ -226,8 +254,13 @@ class Queue:
         if turn.failed:
             again = min(LONGEST_BACKOFF, FIRST_BACKOFF * 2 ** min(entry.failures - 1, 10))
             entry.blocked = max(entry.blocked, now + min(again, LONGEST_BLOCK))
+        entry.rested = max(now + GAP, entry.blocked) + entry.owed
+        entry.lull = turn.lull and not turn.failed and not entry.owed
         if entry.due is not None:
-            rested = entry.blocked if entry.rush else max(entry.blocked, now + GAP)
-            self._place(key, entry, max(entry.due, rested))
+            due, entry.due = entry.due, None
+            if entry.lull and not entry.rush:
+                self._await_lull(key, entry, max(due, now))
+            else:
+                self._place(key, entry, max(due, entry.blocked if entry.rush else entry.rested))
         if again is not None:
             self.add(key, delay=again, urgent=True)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fiber_api.times import format_time, parse_time
+from fiber_api.times import EARLIEST, LATEST, format_time, parse_time
 
 MOMENT = 1795272973.0
 
@@ -25,7 +25,12 @@ def test_what_kubernetes_writes_can_be_read(text: str, seconds: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "yesterday", "2026-11-21T14:56:13", "2026-11-21", "0", "\ud800"]
+    "text",
+    [
+        *("", "yesterday", "2026-11-21T14:56:13", "2026-11-21", "0", "\ud800"),
+        "9999-12-31T23:59:59-01:00",
+        "0001-01-01T00:00:00+01:00",
+    ],
 )
 def test_what_is_no_point_in_time_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is no time such as"):
@@ -44,7 +49,12 @@ def test_fractions_are_cut_off() -> None:
     assert format_time(-0.5) == "1969-12-31T23:59:59Z"
 
 
+def test_what_no_calendar_has_is_written_as_the_end_of_it() -> None:
+    assert format_time(1e308) == format_time(LATEST) == "9999-12-31T23:59:59Z"
+    assert format_time(-1e308) == format_time(EARLIEST) == "0001-01-01T00:00:00Z"
+
+
 @settings(deadline=None)
-@given(st.integers(min_value=0, max_value=253402300799))
+@given(st.integers(min_value=int(EARLIEST), max_value=int(LATEST)))
 def test_whole_seconds_come_back(seconds: int) -> None:
     assert parse_time(format_time(seconds)) == seconds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import pytest
@@ -106,6 +107,16 @@ def test_a_template_that_is_no_pod(pool: Pool, agent: Body) -> None:
     pool.apply(agent, minReplicas=1)
     pool.ready(1)
     assert pool.condition("Accepted")["status"] == "True"
+
+
+def test_a_misspelt_field_of_the_template_is_named(pool: Pool, agent: Body) -> None:
+    """The schema lets it pass, since what a pod may be depends on the cluster."""
+    misspelt = copy.deepcopy(agent)
+    misspelt["spec"]["containers"][0]["resorces"] = {"limits": {"memory": "1Gi"}}
+    pool.apply(misspelt, minReplicas=1)
+    problem = pool.has_problem("InvalidTemplate", severity="Error", terminal=True)
+    assert "spec.template.spec.containers[0].resorces" in problem["message"]
+    assert not pool.ever
 
 
 def test_a_template_that_becomes_none_leaves_workers_alone(pool: Pool, agent: Body) -> None:

@@ -16,7 +16,8 @@ from typing import Any
 
 from aiohttp import web
 
-from fakes.store import KINDS, Body, Change, Failure, Store, line, matches
+from fakes import strict
+from fakes.store import KINDS, Body, Change, Failure, Store, has_fields, line, matches
 
 BOOKMARK_SECONDS = 60.0
 
@@ -77,6 +78,8 @@ class KubernetesApi:
         """Who asked, as far as a client says."""
         self.faults: list[Fault] = []
         self.after: Callable[[Call], None] = lambda call: None
+        self.page = 0
+        """How many objects a list has at most though nobody asks for pages; 0: all."""
         self.watch_delay = 0.0
         """Seconds between a change and its event."""
         self.silent = False
@@ -154,6 +157,8 @@ class KubernetesApi:
         if call.verb == "get":
             return self.store.get(*where)
         if call.verb == "create":
+            if call.plural == "pods" and request.query.get("fieldValidation") == "Strict":
+                strict.check(body)
             return self.store.create(*where[:2], body, dry_run=call.dry_run)
         if call.verb == "update":
             return self.store.update(*where, body)
@@ -163,9 +168,15 @@ class KubernetesApi:
         return {"kind": "Status", "apiVersion": "v1", "status": "Success"}
 
     def _list(self, request: web.Request, call: Call) -> Body:
-        items = self.store.list(call.plural, call.namespace, request.query.get("labelSelector", ""))
+        items = [
+            item
+            for item in self.store.list(
+                call.plural, call.namespace, request.query.get("labelSelector", "")
+            )
+            if has_fields(item, request.query.get("fieldSelector", ""))
+        ]
         start = int(request.query.get("continue", "0"))
-        limit = int(request.query.get("limit", "0")) or len(items)
+        limit = int(request.query.get("limit", "0")) or self.page or len(items)
         rest = str(start + limit) if start + limit < len(items) else ""
         version, kind = KINDS[call.plural]
         return {

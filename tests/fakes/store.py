@@ -259,6 +259,18 @@ def matches(body: Body, selector: str) -> bool:
     return True
 
 
+def has_fields(body: Body, selector: str) -> bool:
+    """Whether the fields of ``body`` match: ``a.b=c``, joined by commas."""
+    for term in filter(None, selector.split(",")):
+        path, _, value = term.partition("=")
+        place: Any = body
+        for name in path.split("."):
+            place = place.get(name) if isinstance(place, dict) else None
+        if place != value:
+            return False
+    return True
+
+
 def line(type_: str, body: Body) -> bytes:
     """One line of a watch."""
     return json.dumps({"type": type_, "object": body}).encode() + b"\n"

@@ -46,11 +46,15 @@ class Feed:
         self._notice = notice
         self._gate = options["gate"]
         self._on_start = options["on_start"]
+        self._answered = options["answered"]
         self._namespaces = options["namespaces"]
 
     async def run(self) -> None:
         await self._gate()
         self._on_start(True)
+        for where in [f" in {namespace}" for namespace in self._namespaces] or [""]:
+            for plural in ("fiberpools", "pods"):
+                self._answered(f"watch {plural}{where}", None)
         seen = 0
         while True:
             changes = self._world.store.changes

@@ -14,7 +14,7 @@ from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
 from fiber_operator import events
-from fiber_operator.cluster import Cluster, Conflict, TooMany, Unavailable
+from fiber_operator.cluster import Cluster, Conflict, Permit, TooMany, Unavailable
 from fiber_operator.creation import ENOUGH, Created, Creator, Pace, draw_suffix
 from fiber_operator.events import Recorder
 from fiber_operator.lease import NotHolder
@@ -25,7 +25,7 @@ ES = Key("team", "es")
 
 
 @contextlib.asynccontextmanager
-async def a_cluster(permit: Callable[[], None]) -> AsyncIterator[tuple[KubernetesApi, Cluster]]:
+async def a_cluster(permit: Permit) -> AsyncIterator[tuple[KubernetesApi, Cluster]]:
     api = KubernetesApi(Store(asyncio.get_running_loop().time))
     async with api.serving():
         door = Cluster(configuration(api), connections=16, permit=permit)
@@ -38,7 +38,7 @@ async def a_cluster(permit: Callable[[], None]) -> AsyncIterator[tuple[Kubernete
 Test = Callable[[KubernetesApi, Cluster], Coroutine[Any, Any, None]]
 
 
-def played(test: Test, permit: Callable[[], None] = lambda: None) -> Callable[[], None]:
+def played(test: Test, permit: Permit = lambda namespace: 10.0) -> Callable[[], None]:
     async def main() -> None:
         async with a_cluster(permit) as (api, door):
             await test(api, door)
@@ -142,8 +142,15 @@ async def test_a_long_creation_stops_in_between_and_goes_on(
     assert len((await create(door, 93, pace)).names) == 8 + 16 + 32
 
 
+@played
+async def test_a_creation_that_has_time_takes_it(api: KubernetesApi, door: Cluster) -> None:
+    api.faults.append(Fault("create", "pods", late=0.4, times=10**6))
+    done = await Creator(door).create("es", "team", body, 100, 16, Pace(), enough=3.0)
+    assert len(done.names) == 1 + 2 + 4 + 8 + 16 + 16 + 16 + 16
+
+
 def test_without_the_lease_nothing_is_created() -> None:
-    def refuse() -> None:
+    def refuse(namespace: str) -> float:
         raise NotHolder
 
     async def test(api: KubernetesApi, door: Cluster) -> None:

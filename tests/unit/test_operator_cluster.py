@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
+import aiohttp
 import pytest
 from kubernetes.aio.client.configuration import Configuration
 from kubernetes.aio.config import incluster_config
@@ -66,10 +67,9 @@ def test_objects_are_made_read_changed_and_deleted() -> None:
     with_api(test)
 
 
-def test_a_list_has_every_page_and_only_what_is_selected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "PAGE", 3)
-
+def test_a_list_has_every_page_and_only_what_is_selected() -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
+        api.page = 3  # nobody asks for pages; a server may answer in some
         for number in range(8):
             api.store.create("pods", "here", pod(f"p{number}", of="us"))
         api.store.create("pods", "here", pod("other", of="them"))
@@ -227,7 +227,7 @@ def test_no_server_is_unavailable() -> None:
 
 
 def test_nothing_is_changed_without_permission() -> None:
-    def forbid() -> None:
+    def forbid(namespace: str) -> float:
         raise PermissionError
 
     async def test(api: KubernetesApi, door: Cluster) -> None:
@@ -245,6 +245,29 @@ def test_nothing_is_changed_without_permission() -> None:
         assert {call.verb for call in api.calls} == {"get"}
 
     with_api(test, permit=forbid)
+
+
+def test_a_write_lasts_no_longer_than_is_permitted() -> None:
+    asked: list[str] = []
+
+    def permit(namespace: str) -> float:
+        asked.append(namespace)
+        return 3.0
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        clock = asyncio.get_running_loop().time
+        for verb, call in (
+            ("create", lambda: door.create(PODS, "here", pod("a"))),
+            ("delete", lambda: door.delete(PODS, "here", "a", uid="1")),
+        ):
+            api.faults.append(Fault(verb, late=60.0))
+            began = clock()
+            with pytest.raises(cluster.Unavailable):
+                await call()
+            assert 2.9 < clock() - began < 3.5
+        assert asked == ["here", "here"]
+
+    with_api(test, permit=permit)
 
 
 def test_every_call_is_observed() -> None:
@@ -296,7 +319,7 @@ def test_a_pod_logs_in_with_its_own_account(
     async def main() -> None:
         configuration = await cluster.load_configuration()
         assert configuration.host == "https://[fd00::1]:443"
-        async with await cluster.open_session(configuration) as session:
+        async with await cluster.open_session(configuration, aiohttp.TraceConfig()) as session:
             assert session.headers["Authorization"] == "bearer first"
 
     asyncio.run(main())

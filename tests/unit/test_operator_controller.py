@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -12,6 +13,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Call
 from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, World, a_world
+from fiber_operator.worker import LULL
 
 MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
 
@@ -106,6 +108,31 @@ async def test_creation_begins_with_one_and_doubles(world: World) -> None:
     fault.times = 0
     batches = [at.count(moment) for moment in dict.fromkeys(at)]
     assert batches == [1, 2, 4, 8, 16]
+
+
+@played()
+async def test_what_takes_long_to_list_is_listed_seldom_and_created_meanwhile(
+    world: World,
+) -> None:
+    world.make_pool(replicas=1)
+    await world.ready(1)
+    lists: list[float] = []
+    creations: list[float] = []
+    clock = asyncio.get_running_loop().time
+
+    def note(call: Call) -> None:
+        if call.plural == "pods":
+            {"list": lists, "create": creations}.get(call.verb, []).append(clock())
+
+    world.api.after = note
+    world.slow("list", "pods", 1.0)
+    world.slow("create", "pods", 0.3)
+    world.edit(replicas=1 + 39)
+    await world.ready(40)
+    assert all(late - early >= 3.0 - LULL for early, late in itertools.pairwise(lists))
+    assert lists[-1] - creations[-1] >= LULL
+    assert creations[-1] - creations[0] > 1.0
+    assert not [at for at in lists if creations[0] < at < creations[-1]]
 
 
 @played()

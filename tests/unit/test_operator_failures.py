@@ -155,3 +155,27 @@ def test_times_that_have_not_come_yet_are_none_of_ours() -> None:
     record = Record.read(status, NOW)
     assert (record.last_time, record.newest_created) == (None, None)
     assert failing(next_create_time=NOW + 9999).waits_until(POLICY, NOW) is None
+
+
+@pytest.mark.parametrize(
+    ("due", "consecutive", "shown"),
+    [
+        (NOW + 60, 2, NOW + 60),
+        (NOW - 60, 2, NOW - 60),
+        (NOW + 9999, 2, None),
+        (NOW + 60, 4, None),  # past the limit: nothing is created then either
+    ],
+)
+def test_a_time_for_which_nobody_waits_is_not_kept(
+    due: float, consecutive: int, shown: float | None
+) -> None:
+    kept = count(failing(next_create_time=due, consecutive=consecutive)).record
+    assert kept.next_create_time == shown
+
+
+def test_sums_stay_what_a_status_may_hold() -> None:
+    full = failing(total=2**31 - 1, disrupted=2**31 - 1, consecutive=2**31 - 1)
+    ended = view(3, State.ENDED, trouble=Trouble.DISRUPTED)
+    record = count(full, failed(1), failed(2, created=NOW + 5), ended).record
+    found = record.failures()
+    assert (found.total, found.disrupted, found.consecutive) == (2**31 - 1,) * 3

@@ -18,7 +18,7 @@ from fakes.kubernetes_api import Fault
 from fakes.store import Body
 from fakes.world import NAMESPACE, World, a_world, configuration
 from fiber_operator import handlers
-from fiber_operator.cluster import Configuration, load_configuration
+from fiber_operator.cluster import ApiError, Configuration, load_configuration
 from fiber_operator.handlers import Watcher
 from fiber_operator.program import Program
 from fiber_operator.settings import Settings
@@ -37,6 +37,8 @@ class Watching:
         self.store = world.store
         self.notices: list[Notice] = []
         self.starts: list[bool] = []
+        self.answers: dict[str, str] = {}
+        """What was asked -> why that failed the last time, or nothing."""
         self.gates = 0
         self.stop = asyncio.Event()
         self._task = asyncio.ensure_future(
@@ -46,6 +48,7 @@ class Watching:
                 namespaces=namespaces,
                 gate=self._gate,
                 on_start=self.starts.append,
+                answered=self._answered,
                 stop=self.stop,
             )
         )
@@ -55,6 +58,9 @@ class Watching:
 
     async def _gate(self) -> None:
         self.gates += 1
+
+    def _answered(self, what: str, error: ApiError | None) -> None:
+        self.answers[what] = str(error or "")
 
     async def ended(self) -> None:
         self.stop.set()
@@ -157,6 +163,36 @@ async def test_only_the_given_namespaces_are_asked_for(kopf: Watching) -> None:
     kopf.pod("c", "three")
     await kopf.told(Key("one", "es"), Key("two", "es"))
     assert {call.namespace for call in kopf.api.calls} == {"one", "two"}
+
+
+@played("one", "two")
+async def test_each_answer_to_kopf_is_told(kopf: Watching) -> None:
+    await kopf.watched(2)
+    assert kopf.answers["get /apis/fiber.dev/v1alpha1"] == ""
+    assert {what for what in kopf.answers if not what.startswith("get ")} == {
+        f"{verb} {plural} in {namespace}"
+        for verb in ("list", "watch")
+        for plural in ("fiberpools", "pods")
+        for namespace in ("one", "two")
+    }
+
+
+@pytest.mark.parametrize("verb", ["list", "watch"])
+@pytest.mark.parametrize("plural", ["fiberpools", "pods"])
+def test_a_right_that_is_missing_is_told_and_so_is_its_return(verb: str, plural: str) -> None:
+    @played()
+    async def test(kopf: Watching) -> None:
+        said = f'{plural} is forbidden: User "operator" cannot {verb} resource "{plural}"'
+        denied = Fault(verb, plural, status=403, reason="Forbidden", message=said, times=10**6)
+        kopf.api.faults.append(denied)
+        asked = f"{verb} {plural}"
+        await kopf.world.until(lambda: kopf.answers.get(asked) == f"{asked}: {said}", within=10)
+        denied.times = 0
+        await kopf.world.until(lambda: kopf.answers[asked] == "", within=10)
+        kopf.world.make_pool()
+        await kopf.told(ES)
+
+    test()
 
 
 @played()

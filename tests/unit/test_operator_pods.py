@@ -204,6 +204,23 @@ def test_deletion_cost_is_kubernetes_annotation() -> None:
     assert look(document).deletion_cost == 0
 
 
+@pytest.mark.parametrize("code", [None, "1", True, 2**31, 1.0])
+def test_an_end_without_an_exit_code_is_none(code: Any) -> None:
+    document = running()
+    end = {"terminated": {"exitCode": code, "reason": "Error"}}
+    document["status"]["containerStatuses"][0]["state"] = end
+    pod = look(document)
+    assert (pod.state, pod.exit_code) == (State.READY, None)
+
+
+@pytest.mark.parametrize("conditions", [None, [], "x", [{"type": "Ready", "status": "Unknown"}]])
+def test_a_worker_that_runs_and_of_which_nobody_can_tell_may_have_been_ready(
+    conditions: Any,
+) -> None:
+    pod = look({**running(), "status": {**running()["status"], "conditions": conditions}})
+    assert (pod.state, pod.was_ready) == (State.NOT_READY, True)
+
+
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner),

@@ -177,6 +177,12 @@ def test_nothing_is_added_that_the_api_server_would_refuse_beside(own: Json) -> 
     assert "allowPrivilegeEscalation" not in worker["securityContext"]
 
 
+def test_capabilities_may_hold_anything() -> None:
+    added = {"add": [["SYS_ADMIN"], {}]}
+    context = worker_of({"securityContext": {"capabilities": added}})["securityContext"]
+    assert context["capabilities"] == added
+
+
 def tolerated(spec: Json) -> dict[str, Any]:
     return {
         t.get("key", ""): t.get("tolerationSeconds") for t in body_of(spec)["spec"]["tolerations"]

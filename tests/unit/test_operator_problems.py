@@ -11,7 +11,7 @@ from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
 from fiber_operator import plans
 from fiber_operator.plans import Obstacle, Refusal
 from fiber_operator.reconcile import plan
-from fiber_operator.revisions import template_hash
+from fiber_operator.revisions import spec_hash, template_hash
 from unit.operator_objects import (
     MASTER,
     NOW,
@@ -127,8 +127,6 @@ def test_what_only_events_tell_is_told() -> None:
     found = problem(POOL, pod, warnings={name_of(1): mount})
     assert (found.reason, found.severity) == ("FailedMount", "Warning")
     assert 'secret "token" not found' in found.message
-    over = "FailedScheduling: 0/2 nodes are available"
-    assert status_of(POOL, pod, warnings={name_of(1): over}).problems == ()
 
 
 def test_a_pod_that_takes_too_long_is_an_error() -> None:
@@ -208,6 +206,51 @@ def test_failures_are_summed_up_while_they_last() -> None:
     assert gone.problems == first.problems
     more = status_of(then(pool, first), ended(1), ended(2), ended(3, ago=-2), now=NOW + 5)
     assert (more.problems[0].count, more.problems[0].pod) == (3, name_of(3))
+
+
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        ({}, "A worker failed, and its pod is gone."),
+        ({"lastReason": "Error"}, "A worker failed (Error), and its pod is gone."),
+        (
+            {"lastReason": "OOMKilled", "lastExitCode": 137},
+            "A worker failed (OOMKilled, exit code 137), and its pod is gone.",
+        ),
+    ],
+)
+def test_a_failure_of_which_little_is_known_is_told_as_far_as_it_is(known: Json, said: str) -> None:
+    edited = {"failures": {"consecutive": 2, "specHash": spec_hash(POOL), **known}}
+    found = problem(then(POOL, FiberPoolStatus.model_validate(edited)))
+    assert found.reason == "ContainerFailed"
+    assert found.message == f"{said} See the events of the pool with kubectl describe fiberpool es."
+
+
+def test_a_wait_that_is_not_waited_for_is_not_shown() -> None:
+    far = {"consecutive": 1, "specHash": spec_hash(POOL), "nextCreateTime": "2099-01-01T00:00:00Z"}
+    pool = then(POOL, FiberPoolStatus.model_validate({"failures": far}))
+    status = status_of(pool, ended(1))
+    assert status.failures.next_create_time is None or status.failures.next_create_time < NOW + 999
+    assert "2099" not in str(status.model_dump(mode="json"))
+    assert status_of(pool).failures.next_create_time is None
+
+
+def test_a_problem_is_not_there_since_a_time_that_has_not_come() -> None:
+    first = status_of(POOL, waiting(1, "ErrImagePull", "no such image"))
+    (told,) = first.problems
+    (ready,) = (c for c in first.conditions if c.type == "Ready")
+    edited = first.model_copy(
+        update={
+            "problems": (told.model_copy(update={"since": NOW + 10**9}),),
+            "conditions": (ready.model_copy(update={"last_transition_time": NOW + 10**9}),),
+        }
+    )
+    pod = waiting(1, "ErrImagePull", "no such image")
+    second = status_of(then(POOL, edited), pod, now=NOW + 5)
+    assert second.problems[0].since == NOW + 5
+    assert {c.last_transition_time for c in second.conditions} == {NOW + 5}
+    third = status_of(then(POOL, second), pod, now=NOW + 35)
+    assert third.problems[0].severity == "Error", "it was a warning for half a minute"
 
 
 def test_past_the_limit_the_first_problem_says_what_to_do() -> None:

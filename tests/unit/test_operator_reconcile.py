@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -237,6 +238,14 @@ def test_on_idle_leaves_ready_workers_to_their_master() -> None:
     assert plan_of(released, *outdated(running(1)), running(3)).create == 1
 
 
+def test_a_worker_whose_template_nobody_can_tell_is_not_outdated() -> None:
+    pool = tried(replicas=1)
+    (worker,) = views(pool, running(1))
+    made = plan(pool, [replace(worker, template_hash="")], memory_of(pool), NOW)
+    assert made.delete == ()
+    assert with_plan(pool, made).status.updated_replicas == 1
+
+
 def test_on_idle_replaces_a_warm_pool_a_quarter_at_a_time() -> None:
     pool = tried(replicas=8)
     old = outdated(*(running(number) for number in range(8)))
@@ -376,6 +385,19 @@ def test_what_follows_from_a_lost_master() -> None:
     for on_lost in ("Delete", "ScaleToMin"):
         made = after_grace(on_lost, UNKNOWN)
         assert (made.delete_pool, made.delete, made.create) == (False, (), 0)
+
+
+@pytest.mark.parametrize("ago", [-(10**9), 10**9, 2000])
+def test_a_loss_at_a_time_that_cannot_be_shortens_no_grace(ago: float) -> None:
+    """Somebody has edited the status; the pool is a thousand seconds old."""
+    pool = lost(make_pool(replicas=1, master=LEASED), ago)
+    born = pool.metadata.model_copy(update={"creation_timestamp": NOW - 1000})
+    pool = pool.model_copy(update={"metadata": born})
+    made = plan_of(pool, running(1), master=EXPIRED)
+    assert (made.delete_pool, made.again) == (False, NOW + 60)
+    told = with_plan(pool, made)
+    assert not plan_of(told, running(1), master=EXPIRED, now=NOW + 59).delete_pool
+    assert plan_of(told, running(1), master=EXPIRED, now=NOW + 60).delete_pool
 
 
 def test_a_new_master_ends_the_mourning() -> None:

@@ -24,6 +24,7 @@ from fakes.world import NAMESPACE, World, a_world
 from fiber_operator.health import Health
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.pods import State
+from fiber_operator.watches import Watches
 from fiber_operator.worker import Statistics
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -116,12 +117,17 @@ class Parts:
         self.resync = SimpleNamespace(
             seconds=60.0, failures={}, tried=self.now - 30, succeeded=self.now - 30
         )
+        self.watches = Watches(())
+        self.watches.started(True)
+        self.watches.answered("watch fiberpools", None)
+        self.watches.answered("watch pods", None)
         self.health = Health(
             SimpleNamespace(held=True, why=""),  # type: ignore[arg-type]
+            SimpleNamespace(wrong=list),  # type: ignore[arg-type]
             SimpleNamespace(statistics=lambda: found),  # type: ignore[arg-type]
             self.resync,  # type: ignore[arg-type]
+            self.watches,
             lambda: self.now,
-            watching=True,
         )
 
 
@@ -161,7 +167,7 @@ def test_a_resync_that_never_began_is() -> None:
 def test_pools_that_wait_or_are_not_watched_are_not_served() -> None:
     assert Parts(longest_wait=31.0).health.ready() == ["a pool waits for its turn for 31 s"]
     parts = Parts()
-    parts.health.watching = False
+    parts.watches.started(False)
     assert parts.health.ready() == ["nothing is watched: changes are seen late"]
 
 
@@ -230,6 +236,9 @@ def test_states_of_pods_are_labels() -> None:
 
 # -- The process
 
+DEEP = 1200
+"""More than Python reads by itself, and less than the API server takes."""
+
 
 def environment(tmp_path: Path, server: str, **settings: str) -> dict[str, str]:
     kubeconfig = {
@@ -243,18 +252,20 @@ def environment(tmp_path: Path, server: str, **settings: str) -> dict[str, str]:
     return {**os.environ, "KUBECONFIG": str(tmp_path / "config"), **ours}
 
 
+async def begin(world: World, tmp_path: Path) -> asyncio.subprocess.Process:
+    return await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        "fiber_operator",
+        env=environment(tmp_path, world.api.url, LISTEN="127.0.0.1:0", NAMESPACE="fiber-system"),
+        stderr=subprocess.PIPE,
+    )
+
+
 def test_the_process_works_until_sigterm(tmp_path: Path) -> None:
     async def main() -> None:
         async with a_world(operator=False) as world:
-            process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                "-m",
-                "fiber_operator",
-                env=environment(
-                    tmp_path, world.api.url, LISTEN="127.0.0.1:0", NAMESPACE="fiber-system"
-                ),
-                stderr=subprocess.PIPE,
-            )
+            process = await begin(world, tmp_path)
             try:
                 world.make_pool(replicas=3)
                 await world.until_settled(3)
@@ -267,6 +278,32 @@ def test_the_process_works_until_sigterm(tmp_path: Path) -> None:
             assert lease["spec"]["holderIdentity"] == ""
 
     asyncio.run(main())
+
+
+def test_a_pool_that_is_nested_deeply_hides_no_other(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with a_world(operator=False) as world:
+            nested: Any = []
+            for _ in range(DEEP):
+                nested = [nested]
+            template = {"spec": {"containers": [{"name": "worker", "image": "x"}], "x": nested}}
+            world.make_pool("deep", replicas=1, template=template)
+            process = await begin(world, tmp_path)
+            try:
+                world.make_pool(replicas=3)
+                await world.until(lambda: "InvalidTemplate" in world.reasons("deep"), within=10)
+                await world.until_settled(3)
+            finally:
+                process.terminate()
+                _, said = await asyncio.wait_for(process.communicate(), 10)
+            assert b"RecursionError" not in said
+
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(10 * DEEP)
+    try:
+        asyncio.run(main())
+    finally:
+        sys.setrecursionlimit(limit)
 
 
 def test_the_process_refuses_settings_that_make_no_sense(tmp_path: Path) -> None:

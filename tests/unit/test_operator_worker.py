@@ -11,7 +11,7 @@ import pytest
 
 from fakes import virtual_time
 from fiber_operator import worker
-from fiber_operator.worker import GAP, Key, Queue, Turn
+from fiber_operator.worker import GAP, LULL, Key, Queue, Turn
 
 A, B = Key("team", "a"), Key("team", "b")
 
@@ -124,6 +124,50 @@ async def test_a_pool_rests_whatever_happens(queue: Queue, turns: Turns) -> None
     queue.add(A, urgent=True)
     await asyncio.sleep(20)
     assert turns.times() == [0.0, 4.0]
+
+
+@played()
+async def test_a_lull_ends_a_rest(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(rest=4.0, lull=True)
+    queue.add(A)
+    await asyncio.sleep(1)
+    queue.add(A)
+    await asyncio.sleep(LULL / 2)
+    queue.add(A)
+    await asyncio.sleep(20)
+    assert turns.times() == pytest.approx([0.0, 1 + 1.5 * LULL])
+
+
+@played()
+async def test_what_a_rest_lacked_is_made_up_for(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(rest=4.0, lull=True)
+    queue.add(A)
+    await asyncio.sleep(1)
+    queue.add(A)
+    await asyncio.sleep(1)
+    queue.add(A)  # it has not rested from its second turn and would owe for two
+    await asyncio.sleep(20)
+    assert turns.times() == pytest.approx([0.0, 1 + LULL, 8.0])
+
+
+@played()
+async def test_while_events_do_not_cease_a_pool_rests(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(rest=4.0, lull=True)
+    queue.add(A)
+    for _ in range(90):
+        await asyncio.sleep(LULL / 1.5)
+        queue.add(A)
+    assert turns.times() == pytest.approx([0.0, 4.0, 8.0])
+
+
+@played()
+async def test_no_lull_brings_a_failed_pool_back_early(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(failed=True, rest=4.0, lull=True)
+    queue.add(A)
+    await asyncio.sleep(1)
+    queue.add(A)
+    await asyncio.sleep(2)
+    assert turns.times() == [0.0]
 
 
 @played()

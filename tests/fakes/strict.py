@@ -1,0 +1,52 @@
+"""What ``fieldValidation=Strict`` finds in a pod: fields that Kubernetes does not know."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+from kubernetes.aio.client.models.v1_pod import V1Pod
+from pydantic import BaseModel
+
+from fakes.store import Body, Failure
+
+
+def check(pod: Body) -> None:
+    """Raise what the API server answers."""
+    unknown = ", ".join(f'unknown field "{path}"' for path in unknown_fields(pod))
+    if unknown:
+        message = 'Pod in version "v1" cannot be handled as a Pod: strict decoding error: '
+        raise Failure(400, "BadRequest", message + unknown)
+
+
+def unknown_fields(value: Any, kind: Any = V1Pod, path: str = "") -> Iterator[str]:
+    """The paths of fields that the client's model of a pod has not, ``kind`` being the place's."""
+    model, item = _within(kind)
+    if isinstance(value, list):
+        for number, element in enumerate(value):
+            yield from unknown_fields(element, item, f"{path}[{number}]")
+    elif isinstance(value, dict) and model is not None:
+        fields = {alias: name for name, alias in model.attribute_map.items()}
+        for key, element in value.items():
+            below = f"{path}.{key}".lstrip(".")
+            if key in fields:
+                annotation = model.model_fields[fields[key]].annotation
+                yield from unknown_fields(element, annotation, below)
+            else:
+                yield below
+
+
+def _within(kind: Any) -> tuple[Any, Any]:
+    """The model that an annotation names, if it names one, and what is in its list, if it is one.
+
+    A dictionary is neither: its keys are anybody's.
+    """
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return kind, None
+    inner = [part for part in typing.get_args(kind) if part is not type(None)]
+    if typing.get_origin(kind) is list:
+        return None, inner[0]
+    if typing.get_origin(kind) is typing.Union and len(inner) == 1:
+        return _within(inner[0])
+    return None, None

@@ -1,0 +1,83 @@
+"""A list is read object by object, and never taken for shorter than it is."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fiber_operator.answers import Unavailable
+from fiber_operator.listing import Listing
+
+Json = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=8,
+)
+OBJECTS = st.lists(st.dictionaries(st.text(), Json, max_size=4), max_size=5)
+
+
+def read(data: bytes) -> tuple[list[Any], str]:
+    listing = Listing(data, "list pods")
+    return list(listing), listing.more()
+
+
+def a_list(items: Any, **metadata: Any) -> dict[str, Any]:
+    return {"kind": "PodList", "apiVersion": "v1", "metadata": metadata, "items": items}
+
+
+@given(OBJECTS, st.booleans(), st.sampled_from([None, 1]), st.randoms())
+def test_a_list_is_read_whole(items: Any, plain: bool, indent: int | None, random: Any) -> None:
+    members = list(a_list(items, **{"continue": "next"}).items())
+    random.shuffle(members)
+    data = json.dumps(dict(members), ensure_ascii=plain, indent=indent)
+    assert read(data.encode()) == (items, "next")
+
+
+def test_the_last_part_has_no_more() -> None:
+    assert read(json.dumps(a_list([])).encode()) == ([], "")
+
+
+@given(OBJECTS, st.integers(min_value=0))
+def test_half_an_answer_is_none(items: Any, length: int) -> None:
+    data = json.dumps(a_list(items)).encode()
+    with pytest.raises(Unavailable):
+        read(data[: length % len(data)])
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {},
+        [],
+        "PodList",
+        {"kind": "Pod", "metadata": {}, "items": []},
+        {"kind": "PodList", "items": []},
+        {"kind": "PodList", "metadata": {}},
+        a_list(None),
+        a_list({}),
+        a_list([1]),
+        a_list([{}, None]),
+    ],
+    ids=str,
+)
+def test_what_is_no_list_of_objects_is_refused(document: Any) -> None:
+    with pytest.raises(Unavailable):
+        read(json.dumps(document).encode())
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"<html>", b"\xff", b"{}{}", b'{"items":[{}{}]}', b"{1:2}x", b"[" * 100_000],
+)
+def test_what_is_no_document_is_refused(data: bytes) -> None:
+    with pytest.raises(Unavailable, match="list pods"):
+        read(data)
+
+
+def test_an_answer_that_goes_on_after_its_end_is_refused() -> None:
+    with pytest.raises(Unavailable):
+        read(json.dumps(a_list([{}])).encode() + b" {}")

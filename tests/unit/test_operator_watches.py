@@ -1,0 +1,114 @@
+"""An operator that cannot watch says so, and which right it lacks."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import aiohttp
+import pytest
+
+from fakes.kubernetes_api import Fault
+from fakes.world import World, a_world, configuration
+from fiber_operator.cluster import Configuration, Refused, Unavailable
+from fiber_operator.program import Program
+from fiber_operator.settings import Settings
+from fiber_operator.watches import Watches
+
+SAID = 'pods is forbidden: User "operator" cannot watch resource "pods" at the cluster scope'
+REFUSED = Refused(SAID, what="watch pods", status=403, reason="Forbidden")
+
+
+def all_well(*namespaces: str) -> Watches:
+    watches = Watches(namespaces)
+    watches.started(True)
+    for where in [f" in {namespace}" for namespace in namespaces] or [""]:
+        for plural in ("fiberpools", "pods"):
+            watches.answered(f"list {plural}{where}", None)
+            watches.answered(f"watch {plural}{where}", None)
+    return watches
+
+
+def test_watches_that_are_open_are_well() -> None:
+    assert all_well().wrong() == all_well("one", "two").wrong() == []
+
+
+def test_each_watch_must_have_begun() -> None:
+    watches = Watches(["one"])
+    assert watches.wrong() == ["nothing is watched: changes are seen late"]
+    watches.started(True)
+    watches.answered("list pods in one", None)
+    watches.answered("watch pods in one", None)
+    (said,) = watches.wrong()
+    assert said == "changes are seen late: watch fiberpools in one has not begun yet"
+
+
+def test_all_begins_anew_when_watching_does() -> None:
+    watches = all_well()
+    watches.started(False)
+    watches.started(True)
+    assert len(watches.wrong()) == 2
+
+
+def test_a_missing_right_is_named_until_it_is_there(caplog: pytest.LogCaptureFixture) -> None:
+    watches = all_well()
+    with caplog.at_level(logging.INFO):
+        for _ in range(5):
+            watches.answered("watch pods", REFUSED)
+        (said,) = watches.wrong()
+        assert said == (
+            f"changes are not seen: watch pods: {SAID}. Give the operator's account this right: "
+            "the chart's roles have it"
+        )
+        watches.answered("watch pods", None)
+    assert watches.wrong() == []
+    assert caplog.messages == [said, "watch pods works again"]
+
+
+def test_what_else_fails_is_told_too() -> None:
+    watches = all_well()
+    watches.answered("list pods", Unavailable("too busy", what="list pods", status=500))
+    assert watches.wrong() == ["changes are not seen: list pods: too busy"]
+
+
+@pytest.mark.parametrize("verb", ["list", "watch"])
+def test_an_operator_that_must_not_watch_pods_is_not_ready(verb: str) -> None:
+    """The whole program with kopf in its thread, in real time."""
+
+    async def main() -> None:
+        async with a_world(operator=False) as world:
+            message = f'pods is forbidden: User "operator" cannot {verb} resource "pods"'
+            denied = Fault(verb, "pods", status=403, message=message, times=10**6)
+            world.api.faults.append(denied)
+            stop = asyncio.Event()
+
+            async def configure() -> Configuration:
+                return configuration(world.api)
+
+            settings = Settings(host="127.0.0.1", port=0, identity="operator-1")
+            program = Program(settings, configure=configure, now=world.store.unix_now)
+            task = asyncio.ensure_future(program.run(stop))
+            said = f"changes are not seen: {verb} pods: {message}. Give the operator's account"
+            await until(world, program, said)
+            assert (await ask(program))[0] == 503
+            denied.times = 0
+            await until(world, program, "ok")
+            assert (await ask(program))[0] == 200
+            stop.set()
+            await task
+
+    asyncio.run(main())
+
+
+async def ask(program: Program) -> tuple[int, str]:
+    url = f"http://127.0.0.1:{program.port}/readyz"
+    async with aiohttp.ClientSession() as session, session.get(url) as response:
+        return response.status, await response.text()
+
+
+async def until(world: World, program: Program, said: str) -> None:
+    """Wait until /readyz says so."""
+    await world.until(lambda: bool(program.port), within=10)
+    async with asyncio.timeout(10):
+        while said not in (await ask(program))[1]:
+            await asyncio.sleep(0.05)
