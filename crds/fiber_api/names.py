@@ -241,11 +241,15 @@ class Reason(StrEnum):
     QUOTA_EXCEEDED = "QuotaExceeded"
     """A ResourceQuota refuses more pods (403)."""
     FORBIDDEN = "Forbidden"
-    """An admission policy or missing rights refuse the pod (403 for any other cause)."""
+    """An admission policy, or a right that the operator lacks (403 for any other cause)."""
     NAME_TAKEN = "NameTaken"
     """An object that is not the pool's has a name that the pool needs."""
     INVALID_CREDENTIALS = "InvalidCredentials"
     """The pool's Secret is damaged or about to expire."""
+    ADDRESS_CHANGED = "AddressChanged"
+    """The Service was made anew with another address than the one that workers dial."""
+    CREDENTIALS_CHANGED = "CredentialsChanged"
+    """The Secret was made anew, and workers hold certificates of the old one."""
     INVALID_RELEASE = "InvalidRelease"
     """``scaleDown.release`` names what is not a pod of this pool."""
 
@@ -277,6 +281,7 @@ class Reason(StrEnum):
     MASTER_LOST = "MasterLost"
     """The master's Lease has expired."""
     API_UNAVAILABLE = "ApiUnavailable"
+    """A call of the operator fails: an admission webhook is down, the API server is busy."""
 
     # Conditions: what is neither good nor bad news.
     AS_EXPECTED = "AsExpected"

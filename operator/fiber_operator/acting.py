@@ -8,8 +8,9 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator import manifests
+from fiber_operator import manifests, setbacks
 from fiber_operator.cluster import (
     PODS,
     POOLS,
@@ -26,12 +27,15 @@ from fiber_operator.documents import mapping, text
 from fiber_operator.events import Recorder
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics
-from fiber_operator.plans import Deletion, Event, Plan, Refusal
+from fiber_operator.plans import Deletion, Event, Obstacle, Plan, Refusal
 from fiber_operator.surroundings import Surroundings
-from fiber_operator.worker import Key, Turn
+from fiber_operator.worker import GAP, Key, Turn
 
 DELETIONS = 50
 """Pods that are deleted at once."""
+
+_NO_DRY_RUN = "does not support dry run"
+"""What the API server says of an admission webhook."""
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +49,9 @@ class State:
     accepted: str | None = None
     """The template hash that passed the dry run."""
     refusal: Refusal | None = None
+    creation: Obstacle | None = None
+    deletion: Obstacle | None = None
+    """Why the last one came to nothing."""
     deleted: set[str] = field(default_factory=set)
     """Pods that this process asked to delete and that are still there."""
     warnings: dict[str, str] = field(default_factory=dict)
@@ -61,9 +68,15 @@ class State:
         self, template_hash: str, error: ApiError, now: float, *, dry_run: bool = False
     ) -> None:
         """The API server does not take a pod of this template now."""
+        self.creation = None
         before = self.refusal
         count = before.count + 1 if before and before.template_hash == template_hash else 1
         self.refusal = Refusal(template_hash, error.status, error.message, now, count, dry_run)
+
+    def not_created(self, error: ApiError) -> None:
+        """It is not known whether a pod of this template is made."""
+        # Of a quota that is counted at the same time, which is nobody's trouble, comes a Conflict.
+        self.creation = None if isinstance(error, Conflict) else setbacks.with_creation(error)
 
 
 @dataclass(frozen=True)
@@ -105,37 +118,45 @@ class Actor:
         try:
             await self._cluster.create(PODS, pool.metadata.namespace, body, dry_run=True)
         except (Refused, Invalid) as error:
+            if _NO_DRY_RUN in error.message:
+                # A webhook's fault and no verdict; the first pods will show.
+                state.accepted, state.creation = plan.template_hash, None
+                return None
             state.refused(plan.template_hash, error, self._now(), dry_run=True)
         except ApiError as error:
+            state.not_created(error)
             return error
         else:
-            state.accepted, state.refusal = plan.template_hash, None
+            state.accepted, state.refusal, state.creation = plan.template_hash, None, None
         return None
 
     async def act(self, look: Look) -> Turn:
         """Do what is planned; the first error that is not part of the game is raised."""
         if look.plan.delete_pool:
-            await self._delete_pool(look)
+            try:
+                await self._delete_pool(look)
+            except ApiError as error:
+                look.state.deletion = setbacks.with_deletion(error)
+                await self._write_status(look)
+                raise
             return Turn()
         await self._write_status(look)
-        failure = None
-        turn = Turn()
-        try:
-            turn = await self._change_pods(look)
-        except ApiError as error:
-            failure = error
         # The status says already what they tell of: they would not be planned again.
-        await self._tell(look, look.plan.events)
-        if failure is not None:
-            raise failure
-        return turn
+        self._tell(look, look.plan.events)
+        return await self._change_pods(look)
 
     async def _write_status(self, look: Look) -> None:
         if look.plan.status is None:
             return
-        # The uid keeps it from a new pool of the same name.
+        # The uid keeps it from a new pool of the same name.  What is written is true whatever has
+        # been changed since the pool was read: it names the generation that it is of.
         patch = {"metadata": {"uid": look.state.uid}, "status": dict(look.plan.status)}
-        await self._cluster.patch(POOLS, *look.key, patch, "status")
+        try:
+            await self._cluster.patch(POOLS, *look.key, patch, "status")
+        except (Refused, Invalid) as error:
+            event = Event("Warning", Reason.FORBIDDEN, setbacks.with_status(error))
+            self._tell(look, [event])
+            raise
 
     async def _delete_pool(self, look: Look) -> None:
         version = text(mapping(look.document, "metadata").get("resourceVersion"))
@@ -145,12 +166,13 @@ class Actor:
             )
         except (Gone, Conflict):
             return  # it was changed meanwhile, by its master perhaps; the next look sees
-        await self._tell(look, look.plan.events)
+        self._tell(look, look.plan.events)
 
     async def _change_pods(self, look: Look) -> Turn:
         deleted, as_planned = await self._delete(look)
         if deleted < len(look.plan.delete):
-            return Turn(again=0.0)
+            # Of a change an event tells; a pool that changes all the time is not looked at so.
+            return Turn(again=0.0 if as_planned else GAP)
         turn = await self._create(look)
         return turn if as_planned else dataclasses.replace(turn, again=0.0)
 
@@ -159,26 +181,47 @@ class Actor:
 
         Like creation this stops after a while, so that the status is not out of date for long.
         """
-        key, state, deletions = look.key, look.state, look.plan.delete
+        key, state = look.key, look.state
+        deletions = sorted(look.plan.delete, key=lambda deletion: deletion.may_work)
         clock = asyncio.get_running_loop().time
         enough, done, as_planned = clock() + _enough(look), 0, True
         while done < len(deletions) and (not done or clock() < enough):
             batch = deletions[done : done + DELETIONS]
+            if batch[-1].may_work and await self._has_changed(look):
+                # A master may have attached since: what was free to go may be at work.
+                batch = [deletion for deletion in batch if not deletion.may_work]
+                deletions = deletions[:done] + batch
+                as_planned = False
             state.deleted |= {deletion.name for deletion in batch}
             results = await asyncio.gather(
                 *(self._delete_pod(key.namespace, deletion) for deletion in batch),
                 return_exceptions=True,
             )
+            failure = None
             for deletion, result in zip(batch, results, strict=True):
-                if isinstance(result, Conflict):
+                if isinstance(result, Conflict | Refused | Invalid):
                     state.deleted.discard(deletion.name)
+                if isinstance(result, Conflict):
                     as_planned = False
                 elif isinstance(result, BaseException) and not isinstance(result, Gone):
-                    raise result
+                    if not isinstance(result, ApiError):
+                        raise result
+                    failure = failure or result
                 else:
                     self._metrics.deleted(str(deletion.reason))
+            state.deletion = None if failure is None else setbacks.with_deletion(failure)
+            if failure is not None:
+                raise failure
             done += len(batch)
         return done, as_planned
+
+    async def _has_changed(self, look: Look) -> bool:
+        """Whether the pool is not the one any more that this was planned for."""
+        try:
+            document = await self._cluster.read(POOLS, *look.key)
+        except Gone:
+            return True
+        return _version(document) != _version(look.document)
 
     async def _delete_pod(self, namespace: str, deletion: Deletion) -> None:
         await self._cluster.delete(
@@ -205,19 +248,26 @@ class Actor:
         )
         if done.names:
             self._metrics.created(len(done.names))
-            state.refusal = None
+            state.refusal = state.creation = None
             log.info("created %s", _some(done.names), extra=about(*look.key, uid=state.uid))
         if done.refusal is not None:
             state.refused(plan.template_hash, done.refusal, self._now())
             return Turn(again=0.0)  # so that the status says it
         if done.failure is not None:
+            state.not_created(done.failure)
             log.warning("%s", done.failure, extra=about(*look.key, uid=state.uid))
             return Turn(failed=True, rest=done.wait)
         return Turn(again=0.0) if len(done.names) < plan.create else Turn()
 
-    async def _tell(self, look: Look, events: Sequence[Event]) -> None:
+    def _tell(self, look: Look, events: Sequence[Event]) -> None:
         for event in events:
-            await self._recorder.record(look.key, look.state.uid, event)
+            self._recorder.tell(look.key, look.state.uid, event)
+
+
+def _version(document: Body) -> tuple[object, ...]:
+    """What changes with everything that a plan is made from, and not with the status."""
+    metadata = mapping(document, "metadata")
+    return tuple(metadata.get(key) for key in ("uid", "generation", "deletionTimestamp"))
 
 
 def _enough(look: Look) -> float:

@@ -30,9 +30,16 @@ class ApiError(Exception):
         super().__init__(f"{what}: {message}" if what else message)
         self.message = message
         """The API server's own words."""
+        self.call = " ".join(what.split()[:2])
+        """Verb and resource, as a right names them: ``get secrets``."""
         self.status = status
         self.reason = reason
         """The API server's word for the error, ``AlreadyExists`` for example."""
+
+    @property
+    def writes(self) -> bool:
+        """Whether something was to be changed, which admission webhooks are asked about."""
+        return not self.call.startswith(("get ", "list "))
 
 
 class Gone(ApiError):
@@ -70,11 +77,11 @@ def complaint(error: ApiError) -> str:
     return str(error)
 
 
-def object_of(answer: Body, name: str) -> Body:
+def object_of(answer: Body, name: str, what: str) -> Body:
     """``answer`` if it is the object of that name: what is none must not be taken for one."""
     metadata = answer.get("metadata")
     if not isinstance(metadata, dict) or metadata.get("name") != name:
-        raise Unavailable(f"the answer is not the object {name}")
+        raise Unavailable(f"the answer is not the object {name}", what=what)
     return answer
 
 

@@ -42,7 +42,7 @@ def judge(pool: FiberPool, lease: plans.Master, now: float) -> Attachment:
     master = pool.spec.master
     if master is None:
         return Attachment(attached=False, alive=None)
-    if master.lease_name is None:
+    if master.lease_name is None or lease.unreadable:
         return Attachment(attached=True, alive=None)
     before = _condition(pool)
     alive = lease.alive

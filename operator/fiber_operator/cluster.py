@@ -121,7 +121,8 @@ class Cluster:
 
     async def read(self, resource: Resource, namespace: str, name: str) -> Body:
         """The object as it is now, not as a cache had it."""
-        return object_of(await self._call("get", resource, namespace, name), name)
+        answer = await self._call("get", resource, namespace, name)
+        return object_of(answer, name, f"get {resource.plural} {name}")
 
     async def list(
         self,
@@ -160,11 +161,12 @@ class Cluster:
         """
         query = {"dryRun": "All", "fieldValidation": "Strict"} if dry_run else {}
         answer = await self._call("create", resource, namespace, query=query, body=body)
-        return object_of(answer, body["metadata"]["name"])
+        return object_of(answer, body["metadata"]["name"], f"create {resource.plural}")
 
     async def replace(self, resource: Resource, namespace: str, name: str, body: Body) -> Body:
         """Replace the object; Conflict if ``metadata.resourceVersion`` is not its current one."""
-        return object_of(await self._call("update", resource, namespace, name, body=body), name)
+        answer = await self._call("update", resource, namespace, name, body=body)
+        return object_of(answer, name, f"update {resource.plural} {name}")
 
     async def patch(
         self, resource: Resource, namespace: str, name: str, patch: Body, subresource: str = ""
@@ -173,7 +175,7 @@ class Cluster:
         answer = await self._call(
             "patch", resource, namespace, name, subresource=subresource, body=patch
         )
-        return object_of(answer, name)
+        return object_of(answer, name, f"patch {resource.plural} {name}")
 
     async def delete(
         self,

@@ -59,6 +59,8 @@ class Outlook:
     """Workers more than wanted, of which only the master may say which are idle."""
     replacing: int = 0
     """Live pods of an older template that are to be replaced, now or when they are idle."""
+    lease_unreadable: bool = False
+    """There is no right to read the master's Lease."""
 
     @property
     def worst(self) -> Problem | None:
@@ -146,7 +148,8 @@ def _findings(pool: FiberPool, outlook: Outlook) -> Iterator[Finding]:
 
 def _accepted(outlook: Outlook) -> Finding:
     kind = ConditionType.ACCEPTED
-    if problem := outlook.problem(*_UNACCEPTABLE):
+    problem = outlook.problem(*_UNACCEPTABLE)
+    if problem is not None and problem.severity == "Error":
         return Finding(kind, "False", problem.reason, problem.message)
     return Finding(kind, "True", Reason.AS_EXPECTED)
 
@@ -210,20 +213,27 @@ def _degraded(outlook: Outlook) -> Finding:
 def _master_alive(pool: FiberPool, outlook: Outlook) -> Finding:
     kind, attachment = ConditionType.MASTER_ALIVE, outlook.attachment
     if attachment.alive is None:
-        no_master = pool.spec.master is None
-        message = (
-            "the pool waits for a master"
-            if no_master
-            else "spec.master.leaseName is absent, or its Lease was not seen yet"
-        )
-        reason = Reason.NO_MASTER if no_master else Reason.LEASE_NOT_CHECKED
-        return Finding(kind, "Unknown", reason, message)
+        return _master_unknown(pool, outlook)
     if attachment.alive:
         return Finding(kind, "True", Reason.LEASE_RENEWED)
     lost = outlook.problem(Reason.MASTER_LOST)
     message = lost.message if lost else ""
     # Not the time at which an earlier master was lost: this one has its own grace.
     return Finding(kind, "False", Reason.MASTER_LOST, message, attachment.lost_since)
+
+
+def _master_unknown(pool: FiberPool, outlook: Outlook) -> Finding:
+    kind, master = ConditionType.MASTER_ALIVE, pool.spec.master
+    if master is None:
+        return Finding(kind, "Unknown", Reason.NO_MASTER, "the pool waits for a master")
+    if master.lease_name is None:
+        message = "spec.master.leaseName is absent, so that nobody can tell"
+        return Finding(kind, "Unknown", Reason.LEASE_NOT_CHECKED, message)
+    if outlook.lease_unreadable:
+        message = f"the operator may not read the Lease {master.lease_name}"
+        return Finding(kind, "Unknown", Reason.FORBIDDEN, message)
+    message = f"the Lease {master.lease_name} was not seen to change yet"
+    return Finding(kind, "Unknown", Reason.LEASE_NOT_CHECKED, message)
 
 
 def _scaling_limited(pool: FiberPool) -> Finding:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
-from fiber_operator import inspection, reconcile
+from fiber_operator import inspection, reconcile, setbacks
 from fiber_operator.acting import Actor, Look, State
 from fiber_operator.cluster import PODS, POOLS, ApiError, Body, Cluster, Gone, TooMany, Unavailable
 from fiber_operator.creation import Creator
@@ -127,16 +127,17 @@ class Controller:
         if pool.unread:
             complaint = "; ".join(pool.unread)
             log.warning("the status was damaged: %s", complaint, extra=about(*key, uid=state.uid))
+        failure = None
         if pool.metadata.deletion_timestamp is None:
             state.surroundings = await self._keeper.ensure(pool, state.surroundings)
-        pods, rested = await self._pods(key, state, pool.spec.worker_container)
+            failure = state.surroundings.failure
+        pods, rested = await self._pods(key, document, state, pool.spec.worker_container)
         plan = self._plan(key, pool, pods, state)
-        failure = None
         if plan.inspect:
             # Not added to: what is not asked about any more may be over.
             state.warnings = await inspection.warnings(self._cluster, key, plan.inspect, pods)
         if plan.dry_run:
-            failure = await self._actor.dry_run(pool, plan, state)
+            failure = await self._actor.dry_run(pool, plan, state) or failure
         if plan.inspect or plan.dry_run:
             plan = self._plan(key, pool, pods, state)
         turn = await self._act(Look(key, document, pool, state, plan, rested), pods)
@@ -148,20 +149,27 @@ class Controller:
         self, key: Key, document: Body, state: State, error: InvalidPool
     ) -> Turn:
         container = text(mapping(document, "spec").get("workerContainer"))
-        pods, rested = await self._pods(key, state, container or names.WORKER_CONTAINER)
+        pods, rested = await self._pods(key, document, state, container or names.WORKER_CONTAINER)
         plan = reconcile.plan_unreadable(document, pods, error.errors, self._now())
         return await self._act(Look(key, document, None, state, plan, rested), pods)
 
-    async def _pods(self, key: Key, state: State, container: str) -> tuple[list[PodView], float]:
+    async def _pods(
+        self, key: Key, document: Body, state: State, container: str
+    ) -> tuple[list[PodView], float]:
         """The pool's pods, from a fresh list, and until when to rest from it."""
         clock = asyncio.get_running_loop().time
         started = clock()
-        pods = await self._cluster.list(
-            PODS,
-            key.namespace,
-            lambda pod: observe(pod, container),
-            selector=f"{names.LABEL_POOL_UID}={state.uid}",
-        )
+        try:
+            pods = await self._cluster.list(
+                PODS,
+                key.namespace,
+                lambda pod: observe(pod, container),
+                selector=f"{names.LABEL_POOL_UID}={state.uid}",
+            )
+        except ApiError as error:
+            plan = reconcile.plan_blind(document, setbacks.with_list(error), self._now())
+            await self._actor.act(Look(key, document, None, state, plan))
+            raise
         ended = clock()
         rested = ended + min(LIST_SHARE * (ended - started), LONGEST_REST)
         there = {pod.name for pod in pods}
@@ -171,9 +179,14 @@ class Controller:
         return pods, rested
 
     def _plan(self, key: Key, pool: FiberPool, pods: Sequence[PodView], state: State) -> Plan:
+        around = state.surroundings
         memory = Memory(
             address=state.address,
-            obstacles=state.surroundings.obstacles if state.surroundings else (),
+            credentials_made=around.credentials_made if around else 0.0,
+            obstacles=around.obstacles if around else (),
+            led=around is None or around.master == pool.spec.master,
+            creation=state.creation,
+            deletion=state.deletion,
             accepted=state.accepted,
             refusal=state.refusal,
             master=self._masters.follow(key, _term(pool)),

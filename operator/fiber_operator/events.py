@@ -2,6 +2,9 @@
 
 An event that repeats within ``WINDOW`` raises the count of the one that is there, and not more
 often than every ``PAUSE`` seconds, so that a pool in trouble does not flood the API server.
+What would differ each time, such as a number of pods, is therefore not in the words of an event.
+
+They are posted one after the other beside the looks at pools, which wait for none.
 """
 
 from __future__ import annotations
@@ -10,12 +13,13 @@ import asyncio
 import datetime
 import logging
 import secrets
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from fiber_api import names
 from fiber_operator.cluster import EVENTS, ApiError, Body, Cluster
+from fiber_operator.lease import NotHolder
 from fiber_operator.logs import about
 from fiber_operator.plans import Event
 from fiber_operator.worker import Key
@@ -23,6 +27,8 @@ from fiber_operator.worker import Key
 WINDOW = 600.0
 PAUSE = 30.0
 REMEMBERED = 1000
+WAITING = 200
+"""Events that wait to be posted; beyond that the oldest are given up."""
 MESSAGE_LIMIT = 1024
 """The API server refuses longer ones."""
 
@@ -44,12 +50,27 @@ class Recorder:
         self._cluster = cluster
         self._now = now
         self._identity = identity
+        self._waiting: deque[tuple[Key, str, Event]] = deque(maxlen=WAITING)
+        self._bell = asyncio.Event()
         self._posted: OrderedDict[tuple[str, str, str], _Posted] = OrderedDict()
+
+    def tell(self, key: Key, uid: str, event: Event) -> None:
+        """Log ``event`` and have it posted on the pool when its turn comes."""
+        level = logging.WARNING if event.type == "Warning" else logging.INFO
+        log.log(level, "%s", event.message, extra=about(*key, uid=uid, reason=event.reason))
+        self._waiting.append((key, uid, event))
+        self._bell.set()
+
+    async def run(self) -> None:
+        """Post what was told, until cancelled."""
+        while True:
+            await self._bell.wait()
+            self._bell.clear()
+            while self._waiting:
+                await self.record(*self._waiting.popleft())
 
     async def record(self, key: Key, uid: str, event: Event) -> None:
         """Post ``event`` on the pool; it never fails, it only may not be posted."""
-        level = logging.WARNING if event.type == "Warning" else logging.INFO
-        log.log(level, event.message, extra=about(*key, uid=uid, reason=event.reason))
         now, place = self._now(), (uid, event.reason, event.message)
         posted = self._posted.get(place)
         try:
@@ -58,7 +79,7 @@ class Recorder:
                     await self._post(place, key, event, now)
                 else:
                     await self._repeat(posted, key, now)
-        except (ApiError, TimeoutError) as error:
+        except (ApiError, TimeoutError, NotHolder) as error:
             log.warning("an event could not be posted: %s", error, extra=about(*key, uid=uid))
 
     async def _post(self, place: tuple[str, str, str], key: Key, event: Event, now: float) -> None:

@@ -296,7 +296,12 @@ class Watcher:
 
     def _pass_on(self) -> None:
         while self._untold:
-            self._notice(*self._untold.popleft())
+            notice = self._untold.popleft()
+            try:
+                self._notice(*notice)
+            except Exception:
+                # What is left would never be passed on: ``_tell`` waits for the last one to go.
+                log.exception("an event could not be passed on")
 
     def _call(self, function: Callable[..., None], *arguments: object) -> None:
         try:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Gone, Refused
@@ -98,7 +98,7 @@ class Masters:
             log.warning("the master's Lease cannot be read: %s", error, extra=about(*key))
             watched.seen, watched.due = None, self._now() + watched.pause
             if isinstance(error, Refused):
-                self._conclude(key, watched, replace(watched.verdict, missing=True))
+                self._conclude(key, watched, Master(unreadable=error.message))
             return
         verdict = self._judge(watched, lease)
         watched.looked = self._now()

@@ -36,10 +36,11 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Why a pod cannot be made at all: an object of the pool that could not be had.
+    """What stands in the way of the operator, as an object of the pool that could not be had.
 
     ``reason`` is ``Reason.NAME_TAKEN``, ``INVALID_CREDENTIALS``, ``FORBIDDEN`` or
-    ``API_UNAVAILABLE``; ``message`` says what, why and what to do and is shown as it is.
+    ``API_UNAVAILABLE``, which is no error until it lasts; ``message`` says what, why and what to do
+    and is shown as it is.
     """
 
     reason: Reason
@@ -62,7 +63,9 @@ class Master:
     holder: str = ""
     """``spec.holderIdentity`` of the Lease, for messages; may be empty."""
     missing: bool = False
-    """There is no Lease of that name, or no right to read it."""
+    """There is no Lease of that name."""
+    unreadable: str = ""
+    """Why the Lease cannot be read at all, in the API server's words: there is no right to."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,16 @@ class Memory:
 
     address: str | None = None
     """``host:port`` of the pool's Service.  Nothing is created while it is None."""
+    credentials_made: float = 0.0
+    """When the pool's Secret was made, as the cluster says."""
     obstacles: tuple[Obstacle, ...] = ()
+    """Nothing is created while there is any."""
+    led: bool = True
+    """The EndpointSlice leads where ``spec.master`` says."""
+    creation: Obstacle | None = None
+    """Why the last creation, or the last dry run, came to nothing, other than by a refusal."""
+    deletion: Obstacle | None = None
+    """Why what was to be deleted last could not be."""
     accepted: str | None = None
     """The template hash that passed the server-side dry run in this process."""
     refusal: Refusal | None = None
@@ -100,6 +112,9 @@ class Deletion:
     resource_version: str | None
     """A precondition where set: the pod must not have become Ready meanwhile."""
     reason: Reason
+    may_work: bool = False
+    """The pod could be at work if a master attached after the pool was read: nobody released it,
+    and no precondition guards it.  It goes only while the pool is the one that was planned for."""
     grace: int | None = None
     """``gracePeriodSeconds``; None leaves the pod's own."""
 
@@ -120,10 +135,11 @@ class Plan:
 
     0. if ``delete_pool``, delete the FiberPool, with its uid and the resourceVersion that the plan
        was made from as preconditions, and do nothing else: a master that comes back in this very
-       moment writes the spec and wins;
+       moment writes the spec and wins; ``status`` is for the case that it cannot be deleted;
     1. write ``status``, if it is not None: what it counts must be safe before the pods that were
        counted are deleted;
-    2. delete ``delete``;
+    2. delete ``delete``, and read the pool again before those that ``may_work``: if it is another
+       or has changed, plan anew;
     3. if ``dry_run``, send ``manifests.pod(...)`` with ``dryRun=All`` and
        ``fieldValidation=Strict``, without which a misspelt field is dropped in silence; then plan
        again with the outcome in ``Memory.accepted`` or ``Memory.refusal``;

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from fiber_api.names import ANNOTATION_DELETION_COST, LABEL_TEMPLATE_HASH
+from fiber_api.names import ANNOTATION_DELETION_COST, ENV_ADDRESS, LABEL_TEMPLATE_HASH
 from fiber_operator.documents import items, mapping, seconds, text, whole
 
 BRIEF = 10.0
@@ -81,6 +81,8 @@ class PodView:
     lingers: bool = False
     """The worker has ended but other containers of the pod have not."""
     deletion_cost: int = 0
+    address: str = ""
+    """Where the agent dials; empty where that is not said in so many words."""
 
     @property
     def live(self) -> bool:
@@ -144,6 +146,14 @@ class _Observation:
         self._others = [s for name, s in statuses.items() if name != container]
         self._init = list(items(self._status.get("initContainerStatuses")))
         self._end = _end(self._state)
+        self._worker = next(
+            (
+                found
+                for found in items(mapping(pod, "spec").get("containers"))
+                if found.get("name") == container
+            ),
+            {},
+        )
         self._scheduled = bool(text(mapping(pod, "spec").get("nodeName")))
         self._phase = text(self._status.get("phase"))
         self._created = seconds(self._meta.get("creationTimestamp"))
@@ -170,6 +180,7 @@ class _Observation:
             scheduled=self._scheduled,
             lingers=state is State.ENDED and self._others_go_on(),
             deletion_cost=self._deletion_cost(),
+            address=self._address(),
         )
 
     # Where it is in its life
@@ -297,7 +308,10 @@ class _Observation:
         reason = text(self._status.get("reason")) or text(condition.get("reason"))
         message = text(self._status.get("message")) or text(condition.get("message"))
         end = self._ending()
-        return reason or text(end.get("reason")), message or text(end.get("message"))
+        cause = text(end.get("reason"))
+        # Else it is the worker's own output, which says nothing of what has ended it.
+        words = text(end.get("message")) if cause in _LOST_CONTAINERS else ""
+        return reason or cause, message or words
 
     # Fields
 
@@ -315,6 +329,10 @@ class _Observation:
     def _owner(self) -> str:
         owners = items(self._meta.get("ownerReferences"))
         return next((text(o.get("uid")) for o in owners if o.get("controller") is True), "")
+
+    def _address(self) -> str:
+        variables = items(self._worker.get("env"))
+        return next((text(v.get("value")) for v in variables if v.get("name") == ENV_ADDRESS), "")
 
     def _deletion_cost(self) -> int:
         cost = text(mapping(self._meta, "annotations").get(ANNOTATION_DELETION_COST))

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Problem
-from fiber_operator import wording
+from fiber_operator import cut_off, setbacks, wording
 from fiber_operator.failed_pods import failed_pods
 from fiber_operator.plans import Refusal
 from fiber_operator.situation import Situation
@@ -37,13 +37,26 @@ def _all(situation: Situation) -> Iterator[Problem]:
     yield from failed_pods(situation)
     yield from pods_that_do_not_start(situation)
     yield from pods_not_ready_any_more(situation)
+    yield from cut_off.problems(situation)
     yield from _masters(situation)
     yield from _releases(situation)
 
 
 def _obstacles(situation: Situation) -> Iterator[Problem]:
-    for obstacle in situation.memory.obstacles:
-        yield situation.problem(obstacle.reason, obstacle.message, terminal=obstacle.terminal)
+    memory = situation.memory
+    hindered = (
+        *memory.obstacles,
+        memory.creation if situation.creates else None,
+        memory.deletion if situation.deletes else None,
+    )
+    for obstacle in filter(None, hindered):
+        passing = obstacle.reason == Reason.API_UNAVAILABLE
+        yield situation.problem(
+            obstacle.reason,
+            obstacle.message,
+            severity=situation.severity(obstacle.reason) if passing else "Error",
+            terminal=obstacle.terminal,
+        )
 
 
 def _refusals(situation: Situation) -> Iterator[Problem]:
@@ -81,6 +94,9 @@ def _masters(situation: Situation) -> Iterator[Problem]:
     if attachment.lost_since is not None:
         message = wording.master_lost(pool, attachment.lost_since, memory.master.holder)
         yield situation.problem(Reason.MASTER_LOST, message)
+    if pool.spec.master and memory.master.unreadable:
+        message = setbacks.with_lease(pool.spec.master, memory.master.unreadable)
+        yield situation.problem(Reason.FORBIDDEN, message, severity="Warning")
     if pool.spec.master and memory.address and _families_differ(pool, memory.address):
         message = wording.wrong_family(pool, memory.address)
         yield situation.problem(Reason.INVALID_SPEC, message, terminal=True)

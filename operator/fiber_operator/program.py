@@ -139,10 +139,11 @@ class Program:
             wall_clock=self._now,
         )
         self.masters = Masters(cluster, lambda key: self.queue.add(key, urgent=True))
+        self.recorder = Recorder(cluster, self._now, settings.identity)
         self.controller = Controller(
             cluster,
             masters=self.masters,
-            recorder=Recorder(cluster, self._now, settings.identity),
+            recorder=self.recorder,
             metrics=self.metrics,
             creator=Creator(cluster, self._draw),
             now=self._now,
@@ -173,6 +174,7 @@ class Program:
             self.masters,
             self.queue,
             self.resync,
+            self.recorder,
             watcher,
         ]
         tasks = [asyncio.ensure_future(part.run()) for part in parts]

@@ -33,10 +33,11 @@ from typing import Any
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator import failures, problems, revisions, scaling, status, wording
+from fiber_operator import cut_off, failures, problems, revisions, scaling, status, wording
 from fiber_operator.attachment import judge
 from fiber_operator.conditions import Counts, Outlook
-from fiber_operator.plans import Deletion, Event, Memory, Plan
+from fiber_operator.documents import items, mapping, text
+from fiber_operator.plans import Deletion, Event, Memory, Obstacle, Plan
 from fiber_operator.pods import PodView, State, Trouble
 from fiber_operator.situation import SECOND_LOOK, Situation
 from fiber_operator.transitions import Change, events
@@ -77,6 +78,15 @@ def plan_unreadable(
     return Plan(status=status.describe_unreadable(document, pods, errors, now))
 
 
+def plan_blind(document: Mapping[str, Any], obstacle: Obstacle, now: float) -> Plan:
+    """The plan for a pool whose pods cannot be listed: say so, touch no pod."""
+    described = status.describe_blind(document, obstacle, now)
+    said = {text(p.get("reason")) for p in items(mapping(document, "status").get("problems"))}
+    news = described is not None and obstacle.reason not in said
+    event = Event("Warning", obstacle.reason, obstacle.message)
+    return Plan(status=described, events=(event,) if news else ())
+
+
 class _Planner:
     """One plan.  Everything is worked out from its arguments alone."""
 
@@ -89,6 +99,8 @@ class _Planner:
         # Whoever has taken that label away has said nothing against the pod.
         self._pods = [p if p.template_hash else replace(p, template_hash=self._hash) for p in pods]
         self._attachment = judge(pool, memory.master, now)
+        lost = cut_off.find(pool, [pod for pod in self._pods if pod.live], memory)
+        self._pods = cut_off.outdated(self._pods, lost, attached=self._attachment.attached)
         self._ends = pool.metadata.deletion_timestamp is not None
         self._live = [pod for pod in self._pods if pod.live]
         self._ended = [pod for pod in self._pods if pod.state is State.ENDED]
@@ -112,8 +124,9 @@ class _Planner:
         found = problems.find(self._situation())
         after = self._status(found, create)
         document = status.patch(self._pool, after)
-        if dry_run and not self._deletions and not self._account.news:
-            document = None  # the outcome follows at once, and is what is worth telling
+        outcome_follows = dry_run and self._memory.creation is None
+        if outcome_follows and not self._deletions and not self._account.news:
+            document = None  # it is what is worth telling
         change = Change(self._pool.status, after, self._account, create, self._in_order())
         return Plan(
             create=create,
@@ -133,7 +146,13 @@ class _Planner:
             self._pool, self._attachment.lost_since, self._memory.master.holder
         )
         event = Event("Warning", Reason.MASTER_LOST, message)
-        return Plan(delete_pool=True, template_hash=self._hash, events=(event,))
+        after = self._status(problems.find(self._situation(deletes=True)), 0)
+        return Plan(
+            delete_pool=True,
+            template_hash=self._hash,
+            status=status.patch(self._pool, after),
+            events=(event,),
+        )
 
     # What is so
 
@@ -237,9 +256,10 @@ class _Planner:
 
     def _take(self, pods: Sequence[PodView], reason: Reason, *, guarded: bool = False) -> None:
         for pod in pods:
-            version = pod.resource_version if guarded and not pod.was_ready else None
+            version = (pod.resource_version if guarded and not pod.was_ready else None) or None
+            may_work = pod.live and version is None and reason != Reason.RELEASED
             self._deletions.setdefault(
-                pod.name, Deletion(pod.name, pod.uid, version or None, reason)
+                pod.name, Deletion(pod.name, pod.uid, version, reason, may_work)
             )
 
     def _in_order(self) -> tuple[Deletion, ...]:
@@ -264,7 +284,8 @@ class _Planner:
 
     # What to say
 
-    def _situation(self) -> Situation:
+    def _situation(self, *, deletes: bool = False) -> Situation:
+        missing = len(self._remaining) < self._desired
         return Situation(
             pool=self._pool,
             live=self._remaining,
@@ -273,7 +294,9 @@ class _Planner:
             attachment=self._attachment,
             memory=self._memory,
             template_hash=self._hash,
-            wants_more=len(self._remaining) < self._desired,
+            wants_more=missing,
+            creates=self._may_create and (missing or not self._accepted),
+            deletes=deletes or bool(self._deletions),
             now=self._now,
         )
 
@@ -289,12 +312,14 @@ class _Planner:
             waits_until=waits if missing > 0 else None,
             draining=0 if self._ends else max(0, -missing),
             replacing=self._to_be_replaced(),
+            lease_unreadable=bool(self._memory.master.unreadable),
         )
         return status.describe(
             self._pool,
             outlook,
             self._record,
             address=self._memory.address,
+            led=self._memory.led,
             template_hash=self._hash,
             now=self._now,
         )

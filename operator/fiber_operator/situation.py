@@ -34,6 +34,10 @@ class Situation:
     template_hash: str
     wants_more: bool
     """Pods are missing, whether or not they may be created now."""
+    creates: bool
+    """Pods, or a dry run of one, are asked for now."""
+    deletes: bool
+    """Something is to be deleted now."""
     now: float
 
     def previous(self, reason: str) -> Problem | None:

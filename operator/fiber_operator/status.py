@@ -13,7 +13,9 @@ from fiber_operator import manifests
 from fiber_operator.conditions import Counts, Finding, Outlook, Truth, conditions, dated, phase
 from fiber_operator.documents import mapping, past, whole
 from fiber_operator.failures import Record
+from fiber_operator.plans import Obstacle
 from fiber_operator.pods import PodView
+from fiber_operator.situation import SECOND_LOOK
 
 
 def describe(
@@ -22,13 +24,15 @@ def describe(
     record: Record,
     *,
     address: str | None,
+    led: bool,
     template_hash: str,
     now: float,
 ) -> FiberPoolStatus:
     """The status that ``pool`` should have."""
     before, counts, master = pool.status, outlook.counts, pool.spec.master
     found = conditions(pool, outlook, now)
-    epoch = master.epoch if master else 0
+    epoch = master.epoch if master and led else 0
+    leads_to = names.address_of(master.host, master.port) if master else None
     return FiberPoolStatus(
         observed_generation=pool.metadata.generation,
         phase=phase(pool, found, outlook),
@@ -40,7 +44,7 @@ def describe(
         updated_replicas=counts.updated,
         selector=manifests.selector(pool),
         endpoint=f"{names.ENDPOINT_SCHEME}://{address}" if address else before.endpoint,
-        master=names.address_of(master.host, master.port) if master else None,
+        master=leads_to if led else before.master,
         master_epoch=max(epoch, before.master_epoch or 0) or None,
         credentials_secret=names.secret_name(pool.metadata.name),
         template_hash=template_hash,
@@ -106,6 +110,55 @@ def describe_unreadable(
         return None
     return after.model_dump(mode="json", by_alias=True)
 
+
+def describe_blind(
+    document: Mapping[str, Any], obstacle: Obstacle, now: float
+) -> dict[str, Any] | None:
+    """The status of a pool whose pods cannot be listed: what it was, and why it says no more.
+
+    The generation that it was of stays: what changed since is not carried out.
+    """
+    before, unread = FiberPoolStatus.salvage(document.get("status") or {})
+    problem = _lasting(obstacle, before, now)
+    others = [p for p in before.problems if p.reason != problem.reason]
+    update: dict[str, Any] = {
+        "phase": before.phase or Phase.PENDING,
+        "problems": (problem, *others)[: names.MAX_PROBLEMS],
+    }
+    if problem.severity == "Error":
+        generation = whole(mapping(document, "metadata").get("generation"))
+        known = {condition.type: condition for condition in before.conditions}
+        told = [
+            dated(Finding(kind, truth, problem.reason, problem.message), found, generation, now)
+            for kind, truth in _BLIND.items()
+            for found in [known.pop(kind, None)]
+        ]
+        update["conditions"] = (*told, *known.values())
+        if before.phase not in (Phase.TERMINATING, Phase.SUSPENDED, Phase.FAILED):
+            update["phase"] = Phase.DEGRADED
+    after = before.model_copy(update=update)
+    if after == before and not unread:
+        return None
+    return after.model_dump(mode="json", by_alias=True)
+
+
+def _lasting(obstacle: Obstacle, before: FiberPoolStatus, now: float) -> Problem:
+    known = next((p for p in before.problems if p.reason == obstacle.reason), None)
+    since = (past(known.since, now) if known else None) or float(math.floor(now))
+    was_error = known is not None and known.severity == "Error"
+    lasts = was_error or now - since >= SECOND_LOOK or obstacle.reason != Reason.API_UNAVAILABLE
+    return Problem(
+        reason=obstacle.reason,
+        severity="Error" if lasts else "Warning",
+        since=since,
+        message=obstacle.message,
+    )
+
+
+_BLIND: Mapping[ConditionType, Truth] = {
+    ConditionType.READY: "Unknown",
+    ConditionType.DEGRADED: "True",
+}
 
 _TOLD: Mapping[ConditionType, Truth] = {
     ConditionType.ACCEPTED: "False",

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import datetime
-from collections.abc import Callable, Mapping
+import ipaddress
+import urllib.parse
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,21 +18,21 @@ from fiber_api import names
 from fiber_api.certificates import Certificates, InvalidCertificates, make_pool_certificates
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Master
-from fiber_operator import manifests
+from fiber_operator import manifests, setbacks
 from fiber_operator.cluster import (
     SECRETS,
     SERVICES,
     SLICES,
+    ApiError,
     Body,
     Cluster,
     Conflict,
     Gone,
     Invalid,
-    Refused,
     Resource,
     Unavailable,
 )
-from fiber_operator.documents import items, mapping
+from fiber_operator.documents import items, mapping, seconds, text
 from fiber_operator.plans import Obstacle
 
 LOOK_AGAIN = 50.0
@@ -46,6 +48,23 @@ class Surroundings:
     master: Master | None
     """Where the EndpointSlice leads."""
     looked: float
+    credentials_made: float = 0.0
+    """When the Secret was, as the cluster says; 0.0 where that is not known."""
+    failure: ApiError | None = None
+    """A call that nobody knows the outcome of: to be raised once it is told."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What came of one step."""
+
+    told: str | None = None
+    """Of the Service its address, of the Secret when it was made."""
+    obstacle: Obstacle | None = None
+    failure: ApiError | None = None
+
+
+_Step = Callable[[FiberPool], Awaitable[str | None]]
 
 
 class _Obstructed(Exception):
@@ -62,30 +81,52 @@ class Keeper:
         self._now = now
 
     async def ensure(self, pool: FiberPool, known: Surroundings | None) -> Surroundings:
-        """What there is now; ``known`` is what this returned for the pool last time."""
+        """What there is now; ``known`` is what this returned for the pool last time.
+
+        What fails is an obstacle and not raised, but for a Conflict: then the next look finds out
+        what there is.
+        """
+        name = pool.metadata.name
+        steps: list[tuple[str, _Step]] = [
+            (f"the EndpointSlice {names.endpoint_slice_name(name)}", self._slice)
+        ]
         fresh = known is not None and self._now() - known.looked < LOOK_AGAIN
         if known is not None and fresh and not known.obstacles:
             if known.master == pool.spec.master:
                 return known
-            (slice_,) = await self._all(self._slice(pool))
-            return Surroundings(known.address, slice_[1], pool.spec.master, known.looked)
-        found = await self._all(self._slice(pool), self._service(pool), self._secret(pool))
-        obstacles = tuple(obstacle for _, several in found for obstacle in several)
-        return Surroundings(found[1][0], obstacles, pool.spec.master, self._now())
+            address, made, looked = known.address, known.credentials_made, known.looked
+        else:
+            address, made, looked = None, 0.0, self._now()
+            steps += [
+                (f"the Service {names.service_name(name)}", self._service),
+                (f"the Secret {names.secret_name(name)}", self._secret),
+            ]
+        found = await _all(*(self._attempt(pool, *step) for step in steps))
+        if len(found) > 1:
+            address, made = found[1].told, seconds(found[2].told)
+        led = found[0].obstacle is None
+        before = known.master if known is not None else None
+        return Surroundings(
+            address,
+            tuple(step.obstacle for step in found if step.obstacle is not None),
+            pool.spec.master if led else before,
+            looked,
+            made,
+            next((step.failure for step in found if step.failure is not None), None),
+        )
 
-    async def _all(self, *steps: Any) -> list[tuple[str | None, tuple[Obstacle, ...]]]:
-        """What each step returns, and what stands in its way; the first other error is raised."""
-        results: list[tuple[str | None, tuple[Obstacle, ...]]] = []
-        for result in await asyncio.gather(*steps, return_exceptions=True):
-            if isinstance(result, _Obstructed):
-                results.append((None, (result.obstacle,)))
-            elif isinstance(result, BaseException):
-                raise result
-            else:
-                results.append((result, ()))
-        return results
+    async def _attempt(self, pool: FiberPool, what: str, step: _Step) -> _Found:
+        try:
+            return _Found(await step(pool))
+        except _Obstructed as obstructed:
+            return _Found(obstacle=obstructed.obstacle)
+        except Conflict:
+            raise
+        except ApiError as error:
+            obstacle = setbacks.with_object(error, what)
+            return _Found(None, obstacle, error if isinstance(error, Unavailable) else None)
 
-    async def _secret(self, pool: FiberPool) -> None:
+    async def _secret(self, pool: FiberPool) -> str:
         now = datetime.datetime.fromtimestamp(self._now(), datetime.UTC)
         name, namespace = names.secret_name(pool.metadata.name), pool.metadata.namespace
 
@@ -103,11 +144,12 @@ class Keeper:
                 "one. Then restart the master and the workers, which hold the old ones."
             )
             raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True)) from None
+        return text(mapping(existing, "metadata").get("creationTimestamp"))
 
     async def _service(self, pool: FiberPool) -> str:
         name, namespace = names.service_name(pool.metadata.name), pool.metadata.namespace
         wanted = manifests.service(pool)
-        existing = await self._have(pool, SERVICES, name, lambda: wanted)
+        existing = await self._have_service(pool, name, wanted)
         spec = mapping(existing, "spec")
         if spec.get("selector") or not _has_ports(spec, wanted["spec"]["ports"]):
             patch = {"spec": {"selector": None, "ports": wanted["spec"]["ports"]}}
@@ -120,6 +162,16 @@ class Keeper:
             )
             raise _Obstructed(Obstacle(Reason.NAME_TAKEN, message, True))
         return names.address_of(host, names.MASTER_PORT)
+
+    async def _have_service(self, pool: FiberPool, name: str, wanted: Body) -> Body:
+        """One that was deleted gets its old address again, which workers dial, if it is free."""
+        if address := _former_address(pool):
+            former = {**wanted, "spec": {**wanted["spec"], "clusterIP": address}}
+            try:
+                return await self._have(pool, SERVICES, name, lambda: former)
+            except Invalid:
+                pass  # somebody has it now
+        return await self._have(pool, SERVICES, name, lambda: wanted)
 
     async def _slice(self, pool: FiberPool) -> None:
         name, namespace = names.endpoint_slice_name(pool.metadata.name), pool.metadata.namespace
@@ -142,30 +194,30 @@ class Keeper:
         try:
             existing = await self._cluster.read(resource, namespace, name)
         except Gone:
-            return await self._make(pool, resource, name, new())
+            # A Conflict: it was made between the two calls; the next look finds out by whom.
+            return await self._cluster.create(resource, namespace, new())
         if not manifests.is_ours(pool, existing):
             raise _Obstructed(_taken(pool, resource, name, existing))
         return existing
 
-    async def _make(self, pool: FiberPool, resource: Resource, name: str, body: Body) -> Body:
-        what = f"the {body['kind']} {name}"
-        try:
-            return await self._cluster.create(resource, pool.metadata.namespace, body)
-        except Conflict:
-            # It was made between the two calls; the next look finds out by whom.
-            raise
-        except (Refused, Invalid) as error:
-            message = (
-                f"{what} cannot be made: {error.message}. The pool needs it; remove what refuses "
-                "it (a quota, a policy, missing rights of the operator)."
-            )
-            raise _Obstructed(Obstacle(Reason.FORBIDDEN, message)) from error
-        except Unavailable as error:
-            message = (
-                f"{what} could not be made: {error.message}. The operator tries again; look at "
-                "the API server if this stays."
-            )
-            raise _Obstructed(Obstacle(Reason.API_UNAVAILABLE, message)) from error
+
+async def _all(*steps: Awaitable[_Found]) -> list[_Found]:
+    """What each step came to, once all have ended; what one raised is raised then."""
+    found = []
+    for result in await asyncio.gather(*steps, return_exceptions=True):
+        if isinstance(result, BaseException):
+            raise result
+        found.append(result)
+    return found
+
+
+def _former_address(pool: FiberPool) -> str | None:
+    """The IP address in ``status.endpoint``, if there is one in it."""
+    try:
+        host = urllib.parse.urlsplit(pool.status.endpoint or "").netloc.rpartition(":")[0]
+        return str(ipaddress.ip_address(host.strip("[]")))
+    except ValueError:
+        return None
 
 
 def _has_ports(spec: Mapping[str, Any], ports: list[Body]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -34,23 +33,22 @@ def events(change: Change, *, told: bool) -> Iterator[Event]:
 
 
 _DELETIONS = {
-    Reason.RELEASED: "Deleting {n} that the master released",
-    Reason.SCALED_DOWN: "Deleting {n}: fewer are wanted",
-    Reason.REPLACED: "Deleting {n} of an older template",
-    Reason.COMPLETED: "Deleting {n} that had ended with exit code 0",
-    Reason.SUSPENDED: "Deleting {n}: the pool is suspended",
+    Reason.RELEASED: "Deleting workers that the master released",
+    Reason.SCALED_DOWN: "Deleting workers: fewer are wanted",
+    Reason.REPLACED: "Deleting workers of an older template",
+    Reason.COMPLETED: "Deleting workers that had ended with exit code 0",
+    Reason.SUSPENDED: "Deleting workers: the pool is suspended",
 }
 
 
 def _actions(change: Change) -> Iterator[Event]:
-    reasons = Counter(deletion.reason for deletion in change.delete)
+    # Without numbers: a look follows the other, and what is told again raises a count.
+    reasons = {deletion.reason for deletion in change.delete}
     for reason, said in _DELETIONS.items():
-        if number := reasons[reason]:
-            yield Event("Normal", reason, said.format(n=_workers(number)))
+        if reason in reasons:
+            yield Event("Normal", reason, said)
     if change.create:
-        there, wanted = change.after.replicas, change.after.desired_replicas
-        message = f"Creating {_workers(change.create)}; {there} of {wanted} were there"
-        yield Event("Normal", Reason.SCALED_UP, message)
+        yield Event("Normal", Reason.SCALED_UP, "Creating workers: more are wanted than are there")
 
 
 def _disruptions(change: Change) -> Iterator[Event]:
@@ -69,7 +67,7 @@ def _problems(change: Change) -> Iterator[Event]:
     failed = {pod.name for pod in change.account.failed}
     for problem in change.after.problems:
         if (problem.reason, problem.severity) not in known or problem.pod in failed:
-            yield Event("Warning", problem.reason, problem.message)
+            yield Event("Warning", problem.reason, _without_output(problem.message))
     if _degraded(change.before) == "True" and _degraded(change.after) == "False":
         yield Event("Normal", Reason.RECOVERED, "What was wrong with the pool is so no more")
 
@@ -85,10 +83,15 @@ def _masters(change: Change) -> Iterator[Event]:
     yield Event("Normal", Reason.MASTER_CHANGED, message)
 
 
+def _without_output(message: str) -> str:
+    """Less a worker's last lines.
+
+    They may hold what others must not read, and events and this operator's log end up where
+    everybody looks; the status and the pod's log are read by whoever may read pools and pods.
+    """
+    return message.partition(wording.LAST_LINES)[0]
+
+
 def _degraded(status: FiberPoolStatus) -> str:
     found = (c.status for c in status.conditions if c.type == ConditionType.DEGRADED)
     return next(found, "Unknown")
-
-
-def _workers(number: int) -> str:
-    return "1 worker" if number == 1 else f"{number} workers"

@@ -124,13 +124,16 @@ def not_ready(pod: PodView) -> str:
 
 # -- Pods that fail
 
+LAST_LINES = " Its last lines:\n"
+"""Ends what is said of a failure; a worker's own output follows."""
+
 
 def failure(pool: FiberPool, record: Record, reason: Reason, pod: PodView) -> str:
     """How a worker failed, when the next one comes, and its last lines."""
     due = record.next_create_time
     wait = f" No other is created before {format_time(due)}." if due else ""
     own = pod.message and not _ended_by_node(pod) and reason != Reason.RUN_CONTAINER_ERROR
-    lines = f" Its last lines:\n{pod.message}" if own else ""
+    lines = f"{LAST_LINES}{pod.message}" if own else ""
     return f"{_ending(pool, reason, pod)}{wait}{lines}"
 
 

@@ -12,6 +12,10 @@ While a pool changes it is also looked at when the events of its pods cease, tho
 rested: what they led to is in the status at once, and not after a rest that began in the middle of
 it.  The next rest is longer by what this one lacked, and is not shortened.
 
+Pools that are in trouble do not hold up the others.  A turn that lasts, since a webhook hangs for
+instance, hands its place on to the next after ``LONG`` seconds; pools whose last turn failed let
+others go first and never take all places.
+
 Runs in one event loop and reads its clock; nothing here is called from another thread.
 """
 
@@ -37,7 +41,17 @@ LONGEST_BACKOFF = 30.0
 LONGEST_BLOCK = 1.0
 """Seconds for which a failure keeps even new events out."""
 
+LONG = 2.0
+"""Seconds after which a turn waits for somebody rather than works."""
+YIELD = 10.0
+"""Seconds by which a pool whose last turn failed lets others go first."""
+CROWD = 4
+"""Turns under way at most, those that wait included, for each that may work."""
+
 log = logging.getLogger(__name__)
+
+
+_Heap = list[tuple[float, int, "Key"]]
 
 
 class Key(NamedTuple):
@@ -109,9 +123,11 @@ class Queue:
         self._turn = turn
         self._concurrency = concurrency
         self._entries: dict[Key, _Entry] = {}
-        self._heap: list[tuple[float, int, Key]] = []
+        self._well: _Heap = []
+        self._failing: _Heap = []
         self._orders = itertools.count()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: dict[asyncio.Task[None], float] = {}
+        """Turns under way, the oldest first, and since when."""
         self._wake = asyncio.Event()
         self._last_end = self._now()
 
@@ -191,46 +207,67 @@ class Queue:
     def _place(self, key: Key, entry: _Entry, due: float) -> None:
         entry.due, entry.order = due, next(self._orders)
         if entry.running is None:
-            heapq.heappush(self._heap, (due, entry.order, key))
+            heapq.heappush(self._failing if entry.failures else self._well, (due, entry.order, key))
             self._wake.set()
 
-    def _next(self) -> tuple[float, Key] | None:
+    def _first(self, heap: _Heap) -> tuple[float, Key] | None:
         """The first place in the heap that is not void."""
-        while self._heap:
-            due, order, key = self._heap[0]
+        while heap:
+            due, order, key = heap[0]
             entry = self._entries.get(key)
             if entry is not None and entry.order == order:
                 return due, key
-            heapq.heappop(self._heap)
+            heapq.heappop(heap)
         return None
 
-    def _start_due(self) -> None:
+    def _open(self) -> list[_Heap]:
+        """From where a turn may begin now."""
+        now, most = self._now(), self._concurrency
+        working = sum(started + LONG > now for started in self._tasks.values())
+        if working >= most or len(self._tasks) >= CROWD * most:
+            return []
+        if working >= max(1, most - most // 4) or len(self._tasks) >= (CROWD - 1) * most:
+            return [self._well]
+        return [self._well, self._failing]
+
+    def _next(self) -> _Heap | None:
+        """Where the one is whose turn it is."""
         now = self._now()
-        while len(self._tasks) < self._concurrency and (first := self._next()):
-            due, key = first
-            if due > now:
-                return
-            heapq.heappop(self._heap)
+        due = {
+            first[0] + (YIELD if heap is self._failing else 0.0): heap
+            for heap in self._open()
+            if (first := self._first(heap)) and first[0] <= now
+        }
+        return due[min(due)] if due else None
+
+    def _start_due(self) -> None:
+        while heap := self._next():
+            now, (_, _, key) = self._now(), heapq.heappop(heap)
             entry = self._entries[key]
             entry.owed = max(0.0, entry.rested - now) if entry.limit is not None else 0.0
             entry.due, entry.limit, entry.order = None, None, -1
             entry.running, entry.rush, entry.lull = now, False, False
             task = asyncio.create_task(self._take(key, entry), name=f"turn of {key}")
-            self._tasks.add(task)
+            self._tasks[task] = now
             task.add_done_callback(self._done)
 
     def _done(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
+        del self._tasks[task]
         self._wake.set()
 
     async def _sleep(self) -> None:
-        first = self._next() if len(self._tasks) < self._concurrency else None
-        timeout = None if first is None else max(0.0, first[0] - self._now())
+        """Until a place is due or comes free, or something happens."""
+        now = self._now()
+        firsts = [first[0] for heap in self._open() if (first := self._first(heap))]
+        handing_on = [started + LONG for started in self._tasks.values() if started + LONG > now]
+        timeout = None
+        if self._concurrency and (times := firsts + handing_on):
+            timeout = max(0.0, min(times) - now)
         try:
             async with asyncio.timeout(timeout):
                 await self._wake.wait()
         except TimeoutError:
-            pass  # the first one in the heap is due
+            pass  # it is time
 
     async def _take(self, key: Key, entry: _Entry) -> None:
         try:

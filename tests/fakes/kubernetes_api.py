@@ -53,12 +53,15 @@ class Fault:
     """Seconds before anything happens; with nothing else set, nothing goes wrong then."""
     times: float = 1
     skip: int = 0
+    name: str = ""
+    """Only calls about the object of this name."""
 
     def strikes(self, call: Call) -> bool:
         if (
             self.times <= 0
             or self.verb not in ("", call.verb)
             or self.plural not in ("", call.plural)
+            or self.name not in ("", call.name)
         ):
             return False
         if self.skip:

@@ -184,6 +184,49 @@ async def test_an_event_that_repeats_is_counted(api: KubernetesApi, door: Cluste
 
 
 @played
+async def test_events_are_posted_in_order_and_nobody_waits(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    record, clock = recorder(api, door), asyncio.get_running_loop().time
+    running = asyncio.ensure_future(record.run())
+    slow = Fault("create", "events", late=4.5, times=10**6)
+    api.faults.append(slow)
+    for number in range(events.WAITING + 10):
+        record.tell(ES, "uid", Event("Normal", "A", str(number)))
+    assert clock() == 0.0
+    await asyncio.sleep(20)
+    assert [event["message"] for event in api.store.list("events")] != []
+    slow.late = 0.001
+    await asyncio.sleep(30)
+    told = [change.object["message"] for change in api.store.changes]
+    assert told == [str(number) for number in range(10, events.WAITING + 10)]
+    running.cancel()
+
+
+def test_events_without_the_lease_are_given_up() -> None:
+    held = False
+
+    def require(namespace: str) -> float:
+        if not held:
+            raise NotHolder
+        return 10.0
+
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        nonlocal held
+        record = recorder(api, door)
+        running = asyncio.ensure_future(record.run())
+        record.tell(ES, "uid", Event("Normal", "A", "before"))
+        await asyncio.sleep(1)
+        held = True
+        record.tell(ES, "uid", Event("Normal", "A", "after"))
+        await asyncio.sleep(1)
+        assert [event["message"] for event in api.store.list("events")] == ["after"]
+        running.cancel()
+
+    played(test, require)()
+
+
+@played
 async def test_events_differ_by_pool_reason_and_words(api: KubernetesApi, door: Cluster) -> None:
     record = recorder(api, door)
     for uid, reason, message in [

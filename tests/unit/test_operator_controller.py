@@ -518,3 +518,18 @@ async def test_people_see_what_the_operator_does(world: World) -> None:
         assert event["involvedObject"]["kind"] == "FiberPool"
         assert event["involvedObject"]["name"] == "es"
         assert event["message"]
+
+
+def test_what_workers_write_is_not_in_the_operators_log(caplog: pytest.LogCaptureFixture) -> None:
+    @played()
+    async def test(world: World) -> None:
+        world.make_pool(replicas=3)
+        await world.ready(3)
+        world.kubelet.exit(NAMESPACE, world.names()[0], 3)
+        await world.until(lambda: "last words" in str(world.status()))
+        await world.settled()
+
+    with caplog.at_level("DEBUG", "fiber_operator"):
+        test()
+    assert "exited with code 3" in caplog.text
+    assert "last words" not in caplog.text

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from fakes import strict, virtual_time
-from fakes.kubernetes_api import Fault
+from fakes.kubernetes_api import Call, Fault
 from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, World, a_world
 from fiber_api.names import Reason
@@ -185,3 +185,19 @@ async def test_the_wrong_type_in_a_template_is_a_problem(world: World) -> None:
     message = await message_of(world, "InvalidTemplate")
     assert "Container.spec.containers.env of type []v1.EnvVar. Correct spec.template" in message
     assert world.store.list("pods", NAMESPACE) == []
+
+
+@played
+async def test_a_webhook_that_cannot_do_dry_runs_is_no_verdict(world: World) -> None:
+    message = 'admission webhook "old.example" does not support dry run'
+
+    class OfDryRuns(Fault):
+        def strikes(self, call: Call) -> bool:
+            return call.dry_run and super().strikes(call)
+
+    refusal = {"status": 400, "reason": "BadRequest", "message": message}
+    world.api.faults.append(OfDryRuns("create", "pods", times=10**6, **refusal))
+    world.make_pool(replicas=5)
+    await world.ready(5)
+    assert world.reasons() == []
+    assert creations(world).count(True) == 1

@@ -11,6 +11,7 @@ import pytest
 from fakes import virtual_time
 from fakes.kubernetes_api import Call, Fault
 from fakes.world import NAMESPACE, World, a_world
+from fiber_operator import acting
 
 MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
 
@@ -222,15 +223,25 @@ async def test_events_that_cannot_be_posted_hold_back_nothing(world: World) -> N
 
 
 @played
-async def test_rights_that_are_missing_are_told(world: World) -> None:
-    world.api.faults.append(Fault("create", "secrets", status=403, reason="Forbidden", times=10**6))
-    world.make_pool(replicas=5)
-    await world.until(lambda: "Forbidden" in world.reasons())
-    assert "Secret es-tls" in world.status()["problems"][0]["message"]
-    await world.settled(60)
-    assert world.api.count("create", "secrets") < 30
-    world.api.faults.clear()
-    await world.ready(5)
+async def test_events_that_are_slow_hold_up_nothing(world: World) -> None:
+    world.make_pool(replicas=3)
+    await world.ready(3)
+    world.slow("create", "events", 4.5)
+    for number, name in enumerate(world.names()[:2]):
+        world.kubelet.exit(NAMESPACE, name, 3)
+        told = await world.until(
+            lambda n=number + 1: world.status()["failures"]["total"] == n  # type: ignore[misc]
+        )
+        assert told <= 1.0
+
+
+@played
+async def test_a_long_scale_up_is_one_event(world: World) -> None:
+    world.slow("create", "pods", 0.3)
+    world.make_pool(replicas=200, scaleUp={"maxInFlight": 10})
+    await world.ready(200)
+    reasons = [event["reason"] for event in world.store.list("events")]
+    assert reasons.count("ScaledUp") == 1
 
 
 @played
@@ -336,3 +347,97 @@ async def test_a_master_that_comes_back_in_the_last_moment_keeps_its_pool(world:
     assert world.store.list("fiberpools") != []
     assert len(world.pods()) == 3
     assert "MasterLost" not in world.reasons()
+
+
+def a_master_attaches_after(verb: str, plural: str, world: World, **spec: Any) -> None:
+    """In the middle of the operator's look: once the next such call is answered."""
+
+    def attach(call: Call) -> None:
+        if (call.verb, call.plural) == (verb, plural):
+            world.api.after = lambda call: None
+            world.edit(master=MASTER, **spec)
+
+    world.api.after = attach
+
+
+NEW_TEMPLATE = {"spec": {"containers": [{"name": "worker", "image": "registry/worker:2"}]}}
+
+
+@pytest.mark.parametrize(
+    ("edit", "call", "attachment"),
+    [
+        ({"template": NEW_TEMPLATE}, ("list", "pods"), {}),
+        ({"replicas": 10}, ("list", "pods"), {"replicas": 40}),
+        ({"replicas": 10}, ("patch", "fiberpools"), {"replicas": 40}),
+        ({"replicas": 10}, ("list", "pods"), {}),
+    ],
+    ids=["outdated", "fewer-wanted", "after-the-status", "fewer-wanted-still"],
+)
+def test_no_worker_of_a_master_that_attaches_during_a_look_is_deleted(
+    edit: dict[str, Any], call: tuple[str, str], attachment: dict[str, Any]
+) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.make_pool(replicas=40)
+        await world.ready(40)
+        await world.settled()
+        a_master_attaches_after(*call, world, **attachment)
+        world.edit(**edit)
+        await world.settled(60)
+        assert deleted(world) == []
+        assert len(world.pods()) == 40
+        assert world.status()["master"] == "10.0.3.7:41337"
+
+    test()
+
+
+@played
+async def test_a_master_that_attaches_during_a_long_deletion_keeps_who_is_left(
+    world: World,
+) -> None:
+    """Each batch is begun only while the pool is the one that the plan was made for."""
+    world.make_pool(replicas=200)
+    await world.ready(200)
+    await world.settled()
+    world.slow("delete", "pods", 0.2)
+    a_master_attaches_after("delete", "pods", world, replicas=200)
+    world.edit(replicas=10)
+    await world.settled(60)
+    assert 0 < len(deleted(world)) <= acting.DELETIONS
+
+
+@played
+async def test_what_is_released_goes_though_the_pool_changes_all_the_time(world: World) -> None:
+    world.make_pool(replicas=5, master=MASTER, update={"strategy": "Recreate"})
+    await world.ready(5)
+    released = world.names()[2]
+    world.slow("list", "pods", 0.1)
+
+    def change(call: Call) -> None:
+        if (call.verb, call.plural) == ("list", "pods"):
+            world.edit(failurePolicy={"backoffBaseSeconds": 1 + world.api.count("list", "pods")})
+
+    world.api.after = change
+    world.edit(template=NEW_TEMPLATE, scaleDown={"release": [released]})
+    await world.settled(5)
+    assert deleted(world) == [released]
+    world.api.after = lambda call: None
+    await world.until(lambda: len(deleted(world)) == 5)
+
+
+@played
+async def test_a_pool_that_is_gone_during_a_look_is_no_error(world: World) -> None:
+    world.make_pool(replicas=5)
+    await world.ready(5)
+    world.store.collects_garbage = False
+
+    def remove(call: Call) -> None:
+        if (call.verb, call.plural) == ("patch", "fiberpools"):
+            world.api.after = lambda call: None
+            world.store.delete("fiberpools", NAMESPACE, "es")
+
+    world.api.after = remove
+    world.edit(replicas=2)
+    await world.settled(30)
+    assert deleted(world) == []
+    assert world.program.queue.known() == []

@@ -346,6 +346,34 @@ def test_the_thread_tells_the_loop_that_made_it_and_ends_with_it() -> None:
     asyncio.run(main())
 
 
+def test_a_fault_of_ours_holds_up_no_other_event() -> None:
+    """Of two events that come together the first one is not taken."""
+
+    async def main() -> None:
+        told: list[str] = []
+
+        def notice(what: str) -> None:
+            told.append(what)
+            if what == "bad":
+                raise KeyError("a fault of ours")
+
+        watcher = Watcher(
+            notice,  # type: ignore[arg-type]
+            configure=load_configuration,
+            namespaces=(),
+            gate=lambda: asyncio.sleep(0),
+            on_start=lambda _: None,
+        )
+        watcher._loop = asyncio.get_running_loop()
+        for pair in (("bad", "good"), ("bad", "again")):
+            for what in pair:
+                watcher._tell(what)
+            await asyncio.sleep(2 * handlers.TOGETHER)
+        assert told == ["bad", "good", "bad", "again"]
+
+    virtual_time.run(main())
+
+
 def test_a_thread_that_cannot_watch_ends_the_program() -> None:
     async def main() -> None:
         def fail() -> None:

@@ -218,6 +218,22 @@ async def test_a_lease_that_another_took_is_lost_at_once(found: Operators) -> No
     assert found.lease()["leaseTransitions"] == 8
 
 
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("way", [{}, {"status": 500}], ids=str)
+def test_a_renewal_whose_answer_is_lost_is_still_ours(way: Body, times: int) -> None:
+    @played
+    async def test(found: Operators) -> None:
+        guard = found.start("a")
+        await until(lambda: guard.held)
+        found.api.faults.append(Fault("update", "leases", carried_out=True, times=times, **way))
+        for _ in range(400):
+            await asyncio.sleep(0.1)
+            assert guard.held
+        assert found.told == [("a", True)]
+
+    test()
+
+
 @played
 async def test_two_that_ask_at_once_do_not_both_get_it(found: Operators) -> None:
     guards = [found.start(name) for name in "abcd"]

@@ -201,7 +201,7 @@ async def test_what_cannot_be_read_is_not_judged(watch: Watch) -> None:
     watch.api.faults.append(Fault("get", "leases", status=403, times=10**6))
     watch.masters.follow(ES, TERM)
     await asyncio.sleep(300)
-    assert watch.masters.follow(ES, TERM) == Master(alive=None, missing=True)
+    assert watch.masters.follow(ES, TERM) == Master(unreadable="this is a test")
     assert len(watch.told) == 1
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.plans import Plan
 from fiber_operator.reconcile import plan
 from unit.operator_objects import (
     MASTER,
     NOW,
+    condition,
     ended,
     make_pool,
     memory_of,
@@ -39,9 +42,9 @@ def test_what_is_done_is_told() -> None:
     pool = make_pool(replicas=3, master=MASTER, scaleDown={"release": [name_of(1)]})
     made, _ = look(pool, running(1), of_template("older", waiting(2, "ErrImagePull")), running(3))
     assert [event.message for event in made.events[:3]] == [
-        "Deleting 1 worker that the master released",
-        "Deleting 1 worker of an older template",
-        "Creating 2 workers; 3 of 3 were there",
+        "Deleting workers that the master released",
+        "Deleting workers of an older template",
+        "Creating workers: more are wanted than are there",
     ]
 
 
@@ -75,6 +78,22 @@ def test_each_failure_is_told_even_if_the_problem_stays() -> None:
     second, pool = look(pool, ended(1), ended(2, ago=-2), now=NOW + 3)
     assert reasons(second) == ["ContainerFailed"]
     assert name_of(2) in second.events[0].message
+
+
+@pytest.mark.parametrize("limit", [0, 6])
+def test_what_a_worker_wrote_is_in_the_status_alone(limit: int) -> None:
+    pool = make_pool(replicas=1, failurePolicy={"backoffLimit": limit})
+    made, pool = look(pool, ended(1, message="password: 1234"))
+    assert reasons(made)[-1] == "ContainerFailed"
+    assert "password" in str(pool.status.problems)
+    assert "password" not in str(made.events)
+
+
+def test_what_a_worker_wrote_is_not_why_it_was_disrupted() -> None:
+    evicted = condition("DisruptionTarget", "True", reason="PreemptionByScheduler")
+    made, _ = look(make_pool(replicas=1), ended(1, message="password: 1", conditions=[evicted]))
+    assert "Disrupted" in reasons(made)
+    assert "password" not in str(made.events)
 
 
 def test_disruptions_are_told_together() -> None:

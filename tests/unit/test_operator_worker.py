@@ -241,6 +241,69 @@ async def test_pools_take_turns_side_by_side(queue: Queue, turns: Turns) -> None
     assert [when for when, _ in turns.begun] == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
 
 
+class Trouble(Turns):
+    """Turns of pools in the namespace ``bad`` last and fail."""
+
+    async def __call__(self, key: Key) -> Turn:
+        self.begun.append((asyncio.get_running_loop().time(), key))
+        bad = key.namespace == "bad"
+        await asyncio.sleep(10.0 if bad else 0.1)
+        return Turn(failed=bad)
+
+
+async def in_trouble(queue: Queue, pools: int, since: float) -> None:
+    for number in range(pools):
+        queue.add(Key("bad", str(number)))
+    await asyncio.sleep(since)
+
+
+@pytest.mark.parametrize("since", [0.0, 3.0, 60.0, 200.0])
+@pytest.mark.parametrize("pools", [8, 40])
+def test_pools_in_trouble_do_not_hold_up_the_others(pools: int, since: float) -> None:
+    async def main() -> None:
+        turns = Trouble()
+        queue = Queue(turns, concurrency=8)
+        task = asyncio.ensure_future(queue.run())
+        await in_trouble(queue, pools, since)
+        added = asyncio.get_running_loop().time()
+        queue.add(A)
+        await asyncio.sleep(60)
+        (began,) = turns.times()
+        # What never had a turn cannot be known to be in trouble.
+        assert began - added <= (12.0 if since < 10 else 1.0)
+        task.cancel()
+        await asyncio.wait([task])
+
+    virtual_time.run(main())
+
+
+@played(concurrency=1)
+async def test_who_fails_is_not_forgotten_over_others(queue: Queue, turns: Turns) -> None:
+    turns.result = Turn(failed=True)
+    queue.add(A)
+    await asyncio.sleep(0.1)
+    turns.result, turns.lasts = Turn(), 1.0
+
+    async def add_others() -> None:
+        for number in range(60):
+            queue.add(Key("team", str(number)))
+            queue.add(Key("team", f"{number}-too"))
+            await asyncio.sleep(1)
+
+    await asyncio.wait_for(add_others(), 100)
+    assert 10 < turns.times()[1] < 30
+
+
+@played(concurrency=2)
+async def test_a_turn_that_lasts_hands_its_place_on_to_so_many(queue: Queue, turns: Turns) -> None:
+    turns.lasts = 100.0
+    for number in range(20):
+        queue.add(Key("team", str(number)))
+    await asyncio.sleep(50)
+    assert [when for when, _ in turns.begun] == [0, 0, 2, 2, 4, 4, 6, 6]
+    assert turns.most_at_once == worker.CROWD * 2
+
+
 @played()
 async def test_a_pool_that_is_gone_is_forgotten(queue: Queue, turns: Turns) -> None:
     turns.result = Turn(forget=True)

@@ -1,0 +1,172 @@
+"""Workers that were made with an address or certificates that are of no use any more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from fakes import virtual_time
+from fakes.store import Body, Failure
+from fakes.world import NAMESPACE, TEMPLATE, World, a_world
+
+MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+
+Test = Callable[[World], Coroutine[Any, Any, None]]
+
+
+def played(test: Test) -> Callable[[], None]:
+    async def main() -> None:
+        async with a_world() as world:
+            await test(world)
+
+    return lambda: virtual_time.run(main())
+
+
+def created(world: World) -> list[str]:
+    return [c.place[2] for c in world.store.changes if c.type == "ADDED" and c.place[0] == "pods"]
+
+
+def taken(plural: str, body: Body) -> None:
+    if plural == "services" and body["spec"].get("clusterIP"):
+        message = 'spec.clusterIPs: Invalid value: ["10.96.0.1"]: failed to allocate IP'
+        raise Failure(422, "Invalid", f"{message} 10.96.0.1: provided IP is already allocated")
+
+
+def dialled(world: World) -> set[str]:
+    return {
+        variable["value"]
+        for pod in world.pods()
+        for variable in pod["spec"]["containers"][0]["env"]
+        if variable["name"] == "FIBER_AGENT_ADDRESS"
+    }
+
+
+@played
+async def test_a_service_that_was_deleted_comes_back_with_its_address(world: World) -> None:
+    world.make_pool(replicas=2, master=MASTER)
+    await world.ready(2)
+    endpoint = world.status()["endpoint"]
+    world.store.delete("services", NAMESPACE, "es-master")
+    await world.until(lambda: world.store.list("services") != [], within=125)
+    await world.settled()
+    assert world.status()["endpoint"] == endpoint
+    assert f"tls+tcp://{world.store.list('services')[0]['spec']['clusterIP']}:7070" == endpoint
+    assert (world.reasons(), len(created(world))) == ([], 2)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "address"),
+    [
+        ("tls+tcp://10.96.0.77:7070", "10.96.0.77"),
+        ("tls+tcp://[fd00::77]:7070", "fd00::77"),
+        ("tls+tcp://[fd00::77", "10.96.0.2"),
+        ("tls+tcp://es-master:7070", "10.96.0.2"),
+        ("nonsense", "10.96.0.2"),
+        ("", "10.96.0.2"),
+    ],
+)
+def test_the_address_is_what_the_status_says_if_that_is_one(endpoint: str, address: str) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.make_pool()
+        await world.until(lambda: "endpoint" in world.status())
+        await world.stop()
+        world.store.delete("services", NAMESPACE, "es-master")
+        status = {**world.status(), "endpoint": endpoint}
+        world.store.set_status("fiberpools", NAMESPACE, "es", status)
+        world.start()
+        await world.until(lambda: world.store.list("services") != [])
+        assert world.store.list("services")[0]["spec"]["clusterIP"] == address
+
+    test()
+
+
+async def lose_the_address(world: World) -> str:
+    """Delete the Service, and let another have its address; the one that workers dial."""
+    (before,) = dialled(world)
+    world.store.admit = taken
+    world.store.delete("services", NAMESPACE, "es-master")
+    await world.until(lambda: world.store.list("services") != [], within=125)
+    return before
+
+
+@played
+async def test_workers_without_a_master_that_dial_an_old_address_are_replaced(
+    world: World,
+) -> None:
+    world.make_pool(replicas=8)
+    await world.ready(8)
+    before = await lose_the_address(world)
+    await world.until(lambda: "AddressChanged" in world.reasons(), 5)
+    assert before in world.status()["problems"][0]["message"]
+    await world.until(lambda: before not in dialled(world))
+    await world.ready(8)
+    assert world.reasons() == []
+    assert f"tls+tcp://{dialled(world).pop()}" == world.status()["endpoint"]
+
+
+@played
+async def test_workers_of_a_master_that_dial_an_old_address_stay_and_are_told(
+    world: World,
+) -> None:
+    world.make_pool(replicas=3, master=MASTER)
+    await world.ready(3)
+    before = await lose_the_address(world)
+    await world.settled(60)
+    assert dialled(world) == {before}
+    (problem,) = world.status()["problems"]
+    assert (problem["reason"], problem["count"]) == ("AddressChanged", 3)
+    assert "kubectl -n team delete pods -l fiber.dev/pool=es" in problem["message"]
+    assert (world.status()["phase"], world.status()["updatedReplicas"]) == ("Degraded", 0)
+    for name in world.names():
+        world.store.delete("pods", NAMESPACE, name)
+    await world.ready(3)
+    await world.until(lambda: world.reasons() == [])
+
+
+@played
+async def test_a_template_that_says_where_to_dial_is_taken_at_its_word(world: World) -> None:
+    env = [{"name": "FIBER_AGENT_ADDRESS", "value": "10.0.0.1:7"}]
+    container = {**TEMPLATE["spec"]["containers"][0], "env": env}
+    world.make_pool(replicas=2, template={"spec": {"containers": [container]}})
+    await world.ready(2)
+    await world.settled(60)
+    assert (world.reasons(), len(created(world))) == ([], 2)
+
+
+@played
+async def test_workers_without_a_master_that_hold_old_credentials_are_replaced(
+    world: World,
+) -> None:
+    world.make_pool(replicas=8)
+    await world.ready(8)
+    await world.settled()
+    before = world.names()
+    world.store.delete("secrets", NAMESPACE, "es-tls")
+    await world.until(lambda: "CredentialsChanged" in world.reasons(), 125)
+    await world.until(lambda: not {*before} & {*world.names()})
+    await world.ready(8)
+    assert world.reasons() == []
+
+
+@played
+async def test_workers_of_a_master_that_hold_old_credentials_stay_and_are_told(
+    world: World,
+) -> None:
+    world.make_pool(replicas=3, master=MASTER)
+    await world.ready(3)
+    await world.settled()
+    before = world.names()
+    world.store.delete("secrets", NAMESPACE, "es-tls")
+    await world.until(lambda: "CredentialsChanged" in world.reasons(), 125)
+    await world.settled(120)
+    assert world.names() == before
+    (problem,) = world.status()["problems"]
+    assert "Restart the master" in problem["message"]
+    assert world.status()["phase"] == "Degraded"
+    for name in before:
+        world.store.delete("pods", NAMESPACE, name)
+    await world.ready(3)
+    await world.until(lambda: world.reasons() == [])

@@ -1,0 +1,355 @@
+"""Whatever call of the operator fails, a person reads it where they look: in the pool's status."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from fakes import virtual_time
+from fakes.kubernetes_api import Fault
+from fakes.store import Body
+from fakes.world import NAMESPACE, World, a_world
+from fiber_operator.situation import SECOND_LOOK
+
+MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+LOST = {**MASTER, "leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5}
+FOR_EVER = 10**6
+RULES = (
+    Path(__file__).parents[2] / "charts" / "fiber-operator" / "templates" / "_rules.tpl"
+).read_text()
+
+Test = Callable[[World], Coroutine[Any, Any, None]]
+Right = tuple[str, str]
+
+
+def played(test: Test) -> Callable[[], None]:
+    async def main() -> None:
+        async with a_world() as world:
+            await test(world)
+
+    return lambda: virtual_time.run(main())
+
+
+def rights() -> list[Right]:
+    """What the chart lets the operator do in the namespaces of pools."""
+    text = RULES[RULES.index("\npools:") : RULES.index("\nown:")]
+    rules = yaml.safe_load(text)["pools"]
+    return [(v, plural) for rule in rules for plural in rule["resources"] for v in rule["verbs"]]
+
+
+def fault(right: Right, **what: Any) -> Fault:
+    verb, plural = right
+    return Fault(verb, plural.partition("/")[0], times=FOR_EVER, **what)
+
+
+def denied(right: Right) -> Fault:
+    verb, plural = right
+    message = f'User "operator" cannot {verb} resource "{plural}"'
+    return fault(right, status=403, reason="Forbidden", message=message)
+
+
+# -- Rights: what a pool goes through in which each is needed
+
+
+async def is_new(world: World) -> None:
+    world.make_pool(replicas=2)
+
+
+async def releases(world: World) -> None:
+    world.edit(replicas=1, scaleDown={"release": world.names()[:1]})
+
+
+async def has_its_service_changed(world: World) -> None:
+    world.store.merge("services", NAMESPACE, "es-master", {"spec": {"selector": {"app": "x"}}})
+
+
+async def gets_another_master(world: World) -> None:
+    world.edit(master={**MASTER, "epoch": 2, "port": 2})
+
+
+async def gets_a_master_of_another_family(world: World) -> None:
+    world.edit(master={**MASTER, "epoch": 2, "host": "fd00::7"})
+
+
+async def loses_its_master(world: World) -> None:
+    world.edit(master=LOST)
+
+
+async def is_made_anew(world: World) -> None:
+    world.store.delete("fiberpools", NAMESPACE, "es")
+    world.make_pool(replicas=2)
+
+
+LIVES: dict[Right, Callable[[World], Awaitable[None]]] = {
+    ("create", "pods"): is_made_anew,
+    ("delete", "pods"): releases,
+    ("list", "pods"): releases,
+    ("create", "services"): is_made_anew,
+    ("get", "services"): is_made_anew,
+    ("patch", "services"): has_its_service_changed,
+    ("create", "secrets"): is_made_anew,
+    ("get", "secrets"): is_made_anew,
+    ("create", "endpointslices"): is_made_anew,
+    ("get", "endpointslices"): gets_another_master,
+    ("patch", "endpointslices"): gets_another_master,
+    ("delete", "endpointslices"): gets_a_master_of_another_family,
+    ("get", "leases"): loses_its_master,
+    ("delete", "fiberpools"): loses_its_master,
+}
+"""What is told in the status."""
+
+BY_EVENT = [("patch", "fiberpools/status")]
+BY_READINESS = [
+    ("list", "fiberpools"),
+    ("watch", "fiberpools"),
+    ("watch", "pods"),
+    ("create", "leases"),
+    ("update", "leases"),
+]
+BY_LOG = [("get", "fiberpools")]
+EVENTS = [("create", "events"), ("list", "events"), ("patch", "events")]
+"""Only an explanation is missing without these."""
+
+
+def test_every_right_is_in_one_of_these_tests() -> None:
+    assert sorted(rights()) == sorted([*LIVES, *BY_EVENT, *BY_READINESS, *BY_LOG, *EVENTS])
+
+
+@pytest.mark.parametrize("right", LIVES, ids=" ".join)
+def test_a_right_that_is_missing_is_told_in_the_status(right: Right) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.make_pool(replicas=2, master=MASTER)
+        await world.ready(2)
+        without = denied(right)
+        world.api.faults.append(without)
+        await LIVES[right](world)
+        await world.until(lambda: "Forbidden" in world.reasons(), within=60)
+        (problem,) = (p for p in world.status()["problems"] if p["reason"] == "Forbidden")
+        assert f"cannot {right[0]} resource" in problem["message"]
+        assert "operator" in problem["message"].replace('User "operator"', "")
+        await world.settled(60)
+        assert "Forbidden" in world.reasons(), "as long as it is missing"
+        assert world.api.count(*right) < 40
+        without.times = 0
+        await world.until(
+            lambda: not world.store.list("fiberpools") or "Forbidden" not in world.reasons(), 60
+        )
+
+    test()
+
+
+@pytest.mark.parametrize("right", BY_EVENT, ids=" ".join)
+def test_a_status_that_may_not_be_written_is_told_by_an_event(right: Right) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.api.faults.append(denied(right))
+        await is_new(world)
+        await world.until(lambda: world.store.list("events") != [], within=5)
+        await world.settled(120)
+        (event,) = world.store.list("events")
+        assert event["reason"] == "Forbidden"
+        assert "cannot patch resource" in event["message"]
+        assert world.pods() == []
+
+    test()
+
+
+@pytest.mark.parametrize("right", BY_LOG, ids=" ".join)
+def test_a_pool_that_may_not_be_read_is_told_in_the_log(
+    right: Right, caplog: pytest.LogCaptureFixture
+) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.api.faults.append(denied(right))
+        await is_new(world)
+        await world.settled(10)
+
+    test()
+    assert "get fiberpools es in team" in caplog.text
+
+
+@pytest.mark.parametrize("right", EVENTS, ids=" ".join)
+def test_without_events_a_pool_works(right: Right) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.api.faults.append(denied(right))
+        await is_new(world)
+        await world.ready(2)
+        assert world.reasons() == []
+
+    test()
+
+
+def test_without_the_right_to_list_pools_the_operator_is_not_ready() -> None:
+    """That to watch is of ``test_operator_watches``, that to leases of ``test_operator_claims``."""
+
+    @played
+    async def test(world: World) -> None:
+        world.api.faults.append(denied(("list", "fiberpools")))
+        await world.settled(1)
+        await world.until(lambda: "list fiberpools" in str(world.program.health.ready()), 120)
+
+    test()
+
+
+# -- A refusal does not hold up what it is not about
+
+
+@played
+async def test_a_master_that_is_not_led_to_is_not_told_as_if_it_were(world: World) -> None:
+    world.make_pool(replicas=3, master=MASTER)
+    await world.ready(3)
+    world.api.faults.append(denied(("patch", "endpointslices")))
+    released = world.names()[0]
+    another = {**MASTER, "epoch": 2, "port": 2}
+    world.edit(replicas=2, master=another, scaleDown={"release": [released]})
+    await world.until(lambda: world.status().get("observedGeneration") == 2, within=5)
+    assert world.status()["phase"] == "Degraded"
+    assert world.status()["master"] == "10.0.3.7:41337"
+    assert "the EndpointSlice es-master" in world.status()["problems"][0]["message"]
+    await world.until(lambda: released not in world.names())
+    world.api.faults.clear()
+    await world.until(lambda: world.status()["master"] == "10.0.3.7:2", within=10)
+    await world.ready(2)
+
+
+@played
+async def test_a_lease_that_may_not_be_read_is_a_warning(world: World) -> None:
+    without = denied(("get", "leases"))
+    without.name = "es"
+    world.api.faults.append(without)
+    world.make_pool(replicas=2, master=LOST)
+    await world.until(lambda: "Forbidden" in world.reasons())
+    await world.settled(60)
+    conditions = {c["type"]: c for c in world.status()["conditions"]}
+    assert conditions["MasterAlive"]["status"] == "Unknown"
+    assert "may not read the Lease es" in conditions["MasterAlive"]["message"]
+    assert conditions["Accepted"]["status"] == "True"
+    assert world.status()["phase"] == "Ready"
+    assert "onLost (Delete) is never applied" in world.status()["problems"][0]["message"]
+
+
+# -- Calls that fail
+
+
+WEBHOOK = 'Internal error occurred: failed calling webhook "v.example": connection refused'
+WAYS: dict[str, tuple[Body, float]] = {
+    "down": ({"status": 500, "message": WEBHOOK}, 0.0),
+    "slow": ({"late": 12.0}, 10.0),
+    "hangs": ({"late": 60.0}, 10.0),
+    "no-answer": ({}, 0.0),
+    "busy": ({"status": 429, "retry_after": 3, "message": "too many requests"}, 0.0),
+}
+"""How pods cannot be made, and when the first call has failed."""
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("replicas", [0, 5])
+def test_a_new_pool_whose_pods_cannot_be_made_says_so(way: str, replicas: int) -> None:
+    what, fails = WAYS[way]
+
+    @played
+    async def test(world: World) -> None:
+        world.api.faults.append(fault(("create", "pods"), **what))
+        world.make_pool(replicas=replicas)
+        assert await world.until(lambda: "ApiUnavailable" in world.reasons()) <= fails + 1.0
+        (problem,) = world.status()["problems"]
+        assert (problem["severity"], problem["terminal"]) == ("Warning", False)
+        assert str(what.get("message", "")) in problem["message"]
+        assert "admission webhook" in problem["message"]
+        await world.settled(SECOND_LOOK + 60)
+        assert world.status()["problems"][0]["severity"] == "Error"
+        assert world.status()["phase"] == "Degraded"
+        assert world.api.count("create", "pods") < 12
+        world.api.faults.clear()
+        await world.ready(replicas)
+        await world.until(lambda: world.reasons() == [])
+
+    test()
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_pool_that_worked_and_whose_pods_cannot_be_made_says_so(way: str) -> None:
+    what, fails = WAYS[way]
+
+    @played
+    async def test(world: World) -> None:
+        world.make_pool(replicas=2)
+        await world.ready(2)
+        world.api.faults.append(fault(("create", "pods"), **what))
+        world.edit(replicas=5)
+        assert await world.until(lambda: "ApiUnavailable" in world.reasons()) <= fails + 4.0
+        world.edit(replicas=2)
+        await world.until(lambda: world.reasons() == [], within=40)
+        world.api.faults.clear()
+        world.edit(replicas=5)
+        await world.ready(5)
+        assert world.reasons() == []
+
+    test()
+
+
+@pytest.mark.parametrize(
+    "right",
+    [right for right in LIVES if right not in [("create", "pods"), ("get", "leases")]],
+    ids=" ".join,
+)
+def test_a_call_that_fails_is_told_in_the_status(right: Right) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.make_pool(replicas=2, master=MASTER)
+        await world.ready(2)
+        world.api.faults.append(fault(right, status=500, message="etcdserver: no leader"))
+        await LIVES[right](world)
+        await world.until(lambda: "ApiUnavailable" in world.reasons(), within=60)
+        (problem,) = (p for p in world.status()["problems"] if p["reason"] == "ApiUnavailable")
+        assert "etcdserver: no leader" in problem["message"]
+        await world.settled(SECOND_LOOK + 40)
+        assert world.status()["phase"] == "Degraded"
+        assert world.api.count(*right) < 40
+        world.api.faults.clear()
+        await world.until(
+            lambda: not world.store.list("fiberpools") or "ApiUnavailable" not in world.reasons(),
+            within=60,
+        )
+
+    test()
+
+
+# -- Nobody knows which pods there are
+
+
+@played
+async def test_nothing_is_planned_on_an_unknown_list_of_pods(world: World) -> None:
+    world.make_pool(replicas=3)
+    await world.ready(3)
+    world.api.faults.append(fault(("list", "pods"), status=500))
+    world.edit(replicas=1)
+    await world.until(lambda: "ApiUnavailable" in world.reasons(), within=2)
+    status = world.status()
+    assert (status["observedGeneration"], status["readyReplicas"]) == (1, 3)
+    assert status["phase"] == "Ready", "it may pass at once"
+    await world.settled(120)
+    conditions = {c["type"]: c["status"] for c in world.status()["conditions"]}
+    assert (conditions["Ready"], conditions["Degraded"]) == ("Unknown", "True")
+    assert len(world.pods()) == 3
+    world.api.faults.clear()
+    await world.ready(1)
+    assert world.status()["phase"] == "Ready"
+
+
+@played
+async def test_a_new_pool_whose_pods_cannot_be_listed_says_so(world: World) -> None:
+    world.api.faults.append(fault(("list", "pods"), status=500))
+    world.make_pool(replicas=3)
+    await world.until(lambda: "ApiUnavailable" in world.reasons(), within=2)
+    assert world.status()["phase"] == "Pending"
+    await world.settled(60)
+    assert world.status()["phase"] == "Degraded"
+    assert world.pods() == []
+    assert [event["reason"] for event in world.store.list("events")] == ["ApiUnavailable"]
