@@ -9,8 +9,9 @@ takes what it needs from its environment:
                                         has an account
 ``MASTER_LOST_GRACE``                   its lostGraceSeconds; the default if absent
 
-and prints a JSON object a line: ``{"event": "joined", "name": "es-…", "at": 0.4}``.  ``at`` is in
-seconds since just before it wrote itself into the pool.
+and prints a JSON object a line: ``{"event": "joined", "name": "es-…", "at": 0.4}``, and the same
+with ``welcomed`` when the agent knows it.  ``at`` is in seconds since just before it wrote itself
+into the pool.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from fiber._transport.credentials import Credentials
 from fiber._transport.link import Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
+from fiber._wire.messages import TakeBack
 from fiber_api import names
 
 ACCOUNT = Path("/var/run/secrets/kubernetes.io/serviceaccount")
@@ -102,10 +104,19 @@ class Api:
 class Agent:
     """Hears of one agent."""
 
-    def __init__(self, link: Link, say: Any) -> None:
-        self._name, self._say = link.peer.name, say
+    def __init__(self, link: Link, loop: Loop, say: Any) -> None:
+        self._name, self._loop, self._link, self._say = link.peer.name, loop, link, say
         link.attach(self)
         say("joined", name=self._name)
+        link.send(TakeBack(0).encode())  # something harmless, to see it acknowledged
+        self._tell_when_welcomed()
+
+    def _tell_when_welcomed(self) -> None:
+        statistics = self._link.statistics()
+        if statistics.frames_sent and not statistics.unacknowledged_datagrams:
+            self._say("welcomed", name=self._name)
+        else:
+            self._loop.call_later(0.01, self._tell_when_welcomed)
 
     def on_frame(self, frame: object) -> None: ...
     def on_suspect(self) -> None: ...
@@ -134,7 +145,7 @@ def main() -> None:
         loop,
         names.address_of(host, 0),
         api.credentials(),
-        on_agent=lambda link: agents.append(Agent(link, say)),
+        on_agent=lambda link: agents.append(Agent(link, loop, say)),
         on_refused=lambda reason: say("refused", reason=reason),
         lost_grace=lost_grace,
     )

@@ -42,6 +42,13 @@ class Master:
         self.pool.wait(f"{wanted} join", lambda: wanted <= set(self.joined), seconds)
         return max(self.joined[name] for name in wanted)
 
+    def has_welcomed(self, worker: str) -> None:
+        """Wait until the worker itself knows that it has joined."""
+        welcome = {"event": "welcomed", "name": worker}
+        self.pool.wait(
+            f"{worker} is welcome", lambda: any(welcome.items() <= s.items() for s in self.said)
+        )
+
     def _hear(self, line: str) -> None:
         if line.startswith("{"):
             self.said.append(json.loads(line))

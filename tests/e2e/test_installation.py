@@ -78,6 +78,8 @@ def small(
     try:
         yield small
     finally:
+        # The other one would not be ready while nothing but a namespace of this one has a pool.
+        kube.kubectl("delete", "fiberpools", "--all", "--namespace", scene.namespace)
         small.uninstall()
         release.start()
 

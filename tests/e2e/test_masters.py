@@ -96,7 +96,7 @@ def test_workers_end_some_time_after_their_master(pool: Pool, agent: Body, host:
     pool.apply(agent, minReplicas=1)  # warm: the worker is older than what the master asks for
     (worker,) = pool.ready(1)
     with outside(pool, host, lost_grace=1) as master:
-        master.is_joined_by(worker)
+        master.has_welcomed(worker)
     pool.wait("another", lambda: pool.ever - {worker}, seconds=90)
     assert worker not in pool.ready(1)
     assert pool.status["failures"].get("total", 0) == 0

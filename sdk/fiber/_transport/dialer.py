@@ -18,7 +18,7 @@ from fiber._transport.session_link import SessionLink
 from fiber._wire.messages import ProtocolError
 from fiber.errors import AuthenticationError, FiberError, LinkError
 
-_PAUSE_MIN, _PAUSE_MAX = 0.1, 0.5
+_PAUSE_MIN, _PAUSE_MAX = 0.1, 0.3
 """Seconds from one attempt to dial to the next, growing: a thousand agents that wait for a master
 must neither flood its network nor keep it waiting."""
 
