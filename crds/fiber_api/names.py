@@ -182,9 +182,9 @@ def address_of(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def endpoint_of(host: str, port: int) -> str:
-    """The address as ``status.endpoint`` shows it."""
-    return f"{ENDPOINT_SCHEME}://{address_of(host, port)}"
+def endpoint_of(address: str) -> str:
+    """``host:port`` as ``status.endpoint`` shows it."""
+    return f"{ENDPOINT_SCHEME}://{address}"
 
 
 # -- What a status says
@@ -213,7 +213,7 @@ class Phase(StrEnum):
     """``status.phase``: the conditions in one word, for people.  Programs read the conditions."""
 
     PENDING = "Pending"
-    """New; the operator has not judged it yet."""
+    """It has no workers, and the API server has not said yet whether it takes any."""
     SCALING = "Scaling"
     """Workers are on their way, or are leaving."""
     READY = "Ready"
@@ -280,11 +280,15 @@ class Reason(StrEnum):
     # Problems: the master and the API server.
     MASTER_LOST = "MasterLost"
     """The master's Lease has expired."""
+    LEASE_NOT_FOUND = "LeaseNotFound"
+    """There is no Lease of the name in ``spec.master.leaseName``, and there was none before."""
     API_UNAVAILABLE = "ApiUnavailable"
     """A call of the operator fails: an admission webhook is down, the API server is busy."""
 
     # Conditions: what is neither good nor bad news.
     AS_EXPECTED = "AsExpected"
+    NOT_JUDGED = "NotJudged"
+    """The API server has not said yet whether it takes pods of the template."""
     CREATING = "Creating"
     STARTING = "Starting"
     BACKING_OFF = "BackingOff"

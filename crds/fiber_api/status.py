@@ -25,6 +25,12 @@ class Failures(Model):
     """Failures since the pool was made."""
     disrupted: Count = 0
     """Workers that the cluster ended, since the pool was made. They do not count as failures."""
+    completed: Count = 0
+    """Workers that ended with exit code 0 and were not released, since the pool was made."""
+    completions: Count = 0
+    """Rounds of such ends in a row. From the second on, the next creation waits."""
+    last_completed: Time | None = None
+    """When the last of these rounds began."""
     last_exit_code: ExitCode | None = None
     """Exit code of the worker that failed last."""
     last_reason: str | None = None
@@ -40,7 +46,12 @@ class Failures(Model):
         tuple[str, ...],
         Field(strict=False, json_schema_extra={"x-kubernetes-list-type": "atomic"}),
     ] = ()
-    """Failed pods that still exist and are counted already."""
+    """Pods that have ended, still exist and are counted already, by the ends of their names."""
+    deleting: Annotated[
+        tuple[str, ...],
+        Field(strict=False, json_schema_extra={"x-kubernetes-list-type": "atomic"}),
+    ] = ()
+    """Pods that the operator deletes, whose end counts as nothing, by the ends of their names."""
     spec_hash: str | None = None
     """Hash of the part of the spec that the failures in a row are those of; it changes, they are
     forgotten."""
@@ -111,7 +122,7 @@ class FiberPoolStatus(Model):
     master_epoch: Annotated[int | None, Field(ge=0, le=2**53)] = None
     """The highest epoch that a master of this pool has had. A new master takes a higher one."""
     credentials_secret: str | None = None
-    """Name of the Secret that the master listens with."""
+    """Name of the Secret that the master listens with, once it is made and whole."""
     template_hash: str | None = None
     """Hash of the current template; the pods' label fiber.dev/template-hash."""
     proven_template_hash: str | None = None

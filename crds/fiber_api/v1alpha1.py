@@ -163,7 +163,9 @@ class FailurePolicy(Model):
     backoff_max_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 300
     """The longest wait between two attempts."""
     backoff_limit: Annotated[int, Field(ge=0, le=10_000)] = 6
-    """Failures in a row after which nothing more is created until the spec changes."""
+    """With more rounds of failures in a row than this nothing more is created until template,
+    processesPerPod, failurePolicy, update or suspend changes, or a master with a new epoch comes.
+    Workers that fail together are one round."""
     startup_timeout_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 900
     """How long a worker may take to become ready once its container runs. Then it counts as
     failed: its pod is deleted, and replaced like that of any other failure. A pod whose container
@@ -239,12 +241,9 @@ class Metadata(Model):
     name: Annotated[str, Field(min_length=1)]
     namespace: str = ""
     uid: str = ""
-    resource_version: str = ""
     generation: int = 0
     creation_timestamp: Time | None = None
     deletion_timestamp: Time | None = None
-    labels: dict[str, str] = Field(default_factory=dict)
-    annotations: dict[str, str] = Field(default_factory=dict)
 
 
 class FiberPool(Model):

@@ -52,8 +52,6 @@ class State:
     creation: Obstacle | None = None
     deletion: Obstacle | None = None
     """Why the last one came to nothing."""
-    deleted: set[str] = field(default_factory=set)
-    """Pods that this process asked to delete and that are still there."""
     warnings: dict[str, str] = field(default_factory=dict)
     pace: Pace = field(default_factory=Pace)
     generation: int = -1
@@ -181,7 +179,7 @@ class Actor:
 
         Like creation this stops after a while, so that the status is not out of date for long.
         """
-        key, state = look.key, look.state
+        key = look.key
         deletions = sorted(look.plan.delete, key=lambda deletion: deletion.may_work)
         clock = asyncio.get_running_loop().time
         enough, done, as_planned = clock() + _enough(look), 0, True
@@ -192,15 +190,12 @@ class Actor:
                 batch = [deletion for deletion in batch if not deletion.may_work]
                 deletions = deletions[:done] + batch
                 as_planned = False
-            state.deleted |= {deletion.name for deletion in batch}
             results = await asyncio.gather(
                 *(self._delete_pod(key.namespace, deletion) for deletion in batch),
                 return_exceptions=True,
             )
             failure = None
             for deletion, result in zip(batch, results, strict=True):
-                if isinstance(result, Conflict | Refused | Invalid):
-                    state.deleted.discard(deletion.name)
                 if isinstance(result, Conflict):
                     as_planned = False
                 elif isinstance(result, BaseException) and not isinstance(result, Gone):
@@ -209,7 +204,7 @@ class Actor:
                     failure = failure or result
                 else:
                     self._metrics.deleted(str(deletion.reason))
-            state.deletion = None if failure is None else setbacks.with_deletion(failure)
+            look.state.deletion = None if failure is None else setbacks.with_deletion(failure)
             if failure is not None:
                 raise failure
             done += len(batch)
@@ -230,7 +225,6 @@ class Actor:
             deletion.name,
             uid=deletion.uid,
             resource_version=deletion.resource_version,
-            grace=deletion.grace,
         )
 
     async def _create(self, look: Look) -> Turn:

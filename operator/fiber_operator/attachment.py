@@ -9,7 +9,6 @@ from fiber_api.names import ConditionType
 from fiber_api.v1alpha1 import Condition, FiberPool
 from fiber_operator import plans
 from fiber_operator.documents import past
-from fiber_operator.revisions import spec_hash
 
 
 @dataclass(frozen=True)
@@ -24,6 +23,8 @@ class Attachment:
     """Set while ``alive`` is False."""
     due: float | None = None
     """When the grace of a lost master ends, if it has not ended."""
+    unseen: bool = False
+    """There is no Lease of that name and never was, as far as anybody knows."""
     gone: bool = False
     """The grace is over and this process itself found the Lease expired: ``onLost`` applies."""
 
@@ -33,7 +34,7 @@ class Attachment:
         return self.alive is False and self.due is None
 
 
-def judge(pool: FiberPool, lease: plans.Master, now: float) -> Attachment:
+def judge(pool: FiberPool, lease: plans.LeaseVerdict, now: float) -> Attachment:
     """What the spec, the Lease and the status together say.
 
     After a restart the operator does not know for a while; it goes by the status meanwhile, if
@@ -45,8 +46,12 @@ def judge(pool: FiberPool, lease: plans.Master, now: float) -> Attachment:
     if master.lease_name is None or lease.unreadable:
         return Attachment(attached=True, alive=None)
     before = _condition(pool)
+    if before is not None and before.status == "Unknown":
+        before = None
+    if lease.missing and before is None:
+        return Attachment(attached=True, alive=None, unseen=True)
     alive = lease.alive
-    if alive is None and before is not None and before.status != "Unknown":
+    if alive is None and before is not None:
         alive = before.status == "True"
     if alive is not False:
         return Attachment(attached=True, alive=alive)
@@ -68,8 +73,8 @@ def _lost_since(pool: FiberPool, before: Condition | None, now: float) -> float:
 
 
 def _condition(pool: FiberPool) -> Condition | None:
-    """What the status says of this very master."""
-    if pool.status.failures.spec_hash != spec_hash(pool):
+    """What the status says of this very master, whatever else of the spec has changed."""
+    if pool.spec.master is None or pool.status.master_epoch != pool.spec.master.epoch:
         return None
     conditions = pool.status.conditions
     return next((c for c in conditions if c.type == ConditionType.MASTER_ALIVE), None)

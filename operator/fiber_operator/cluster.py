@@ -185,7 +185,6 @@ class Cluster:
         *,
         uid: str,
         resource_version: str | None = None,
-        grace: int | None = None,
     ) -> None:
         """Delete this very object; Conflict if another has its name, or it changed since."""
         preconditions = {"uid": uid, "resourceVersion": resource_version}
@@ -195,8 +194,6 @@ class Cluster:
             "preconditions": {key: value for key, value in preconditions.items() if value},
             "propagationPolicy": "Background",
         }
-        if grace is not None:
-            options["gracePeriodSeconds"] = grace
         await self._call("delete", resource, namespace, name, body=options)
 
     async def _call(

@@ -50,11 +50,13 @@ class Outlook:
     counts: Counts
     problems: tuple[Problem, ...]
     attachment: Attachment
+    judged: bool = True
+    """Whether the API server has said what it thinks of the template, as far as that matters."""
     create: int = 0
     delete: int = 0
     """Live pods that go now."""
     waits_until: float | None = None
-    """Nothing is created before this time, for workers have failed."""
+    """Nothing is created before this time, for workers have failed or ended too often."""
     draining: int = 0
     """Workers more than wanted, of which only the master may say which are idle."""
     replacing: int = 0
@@ -120,6 +122,8 @@ def phase(pool: FiberPool, found: Sequence[Condition], outlook: Outlook) -> Phas
         return Phase.FAILED
     if status[ConditionType.DEGRADED] == "True":
         return Phase.DEGRADED
+    if not outlook.judged and not outlook.counts.live:
+        return Phase.PENDING
     if status[ConditionType.READY] != "True" or status[ConditionType.PROGRESSING] == "True":
         return Phase.SCALING
     return Phase.READY
@@ -151,6 +155,9 @@ def _accepted(outlook: Outlook) -> Finding:
     problem = outlook.problem(*_UNACCEPTABLE)
     if problem is not None and problem.severity == "Error":
         return Finding(kind, "False", problem.reason, problem.message)
+    if not outlook.judged:
+        message = "the API server has not said yet whether it takes pods of this template"
+        return Finding(kind, "Unknown", Reason.NOT_JUDGED, message)
     return Finding(kind, "True", Reason.AS_EXPECTED)
 
 
@@ -188,7 +195,7 @@ def _progressing(pool: FiberPool, outlook: Outlook) -> Finding:
         return Finding(kind, "True", Reason.CREATING, lack)
     if outlook.waits_until is not None:
         message = (
-            f"{lack}; after failures none is created before {format_time(outlook.waits_until)}"
+            f"{lack}; workers ended, so none is created before {format_time(outlook.waits_until)}"
         )
         return Finding(kind, "True", Reason.BACKING_OFF, message)
     if outlook.replacing:
@@ -227,11 +234,13 @@ def _master_unknown(pool: FiberPool, outlook: Outlook) -> Finding:
     if master is None:
         return Finding(kind, "Unknown", Reason.NO_MASTER, "the pool waits for a master")
     if master.lease_name is None:
-        message = "spec.master.leaseName is absent, so that nobody can tell"
+        message = "spec.master.leaseName is absent: nobody checks it"
         return Finding(kind, "Unknown", Reason.LEASE_NOT_CHECKED, message)
     if outlook.lease_unreadable:
         message = f"the operator may not read the Lease {master.lease_name}"
         return Finding(kind, "Unknown", Reason.FORBIDDEN, message)
+    if problem := outlook.problem(Reason.LEASE_NOT_FOUND):
+        return Finding(kind, "Unknown", Reason.LEASE_NOT_FOUND, problem.message)
     message = f"the Lease {master.lease_name} was not seen to change yet"
     return Finding(kind, "Unknown", Reason.LEASE_NOT_CHECKED, message)
 

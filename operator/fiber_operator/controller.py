@@ -173,7 +173,6 @@ class Controller:
         ended = clock()
         rested = ended + min(LIST_SHARE * (ended - started), LONGEST_REST)
         there = {pod.name for pod in pods}
-        state.deleted &= there
         state.warnings = {name: text for name, text in state.warnings.items() if name in there}
         state.pace.unsure = [name for name in state.pace.unsure if name not in there]
         return pods, rested
@@ -182,6 +181,7 @@ class Controller:
         around = state.surroundings
         memory = Memory(
             address=state.address,
+            credentials=around.credentials if around else None,
             credentials_made=around.credentials_made if around else 0.0,
             obstacles=around.obstacles if around else (),
             led=around is None or around.master == pool.spec.master,
@@ -190,7 +190,6 @@ class Controller:
             accepted=state.accepted,
             refusal=state.refusal,
             master=self._masters.follow(key, _term(pool)),
-            deleted=frozenset(state.deleted),
             warnings=dict(state.warnings),
         )
         return reconcile.plan(pool, pods, memory, self._now())

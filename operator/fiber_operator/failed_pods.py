@@ -29,6 +29,25 @@ def failed_pods(situation: Situation) -> Iterator[Problem]:
     yield last
 
 
+def completed_pods(situation: Situation) -> Iterator[Problem]:
+    """Workers that end of themselves again and again."""
+    record, reason = situation.account.record, Reason.COMPLETED
+    if record.completions < 2:
+        return
+    before, newly = situation.previous(reason), situation.account.completed[-1:]
+    if before and before.severity == "Warning" and not newly:
+        yield before
+        return
+    message = wording.completed(situation.pool, record, newly[0] if newly else None)
+    yield situation.problem(
+        reason,
+        message,
+        severity="Warning",
+        count=record.completions,
+        pod=newly[0].name if newly else None,
+    )
+
+
 _FAILURES = (
     Reason.CONTAINER_FAILED,
     Reason.OOM_KILLED,
@@ -52,7 +71,11 @@ def _last_failure(situation: Situation) -> Problem:
         return before or situation.problem(kinds[0], wording.forgotten_failure(pool, record))
     reason = failure_reason(newest)
     before = situation.previous(reason)
-    message = wording.failure(pool, record, reason, newest)
+    if late:
+        warning = situation.memory.warnings.get(newest.name, "")
+        message = wording.late_failure(pool, record, newest, warning)
+    else:
+        message = wording.failure(pool, record, reason, newest)
     return situation.problem(
         reason,
         message,

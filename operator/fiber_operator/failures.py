@@ -5,8 +5,15 @@ first failure.  Were each pod counted, a pool of two hundred workers would be pa
 first time that all of them run into the same fault.  A failed pod that was created after the last
 round began opens the next one.
 
+A worker that ends with exit code 0 and was not released has not failed: an agent ends so when it
+was without a master for too long.  But one that does so again and again runs the wrong program,
+and its successors wait like those of failures, from the second round on, though without a limit.
+
 The whole record stands in the pool's status, so that it survives the operator; ``counted`` names
-the ended pods that still exist and are in the sums already.
+the ended pods that still exist and are in the sums already, ``deleting`` those whose end the
+operator itself is about to ask for or has asked for.  Both are written before anything is deleted.
+They are kept small, for a status that etcd refuses would stop the pool: what has no place in them
+waits for the next look.
 """
 
 from __future__ import annotations
@@ -24,6 +31,16 @@ from fiber_operator.pods import BRIEF, PodView, State, Trouble
 
 RECOVERY = 60.0
 """Seconds that a new pod must stay Ready until the failures before it are forgotten."""
+
+FORGIVEN = 600.0
+"""Seconds without a new round after which ends with exit code 0 are no row any more."""
+
+NAMES = 2000
+"""Pods that a record names, at most: some thirty kilobytes."""
+
+ROUND = 50
+"""Pods that are seen to in one look though no name has a place any more: others may take long to
+end, on a node that is silent for instance."""
 
 _JITTER = 0.1
 """How much longer than its due a wait may be, so that pools which fail together come apart."""
@@ -45,6 +62,11 @@ class Record:
     """Rounds in a row."""
     total: int = 0
     disrupted: int = 0
+    completed: int = 0
+    completions: int = 0
+    """Rounds in a row in which workers ended with exit code 0."""
+    last_completed: float | None = None
+    """When the last of these began."""
     last_exit_code: int | None = None
     last_reason: str | None = None
     last_time: float | None = None
@@ -53,43 +75,58 @@ class Record:
     newest_created: float | None = None
     """When the newest pod was created that was there at the beginning of the last round."""
     counted: frozenset[str] = frozenset()
+    deleting: frozenset[str] = frozenset()
     spec_hash: str | None = None
     """What the user asked for when this was written; something else begins anew."""
     proven: str | None = None
     """The template hash of which a pod was Ready."""
 
     @classmethod
-    def read(cls, status: FiberPoolStatus, now: float) -> Record:
-        """What the status remembers, less times that have not come yet: those are none of ours."""
+    def read(cls, status: FiberPoolStatus, pool: str, now: float) -> Record:
+        """What the status of ``pool`` remembers, less times that have not come yet: those are none
+        of ours."""
         kept = status.failures
         return cls(
             kept.consecutive,
             kept.total,
             kept.disrupted,
+            kept.completed,
+            kept.completions,
+            past(kept.last_completed, now),
             kept.last_exit_code,
             kept.last_reason,
             past(kept.last_time, now),
             kept.next_create_time,
             past(kept.newest_created, now),
-            frozenset(kept.counted),
+            frozenset(_long(name, pool) for name in kept.counted),
+            frozenset(_long(name, pool) for name in kept.deleting),
             kept.spec_hash,
             status.proven_template_hash,
         )
 
-    def failures(self) -> Failures:
-        """As it stands in the status."""
+    def failures(self, pool: str) -> Failures:
+        """As it stands in the status of ``pool``."""
         return Failures(
             consecutive=self.consecutive,
             total=self.total,
             disrupted=self.disrupted,
+            completed=self.completed,
+            completions=self.completions,
+            last_completed=self.last_completed,
             last_exit_code=self.last_exit_code,
             last_reason=self.last_reason,
             last_time=self.last_time,
             next_create_time=self.next_create_time,
             newest_created=self.newest_created,
-            counted=tuple(sorted(self.counted)),
+            counted=tuple(sorted(_short(name, pool) for name in self.counted)),
+            deleting=tuple(sorted(_short(name, pool) for name in self.deleting)),
             spec_hash=self.spec_hash,
         )
+
+    @property
+    def room(self) -> int:
+        """How many more pods it has a place for."""
+        return max(0, NAMES - len(self.counted) - len(self.deleting))
 
     def next_creation(self, policy: FailurePolicy, now: float) -> float | None:
         """``next_create_time`` if it can be ours.
@@ -110,6 +147,15 @@ class Record:
         return self.consecutive > policy.backoff_limit
 
 
+def _short(name: str, pool: str) -> str:
+    """A pod's name less the pool's, with which nearly all begin: ``-1a2b3c4d5e``."""
+    return name.removeprefix(pool) if name.startswith(f"{pool}-") else name
+
+
+def _long(name: str, pool: str) -> str:
+    return f"{pool}{name}" if name.startswith("-") else name
+
+
 @dataclass(frozen=True)
 class Account:
     """What one look at the pods added."""
@@ -118,13 +164,15 @@ class Account:
     failed: tuple[PodView, ...] = ()
     """Newly counted failures, the newest last."""
     disrupted: tuple[PodView, ...] = ()
+    completed: tuple[PodView, ...] = ()
+    """Newly counted ends with exit code 0, the newest last."""
     again: float | None = None
-    """When a pod will have been Ready for long enough."""
+    """When something will be forgotten: a pod was Ready for long enough, say."""
 
     @property
     def news(self) -> bool:
         """Whether anything was counted."""
-        return bool(self.failed or self.disrupted)
+        return bool(self.failed or self.disrupted or self.completed)
 
 
 def account(
@@ -145,43 +193,75 @@ def account(
     ``expected`` names pods whose end was asked for; ``late`` names pods that are not Ready in
     time, which counts as a failure; ``desired`` is how many are wanted.
     """
-    record = _begin(record, pods, spec_hash)
+    record = _begin(record, pods, late, spec_hash)
     record = replace(record, next_create_time=record.next_creation(policy, now))
     uncounted = [p for p in pods if p.name not in record.counted and p.name not in expected]
-    failed = sorted(
-        (p for p in uncounted if _failed(p) or p.name in late), key=lambda p: (p.since, p.name)
-    )
-    disrupted = [p for p in uncounted if p.name not in late and _disrupted(p)]
+    uncounted.sort(key=lambda pod: (pod.since, pod.name))
+    failed = [p for p in uncounted if _failed(p) or p.name in late][: max(ROUND, record.room)]
+    record = _count(record, failed)
+    completed = [p for p in uncounted if _completed(p)][: max(ROUND, record.room)]
+    record = _count(record, completed)
+    disrupted = [p for p in uncounted if p.name not in late and _disrupted(p, record)]
+    disrupted = disrupted[: record.room]
+    record = _count(record, disrupted)
     record = replace(
         record,
         total=min(record.total + len(failed), MAX_COUNT),
+        completed=min(record.completed + len(completed), MAX_COUNT),
         disrupted=min(record.disrupted + len(disrupted), MAX_COUNT),
-        counted=record.counted.union(p.name for p in (*failed, *disrupted)),
     )
     if failed:
         record = _fail(record, pods, failed, policy, seed, now)
+    if completed:
+        record = _complete(record, completed, policy, seed, now)
     again = None if record.exhausted(policy) else _recovery(record, pods, desired)
     if again is not None and again <= now:
         record, again = replace(record, consecutive=0, next_create_time=None), None
+    record, forgiven = _forgive(record, now)
     record = _prove(record, pods, failed, template_hash, now)
-    return Account(record, tuple(failed), tuple(disrupted), again)
+    times = [time for time in (again, forgiven) if time is not None]
+    return Account(
+        record, tuple(failed), tuple(disrupted), tuple(completed), min(times, default=None)
+    )
 
 
-def _begin(record: Record, pods: Sequence[PodView], spec_hash: str) -> Record:
-    names = {pod.name for pod in pods}
-    record = replace(record, counted=record.counted & names)
+def _count(record: Record, pods: Sequence[PodView]) -> Record:
+    return replace(record, counted=record.counted.union(pod.name for pod in pods))
+
+
+def _begin(
+    record: Record, pods: Sequence[PodView], late: Collection[str], spec_hash: str
+) -> Record:
+    # One that was to be deleted and lives, for something came between, is like any other.
+    ending = {pod.name for pod in pods if not pod.live or pod.name in late}
+    deleted = {pod.name for pod in pods if pod.state is State.TERMINATING}
+    record = replace(
+        record, counted=record.counted & ending, deleting=record.deleting & deleted - record.counted
+    )
     if record.spec_hash == spec_hash:
         return record
-    return replace(record, spec_hash=spec_hash, consecutive=0, next_create_time=None)
+    return replace(
+        record,
+        spec_hash=spec_hash,
+        consecutive=0,
+        completions=0,
+        last_completed=None,
+        next_create_time=None,
+    )
 
 
 def _failed(pod: PodView) -> bool:
     return pod.state is State.ENDED and pod.trouble is Trouble.APPLICATION
 
 
-def _disrupted(pod: PodView) -> bool:
-    ended = pod.state is State.ENDED and pod.trouble is Trouble.DISRUPTED
-    return ended or pod.state is State.TERMINATING
+def _completed(pod: PodView) -> bool:
+    return pod.state is State.ENDED and pod.trouble is Trouble.COMPLETED
+
+
+def _disrupted(pod: PodView, record: Record) -> bool:
+    if pod.state is State.TERMINATING:
+        return pod.name not in record.deleting
+    return pod.state is State.ENDED and pod.trouble is Trouble.DISRUPTED
 
 
 def _fail(
@@ -207,6 +287,30 @@ def _fail(
     # In whole seconds, so that what is created then is newer than what is there now.
     due = math.ceil(now + delay(policy, rounds, seed))
     return replace(record, next_create_time=None if record.exhausted(policy) else float(due))
+
+
+def _complete(
+    record: Record, completed: Sequence[PodView], policy: FailurePolicy, seed: str, now: float
+) -> Record:
+    began = record.last_completed
+    if began is not None and all(pod.created <= began for pod in completed):
+        return record
+    rounds = min(record.completions + 1, MAX_COUNT)
+    record = replace(record, completions=rounds, last_completed=float(math.floor(now)))
+    if rounds == 1 or record.exhausted(policy):
+        return record
+    due = float(math.ceil(now + delay(policy, rounds - 1, seed)))
+    return replace(record, next_create_time=max(due, record.next_create_time or 0.0))
+
+
+def _forgive(record: Record, now: float) -> tuple[Record, float | None]:
+    """Without a row that is over, and when it will be."""
+    if not record.completions:
+        return record, None
+    due = max(record.last_completed or 0.0, record.next_create_time or 0.0) + FORGIVEN
+    if due > now:
+        return record, due
+    return replace(record, completions=0, last_completed=None), None
 
 
 def _recovery(record: Record, pods: Sequence[PodView], desired: int) -> float | None:

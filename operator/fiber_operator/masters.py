@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Gone, Refused
 from fiber_operator.logs import about
-from fiber_operator.plans import Master
+from fiber_operator.plans import LeaseVerdict
 from fiber_operator.worker import Key
 
 LOOKS = 3
@@ -39,7 +39,7 @@ class Term(NamedTuple):
 class _Watched:
     term: Term
     due: float
-    verdict: Master
+    verdict: LeaseVerdict
     seen: tuple[object, ...] | None = None
     """What the Lease said at the last look; None: there was none, or there is a gap since."""
     changed: float = 0.0
@@ -60,14 +60,14 @@ class Masters:
         self._watched: dict[Key, _Watched] = {}
         self._wake = asyncio.Event()
 
-    def follow(self, key: Key, term: Term | None) -> Master:
+    def follow(self, key: Key, term: Term | None) -> LeaseVerdict:
         """Watch this master of the pool from now on (None: none) and say what is known of it."""
         watched = self._watched.get(key)
         if term is None:
             self._watched.pop(key, None)
-            return Master()
+            return LeaseVerdict()
         if watched is None or watched.term != term:
-            watched = self._watched[key] = _Watched(term, self._now(), Master())
+            watched = self._watched[key] = _Watched(term, self._now(), LeaseVerdict())
             self._wake.set()
         return watched.verdict
 
@@ -98,19 +98,19 @@ class Masters:
             log.warning("the master's Lease cannot be read: %s", error, extra=about(*key))
             watched.seen, watched.due = None, self._now() + watched.pause
             if isinstance(error, Refused):
-                self._conclude(key, watched, Master(unreadable=error.message))
+                self._conclude(key, watched, LeaseVerdict(unreadable=error.message))
             return
         verdict = self._judge(watched, lease)
         watched.looked = self._now()
         watched.due = watched.looked + watched.pause
         self._conclude(key, watched, verdict)
 
-    def _conclude(self, key: Key, watched: _Watched, verdict: Master) -> None:
+    def _conclude(self, key: Key, watched: _Watched, verdict: LeaseVerdict) -> None:
         before, watched.verdict = watched.verdict, verdict
         if watched.verdict != before and self._watched.get(key) is watched:
             self._on_change(key)
 
-    def _judge(self, watched: _Watched, lease: Body) -> Master:
+    def _judge(self, watched: _Watched, lease: Body) -> LeaseVerdict:
         spec = lease.get("spec")
         spec = spec if isinstance(spec, dict) else {}
         holder, seen = (
@@ -127,7 +127,7 @@ class Masters:
         elif now - watched.changed >= watched.term.seconds:
             alive = False
         watched.seen = seen
-        return Master(alive=alive, holder=str(holder), missing=not lease)
+        return LeaseVerdict(alive=alive, holder=str(holder), missing=not lease)
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()

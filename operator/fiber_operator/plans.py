@@ -50,13 +50,13 @@ class Obstacle:
 
 
 @dataclass(frozen=True)
-class Master:
+class LeaseVerdict:
     """What the operator's own monotonic clock says of the master's Lease.
 
     ``masters.py`` makes one for each pool whose ``spec.master.leaseName`` is set, anew for each
     epoch.  After a restart of the operator ``alive`` is None until the Lease is seen to change
     (True) or a whole duration passes without a change (False).  A Lease that does not exist is one
-    that does not change.
+    that does not change; ``attachment.judge`` tells one that is gone from one that never was.
     """
 
     alive: bool | None = None
@@ -77,6 +77,8 @@ class Memory:
 
     address: str | None = None
     """``host:port`` of the pool's Service.  Nothing is created while it is None."""
+    credentials: bool | None = None
+    """Whether the pool's Secret was seen to be the pool's own and whole; None: not looked at."""
     credentials_made: float = 0.0
     """When the pool's Secret was made, as the cluster says."""
     obstacles: tuple[Obstacle, ...] = ()
@@ -90,10 +92,7 @@ class Memory:
     accepted: str | None = None
     """The template hash that passed the server-side dry run in this process."""
     refusal: Refusal | None = None
-    master: Master = field(default_factory=Master)
-    deleted: frozenset[str] = frozenset()
-    """Names of pods that this process asked to delete, so that their end is not taken for
-    somebody else's doing.  Names that are not in the list any more may be dropped."""
+    master: LeaseVerdict = field(default_factory=LeaseVerdict)
     warnings: Mapping[str, str] = field(default_factory=dict)
     """Pod name -> the newest event about it, as ``Reason: message``, where that is a Warning, of
     the pods that ``Plan.inspect`` asked about."""
@@ -115,8 +114,6 @@ class Deletion:
     may_work: bool = False
     """The pod could be at work if a master attached after the pool was read: nobody released it,
     and no precondition guards it.  It goes only while the pool is the one that was planned for."""
-    grace: int | None = None
-    """``gracePeriodSeconds``; None leaves the pod's own."""
 
 
 @dataclass(frozen=True)
@@ -136,13 +133,14 @@ class Plan:
     0. if ``delete_pool``, delete the FiberPool, with its uid and the resourceVersion that the plan
        was made from as preconditions, and do nothing else: a master that comes back in this very
        moment writes the spec and wins; ``status`` is for the case that it cannot be deleted;
-    1. write ``status``, if it is not None: what it counts must be safe before the pods that were
-       counted are deleted;
-    2. delete ``delete``, and read the pool again before those that ``may_work``: if it is another
-       or has changed, plan anew;
-    3. if ``dry_run``, send ``manifests.pod(...)`` with ``dryRun=All`` and
+    1. if ``dry_run``, send ``manifests.pod(...)`` with ``dryRun=All`` and
        ``fieldValidation=Strict``, without which a misspelt field is dropped in silence; then plan
-       again with the outcome in ``Memory.accepted`` or ``Memory.refusal``;
+       again with the outcome in ``Memory.accepted`` or ``Memory.refusal``, or go on with this plan
+       if there is none;
+    2. write ``status``, if it is not None: what it counts must be safe before the pods that were
+       counted are deleted, and so must the names of all that are;
+    3. delete ``delete``, and read the pool again before those that ``may_work``: if it is another
+       or has changed, plan anew;
     4. create ``create`` pods in slow-start batches 1, 2, 4 ... ``batch_limit``, and stop at the
        first 403 or 422, which becomes ``Memory.refusal``;
     5. emit ``events``.
@@ -162,9 +160,9 @@ class Plan:
     on the status subresource: a field that is to go away is None in it, lists are whole."""
     events: tuple[Event, ...] = ()
     inspect: tuple[str, ...] = ()
-    """Names of pods, one at most, that have a node and yet no running container for some seconds,
-    and whose status does not say why.  What the kubelet is stuck at (a volume whose Secret is
-    missing, a network that fails) stands in the pod's events alone: read those with its
+    """Names of pods, one at most, that have a node and are not Ready for some seconds, and whose
+    status does not say why.  What the kubelet is stuck at (a volume whose Secret is missing, a
+    network that fails, a probe) stands in the pod's events alone: read those with its
     ``involvedObject.uid``.  If the newest is a Warning, it goes into ``Memory.warnings``; one that
     is followed by a Normal event, as when an image is being pulled at last, is over."""
     again: float | None = None

@@ -43,7 +43,8 @@ class Trouble(StrEnum):
     DISRUPTED = "Disrupted"
     """The cluster ended it: replaced at once, not counted."""
     COMPLETED = "Completed"
-    """The worker ended with exit code 0 after a while: replaced at once, not counted."""
+    """The worker ended with exit code 0 after a while: replaced at once, unless that happens again
+    and again."""
     APPLICATION = "Application"
     """The worker failed, or ended at once: counted, and replaced after a while."""
     CANNOT_START = "CannotStart"
@@ -246,7 +247,7 @@ class _Observation:
             return self._why_ended()
         if state is State.PENDING:
             return self._why_pending()
-        if state is State.NOT_READY:
+        if state in (State.STARTING, State.NOT_READY):
             condition = self._condition("Ready")
             return None, text(condition.get("reason")), text(condition.get("message"))
         if state is State.TERMINATING and self._disruption():

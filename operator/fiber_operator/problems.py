@@ -10,7 +10,7 @@ from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Problem
 from fiber_operator import cut_off, setbacks, wording
-from fiber_operator.failed_pods import failed_pods
+from fiber_operator.failed_pods import completed_pods, failed_pods
 from fiber_operator.plans import Refusal
 from fiber_operator.situation import Situation
 from fiber_operator.starting_pods import pods_not_ready_any_more, pods_that_do_not_start
@@ -35,6 +35,7 @@ def _all(situation: Situation) -> Iterator[Problem]:
     yield from _obstacles(situation)
     yield from _refusals(situation)
     yield from failed_pods(situation)
+    yield from completed_pods(situation)
     yield from pods_that_do_not_start(situation)
     yield from pods_not_ready_any_more(situation)
     yield from cut_off.problems(situation)
@@ -92,8 +93,12 @@ def _may_pass(refused: Refusal) -> bool:
 def _masters(situation: Situation) -> Iterator[Problem]:
     pool, memory, attachment = situation.pool, situation.memory, situation.attachment
     if attachment.lost_since is not None:
-        message = wording.master_lost(pool, attachment.lost_since, memory.master.holder)
+        message = wording.master_lost(pool, attachment.lost_since, memory.master)
         yield situation.problem(Reason.MASTER_LOST, message)
+    if attachment.unseen:
+        severity = situation.severity(Reason.LEASE_NOT_FOUND)
+        message = wording.no_lease(pool)
+        yield situation.problem(Reason.LEASE_NOT_FOUND, message, severity=severity)
     if pool.spec.master and memory.master.unreadable:
         message = setbacks.with_lease(pool.spec.master, memory.master.unreadable)
         yield situation.problem(Reason.FORBIDDEN, message, severity="Warning")

@@ -27,7 +27,7 @@ it, unless ``onLost`` is ``Retain``.  Then ``Delete`` deletes the FiberPool, ``S
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -47,6 +47,9 @@ STUCK = 5.0
 
 QUOTA_WAIT = 30.0
 """The longest wait until a full quota is tried again: it is freed without a sign."""
+
+NEXT_ROUND = 1.0
+"""Seconds until those pods are deleted that were too many for one look."""
 
 _ENDED: Mapping[Trouble | None, Reason] = {
     Trouble.COMPLETED: Reason.COMPLETED,
@@ -97,7 +100,8 @@ class _Planner:
         self._memory, self._now = memory, now
         self._hash = revisions.template_hash(pool)
         # Whoever has taken that label away has said nothing against the pod.
-        self._pods = [p if p.template_hash else replace(p, template_hash=self._hash) for p in pods]
+        pods = [p if p.template_hash else replace(p, template_hash=self._hash) for p in pods]
+        self._pods = [self._fairly_judged(pod) for pod in pods]
         self._attachment = judge(pool, memory.master, now)
         lost = cut_off.find(pool, [pod for pod in self._pods if pod.live], memory)
         self._pods = cut_off.outdated(self._pods, lost, attached=self._attachment.attached)
@@ -106,11 +110,13 @@ class _Planner:
         self._ended = [pod for pod in self._pods if pod.state is State.ENDED]
         self._late = self._not_ready_in_time()
         self._desired = self._wanted()
+        self._expected = self._asked_to_end()
         self._account = self._count()
         self._record = self._account.record
         self._refused = self._refused_until()
         self._may_create = self._can_make_pods()
         self._deletions: dict[str, Deletion] = {}
+        self._postponed: set[str] = set()
 
     def plan(self) -> Plan:
         """The whole of it."""
@@ -119,14 +125,12 @@ class _Planner:
             return self._delete_pool()
         if not self._ends:
             self._delete()
+        self._remember_deletions()
         dry_run = self._may_create and not self._accepted and not self._spec.suspend
         create, trial_ends = self._creations()
         found = problems.find(self._situation())
-        after = self._status(found, create)
+        after = self._status(found, create, judged=not dry_run)
         document = status.patch(self._pool, after)
-        outcome_follows = dry_run and self._memory.creation is None
-        if outcome_follows and not self._deletions and not self._account.news:
-            document = None  # it is what is worth telling
         change = Change(self._pool.status, after, self._account, create, self._in_order())
         return Plan(
             create=create,
@@ -136,17 +140,15 @@ class _Planner:
             template_hash=self._hash,
             status=document,
             events=tuple(events(change, told=document is not None)),
-            inspect=tuple(p.name for p in self._silent() if self._now >= p.created + STUCK)[:1],
+            inspect=tuple(self._to_inspect())[:1],
             again=self._again(found, trial_ends),
         )
 
     def _delete_pool(self) -> Plan:
         assert self._attachment.lost_since is not None
-        message = wording.master_lost(
-            self._pool, self._attachment.lost_since, self._memory.master.holder
-        )
+        message = wording.master_lost(self._pool, self._attachment.lost_since, self._memory.master)
         event = Event("Warning", Reason.MASTER_LOST, message)
-        after = self._status(problems.find(self._situation(deletes=True)), 0)
+        after = self._status(problems.find(self._situation(deletes=True)), 0, judged=self._accepted)
         return Plan(
             delete_pool=True,
             template_hash=self._hash,
@@ -156,6 +158,15 @@ class _Planner:
 
     # What is so
 
+    def _fairly_judged(self, pod: PodView) -> PodView:
+        """An agent whose master is lost ends with 0, however soon that is."""
+        master, brief = self._spec.master, pod.state is State.ENDED and pod.exit_code == 0
+        if master is None or not brief or pod.trouble is not Trouble.APPLICATION:
+            return pod
+        # The cluster's times are whole seconds.
+        waited = pod.ran > 0 and pod.ran >= master.lost_grace_seconds - 1
+        return replace(pod, trouble=Trouble.COMPLETED) if waited else pod
+
     def _not_ready_in_time(self) -> list[PodView]:
         """Workers that run and do not get Ready: they failed, only that they do not end."""
         if self._ends or self._spec.suspend:
@@ -163,14 +174,16 @@ class _Planner:
         limit = self._now - self._spec.failure_policy.startup_timeout_seconds
         return [pod for pod in self._live if pod.state is State.STARTING and pod.since <= limit]
 
-    def _count(self) -> failures.Account:
-        expected = self._memory.deleted.union(self._spec.scale_down.release)
+    def _asked_to_end(self) -> frozenset[str]:
         if self._ends or self._spec.suspend:
-            expected = expected.union(pod.name for pod in self._pods)
+            return frozenset(pod.name for pod in self._pods)
+        return frozenset(self._spec.scale_down.release)
+
+    def _count(self) -> failures.Account:
         return failures.account(
-            failures.Record.read(self._pool.status, self._now),
+            failures.Record.read(self._pool.status, self._pool.metadata.name, self._now),
             self._pods,
-            expected=expected,
+            expected=self._expected,
             late={pod.name for pod in self._late},
             desired=self._desired,
             template_hash=self._hash,
@@ -231,7 +244,8 @@ class _Planner:
             self._take(self._live + self._ended, Reason.SUSPENDED)
         release = set(spec.scale_down.release)
         self._take([p for p in self._live + self._ended if p.name in release], Reason.RELEASED)
-        self._take(self._late, Reason.STARTUP_TIMEOUT, guarded=True)
+        late = [pod for pod in self._late if pod.name in self._record.counted]
+        self._take(late, Reason.STARTUP_TIMEOUT, guarded=True)
         if self._accepted and self._may_create:
             self._take(self._outdated(), Reason.REPLACED, guarded=attached)
         free = spec.scale_down.policy == "Any" or not attached
@@ -242,7 +256,8 @@ class _Planner:
             free_choice=free,
         )
         self._take(excess, Reason.SCALED_DOWN, guarded=not free)
-        for pod in scaling.ended_to_delete(self._ended, self._record.counted):
+        settled = self._record.counted.union(self._expected)
+        for pod in scaling.ended_to_delete(self._ended, settled):
             self._take([pod], _ENDED.get(pod.trouble, Reason.CONTAINER_FAILED))
 
     def _outdated(self) -> list[PodView]:
@@ -252,6 +267,7 @@ class _Planner:
             strategy=self._spec.update.strategy,
             attached=self._attachment.attached,
             desired=self._desired,
+            proven=self._record.proven == self._hash,
         )
 
     def _take(self, pods: Sequence[PodView], reason: Reason, *, guarded: bool = False) -> None:
@@ -262,8 +278,16 @@ class _Planner:
                 pod.name, Deletion(pod.name, pod.uid, version, reason, may_work)
             )
 
+    def _remember_deletions(self) -> None:
+        """So that nobody takes them for somebody else's doing; what is too much comes later."""
+        counted = self._record.counted
+        named = [name for name in self._deletions if name not in counted]
+        self._postponed = set(named[max(failures.ROUND, self._record.room) :])
+        deleting = self._record.deleting.union(named).difference(self._postponed)
+        self._record = replace(self._record, deleting=deleting)
+
     def _in_order(self) -> tuple[Deletion, ...]:
-        return tuple(self._deletions.values())
+        return tuple(d for d in self._deletions.values() if d.name not in self._postponed)
 
     @property
     def _remaining(self) -> list[PodView]:
@@ -274,13 +298,20 @@ class _Planner:
     def _creations(self) -> tuple[int, float | None]:
         """How many now, and when more may follow if that is not all."""
         missing = self._desired - len(self._remaining)
-        if missing <= 0 or not self._may_create or not self._accepted:
+        if missing <= 0 or not self._may_create or not self._accepted or self._postponed:
             return 0, None
         current = [pod for pod in self._remaining if pod.template_hash == self._hash]
-        trial = scaling.trial(current, proven=self._record.proven == self._hash, now=self._now)
-        if trial.limit is None:
-            return missing, None
-        return max(0, min(missing, trial.limit - len(current))), trial.again
+        trial = scaling.trial(
+            current,
+            proven=self._record.proven == self._hash,
+            failing=self._is_complained_of(current),
+            now=self._now,
+        )
+        return missing if trial.room is None else min(missing, trial.room), trial.again
+
+    def _is_complained_of(self, pods: Sequence[PodView]) -> bool:
+        ended = self._record.consecutive or self._record.completions
+        return bool(ended) or any(self._memory.warnings.get(pod.name) for pod in pods)
 
     # What to say
 
@@ -300,13 +331,14 @@ class _Planner:
             now=self._now,
         )
 
-    def _status(self, found: tuple[Problem, ...], create: int) -> FiberPoolStatus:
+    def _status(self, found: tuple[Problem, ...], create: int, *, judged: bool) -> FiberPoolStatus:
         missing = self._desired - len(self._remaining)
         waits = self._record.waits_until(self._spec.failure_policy, self._now)
         outlook = Outlook(
             Counts.of(self._pods, self._desired, self._hash),
             found,
             self._attachment,
+            judged=judged,
             create=create,
             delete=len(self._live) - len(self._remaining),
             waits_until=waits if missing > 0 else None,
@@ -320,6 +352,7 @@ class _Planner:
             self._record,
             address=self._memory.address,
             led=self._memory.led,
+            credentials=self._memory.credentials,
             template_hash=self._hash,
             now=self._now,
         )
@@ -328,6 +361,11 @@ class _Planner:
         if self._spec.update.strategy == "OnDelete":
             return 0
         return sum(pod.template_hash != self._hash for pod in self._live)
+
+    def _to_inspect(self) -> Iterator[str]:
+        """Whose events may say more: what failed though it runs, for it goes now; then others."""
+        yield from (p.name for p in self._account.failed[-1:] if p.state is not State.ENDED)
+        yield from (p.name for p in self._silent() if self._now >= p.created + STUCK)
 
     def _silent(self) -> list[PodView]:
         """Pods with a node that do not get Ready and whose status does not say why."""
@@ -345,6 +383,7 @@ class _Planner:
         times = [
             trial_ends,
             self._account.again,
+            self._now + NEXT_ROUND if self._postponed else None,
             self._attachment.due,
             self._refused,
             self._record.waits_until(self._spec.failure_policy, self._now),

@@ -15,8 +15,8 @@ from fiber_operator.pods import PodView, State, Trouble
 CANARIES = 3
 """Pods that try out a template that never worked."""
 
-PATIENCE = 10.0
-"""Seconds after which a canary without bad news is good news."""
+PATIENCE = 30.0
+"""Seconds after which canaries of which nothing bad is known are joined by as many again."""
 
 
 def outdated_to_replace(
@@ -26,13 +26,14 @@ def outdated_to_replace(
     strategy: str,
     attached: bool,
     desired: int,
+    proven: bool,
 ) -> list[PodView]:
     """Pods of an older template that go now.
 
     ``OnDelete``: none.  ``Recreate``: all, at work or not.  ``OnIdle``: those that were never
     Ready.  The others are at work while a master is attached; it sees ``updatedReplicas`` and
-    releases them when they are idle.  Without one they are replaced a quarter at a time, so that
-    a template that does not work costs no more than a quarter of a warm pool.
+    releases them when they are idle.  Without one they are replaced a quarter at a time, and no
+    more than there may be canaries until the new template is ``proven`` to work.
     """
     outdated = [pod for pod in live if pod.template_hash != template_hash]
     if strategy == "OnDelete":
@@ -45,7 +46,8 @@ def outdated_to_replace(
     unready = [pod for pod in outdated if pod.was_ready and pod.state is not State.READY]
     ready = [pod for pod in outdated if pod.state is State.READY]
     missing = desired - sum(pod.state is State.READY for pod in live)
-    spare = max(0, max(1, desired // 4) - max(0, missing))
+    quarter = max(1, desired // 4)
+    spare = max(0, (quarter if proven else min(quarter, CANARIES)) - max(0, missing))
     return fresh + unready + expendable(ready, template_hash)[:spare]
 
 
@@ -81,37 +83,43 @@ def excess_to_delete(
 
 @dataclass(frozen=True)
 class Trial:
-    """How many pods of a template may be there now."""
+    """How many more pods of a template may be there now."""
 
-    limit: int | None = None
+    room: int | None = None
     """None: as many as are wanted."""
     again: float | None = None
-    """When patience ends."""
+    """When there will be more room, if nothing happens until then."""
 
 
-def trial(current: Sequence[PodView], *, proven: bool, now: float) -> Trial:
+def trial(current: Sequence[PodView], *, proven: bool, failing: bool, now: float) -> Trial:
     """Whether a template, of which ``current`` are the live pods, is still being tried out.
 
-    A pod that no node takes ends the trial: a cluster autoscaler must see the whole demand.
+    It is until one of its pods is Ready.  A pod that cannot start, or ``failing`` ones before
+    these, leave it at the canaries that there are.  While nothing is wrong their number doubles
+    each ``PATIENCE``, for an image may take long to fetch and fetching it on three nodes does not
+    help the others.  Pods that no node takes do not count, and let as many again ask for a node: a
+    cluster autoscaler must see the whole demand.
     """
     if proven:
         return Trial()
-    if any(pod.trouble is Trouble.CANNOT_START for pod in current):
-        return Trial(CANARIES)
-    if any(pod.trouble is Trouble.UNSCHEDULABLE for pod in current):
-        return Trial()
-    if not current:
-        return Trial(CANARIES)
-    due = min(pod.created for pod in current) + PATIENCE
-    return Trial() if now >= due else Trial(CANARIES, due)
+    if failing or any(pod.trouble is Trouble.CANNOT_START for pod in current):
+        return Trial(max(0, CANARIES - len(current)))
+    turned_away = sum(pod.trouble is Trouble.UNSCHEDULABLE for pod in current)
+    placed = len(current) - turned_away
+    room = max(CANARIES, turned_away) - placed
+    if room > 0:
+        return Trial(room)
+    due = max(pod.created for pod in current) + PATIENCE
+    return Trial(placed) if now >= due else Trial(0, due)
 
 
 KEPT = 3
 """Failed pods that are kept for ``kubectl logs``."""
 
 
-def ended_to_delete(ended: Sequence[PodView], counted: Collection[str]) -> list[PodView]:
-    """Ended pods that are of no more use: all that are not among the last that failed.
+def ended_to_delete(ended: Sequence[PodView], settled: Collection[str]) -> list[PodView]:
+    """Ended pods that are of no more use: all that are ``settled``, which means counted if they
+    are to be, but the last that failed.
 
     A pod whose other containers go on is not kept: it would hold its resources.
     """
@@ -120,8 +128,4 @@ def ended_to_delete(ended: Sequence[PodView], counted: Collection[str]) -> list[
         key=lambda pod: (pod.since, pod.name),
     )
     kept = {pod.name for pod in failed[-KEPT:]}
-    return [pod for pod in ended if pod.name not in kept and _settled(pod, counted)]
-
-
-def _settled(pod: PodView, counted: Collection[str]) -> bool:
-    return pod.trouble not in (Trouble.APPLICATION, Trouble.DISRUPTED) or pod.name in counted
+    return [pod for pod in ended if pod.name not in kept and pod.name in settled]

@@ -48,6 +48,8 @@ class Surroundings:
     master: Master | None
     """Where the EndpointSlice leads."""
     looked: float
+    credentials: bool
+    """The Secret is the pool's own and whole."""
     credentials_made: float = 0.0
     """When the Secret was, as the cluster says; 0.0 where that is not known."""
     failure: ApiError | None = None
@@ -95,8 +97,10 @@ class Keeper:
             if known.master == pool.spec.master:
                 return known
             address, made, looked = known.address, known.credentials_made, known.looked
+            whole = known.credentials
         else:
             address, made, looked = None, 0.0, self._now()
+            whole = False
             steps += [
                 (f"the Service {names.service_name(name)}", self._service),
                 (f"the Secret {names.secret_name(name)}", self._secret),
@@ -104,6 +108,7 @@ class Keeper:
         found = await _all(*(self._attempt(pool, *step) for step in steps))
         if len(found) > 1:
             address, made = found[1].told, seconds(found[2].told)
+            whole = found[2].obstacle is None
         led = found[0].obstacle is None
         before = known.master if known is not None else None
         return Surroundings(
@@ -111,6 +116,7 @@ class Keeper:
             tuple(step.obstacle for step in found if step.obstacle is not None),
             pool.spec.master if led else before,
             looked,
+            whole,
             made,
             next((step.failure for step in found if step.failure is not None), None),
         )

@@ -9,10 +9,10 @@ from typing import Any
 from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.times import format_time
-from fiber_api.v1alpha1 import FiberPool
+from fiber_api.v1alpha1 import FiberPool, Master
 from fiber_operator.documents import items, mapping, text
 from fiber_operator.failures import Record
-from fiber_operator.plans import Refusal
+from fiber_operator.plans import LeaseVerdict, Refusal
 from fiber_operator.pods import PodView
 
 _SIGNALS = {4: "SIGILL", 6: "SIGABRT", 7: "SIGBUS", 8: "SIGFPE", 9: "SIGKILL", 11: "SIGSEGV"}
@@ -106,10 +106,22 @@ def stuck(pod: PodView, warning: str) -> str:
 
 
 def late(pod: PodView, seconds: int) -> str:
-    """A pod that takes too long to start."""
+    """A pod whose container takes too long to start; it is kept."""
     return (
         f"{pod.name} did not become ready in {seconds} s (failurePolicy.startupTimeoutSeconds). "
         f"See what it waits for with kubectl describe pod {pod.name}, or allow it more time."
+    )
+
+
+def never_ready(pool: FiberPool, pod: PodView, warning: str) -> str:
+    """A pod whose container ran for too long without getting ready; it is deleted."""
+    seconds = pool.spec.failure_policy.startup_timeout_seconds
+    return (
+        f"{pod.name} ran for {seconds} s (failurePolicy.startupTimeoutSeconds) and did not become "
+        f"ready{quoted(warning or pod.message)}. It was deleted, since it holds what a node has. "
+        "Correct the readiness probe in spec.template or what that waits for, or allow more time. "
+        "To see the next one start: kubectl logs --follow --selector "
+        f"{names.LABEL_POOL}={pool.metadata.name}"
     )
 
 
@@ -130,11 +142,20 @@ LAST_LINES = " Its last lines:\n"
 
 def failure(pool: FiberPool, record: Record, reason: Reason, pod: PodView) -> str:
     """How a worker failed, when the next one comes, and its last lines."""
-    due = record.next_create_time
-    wait = f" No other is created before {format_time(due)}." if due else ""
+    wait = _wait(record)
     own = pod.message and not _ended_by_node(pod) and reason != Reason.RUN_CONTAINER_ERROR
     lines = f"{LAST_LINES}{pod.message}" if own else ""
     return f"{_ending(pool, reason, pod)}{wait}{lines}"
+
+
+def late_failure(pool: FiberPool, record: Record, pod: PodView, warning: str) -> str:
+    """A worker that runs and counts as failed, and when the next one comes."""
+    return f"{never_ready(pool, pod, warning)}.{_wait(record)}"
+
+
+def _wait(record: Record) -> str:
+    due = record.next_create_time
+    return f" No other is created before {format_time(due)}." if due else ""
 
 
 def forgotten_failure(pool: FiberPool, record: Record) -> str:
@@ -147,9 +168,23 @@ def forgotten_failure(pool: FiberPool, record: Record) -> str:
     )
 
 
+def completed(pool: FiberPool, record: Record, pod: PodView | None) -> str:
+    """Workers that end of themselves, round after round."""
+    if pod is None:
+        what = "Workers end of themselves"
+    elif pod.reason == "DeadlineExceeded":
+        what = f"{pod.name} was ended by activeDeadlineSeconds of spec.template{_after(pod)}"
+    else:
+        what = f"{pod.name} ended with exit code 0{_after(pod)} and was not released"
+    return (
+        f"{what}, and so did those before it: {record.completions} rounds in a row. A worker is to "
+        f"run until it is released, so the container {pool.spec.worker_container!r} must run "
+        "python -m fiber.agent and nothing that ends. The agent itself ends so when it has had no "
+        f"master for master.lostGraceSeconds: see whether the master can be reached.{_wait(record)}"
+    )
+
+
 def _ending(pool: FiberPool, reason: Reason, pod: PodView) -> str:
-    if reason == Reason.STARTUP_TIMEOUT:
-        return late(pod, pool.spec.failure_policy.startup_timeout_seconds)
     if reason == Reason.OOM_KILLED:
         limit = _memory_limit(pool)
         return (
@@ -184,9 +219,12 @@ def _exit(pod: PodView) -> str:
     code = pod.exit_code or 0
     signal = _SIGNALS.get(code - 128)
     cause = f"exited with code {code}" + (f" ({signal})" if signal else "")
-    after = f" after {pod.ran:.0f} s" if pod.ran else ""
     special = "" if pod.reason in ("Error", "") else f", {pod.reason}"
-    return f"{cause}{after}{special}"
+    return f"{cause}{_after(pod)}{special}"
+
+
+def _after(pod: PodView) -> str:
+    return f" after {pod.ran:.0f} s" if pod.ran else ""
 
 
 def _memory_limit(pool: FiberPool) -> str:
@@ -204,9 +242,10 @@ def limit_exceeded(pool: FiberPool, record: Record, last: str) -> str:
     limit = pool.spec.failure_policy.backoff_limit
     return (
         f"{record.consecutive} failures in a row are more than failurePolicy.backoffLimit allows "
-        f"({limit}): no more workers are created until the spec changes. Correct the cause and "
-        "spec.template, or set spec.suspend and unset it to try again as it is. The last one: "
-        f"{last}"
+        f"({limit}): no more workers are created until the spec changes, in template, "
+        "processesPerPod, failurePolicy, update or suspend, or by a master with a new epoch. "
+        "Correct the cause and spec.template, or set spec.suspend and unset it to try again as it "
+        f"is. The last one: {last}"
     )
 
 
@@ -258,18 +297,33 @@ _REFUSALS: Mapping[Reason, tuple[str, str]] = {
 # -- The pool
 
 
-def master_lost(pool: FiberPool, since: float, holder: str) -> str:
+def master_lost(pool: FiberPool, since: float, lease: LeaseVerdict) -> str:
     """A Lease that is not renewed."""
     master = pool.spec.master
     assert master is not None
-    who = f" by {holder}" if holder else ""
+    who = f" by {lease.holder}" if lease.holder else ""
+    what = f"was not renewed{who} for {master.lease_duration_seconds} s"
     end = format_time(since + master.lost_grace_seconds)
     return (
-        f"The Lease {master.lease_name} was not renewed{who} for {master.lease_duration_seconds} "
-        f"s: the master at {names.address_of(master.host, master.port)} (epoch {master.epoch}) "
-        f"has ended or cannot reach the API server. {_FATE[master.on_lost].format(end=end)} "
-        "Start it again to go on with this pool."
+        f"The Lease {master.lease_name} {'does not exist any more' if lease.missing else what}: "
+        f"the master at {_whereabouts(master)} has ended or cannot reach the API server. "
+        f"{_FATE[master.on_lost].format(end=end)} Start it again to go on with this pool."
     )
+
+
+def no_lease(pool: FiberPool) -> str:
+    """A Lease that never was."""
+    master = pool.spec.master
+    assert master is not None
+    return (
+        f"There is no Lease {master.lease_name} in this namespace, so nobody can tell whether the "
+        f"master at {_whereabouts(master)} is alive, and onLost does not apply. Create it and "
+        "renew it, or correct spec.master.leaseName; without leaseName the master is not checked."
+    )
+
+
+def _whereabouts(master: Master) -> str:
+    return f"{names.address_of(master.host, master.port)} (epoch {master.epoch})"
 
 
 _FATE = {

@@ -93,6 +93,7 @@ async def gets_stuck(world: World) -> None:
 
 async def meets_masters(world: World) -> None:
     """Of one address family and the other, while somebody meddles with the Service."""
+    world.store.create("leases", NAMESPACE, {"metadata": {"name": MASTER["leaseName"]}})
     world.edit(master=MASTER)
     world.store.merge("services", NAMESPACE, "es-master", {"spec": {"selector": {"app": "x"}}})
     await world.until(lambda: bool(counted(world, "patch", "services")))
@@ -101,7 +102,7 @@ async def meets_masters(world: World) -> None:
 
 
 async def is_orphaned(world: World) -> None:
-    """Nobody renews the Lease."""
+    """Nobody renews the Lease of its master."""
     await world.until(lambda: not world.store.list("fiberpools"), within=600)
 
 

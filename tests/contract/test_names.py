@@ -85,7 +85,7 @@ def test_pools_of_different_names_share_no_object() -> None:
 )
 def test_addresses(host: str, address: str) -> None:
     assert names.address_of(host, names.MASTER_PORT) == address
-    assert names.endpoint_of(host, names.MASTER_PORT) == f"tls+tcp://{address}"
+    assert names.endpoint_of(address) == f"tls+tcp://{address}"
 
 
 def test_the_version_has_one_spelling() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from fakes.kubelet import Kubelet
 from fakes.kubernetes_api import Fault, KubernetesApi
-from fakes.store import Body, Store
+from fakes.store import Body, Failure, Store
 from fiber_api.certificates import make_pool_certificates
 from fiber_operator.cluster import Configuration
 from fiber_operator.program import Program
@@ -85,6 +85,7 @@ class World:
         """No event reaches the operator."""
         self.program: Program
         self._task: asyncio.Task[None] | None = None
+        self._nodes: asyncio.Task[None] | None = None
         self._stop = asyncio.Event()
         self._suffixes = iter(range(len(self.store.changes), 10**6))
 
@@ -137,13 +138,14 @@ class World:
 
     @property
     def live_at_most(self) -> int:
-        """The largest number of pods that there ever were at one time, ended ones left out."""
+        """The largest number of pods that there ever were at one time, less those that end."""
         most = 0
         live: set[tuple[str, str, str]] = set()
         for change in self.store.changes:
             if change.place[0] == "pods":
                 phase = change.object.get("status", {}).get("phase")
-                gone = change.type == "DELETED" or phase in ("Failed", "Succeeded")
+                ending = "deletionTimestamp" in change.object["metadata"]
+                gone = change.type == "DELETED" or ending or phase in ("Failed", "Succeeded")
                 (live.discard if gone else live.add)(change.place)
                 most = max(most, len(live))
         return most
@@ -151,6 +153,29 @@ class World:
     @property
     def dead(self) -> bool:
         return self._task is None or self._task.done()
+
+    # -- What nodes do
+
+    def let_pods_linger(self, seconds: float) -> None:
+        """From now on a deleted pod is there, terminating, for so long."""
+
+        async def end() -> None:
+            while True:
+                for pod in self.store.list("pods"):
+                    if "deletionTimestamp" in pod["metadata"]:
+                        loop.call_later(seconds, self._remove, pod)
+                await self.store.changed()
+
+        loop = asyncio.get_running_loop()
+        self.store.pods_linger = True
+        self._nodes = asyncio.ensure_future(end())
+
+    def _remove(self, pod: Body) -> None:
+        metadata = pod["metadata"]
+        with contextlib.suppress(Failure):
+            there = self.store.get("pods", metadata["namespace"], metadata["name"])
+            if there["metadata"]["uid"] == metadata["uid"]:
+                self.store.remove("pods", metadata["namespace"], metadata["name"])
 
     # -- What users do
 
@@ -245,3 +270,5 @@ async def a_world(
         finally:
             if not world.dead:
                 await world.kill()
+            if world._nodes is not None:
+                world._nodes.cancel()

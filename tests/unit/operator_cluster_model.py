@@ -45,6 +45,8 @@ class Model:
     now: float = NOW
     fails: bool = False
     """New workers fail instead of getting Ready."""
+    completes: bool = False
+    """New workers end with exit code 0 instead."""
     created: int = 0
     numbers: Iterable[int] = field(default_factory=lambda: itertools.count(10_000))
 
@@ -73,8 +75,6 @@ class Model:
             else:
                 ending = replace(pod, state=State.TERMINATING, since=self.now)
                 self.pods[pod.name] = ending
-        names = {deletion.name for deletion in made.delete}
-        self.memory = replace(self.memory, deleted=self.memory.deleted | names)
 
     def create(self, made: Plan) -> None:
         if made.dry_run:
@@ -102,6 +102,21 @@ class Model:
         """The operator loses what it remembers."""
         self.memory = Memory(address=ADDRESS)
 
+    def evict(self, number: int) -> bool:
+        """End one of the workers that are Ready, if there is any."""
+        ready = [pod for pod in self.live if pod.state is State.READY]
+        if not ready:
+            return False
+        pod = ready[number % len(ready)]
+        self.pods[pod.name] = replace(
+            pod,
+            state=State.ENDED,
+            since=self.now,
+            trouble=Trouble.DISRUPTED,
+            reason="Evicted",
+        )
+        return True
+
     def pass_time(self, seconds: float = 1.0) -> None:
         """The kubelets go on."""
         self.now += seconds
@@ -123,6 +138,16 @@ class Model:
                 reason="Error",
                 exit_code=1,
                 ran=1.0,
+            )
+        if self.completes:
+            return replace(
+                pod,
+                state=State.ENDED,
+                since=self.now,
+                trouble=Trouble.COMPLETED,
+                reason="Completed",
+                exit_code=0,
+                ran=12.0,
             )
         return replace(pod, state=State.READY, since=self.now, was_ready=True, trouble=None)
 

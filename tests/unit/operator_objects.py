@@ -47,7 +47,7 @@ def with_plan(pool: FiberPool, plan: Plan) -> FiberPool:
 
 def memory_of(pool: FiberPool, **fields: Any) -> Memory:
     """An operator that has made the pool's Service and knows that its template is accepted."""
-    known = {"address": ADDRESS, "accepted": template_hash(pool)}
+    known = {"address": ADDRESS, "credentials": True, "accepted": template_hash(pool)}
     return Memory(**{**known, **fields})
 
 

@@ -320,6 +320,8 @@ def test_an_object_of_somebody_else_is_not_touched(plural: str) -> None:
         problem = world.status()["problems"][0]
         assert problem["terminal"]
         assert name in problem["message"]
+        secret = None if plural == "secrets" else "es-tls"
+        assert world.status().get("credentialsSecret") == secret
         await world.settled(120)
         assert world.store.get(plural, NAMESPACE, name) == theirs
         assert world.pods() == []
@@ -354,6 +356,7 @@ async def test_damaged_credentials_are_told(world: World) -> None:
     world.store.merge("secrets", NAMESPACE, "es-tls", {"data": {"ca.crt": "bm9uc2Vuc2U="}})
     await world.until(lambda: "InvalidCredentials" in world.reasons(), 125)
     assert "Delete it" in world.status()["problems"][0]["message"]
+    assert world.status().get("credentialsSecret") is None
     world.store.delete("secrets", NAMESPACE, "es-tls")
     await world.until(lambda: world.reasons() == [], 125)
 

@@ -201,3 +201,15 @@ async def test_a_webhook_that_cannot_do_dry_runs_is_no_verdict(world: World) -> 
     await world.ready(5)
     assert world.reasons() == []
     assert creations(world).count(True) == 1
+
+
+@played
+async def test_a_new_pool_is_pending_while_nobody_judges_its_template(world: World) -> None:
+    world.api.faults.append(Fault("create", "pods", status=500, times=3))
+    world.make_pool(replicas=2)
+    await world.until(lambda: world.status().get("phase") is not None)
+    assert world.status()["phase"] == "Pending"
+    (accepted,) = (c for c in world.status()["conditions"] if c["type"] == "Accepted")
+    assert (accepted["status"], accepted["reason"]) == ("Unknown", "NotJudged")
+    await world.ready(2)
+    assert world.status()["phase"] == "Ready"

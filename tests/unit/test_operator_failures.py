@@ -142,17 +142,19 @@ def test_failing_at_once_takes_the_proof_back_until_ready_lasts() -> None:
 
 
 def test_a_record_survives_the_status() -> None:
-    record = replace(failing(), counted=frozenset({"a", "b"}), last_reason="Error", proven="new")
-    status = FiberPoolStatus(failures=record.failures(), proven_template_hash=record.proven)
+    record = replace(
+        failing(), counted=frozenset({name_of(1), "b", "es"}), last_reason="Error", proven="new"
+    )
+    status = FiberPoolStatus(failures=record.failures("es"), proven_template_hash=record.proven)
     document = status.model_dump(mode="json", by_alias=True)
-    assert Record.read(FiberPoolStatus.model_validate(document), NOW) == record
+    assert Record.read(FiberPoolStatus.model_validate(document), "es", NOW) == record
 
 
 def test_times_that_have_not_come_yet_are_none_of_ours() -> None:
     status = FiberPoolStatus(
-        failures=failing(last_time=NOW + 9999, newest_created=NOW + 9999).failures()
+        failures=failing(last_time=NOW + 9999, newest_created=NOW + 9999).failures("es")
     )
-    record = Record.read(status, NOW)
+    record = Record.read(status, "es", NOW)
     assert (record.last_time, record.newest_created) == (None, None)
     assert failing(next_create_time=NOW + 9999).waits_until(POLICY, NOW) is None
 
@@ -177,5 +179,73 @@ def test_sums_stay_what_a_status_may_hold() -> None:
     full = failing(total=2**31 - 1, disrupted=2**31 - 1, consecutive=2**31 - 1)
     ended = view(3, State.ENDED, trouble=Trouble.DISRUPTED)
     record = count(full, failed(1), failed(2, created=NOW + 5), ended).record
-    found = record.failures()
+    found = record.failures("es")
     assert (found.total, found.disrupted, found.consecutive) == (2**31 - 1,) * 3
+
+
+def test_what_the_operator_deletes_is_not_disrupted_and_what_others_delete_is() -> None:
+    record = Record(deleting=frozenset({name_of(1), name_of(3)}))
+    pods = [view(number, State.TERMINATING) for number in (1, 2)]
+    found = count(record, *pods)
+    assert [pod.name for pod in found.disrupted] == [name_of(2)]
+    assert found.record.deleting == {name_of(1)}
+    assert count(found.record).record.deleting == frozenset()
+
+
+def test_a_pod_that_was_to_be_deleted_and_is_not_is_like_any_other() -> None:
+    """Its deletion came too late: it changed before."""
+    record = Record(deleting=frozenset({name_of(1), name_of(2)}), counted=frozenset({name_of(2)}))
+    assert [pod.name for pod in count(record, failed(1)).failed] == [name_of(1)]
+    kept = count(record, ready(2)).record
+    assert count(kept, failed(2)).record.total == 1
+
+
+def test_what_has_no_room_in_the_record_is_counted_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fiber_operator.failures.NAMES", 5)
+    monkeypatch.setattr("fiber_operator.failures.ROUND", 2)
+    pods = [failed(number) for number in range(12)]
+    record, totals = Record(), []
+    while pods:
+        found = count(record, *pods)
+        record = found.record
+        assert len(record.counted) <= 5
+        totals.append(record.total)
+        pods = [pod for pod in pods if pod.name not in record.counted]
+    assert totals == [5, 10, 12]
+    assert record.consecutive == 1
+    stuck = [view(number, State.TERMINATING) for number in range(20, 29)]
+    full = count(record, *stuck).record
+    assert full.disrupted == 5
+    assert count(full, *stuck).record == full
+    assert count(full, *stuck, failed(1)).record.total == 13
+
+
+def completed(number: int, *, created: float = NOW - 60) -> PodView:
+    return failed(number, created=created, trouble=Trouble.COMPLETED, exit_code=0, ran=12.0)
+
+
+def test_ends_with_0_are_counted_and_wait_from_the_second_round_on() -> None:
+    first = count(Record(), completed(1), completed(2))
+    assert [pod.name for pod in first.completed] == [name_of(1), name_of(2)]
+    assert first.news
+    record = first.record
+    assert (record.completed, record.completions, record.total) == (2, 1, 0)
+    assert record.waits_until(POLICY, NOW) is None
+    same = count(record, completed(1), completed(2), completed(3), now=NOW + 5).record
+    assert (same.completed, same.completions) == (3, 1)
+    again = count(same, completed(4, created=NOW + 6), now=NOW + 20).record
+    assert (again.completed, again.completions) == (4, 2)
+    due = again.waits_until(POLICY, NOW + 20)
+    assert due is not None
+    assert NOW + 25 <= due <= NOW + 27
+    assert not replace(again, completions=10**6).exhausted(POLICY)
+
+
+def test_ends_with_0_are_forgiven_after_a_while_and_by_another_spec() -> None:
+    record = count(Record(spec_hash="spec"), completed(1)).record
+    kept = count(record, now=NOW + 599)
+    assert (kept.record.completions, kept.again) == (1, NOW + 600)
+    assert count(record, now=NOW + 600).record.completions == 0
+    assert count(record, spec_hash="corrected").record.completions == 0
+    waiting = replace(record, next_create_time=NOW + 50)
+    assert count(waiting).again == NOW + 650

@@ -337,6 +337,7 @@ async def test_a_pool_made_anew_in_the_middle_gets_nothing_of_the_old_ones(world
 @played
 async def test_a_master_that_comes_back_in_the_last_moment_keeps_its_pool(world: World) -> None:
     lost = {"leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5, "onLost": "Delete"}
+    world.store.create("leases", NAMESPACE, {"metadata": {"name": "es"}})
     world.make_pool(replicas=3, master={**MASTER, **lost})
     await world.ready(3)
 

@@ -144,7 +144,7 @@ def troubled(**spec: Any) -> Body:
 
 def memory(pool: FiberPool, alive: bool | None) -> Memory:
     return Memory(
-        address=ADDRESS, accepted=template_hash(pool), master=plans.Master(alive, "another")
+        address=ADDRESS, accepted=template_hash(pool), master=plans.LeaseVerdict(alive, "another")
     )
 
 

@@ -15,7 +15,7 @@ from fakes.store import Store
 from fakes.world import configuration
 from fiber_operator.cluster import Cluster
 from fiber_operator.masters import Masters, Term
-from fiber_operator.plans import Master
+from fiber_operator.plans import LeaseVerdict
 from fiber_operator.worker import Key
 
 ES = Key("team", "es")
@@ -27,7 +27,7 @@ class Watch:
 
     def __init__(self, api: KubernetesApi, door: Cluster) -> None:
         self.api, self.store = api, api.store
-        self.told: list[tuple[float, Master]] = []
+        self.told: list[tuple[float, LeaseVerdict]] = []
         self.masters = Masters(door, self._tell)
         self.task = asyncio.ensure_future(self.masters.run())
         self._renewals: asyncio.Task[None] | None = None
@@ -92,7 +92,7 @@ async def test_one_that_renews_is_alive(watch: Watch) -> None:
     for _ in range(100):
         assert watch.alive() is True
         await asyncio.sleep(5)
-    assert watch.told[-1] == (10.0, Master(alive=True, holder="es-1"))
+    assert watch.told[-1] == (10.0, LeaseVerdict(alive=True, holder="es-1"))
 
 
 @played
@@ -127,7 +127,7 @@ async def test_a_lease_that_is_never_made_does_not_change(watch: Watch) -> None:
     await asyncio.sleep(25)
     assert watch.alive() is None
     await asyncio.sleep(16)
-    assert watch.masters.follow(ES, TERM) == Master(alive=False, missing=True)
+    assert watch.masters.follow(ES, TERM) == LeaseVerdict(alive=False, missing=True)
 
 
 @pytest.mark.parametrize("holder", ["", None])
@@ -201,7 +201,7 @@ async def test_what_cannot_be_read_is_not_judged(watch: Watch) -> None:
     watch.api.faults.append(Fault("get", "leases", status=403, times=10**6))
     watch.masters.follow(ES, TERM)
     await asyncio.sleep(300)
-    assert watch.masters.follow(ES, TERM) == Master(unreadable="this is a test")
+    assert watch.masters.follow(ES, TERM) == LeaseVerdict(alive=None, unreadable="this is a test")
     assert len(watch.told) == 1
 
 
@@ -211,14 +211,14 @@ async def test_another_epoch_is_another_master(watch: Watch) -> None:
     watch.masters.follow(ES, TERM)
     await asyncio.sleep(21)
     assert watch.alive() is True
-    assert watch.masters.follow(ES, TERM._replace(epoch=2)) == Master()
+    assert watch.masters.follow(ES, TERM._replace(epoch=2)) == LeaseVerdict()
 
 
 @played
 async def test_nobody_is_watched_for_nothing(watch: Watch) -> None:
     watch.masters.follow(ES, TERM)
     await asyncio.sleep(21)
-    assert watch.masters.follow(ES, None) == Master()
+    assert watch.masters.follow(ES, None) == LeaseVerdict()
     watch.api.calls.clear()
     await asyncio.sleep(300)
     assert watch.api.calls == []

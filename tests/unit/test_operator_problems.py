@@ -135,6 +135,20 @@ def test_a_pod_that_takes_too_long_is_an_error() -> None:
     assert "900 s" in found.message
 
 
+def test_a_worker_that_ran_and_was_never_ready_is_told_with_all_that_is_known_of_it() -> None:
+    pod = running(1, age=902, ready=False)
+    pod["status"]["conditions"][0]["message"] = "containers with unready status: [worker]"
+    found = problem(POOL, pod)
+    assert (found.reason, found.severity) == ("StartupTimeout", "Error")
+    said = "did not become ready: containers with unready status: [worker]. It was deleted"
+    assert said in found.message
+    assert "kubectl describe pod" not in found.message
+    assert "kubectl logs --follow --selector fiber.dev/pool=es." in found.message
+    assert "No other is created before" in found.message
+    probe = "Unhealthy: Readiness probe failed: HTTP probe failed with statuscode: 503"
+    assert probe in problem(POOL, pod, warnings={name_of(1): probe}).message
+
+
 def test_a_worker_that_is_not_ready_any_more_is_a_warning() -> None:
     pod = running(1)
     pod["status"]["conditions"] = [condition("Ready", "False", ago=5, message="node silent")]
@@ -170,6 +184,21 @@ def test_a_command_that_is_no_agent_is_recognized() -> None:
     found = problem(POOL, ended(1, code=0, ran=0, reason="Completed"))
     assert found.reason == "Completed"
     assert "python -m fiber.agent" in found.message
+
+
+def test_workers_that_end_well_again_and_again_are_a_warning_that_says_what_it_means() -> None:
+    pool, now = make_pool(replicas=1, master=MASTER), NOW
+    for number in (1, 2):
+        pod = ended(number, code=0, age=20 + NOW - now, ran=12, ago=NOW - now)
+        status = status_of(pool, pod, now=now)
+        pool, now = then(pool, status), now + 40
+        assert bool(status.problems) is (number == 2)
+    (found,) = status.problems
+    assert (found.severity, found.count, found.pod) == ("Warning", 2, name_of(2))
+    for said in ("exit code 0 after 12 s", "python -m fiber.agent", "lostGraceSeconds", "before"):
+        assert said in found.message
+    assert status_of(pool, now=now).problems == (found,)
+    assert status_of(pool, now=now + 900).problems == ()
 
 
 def test_a_program_that_is_not_in_the_image_is_hopeless() -> None:
@@ -260,6 +289,8 @@ def test_past_the_limit_the_first_problem_says_what_to_do() -> None:
     assert (limit.reason, limit.terminal) == ("BackoffLimitExceeded", True)
     assert "exited with code 7" in limit.message
     assert "spec.suspend" in limit.message
+    for named in ("template", "processesPerPod", "failurePolicy", "update", "a new epoch"):
+        assert named in limit.message
     assert cause.reason == "ContainerFailed"
     assert status.phase == "Failed"
 
@@ -307,11 +338,33 @@ def test_an_obstacle_is_told_as_it_is() -> None:
 
 def test_a_lost_master_is_told_with_what_will_follow() -> None:
     pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"})
-    expired = plans.Master(alive=False, holder="train-0")
+    expired = plans.LeaseVerdict(alive=False, holder="train-0")
     found = problem(pool, running(1), master=expired)
     assert found.reason == "MasterLost"
     for said in ("10.0.3.7:41337", "epoch 1", "train-0", "onLost is Delete"):
         assert said in found.message
+
+
+def test_a_lease_that_is_gone_is_told_so() -> None:
+    pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"})
+    seen = then(pool, status_of(pool, running(1), master=plans.LeaseVerdict(alive=True)))
+    found = problem(seen, running(1), master=plans.LeaseVerdict(alive=False, missing=True))
+    assert found.reason == "MasterLost"
+    assert "The Lease es does not exist any more" in found.message
+
+
+def test_a_lease_that_never_was_is_told_with_what_to_do() -> None:
+    pool = make_pool(replicas=1, master={**MASTER, "leaseName": "se"})
+    first = status_of(pool, running(1), master=plans.LeaseVerdict(missing=True))
+    (found,) = first.problems
+    assert (found.reason, found.severity) == ("LeaseNotFound", "Warning")
+    for said in ("no Lease se in this namespace", "10.0.3.7:41337", "correct spec.master.lease"):
+        assert said in found.message
+    (alive,) = (c for c in first.conditions if c.type == "MasterAlive")
+    assert (alive.status, alive.reason) == ("Unknown", "LeaseNotFound")
+    never = plans.LeaseVerdict(alive=False, missing=True)
+    later = problem(then(pool, first), running(1), now=NOW + 30, master=never)
+    assert (later.reason, later.severity) == ("LeaseNotFound", "Error")
 
 
 def test_a_master_of_the_other_address_family_is_told() -> None:

@@ -16,6 +16,7 @@ from fiber_operator.plans import Memory, Obstacle, Plan, Refusal
 from fiber_operator.pods import PodView, State, Trouble
 from fiber_operator.reconcile import plan, plan_unreadable
 from fiber_operator.revisions import spec_hash, template_hash
+from fiber_operator.scaling import CANARIES, PATIENCE
 from unit.operator_cluster_model import Model, view
 from unit.operator_objects import ADDRESS, MASTER, NOW, make_pool, name_of, pool_document
 from unit.test_operator_pods import ANYTHING
@@ -94,10 +95,13 @@ def statuses(draw: st.DrawFn, spec: dict[str, Any]) -> dict[str, Any]:
     times = st.sampled_from([-100, -5, 0, 4, 100, 10_000]).map(lambda s: format_time(NOW + s))
     failures = {
         "consecutive": draw(st.sampled_from([0, 0, 1, 3, 8])),
+        "completions": draw(st.sampled_from([0, 0, 1, 3])),
+        "lastCompleted": draw(times),
         "nextCreateTime": draw(times),
         "newestCreated": draw(times),
         "lastTime": draw(times),
         "counted": draw(st.lists(NUMBERS.map(name_of), max_size=4, unique=True)),
+        "deleting": draw(st.lists(NUMBERS.map(name_of), max_size=4, unique=True)),
         "specHash": draw(st.sampled_from([spec_hash(pool), spec_hash(pool), "other"])),
     }
     alive = {
@@ -106,7 +110,8 @@ def statuses(draw: st.DrawFn, spec: dict[str, Any]) -> dict[str, Any]:
         "lastTransitionTime": draw(times),
     }
     proven = draw(st.sampled_from([template_hash(pool), "older", None]))
-    return {"failures": failures, "conditions": [alive], "provenTemplateHash": proven}
+    known = {"failures": failures, "conditions": [alive], "provenTemplateHash": proven}
+    return {**known, "masterEpoch": draw(st.sampled_from([1, 1, None]))}
 
 
 @st.composite
@@ -118,8 +123,11 @@ def memories(draw: st.DrawFn, hash_: str) -> Memory:
         obstacles=draw(st.sampled_from([()] * 4 + [(obstacle,)])),
         accepted=draw(st.sampled_from([hash_, hash_, "older", None])),
         refusal=draw(st.sampled_from([None, None, None, refusal])),
-        master=plans.Master(draw(st.sampled_from([None, True, False]))),
-        deleted=frozenset(draw(st.sets(NUMBERS.map(name_of), max_size=3))),
+        master=plans.LeaseVerdict(
+            draw(st.sampled_from([None, True, False])),
+            missing=draw(st.sampled_from([False, False, True])),
+            unreadable=draw(st.sampled_from(["", "", "forbidden"])),
+        ),
     )
 
 
@@ -181,6 +189,16 @@ def test_a_ready_worker_of_a_master_goes_only_when_released(case: Case) -> None:
 
 
 @given(cases())
+def test_a_pool_is_deleted_for_a_lease_that_was_seen_alone(case: Case) -> None:
+    pool, pods, memory = case
+    made = plan(pool, pods, memory, NOW)
+    if made.delete_pool:
+        before = {c.type: c.status for c in pool.status.conditions}
+        assert memory.master.alive is False
+        assert not memory.master.missing or before["MasterAlive"] != "Unknown"
+
+
+@given(cases())
 def test_creation_never_passes_what_is_wanted(case: Case) -> None:
     pool, pods, memory = case
     made = plan(pool, pods, memory, NOW)
@@ -210,6 +228,27 @@ def test_nothing_is_created_where_something_forbids_it(case: Case) -> None:
     assert template_hash(pool) in (memory.accepted, proven)
 
 
+@given(cases())
+def test_a_template_that_never_worked_gets_few_pods(case: Case) -> None:
+    pool, pods, memory = case
+    made = plan(pool, pods, memory, NOW)
+    status, hash_ = after(pool, made).status, template_hash(pool)
+    if not made.create or status.proven_template_hash == hash_:
+        return
+    gone = {deletion.name for deletion in made.delete}
+    known = own(pool, pods).values()
+    live = [pod for pod in known if pod.live and pod.name not in gone]
+    current = [pod for pod in live if pod.template_hash == hash_]
+    homeless = sum(pod.trouble is Trouble.UNSCHEDULABLE for pod in current)
+    placed = len(current) - homeless + made.create
+    if status.failures.consecutive or Trouble.CANNOT_START in {pod.trouble for pod in current}:
+        assert len(current) + made.create <= CANARIES
+    elif all(pod.created > NOW - PATIENCE for pod in current):
+        assert placed <= max(CANARIES, homeless)
+    else:
+        assert placed <= max(CANARIES, homeless, 2 * len(current))
+
+
 @given(cases(), st.randoms(use_true_random=False))
 def test_the_order_of_the_list_makes_no_difference(case: Case, random: Any) -> None:
     pool, pods, memory = case
@@ -228,7 +267,7 @@ def test_a_plan_whose_status_is_written_stays_the_plan(case: Case) -> None:
         assert second == first
     else:
         assert (second.create, second.delete) == (first.create, first.delete)
-        assert first.dry_run or second.status is None
+        assert second.status is None
 
 
 @given(cases())
@@ -283,12 +322,14 @@ def test_every_state_settles(case: Case) -> None:
 @given(
     failing=st.integers(1, 6),
     kills=st.lists(st.sampled_from(["", "before", "status", "delete", "create"]), max_size=40),
+    completes=st.booleans(),
 )
-@example(failing=6, kills=["status"] * 40)
-def test_each_failure_is_counted_once_though_the_operator_dies(
-    failing: int, kills: list[str]
+@example(failing=6, kills=["status"] * 40, completes=False)
+@example(failing=6, kills=["status"] * 40, completes=True)
+def test_each_end_is_counted_once_though_the_operator_dies(
+    failing: int, kills: list[str], completes: bool
 ) -> None:
-    model = Model(pool_document(replicas=failing), fails=True)
+    model = Model(pool_document(replicas=failing), fails=not completes, completes=completes)
     failed: set[str] = set()
     for kill in [*kills, "", "", ""]:
         made = model.plan()
@@ -300,7 +341,46 @@ def test_each_failure_is_counted_once_though_the_operator_dies(
         model.pass_time()
         failed |= {pod.name for pod in model.pods.values() if pod.state is State.ENDED}
     model.write_status(model.plan())
-    assert model.pool.status.failures.total == len(failed)
+    counts = model.pool.status.failures
+    assert (counts.completed, counts.total)[:: 1 if completes else -1] == (len(failed), 0)
+
+
+LIVES = st.lists(
+    st.tuples(
+        st.sampled_from(["replicas", "suspend", "template", "fails", "evict", "restart", "killed"]),
+        NUMBERS,
+        st.sampled_from([1, 1, 2, 5, 30]),
+    ),
+    max_size=30,
+)
+
+
+@settings(max_examples=100, deadline=None, phases=NO_SHRINKING)
+@given(LIVES, st.sampled_from(["OnIdle", "Recreate"]))
+def test_only_what_others_end_is_disrupted(life: list[tuple[str, int, int]], strategy: str) -> None:
+    model, evicted = Model(pool_document(replicas=4, update={"strategy": strategy})), 0
+    for what, number, seconds in life:
+        spec = model.document["spec"]
+        if what == "replicas":
+            spec["replicas"] = number
+        elif what == "suspend":
+            spec["suspend"] = not spec.get("suspend", False)
+        elif what == "template":
+            spec["template"]["metadata"] = {"labels": {"version": str(number)}}
+        elif what == "fails":
+            model.fails = not model.fails
+        elif what == "restart":
+            model.restart()
+        elif what == "killed":
+            made = model.plan()
+            model.write_status(made)
+            model.delete(made)
+            model.restart()
+        elif not spec.get("suspend", False):
+            evicted += model.evict(number)
+        model.act()
+        model.pass_time(seconds)
+    assert model.pool.status.failures.disrupted == evicted
 
 
 @settings(max_examples=20, deadline=None)
@@ -324,6 +404,30 @@ def test_a_template_that_fails_comes_to_an_end(replicas: int, limit: int) -> Non
     assert model.pool.status.failures.consecutive == 0
 
 
+@settings(max_examples=20, deadline=None)
+@given(replicas=st.integers(1, 12))
+def test_workers_that_end_well_for_ever_come_back_ever_more_slowly(replicas: int) -> None:
+    model = Model(pool_document(replicas=replicas, master=MASTER), completes=True)
+    for _ in range(300):
+        model.act()
+        model.pass_time()
+    status = model.pool.status
+    # At once, at once, and after 5, 10, 20, 40, 80 and 160 seconds; a tenth more at most.
+    assert model.created <= 8 * replicas
+    assert status.failures.completed >= 5 * min(3, replicas)
+    assert (status.failures.total, status.failures.consecutive) == (0, 0)
+    (found,) = status.problems
+    assert (found.reason, found.severity, found.terminal) == ("Completed", "Warning", False)
+    assert status.phase != "Failed"
+    model.completes = False
+    for _ in range(200):
+        model.act()
+        model.pass_time(10)
+    status = model.pool.status
+    assert (status.ready_replicas, status.failures.completions) == (replicas, 0)
+    assert (status.problems, status.phase) == ((), "Ready")
+
+
 @given(
     junk=ANYTHING,
     fields=st.dictionaries(
@@ -344,9 +448,10 @@ def test_a_template_that_fails_comes_to_an_end(replicas: int, limit: int) -> Non
 def test_junk_in_the_status_is_written_over(junk: Any, fields: dict[str, Any]) -> None:
     for status in (junk, fields, {"failures": fields}, {"conditions": [fields]}):
         pool = FiberPool.read({**pool_document(replicas=2), "status": status})
-        made = plan(pool, [], Memory(address=ADDRESS, accepted=template_hash(pool)), NOW)
+        memory = Memory(address=ADDRESS, accepted=template_hash(pool))
+        made = plan(pool, [], memory, NOW)
         assert made.status is not None
-        again = plan(after(pool, made), [], Memory(address=ADDRESS), NOW)
+        again = plan(after(pool, made), [], memory, NOW)
         assert again.status is None
 
 

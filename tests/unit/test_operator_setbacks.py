@@ -76,6 +76,7 @@ async def gets_a_master_of_another_family(world: World) -> None:
 
 
 async def loses_its_master(world: World) -> None:
+    world.store.create("leases", NAMESPACE, {"metadata": {"name": "es"}})  # nobody renews it
     world.edit(master=LOST)
 
 

@@ -160,10 +160,10 @@ def test_bounds_that_bind_are_told(spec: Json, expected: tuple[str, str]) -> Non
 )
 def test_the_master_is_alive_if_its_lease_is(alive: bool | None, expected: tuple[str, str]) -> None:
     pool = make_pool(master={**MASTER, "leaseName": "es"})
-    status = status_of(pool, master=plans.Master(alive=alive))
+    status = status_of(pool, master=plans.LeaseVerdict(alive=alive))
     assert told(status)["MasterAlive"] == expected
     if alive is not None:
-        again = status_of(pool.model_copy(update={"status": status}), master=plans.Master())
+        again = status_of(pool.model_copy(update={"status": status}), master=plans.LeaseVerdict())
         assert told(again)["MasterAlive"] == expected
 
 
@@ -181,6 +181,15 @@ def test_time_alone_changes_nothing() -> None:
     pods = [running(1), running(2), ended(3)]
     pool = with_plan(pool, look(pool, *pods))
     assert look(pool, *pods, now=NOW + 1.5).status is None
+
+
+def test_the_secret_is_named_once_it_is_seen_to_be_the_pools() -> None:
+    pool = make_pool()
+    seen = with_plan(pool, look(pool))
+    assert seen.status.credentials_secret == "es-tls"
+    assert status_of(pool, credentials=None).credentials_secret is None
+    assert status_of(seen, credentials=None).credentials_secret == "es-tls"
+    assert status_of(seen, credentials=False).credentials_secret is None
 
 
 def test_a_damaged_status_is_written_anew() -> None:
