@@ -2,12 +2,12 @@
 
 ::
 
-    handlers ─► worker ─► controller ─► reconcile.plan ─► Plan
-    (kopf)     (queue)     │  ▲             pure: pods, failures, problems,
-                           ▼  │                   status, manifests
-                          cluster
-                    (the API's only door)
+    handlers ─► turns ─► controller ─► planning.reconcile.plan ─► Plan
+    (kopf)     (queue)    │  ▲
+                          ▼  │
+                         cluster
+                   (the API's only door)
 
-What is decided is decided by pure modules, which know no clock, thread, socket, kopf or client;
+What is decided is decided in ``planning``, which knows no clock, thread, socket, kopf or client;
 what is done is done through ``cluster``.
 """

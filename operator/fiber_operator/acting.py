@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator import manifests, setbacks
 from fiber_operator.cluster import (
     PODS,
     POOLS,
@@ -23,13 +22,14 @@ from fiber_operator.cluster import (
     Refused,
 )
 from fiber_operator.creation import ENOUGH, Creator, Pace
-from fiber_operator.documents import mapping, text
 from fiber_operator.events import Recorder
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics
-from fiber_operator.plans import Deletion, Event, Obstacle, Plan, Refusal
+from fiber_operator.planning import manifests, setbacks
+from fiber_operator.planning.documents import mapping, text
+from fiber_operator.planning.plans import Deletion, Event, Obstacle, Plan, Refusal
 from fiber_operator.surroundings import Surroundings
-from fiber_operator.worker import GAP, Key, Turn
+from fiber_operator.turns import GAP, Key, Turn
 
 DELETIONS = 50
 """Pods that are deleted at once."""

@@ -15,21 +15,22 @@ from collections.abc import Callable, Sequence
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
-from fiber_operator import inspection, reconcile, setbacks
+from fiber_operator import inspection
 from fiber_operator.acting import Actor, Look, State
 from fiber_operator.cluster import PODS, POOLS, ApiError, Body, Cluster, Gone, TooMany, Unavailable
 from fiber_operator.creation import Creator
-from fiber_operator.documents import mapping, text, whole
 from fiber_operator.events import Recorder
 from fiber_operator.lease import NotHolder
 from fiber_operator.logs import about
 from fiber_operator.masters import Masters, Term
 from fiber_operator.metrics import Metrics, PoolSample
-from fiber_operator.plans import Memory, Plan
-from fiber_operator.pods import PodView, observe
-from fiber_operator.pods import State as Life
+from fiber_operator.planning import reconcile, setbacks
+from fiber_operator.planning.documents import mapping, text, whole
+from fiber_operator.planning.plans import Memory, Plan
+from fiber_operator.planning.pods import PodView, observe
+from fiber_operator.planning.pods import State as Life
 from fiber_operator.surroundings import Keeper
-from fiber_operator.worker import Key, Turn
+from fiber_operator.turns import Key, Turn
 
 LIST_SHARE = 2.0
 """A pool rests for this many times as long as the list of its pods took: what it does meanwhile

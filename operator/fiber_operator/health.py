@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from fiber_operator.claims import Claims
 from fiber_operator.lease import Guard
 from fiber_operator.resync import Resync
+from fiber_operator.turns import Queue
 from fiber_operator.watches import Watches
-from fiber_operator.worker import Queue
 
 LATE_TURN = 30.0
 """Seconds that a pool may wait for its turn while the operator is ready."""

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from fiber_operator.cluster import EVENTS, ApiError, Body, Cluster
-from fiber_operator.documents import mapping, seconds, text
-from fiber_operator.pods import PodView
-from fiber_operator.worker import Key
+from fiber_operator.planning.documents import mapping, seconds, text
+from fiber_operator.planning.pods import PodView
+from fiber_operator.turns import Key
 
 _NO_NEWS = frozenset(
     {

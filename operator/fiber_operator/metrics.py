@@ -12,9 +12,9 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.registry import Collector
 
-from fiber_operator.documents import items, mapping, text, whole
-from fiber_operator.pods import PodView
-from fiber_operator.worker import Key, Statistics
+from fiber_operator.planning.documents import items, mapping, text, whole
+from fiber_operator.planning.pods import PodView
+from fiber_operator.turns import Key, Statistics
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)

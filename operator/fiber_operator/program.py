@@ -5,7 +5,7 @@
     handlers ──► queue ──► controller ──► cluster
     resync  ────►  ▲          │  ▲            ▲
     masters ───────┘          ▼  │            │ permit
-                          reconcile.plan    guard (Lease of the release: this process acts)
+                            planning        guard (Lease of the release: this process acts)
                                             claims (Lease of a namespace: this release serves it)
 """
 
@@ -39,8 +39,8 @@ from fiber_operator.metrics import Metrics
 from fiber_operator.resync import Resync
 from fiber_operator.server import serving
 from fiber_operator.settings import Settings
+from fiber_operator.turns import Key, Queue, Turn
 from fiber_operator.watches import Watches
-from fiber_operator.worker import Key, Queue, Turn
 
 DRAIN = 5.0
 """Seconds that a call under way may take to end when the operator is to stop."""

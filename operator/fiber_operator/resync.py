@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 from fiber_operator.answers import complaint
 from fiber_operator.cluster import POOLS, ApiError, Body, Cluster
-from fiber_operator.documents import mapping, text
 from fiber_operator.logs import about
-from fiber_operator.worker import Key, Queue
+from fiber_operator.planning.documents import mapping, text
+from fiber_operator.turns import Key, Queue
 
 RETRY = 5.0
 """Seconds until the pools are listed again where that failed."""

@@ -18,7 +18,6 @@ from fiber_api import names
 from fiber_api.certificates import Certificates, InvalidCertificates, make_pool_certificates
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Master
-from fiber_operator import manifests, setbacks
 from fiber_operator.cluster import (
     SECRETS,
     SERVICES,
@@ -32,8 +31,9 @@ from fiber_operator.cluster import (
     Resource,
     Unavailable,
 )
-from fiber_operator.documents import items, mapping, seconds, text
-from fiber_operator.plans import Obstacle
+from fiber_operator.planning import manifests, setbacks
+from fiber_operator.planning.documents import items, mapping, seconds, text
+from fiber_operator.planning.plans import Obstacle
 
 LOOK_AGAIN = 50.0
 

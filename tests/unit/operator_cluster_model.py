@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.plans import Memory, Plan
-from fiber_operator.pods import PodView, State, Trouble
-from fiber_operator.reconcile import plan
-from fiber_operator.revisions import template_hash
+from fiber_operator.planning.plans import Memory, Plan
+from fiber_operator.planning.pods import PodView, State, Trouble
+from fiber_operator.planning.reconcile import plan
+from fiber_operator.planning.revisions import template_hash
 from unit.operator_objects import ADDRESS, NOW, UID, name_of, pool_document
 
 STARTING_TAKES = 2.0

@@ -9,9 +9,9 @@ from typing import Any
 from fiber_api.names import LABEL_TEMPLATE_HASH
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.plans import Memory, Plan
-from fiber_operator.pods import PodView, observe
-from fiber_operator.revisions import template_hash
+from fiber_operator.planning.plans import Memory, Plan
+from fiber_operator.planning.pods import PodView, observe
+from fiber_operator.planning.revisions import template_hash
 
 NOW = 1_800_000_000.0
 UID = "11111111-2222-3333-4444-555555555555"

@@ -18,8 +18,8 @@ from fiber_operator.cluster import Cluster, Conflict, Permit, TooMany, Unavailab
 from fiber_operator.creation import ENOUGH, Created, Creator, Pace, draw_suffix
 from fiber_operator.events import Recorder
 from fiber_operator.lease import NotHolder
-from fiber_operator.plans import Event
-from fiber_operator.worker import Key
+from fiber_operator.planning.plans import Event
+from fiber_operator.turns import Key
 
 ES = Key("team", "es")
 

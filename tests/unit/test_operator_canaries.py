@@ -11,8 +11,8 @@ from fakes import virtual_time
 from fakes.store import Body
 from fakes.world import NAMESPACE, a_world
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.plans import Plan
-from fiber_operator.reconcile import plan
+from fiber_operator.planning.plans import Plan
+from fiber_operator.planning.reconcile import plan
 from unit.operator_objects import (
     NOW,
     ended,

@@ -13,7 +13,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Call
 from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, World, a_world
-from fiber_operator.worker import LULL
+from fiber_operator.turns import LULL
 
 MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
 

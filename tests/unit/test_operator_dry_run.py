@@ -15,9 +15,9 @@ from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, World, a_world
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.plans import Refusal
-from fiber_operator.podspec import pod
-from fiber_operator.problems import refusal_reason
+from fiber_operator.planning.plans import Refusal
+from fiber_operator.planning.podspec import pod
+from fiber_operator.planning.problems import refusal_reason
 from unit.operator_objects import MASTER, NOW, make_pool
 
 Test = Callable[[World], Coroutine[Any, Any, None]]

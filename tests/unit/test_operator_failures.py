@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fiber_api.v1alpha1 import FailurePolicy, FiberPoolStatus
-from fiber_operator.failures import Account, Record, account, delay
-from fiber_operator.pods import PodView, State, Trouble
+from fiber_operator.planning.failures import Account, Record, account, delay
+from fiber_operator.planning.pods import PodView, State, Trouble
 from unit.operator_cluster_model import view
 from unit.operator_objects import NOW, name_of
 
@@ -201,8 +201,8 @@ def test_a_pod_that_was_to_be_deleted_and_is_not_is_like_any_other() -> None:
 
 
 def test_what_has_no_room_in_the_record_is_counted_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fiber_operator.failures.NAMES", 5)
-    monkeypatch.setattr("fiber_operator.failures.ROUND", 2)
+    monkeypatch.setattr("fiber_operator.planning.failures.NAMES", 5)
+    monkeypatch.setattr("fiber_operator.planning.failures.ROUND", 2)
     pods = [failed(number) for number in range(12)]
     record, totals = Record(), []
     while pods:

@@ -15,13 +15,13 @@ from fakes.store import Body
 from fakes.world import NAMESPACE, World, a_world
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
-from fiber_operator import plans
 from fiber_operator.metrics import PoolSample
-from fiber_operator.plans import Memory, Plan
-from fiber_operator.pods import PodView, observe
-from fiber_operator.podspec import pod
-from fiber_operator.reconcile import plan, plan_unreadable
-from fiber_operator.revisions import template_hash
+from fiber_operator.planning import plans
+from fiber_operator.planning.plans import Memory, Plan
+from fiber_operator.planning.pods import PodView, observe
+from fiber_operator.planning.podspec import pod
+from fiber_operator.planning.reconcile import plan, plan_unreadable
+from fiber_operator.planning.revisions import template_hash
 from unit.operator_objects import (
     ADDRESS,
     MASTER,

@@ -16,8 +16,8 @@ from fakes.world import NAMESPACE, World, a_world, configuration
 from fiber_api.times import format_time
 from fiber_operator import inspection
 from fiber_operator.cluster import Cluster
-from fiber_operator.pods import PodView, State
-from fiber_operator.worker import Key
+from fiber_operator.planning.pods import PodView, State
+from fiber_operator.turns import Key
 from unit.operator_cluster_model import view
 from unit.operator_objects import NOW
 from unit.test_operator_pods import ANYTHING

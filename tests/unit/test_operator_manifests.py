@@ -6,7 +6,7 @@ import base64
 from typing import Any
 
 from fiber_api import names
-from fiber_operator import manifests
+from fiber_operator.planning import manifests
 from unit.operator_objects import MASTER, UID, make_pool
 
 

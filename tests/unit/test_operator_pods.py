@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fiber_operator.pods import LONGEST_MESSAGE, PodView, State, Trouble, observe
+from fiber_operator.planning.pods import LONGEST_MESSAGE, PodView, State, Trouble, observe
 from unit.operator_objects import (
     NOW,
     UID,

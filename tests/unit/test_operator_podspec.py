@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fiber_api import names
-from fiber_operator.podspec import NODE_LOST_SECONDS, pod
-from fiber_operator.revisions import spec_hash, template_hash
+from fiber_operator.planning.podspec import NODE_LOST_SECONDS, pod
+from fiber_operator.planning.revisions import spec_hash, template_hash
 from unit.operator_objects import MASTER, UID, make_pool
 from unit.test_operator_pods import ANYTHING
 

@@ -8,10 +8,10 @@ import pytest
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator import plans
-from fiber_operator.plans import Obstacle, Refusal
-from fiber_operator.reconcile import plan
-from fiber_operator.revisions import spec_hash, template_hash
+from fiber_operator.planning import plans
+from fiber_operator.planning.plans import Obstacle, Refusal
+from fiber_operator.planning.reconcile import plan
+from fiber_operator.planning.revisions import spec_hash, template_hash
 from unit.operator_objects import (
     MASTER,
     NOW,

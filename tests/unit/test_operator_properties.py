@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from fiber_api.names import Reason
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
-from fiber_operator import plans
-from fiber_operator.plans import Memory, Obstacle, Plan, Refusal
-from fiber_operator.pods import PodView, State, Trouble
-from fiber_operator.reconcile import plan, plan_unreadable
-from fiber_operator.revisions import spec_hash, template_hash
-from fiber_operator.scaling import CANARIES, PATIENCE
+from fiber_operator.planning import plans
+from fiber_operator.planning.plans import Memory, Obstacle, Plan, Refusal
+from fiber_operator.planning.pods import PodView, State, Trouble
+from fiber_operator.planning.reconcile import plan, plan_unreadable
+from fiber_operator.planning.revisions import spec_hash, template_hash
+from fiber_operator.planning.scaling import CANARIES, PATIENCE
 from unit.operator_cluster_model import Model, view
 from unit.operator_objects import ADDRESS, MASTER, NOW, make_pool, name_of, pool_document
 from unit.test_operator_pods import ANYTHING

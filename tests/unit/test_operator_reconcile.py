@@ -12,11 +12,11 @@ import pytest
 from fiber_api.names import Reason
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator import plans
-from fiber_operator.plans import Memory, Plan, Refusal
-from fiber_operator.pods import State, Trouble
-from fiber_operator.reconcile import plan
-from fiber_operator.revisions import spec_hash, template_hash
+from fiber_operator.planning import plans
+from fiber_operator.planning.plans import Memory, Plan, Refusal
+from fiber_operator.planning.pods import State, Trouble
+from fiber_operator.planning.reconcile import plan
+from fiber_operator.planning.revisions import spec_hash, template_hash
 from unit.operator_cluster_model import view
 from unit.operator_objects import (
     MASTER,
@@ -318,8 +318,8 @@ def with_replicas(pool: FiberPool, replicas: int) -> FiberPool:
 def test_what_is_too_much_for_the_status_is_deleted_in_rounds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("fiber_operator.failures.NAMES", 5)
-    monkeypatch.setattr("fiber_operator.failures.ROUND", 2)
+    monkeypatch.setattr("fiber_operator.planning.failures.NAMES", 5)
+    monkeypatch.setattr("fiber_operator.planning.failures.ROUND", 2)
     pool = tried(replicas=12, update={"strategy": "Recreate"})
     old = outdated(*(running(number) for number in range(12)))
     made = plan_of(pool, *old)

@@ -23,9 +23,9 @@ from fakes.kubernetes_api import Fault
 from fakes.world import NAMESPACE, World, a_world
 from fiber_operator.health import Health
 from fiber_operator.metrics import Metrics, PoolSample
-from fiber_operator.pods import State
+from fiber_operator.planning.pods import State
+from fiber_operator.turns import Statistics
 from fiber_operator.watches import Watches
-from fiber_operator.worker import Statistics
 
 ROOT = Path(__file__).resolve().parents[2]
 

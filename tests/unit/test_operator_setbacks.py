@@ -13,7 +13,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.store import Body
 from fakes.world import NAMESPACE, World, a_world
-from fiber_operator.situation import SECOND_LOOK
+from fiber_operator.planning.situation import SECOND_LOOK
 
 MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
 LOST = {**MASTER, "leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5}

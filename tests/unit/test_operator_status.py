@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
-from fiber_operator import plans
-from fiber_operator.pods import State
-from fiber_operator.reconcile import plan, plan_unreadable
-from fiber_operator.revisions import template_hash
+from fiber_operator.planning import plans
+from fiber_operator.planning.pods import State
+from fiber_operator.planning.reconcile import plan, plan_unreadable
+from fiber_operator.planning.revisions import template_hash
 from unit.operator_cluster_model import view
 from unit.operator_objects import (
     MASTER,

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.plans import Plan
-from fiber_operator.reconcile import plan
+from fiber_operator.planning.plans import Plan
+from fiber_operator.planning.reconcile import plan
 from unit.operator_objects import (
     MASTER,
     NOW,

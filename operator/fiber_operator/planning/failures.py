@@ -26,8 +26,8 @@ from dataclasses import dataclass, replace
 from fiber_api.names import Reason
 from fiber_api.status import MAX_COUNT
 from fiber_api.v1alpha1 import FailurePolicy, Failures, FiberPoolStatus
-from fiber_operator.documents import past
-from fiber_operator.pods import BRIEF, PodView, State, Trouble
+from fiber_operator.planning.documents import past
+from fiber_operator.planning.pods import BRIEF, PodView, State, Trouble
 
 RECOVERY = 60.0
 """Seconds that a new pod must stay Ready until the failures before it are forgotten."""

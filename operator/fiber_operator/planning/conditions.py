@@ -10,9 +10,9 @@ from typing import Literal
 from fiber_api.names import ConditionType, Phase, Reason
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import Condition, FiberPool, Problem
-from fiber_operator.attachment import Attachment
-from fiber_operator.documents import past
-from fiber_operator.pods import PodView, State
+from fiber_operator.planning.attachment import Attachment
+from fiber_operator.planning.documents import past
+from fiber_operator.planning.pods import PodView, State
 
 Truth = Literal["True", "False", "Unknown"]
 

@@ -9,11 +9,11 @@ from typing import Literal
 
 from fiber_api.status import MAX_COUNT
 from fiber_api.v1alpha1 import FiberPool, Problem
-from fiber_operator.attachment import Attachment
-from fiber_operator.documents import past
-from fiber_operator.failures import Account
-from fiber_operator.plans import Memory
-from fiber_operator.pods import PodView
+from fiber_operator.planning.attachment import Attachment
+from fiber_operator.planning.documents import past
+from fiber_operator.planning.failures import Account
+from fiber_operator.planning.plans import Memory
+from fiber_operator.planning.pods import PodView
 
 SECOND_LOOK = 30.0
 """Seconds after which what may pass by itself has not."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from fiber_api.names import ConditionType
 from fiber_api.v1alpha1 import Condition, FiberPool
-from fiber_operator import plans
-from fiber_operator.documents import past
+from fiber_operator.planning import plans
+from fiber_operator.planning.documents import past
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,14 @@ from typing import Any
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator import cut_off, failures, problems, revisions, scaling, status, wording
-from fiber_operator.attachment import judge
-from fiber_operator.conditions import Counts, Outlook
-from fiber_operator.documents import items, mapping, text
-from fiber_operator.plans import Deletion, Event, Memory, Obstacle, Plan
-from fiber_operator.pods import PodView, State, Trouble
-from fiber_operator.situation import SECOND_LOOK, Situation
-from fiber_operator.transitions import Change, events
+from fiber_operator.planning import cut_off, failures, problems, revisions, scaling, status, wording
+from fiber_operator.planning.attachment import judge
+from fiber_operator.planning.conditions import Counts, Outlook
+from fiber_operator.planning.documents import items, mapping, text
+from fiber_operator.planning.plans import Deletion, Event, Memory, Obstacle, Plan
+from fiber_operator.planning.pods import PodView, State, Trouble
+from fiber_operator.planning.situation import SECOND_LOOK, Situation
+from fiber_operator.planning.transitions import Change, events
 
 STUCK = 5.0
 """Seconds after which a pod's events are looked at, if its status does not say why it waits."""

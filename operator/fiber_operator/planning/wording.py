@@ -10,10 +10,10 @@ from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, Master
-from fiber_operator.documents import items, mapping, text
-from fiber_operator.failures import Record
-from fiber_operator.plans import LeaseVerdict, Refusal
-from fiber_operator.pods import PodView
+from fiber_operator.planning.documents import items, mapping, text
+from fiber_operator.planning.failures import Record
+from fiber_operator.planning.plans import LeaseVerdict, Refusal
+from fiber_operator.planning.pods import PodView
 
 _SIGNALS = {4: "SIGILL", 6: "SIGABRT", 7: "SIGBUS", 8: "SIGFPE", 9: "SIGKILL", 11: "SIGSEGV"}
 _SIGNALS |= {1: "SIGHUP", 2: "SIGINT", 15: "SIGTERM"}

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Problem
-from fiber_operator import cut_off, setbacks, wording
-from fiber_operator.failed_pods import completed_pods, failed_pods
-from fiber_operator.plans import Refusal
-from fiber_operator.situation import Situation
-from fiber_operator.starting_pods import pods_not_ready_any_more, pods_that_do_not_start
+from fiber_operator.planning import cut_off, setbacks, wording
+from fiber_operator.planning.failed_pods import completed_pods, failed_pods
+from fiber_operator.planning.plans import Refusal
+from fiber_operator.planning.situation import Situation
+from fiber_operator.planning.starting_pods import pods_not_ready_any_more, pods_that_do_not_start
 
 _NAMESPACE_ENDS = "because it is being terminated"
 """What the API server says where nothing new may be made because the namespace is deleted."""

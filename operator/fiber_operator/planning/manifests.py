@@ -14,9 +14,9 @@ from typing import Any
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, Master
-from fiber_operator.documents import items, mapping, text
-from fiber_operator.podspec import owner_reference, pod, pod_maker
-from fiber_operator.revisions import template_hash
+from fiber_operator.planning.documents import items, mapping, text
+from fiber_operator.planning.podspec import owner_reference, pod, pod_maker
+from fiber_operator.planning.revisions import template_hash
 
 __all__ = [
     "endpoint_slice",

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import Problem
-from fiber_operator import wording
-from fiber_operator.pods import PodView, State, Trouble
-from fiber_operator.situation import Situation
+from fiber_operator.planning import wording
+from fiber_operator.planning.pods import PodView, State, Trouble
+from fiber_operator.planning.situation import Situation
 
 
 def failed_pods(situation: Situation) -> Iterator[Problem]:

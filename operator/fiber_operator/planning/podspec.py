@@ -14,8 +14,8 @@ from typing import Any
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, Master
-from fiber_operator.documents import items, mapping, text
-from fiber_operator.revisions import template_hash
+from fiber_operator.planning.documents import items, mapping, text
+from fiber_operator.planning.revisions import template_hash
 
 NODE_LOST_SECONDS = 60
 """How long a pod stays bound to a node that is silent.  Kubernetes' own default is five minutes; a

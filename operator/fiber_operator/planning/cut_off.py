@@ -13,10 +13,10 @@ from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, Problem
-from fiber_operator.documents import items, mapping
-from fiber_operator.plans import Memory
-from fiber_operator.pods import PodView
-from fiber_operator.situation import Situation
+from fiber_operator.planning.documents import items, mapping
+from fiber_operator.planning.plans import Memory
+from fiber_operator.planning.pods import PodView
+from fiber_operator.planning.situation import Situation
 
 OUTDATED = "cut-off"
 """In place of a template's hash."""

@@ -9,13 +9,21 @@ from typing import Any
 from fiber_api import names
 from fiber_api.names import ConditionType, Phase, Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator import manifests
-from fiber_operator.conditions import Counts, Finding, Outlook, Truth, conditions, dated, phase
-from fiber_operator.documents import mapping, past, whole
-from fiber_operator.failures import Record
-from fiber_operator.plans import Obstacle
-from fiber_operator.pods import PodView
-from fiber_operator.situation import SECOND_LOOK
+from fiber_operator.planning import manifests
+from fiber_operator.planning.conditions import (
+    Counts,
+    Finding,
+    Outlook,
+    Truth,
+    conditions,
+    dated,
+    phase,
+)
+from fiber_operator.planning.documents import mapping, past, whole
+from fiber_operator.planning.failures import Record
+from fiber_operator.planning.plans import Obstacle
+from fiber_operator.planning.pods import PodView
+from fiber_operator.planning.situation import SECOND_LOOK
 
 
 def describe(

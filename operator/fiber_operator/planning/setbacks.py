@@ -8,8 +8,8 @@ from __future__ import annotations
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import Master
 from fiber_operator.answers import ApiError, Invalid, Refused
-from fiber_operator.plans import Obstacle
-from fiber_operator.wording import quoted
+from fiber_operator.planning.plans import Obstacle
+from fiber_operator.planning.wording import quoted
 
 _RIGHTS = (
     "Give the operator's account this right, as the chart's roles do, or change the policy or the "

@@ -12,7 +12,7 @@ from enum import StrEnum
 from typing import Any
 
 from fiber_api.names import ANNOTATION_DELETION_COST, ENV_ADDRESS, LABEL_TEMPLATE_HASH
-from fiber_operator.documents import items, mapping, seconds, text, whole
+from fiber_operator.planning.documents import items, mapping, seconds, text, whole
 
 BRIEF = 10.0
 """Seconds.  A worker that ends sooner never did its job, whatever its exit code."""

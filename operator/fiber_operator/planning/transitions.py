@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from fiber_api.names import ConditionType, Reason
 from fiber_api.v1alpha1 import FiberPoolStatus
-from fiber_operator import wording
-from fiber_operator.failures import Account
-from fiber_operator.plans import Deletion, Event
+from fiber_operator.planning import wording
+from fiber_operator.planning.failures import Account
+from fiber_operator.planning.plans import Deletion, Event
 
 
 @dataclass(frozen=True)

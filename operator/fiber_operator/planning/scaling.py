@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from fiber_operator.pods import PodView, State, Trouble
+from fiber_operator.planning.pods import PodView, State, Trouble
 
 CANARIES = 3
 """Pods that try out a template that never worked."""
