@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from fakes import virtual_time
-from fiber_operator import turns
-from fiber_operator.turns import GAP, LULL, Key, Queue, Turn
+from fiber_operator.turns import CROWD, FIRST_BACKOFF, GAP, LONGEST_BACKOFF, LULL, Key, Queue, Turn
 
 A, B = Key("team", "a"), Key("team", "b")
 
@@ -301,7 +300,7 @@ async def test_a_turn_that_lasts_hands_its_place_on_to_so_many(queue: Queue, tur
         queue.add(Key("team", str(number)))
     await asyncio.sleep(50)
     assert [when for when, _ in turns.begun] == [0, 0, 2, 2, 4, 4, 6, 6]
-    assert turns.most_at_once == turns.CROWD * 2
+    assert turns.most_at_once == CROWD * 2
 
 
 @played()
@@ -366,4 +365,4 @@ async def test_an_end_in_the_middle_of_a_turn_leaves_nothing(queue: Queue, turns
 
 
 def test_the_longest_backoff_is_bounded() -> None:
-    assert turns.FIRST_BACKOFF * 2**10 > turns.LONGEST_BACKOFF
+    assert FIRST_BACKOFF * 2**10 > LONGEST_BACKOFF
