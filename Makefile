@@ -4,9 +4,10 @@ PYTHON ?=
 BACKEND ?= local
 VENV := .venv
 BIN := $(VENV)/bin
-# Side by side: a file's tests stay together, since what they share is made once for it.
+# Side by side, and more than there are processors, since some tests wait for what they started. A
+# file's tests stay together: what they share is made once for it.
 FAST_TESTS := tests/contract tests/simulation tests/unit
-FAST := $(BIN)/python -m pytest -q -n auto --dist loadfile $(FAST_TESTS)
+FAST := $(BIN)/python -m pytest -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile $(FAST_TESTS)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help

@@ -92,6 +92,7 @@ def _nothing_left(request: pytest.FixtureRequest, _nothing_left_at_the_end: None
     failed = call is None or call.excinfo is not None
     marker = request.node.get_closest_marker("may_leak")
     left = [] if failed or marker else watch.left_since(before)
-    watch.kill_processes_since(before)
+    if failed or marker or left:
+        watch.kill_processes_since(before)
     if left:
         pytest.fail("this test left behind: " + "; ".join(left), pytrace=False)

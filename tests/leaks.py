@@ -58,9 +58,10 @@ class Watch:
         self._folder = folder
 
     def look(self) -> Snapshot:
+        started = self._started()
         return Snapshot(
-            lasting=Lasting(_runtime(), self._excused(), _nng_runs()),
-            processes=frozenset(found.pid for found in self._started()),
+            lasting=Lasting(_runtime(), _excused(started), _nng_runs()),
+            processes=frozenset(found.pid for found in started),
             threads=frozenset(threading.enumerate()),
             descriptors=frozenset(_descriptors()),
             files=frozenset(os.listdir(self._folder)),
@@ -81,8 +82,9 @@ class Watch:
 
     def kill_processes_since(self, before: Snapshot) -> None:
         """End what a failed test left, so that the next one is judged by its own deeds."""
-        spared = before.processes | before.lasting.processes | self._excused()
-        census.kill(found for found in self._started() if found.pid not in spared)
+        started = self._started()
+        spared = before.processes | before.lasting.processes | _excused(started)
+        census.kill(found for found in started if found.pid not in spared)
 
     def _compare(self, before: Snapshot, excuse_runtime: bool) -> list[str]:
         now = self.look()
@@ -103,20 +105,20 @@ class Watch:
     def _started(self) -> list[census.Found]:
         return census.started_by(os.getpid(), self._marker)
 
-    def _excused(self) -> frozenset[int]:
-        """The agents of this process, its zygotes, and theirs."""
-        found = self._started()
-        agents = {p.pid for p in found if p.parent == os.getpid() and _AGENT in p.command}
-        owners = agents | {os.getpid()}
-        zygotes = {p.pid for p in found if p.parent in owners and _ZYGOTE in p.command}
-        return frozenset(agents | zygotes)
-
 
 def shut_down_runtime() -> None:
     """End Fiber's runtime, where the tests have made one."""
     state = sys.modules.get("fiber._runtime.state")
     if state is not None:
         state.shutdown()
+
+
+def _excused(started: list[census.Found]) -> frozenset[int]:
+    """The agents of this process, its zygotes, and theirs."""
+    agents = {p.pid for p in started if p.parent == os.getpid() and _AGENT in p.command}
+    owners = agents | {os.getpid()}
+    zygotes = {p.pid for p in started if p.parent in owners and _ZYGOTE in p.command}
+    return frozenset(agents | zygotes)
 
 
 def _runtime() -> object | None:

@@ -22,8 +22,8 @@ class Watched:
         self._since = since
         self._objects: dict[str, Body] = {}
         self._changed = threading.Condition()
-        self._stream = Stream(kube, self._begin, self._tell)
         self.ready: Curve = []
+        self._stream = Stream(kube, self._begin, self._tell)  # its thread uses all of the above
 
     def close(self) -> None:
         """Stop watching."""

@@ -19,7 +19,14 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.operator_scale import command, counters, report, results, trial  # noqa: E402
+from benchmarks.operator_scale import (  # noqa: E402
+    command,
+    counters,
+    report,
+    results,
+    trial,
+    watched,
+)
 from benchmarks.operator_scale.cases import (  # noqa: E402
     CASES,
     FIBER,
@@ -369,6 +376,17 @@ def test_a_trial_times_each_step_and_leaves_nothing(
             "patch fiberpools/status": 3,
         }
         assert found.operator.memory_after == 95e6
+
+
+def test_a_watch_may_begin_before_it_is_wholly_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Listed(Kube):
+        def __init__(self) -> None: ...
+
+        def call(self, method: str, path: str, *_: Any, **__: Any) -> Any:
+            return {"metadata": {"resourceVersion": "1"}, "items": []}
+
+    monkeypatch.setattr(watched, "Stream", lambda kube, begin, tell: begin())
+    assert [count for _, count in watched.Watched(Listed(), "/pools", 0.0).ready] == [0]
 
 
 def test_a_pool_that_nobody_looks_at_is_told_and_removed(
