@@ -208,7 +208,7 @@ def test_a_program_that_is_not_in_the_image(pools: Pools) -> None:
 def test_a_worker_that_is_never_ready(pools: Pools) -> None:
     pool = pools["never-ready"]
     problem = pool.has_problem("StartupTimeout", severity="Error", seconds=60)
-    words = (problem["pod"], "not become ready", "5 s", "startupTimeoutSeconds")
+    words = (problem["pod"], "5 s", "startupTimeoutSeconds", "not become ready", "probe failed")
     assert says(problem["message"], *words)
     assert pool.status["failures"]["total"] >= 1
 

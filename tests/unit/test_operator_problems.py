@@ -8,7 +8,7 @@ import pytest
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator.planning import plans
+from fiber_operator.planning import plans, wording
 from fiber_operator.planning.plans import Obstacle, Refusal
 from fiber_operator.planning.reconcile import plan
 from fiber_operator.planning.revisions import spec_hash, template_hash
@@ -390,3 +390,16 @@ def test_the_worst_comes_first_and_there_are_ten_at_most() -> None:
     assert len(status.problems) == 10
     found = [problem.reason for problem in status.problems]
     assert found[:3] == ["InvalidImageName", "CreateContainerError", "RunContainerError"]
+
+
+@pytest.mark.parametrize(
+    ("said", "ending"),
+    [
+        ("Readiness probe failed: ", ": Readiness probe failed"),
+        ("no such file.", ": no such file"),
+        ("  ", ""),
+        ("", ""),
+    ],
+)
+def test_the_words_of_the_cluster_end_a_clause(said: str, ending: str) -> None:
+    assert wording.quoted(said) == ending

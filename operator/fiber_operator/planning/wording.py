@@ -21,7 +21,7 @@ _SIGNALS |= {1: "SIGHUP", 2: "SIGINT", 15: "SIGTERM"}
 
 def quoted(words: str) -> str:
     """The cluster's words as the end of a clause."""
-    words = words.strip().rstrip(".")
+    words = words.strip().rstrip(".: ")  # a probe that says nothing leaves a colon
     return f": {words}" if words else ""
 
 
