@@ -139,7 +139,7 @@ class Main:
         self._link.close("the agent ended", then=self._loop.stop)
 
     def _on_sigterm(self, *_: object) -> None:
-        self._loop.interrupt(self._drain)
+        self._loop.call_soon(self._drain)
 
     def _drain(self) -> None:
         self._told_to_end = True

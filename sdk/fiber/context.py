@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from fiber import config, cpu
 from fiber._hub.absent import absent
 from fiber._runtime import methods
-from fiber.process import Process
+from fiber.process import ForkProcess, ForkServerProcess, Process, SpawnProcess
 
 if TYPE_CHECKING:
     import logging
@@ -46,24 +46,6 @@ __all__ = [
     "get_spawning_popen",
     "set_spawning_popen",
 ]
-
-
-class ForkProcess(Process):
-    """A process forked from the zygote."""
-
-    _start_method = "fork"
-
-
-class ForkServerProcess(Process):
-    """A process forked from the zygote."""
-
-    _start_method = "forkserver"
-
-
-class SpawnProcess(Process):
-    """A process in a new interpreter."""
-
-    _start_method = "spawn"
 
 
 class BaseContext:

@@ -24,14 +24,15 @@ from multiprocessing.pool import (  # type: ignore[attr-defined]
 )
 from typing import Any
 
-from fiber import context as fiber_context
 from fiber._engine.chunks import default_chunksize
-from fiber._runtime import options
-from fiber._runtime.dispatcher import Dispatcher, Terms
-from fiber._runtime.outcome import Failure
-from fiber._runtime.requests import Request
+from fiber._runtime import methods, options
+from fiber._runtime.executor import Executor
+from fiber._runtime.options import PoolOptions
+from fiber._runtime.state import runtime
+from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from fiber.errors import FiberError
+from fiber.process import process_type
 from fiber.results import (
     ApplyResult,
     AsyncResult,
@@ -100,26 +101,28 @@ class Pool:
         minimum, maximum = options.sizes(processes, min_workers, max_workers)
         if initializer is not None and not callable(initializer):
             raise TypeError("initializer must be a callable")
-        self._ctx = context or fiber_context.default.get_context()
         self._processes = maximum
         self._maxtasksperchild = options.max_tasks(maxtasksperchild)
         self._task_timeout = options.seconds("task_timeout", task_timeout)
         self._owner = os.getpid()
-        self._dispatcher = Dispatcher(
-            Terms(
-                context=self._ctx,
+        process = process_type(methods.settle()) if context is None else context.Process
+        self._executor = Executor(
+            PoolOptions(
+                process_type=process,
                 initializer=initializer,
                 initargs=tuple(initargs),
                 minimum=minimum,
                 maximum=maximum,
-                maxtasks=self._maxtasksperchild,
+                max_tasks=self._maxtasksperchild,
                 retries=options.retries(retries),
                 retryable=(Exception,) if error_handling else options.exceptions(retry_exceptions),
                 idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
-            )
+            ),
+            runtime(),
         )
-        self._dispatcher.start()
-        self._terminate = util.Finalize(self, _abandon, args=(self._dispatcher,), exitpriority=15)
+        # First: whoever is interrupted while the workers start has forgotten the pool.
+        self._terminate = util.Finalize(self, _abandon, args=(self._executor,), exitpriority=15)
+        self._executor.start()
         self._state = RUN
 
     # Calls
@@ -139,11 +142,7 @@ class Pool:
         """
         self._check_running()
         result = AsyncResult(self)
-        dispatcher = self._dispatcher
-        limit = self._limit(timeout)
-        worker = dispatcher.call(result, func, args, kwds, limit, until=result.ready)
-        while worker is not None and not result.ready() and dispatcher.attend(worker):
-            pass
+        self._executor.call(result, func, args, kwds, self._limit(timeout), blocking=True)
         return result.get()
 
     def apply_async(
@@ -163,14 +162,14 @@ class Pool:
         """
         self._check_running()
         result = AsyncResult(self, callback, error_callback)
-        self._dispatcher.post(result, func, args, kwds, self._limit(timeout))
+        self._executor.call(result, func, args, kwds, self._limit(timeout))
         return result
 
     def broadcast(self, func: _Function, *args: Any) -> list[Any]:
         """Call ``func(*args)`` once in every worker, and return the results of all."""
         self._check_running()
         result = MapResult(self)
-        self._dispatcher.broadcast(result, func, args)
+        self._executor.broadcast(result, func, args)
         values: list[Any] = result.get()
         return values
 
@@ -277,16 +276,19 @@ class Pool:
         timeout: float | None,
     ) -> list[Any]:
         result = MapResult(self)
-        if isinstance(iterable, (*_SLICEABLE, list)) or self._maxtasksperchild is not None:
-            request = self._map_async(kind, func, iterable, chunksize, timeout, result)
-        else:
-            request = self._map_stream(kind, func, iterable, chunksize, timeout, result)
-        try:
-            result.wait()
-        except BaseException:  # Ctrl-C: whoever waits for it no longer does
-            if request is not None:
-                self._dispatcher.cancel(request)
-            raise
+        item = self._item(kind, func, result, chunksize, timeout)
+        if item is not None:
+            try:
+                if isinstance(iterable, (*_SLICEABLE, list)) or self._maxtasksperchild is not None:
+                    self._submit(item, iterable, chunksize)
+                else:
+                    stream = self._executor.open_stream(item)
+                    stream.read(iterable)
+                    self._executor.finish(item)
+                result.wait()
+            except BaseException:  # Ctrl-C: whoever waits for it no longer does
+                self._executor.cancel(item)
+                raise
         values: list[Any] = result.get()
         return values
 
@@ -298,70 +300,10 @@ class Pool:
         chunksize: int | None,
         timeout: float | None,
         result: MapResult,
-    ) -> Request | None:
-        self._check_running()
-        if chunksize is not None:
-            chunksize = options.chunksize(chunksize)
-        limit = self._limit(timeout)
-        try:
-            items = iterable if isinstance(iterable, _SLICEABLE) else tuple(iterable)
-        except Exception as error:
-            if not hasattr(iterable, "__len__"):
-                raise
-            # multiprocessing reads what has a length in the background.
-            _fail(result, error)
-            return None
-        try:
-            function = self._dispatcher.function(func)
-        except Exception as error:
-            _fail(result, error)
-            return None
-        if chunksize is None and self._maxtasksperchild is not None:
-            chunksize = default_chunksize(len(items), self._processes)
-        return self._dispatcher.map(
-            kind,
-            function,
-            items,
-            result,
-            unit=chunksize or 1,
-            exact=chunksize == 1,
-            timeout=limit,
-        )
-
-    def _map_stream(
-        self,
-        kind: int,
-        func: _Function,
-        iterable: Iterable[Any],
-        chunksize: int | None,
-        timeout: float | None,
-        result: MapResult,
-    ) -> Request | None:
-        """A map that reads its input on this thread."""
-        self._check_running()
-        if chunksize is not None:
-            chunksize = options.chunksize(chunksize)
-        limit = self._limit(timeout)
-        try:
-            function = self._dispatcher.function(func)
-        except Exception as error:
-            _fail(result, error)
-            return None
-        request = self._dispatcher.stream(
-            kind,
-            function,
-            result,
-            unit=chunksize or 1,
-            exact=chunksize == 1,
-            timeout=limit,
-        )
-        try:
-            self._dispatcher.read(request, iterable)
-        except BaseException:
-            self._dispatcher.cancel(request)
-            raise
-        self._dispatcher.finish(request)
-        return request
+    ) -> None:
+        item = self._item(kind, func, result, chunksize, timeout)
+        if item is not None:
+            self._submit(item, iterable, chunksize)
 
     def _imap(
         self,
@@ -372,33 +314,61 @@ class Pool:
         timeout: float | None,
         buffersize: int | None,
     ) -> IMapIterator:
-        self._check_running()
-        chunksize = options.chunksize(chunksize)
         buffersize = options.buffersize(buffersize)
-        limit = self._limit(timeout)
-        buffer = iterator._buffer
-        dispatcher = self._dispatcher
-        try:
-            function = dispatcher.function(func)
-        except Exception as error:
-            _fail(buffer, error)
+        buffer, executor = iterator._buffer, self._executor
+        item = self._item(work.MAP, func, buffer, options.chunksize(chunksize), timeout)
+        if item is None:
             return iterator
-        terms: dict[str, Any] = {"unit": chunksize, "exact": chunksize == 1, "timeout": limit}
         if buffersize is None and isinstance(iterable, (*_SLICEABLE, list)):
-            items = tuple(iterable) if isinstance(iterable, list) else iterable
-            dispatcher.map(work.MAP, function, items, buffer, **terms)
+            self._submit(item, iterable, chunksize)
             return iterator
-        request = dispatcher.stream(work.MAP, function, buffer, limit=buffersize, **terms)
+        stream = executor.open_stream(item, buffersize)
         if buffersize is not None:
-            buffer.reader = request.reader
-            iterator._cancel = partial(dispatcher.soon, dispatcher.cancel, request)
+            buffer.stream = stream
+            iterator._cancel = partial(executor.cancel, item)
         threading.Thread(
-            target=_feed,
-            args=(dispatcher, request, iterable),
-            name="fiber-pool-feeder",
-            daemon=True,
+            target=_feed, args=(executor, item, iterable), name="fiber-pool-feeder", daemon=True
         ).start()
         return iterator
+
+    def _item(
+        self,
+        kind: int,
+        func: _Function,
+        future: Any,
+        chunksize: int | None,
+        timeout: float | None,
+    ) -> WorkItem | None:
+        """A map to come; None if its function does not pickle, which the future is told."""
+        self._check_running()
+        unit = 1 if chunksize is None else options.chunksize(chunksize)
+        limit = self._limit(timeout)
+        try:
+            function = self._executor.function(func)
+        except Exception as error:
+            future.set_exception(error)
+            return None
+        return WorkItem(
+            kind,
+            function=function,
+            future=future,
+            unit=unit,
+            exact=chunksize == 1,
+            timeout=limit,
+        )
+
+    def _submit(self, item: WorkItem, iterable: Iterable[Any], chunksize: int | None) -> None:
+        try:
+            tasks = iterable if isinstance(iterable, _SLICEABLE) else tuple(iterable)
+        except Exception as error:
+            if not hasattr(iterable, "__len__") or item.future is None:
+                raise
+            # multiprocessing reads what has a length in the background.
+            item.future.set_exception(error)
+            return
+        if chunksize is None and self._maxtasksperchild is not None:
+            item.unit = default_chunksize(len(tasks), self._processes)
+        self._executor.submit(item, tasks)
 
     def _limit(self, timeout: float | None) -> float | None:
         """Seconds that a task may take; None: any."""
@@ -406,14 +376,14 @@ class Pool:
 
     def _call_back(self, action: Callable[[], None]) -> bool:
         """Have a callback run; False if the pool was terminated and none runs any more."""
-        return self._dispatcher.callbacks.post(action)
+        return self._executor.callbacks.submit(action)
 
     # The pool itself
 
     @property
     def _pool(self) -> list[Any]:
         """The processes of its workers."""
-        return list(self._dispatcher.processes())
+        return list(self._executor.processes())
 
     def _repopulate_pool(self) -> None:
         """Nothing: workers are replaced as they go."""
@@ -436,7 +406,7 @@ class Pool:
         util.debug("closing pool")
         if self._state == RUN:
             self._state = CLOSE
-            self._dispatcher.close()
+            self._executor.close()
 
     def terminate(self) -> None:
         """End the workers at once.  Whoever waits for a result gets an error."""
@@ -444,7 +414,7 @@ class Pool:
         util.debug("terminating pool")
         self._state = TERMINATE
         self._terminate.cancel()
-        _end(self._dispatcher)
+        _end(self._executor)
 
     def join(self) -> None:
         """Wait until all workers are gone; after ``close`` or ``terminate``.
@@ -457,7 +427,7 @@ class Pool:
             raise ValueError("Pool is still running")
         if self._state not in (CLOSE, TERMINATE):
             raise ValueError("In unknown state")
-        self._dispatcher.join()
+        self._executor.join()
         self._terminate.cancel()
 
     def __enter__(self) -> Pool:
@@ -480,37 +450,34 @@ class Pool:
             _warn(f"unclosed running multiprocessing pool {self!r}", ResourceWarning, source=self)
 
 
-def _feed(dispatcher: Dispatcher, request: Request, iterable: Iterable[Any]) -> None:
+def _feed(executor: Executor, item: WorkItem, iterable: Iterable[Any]) -> None:
     """What a feeder thread does: read the input of an imap."""
     error = None
     try:
-        dispatcher.read(request, iterable)
+        assert item.stream is not None
+        item.stream.read(iterable)
     except BaseException as raised:
         error = raised
-    dispatcher.finish(request, error)
+    executor.finish(item, error)
 
 
-def _fail(sink: Any, error: BaseException) -> None:
-    """Nothing can be sent, because of ``error``."""
-    sink.put(0, [Failure(error)], True)
-    sink.end()
+def _end(executor: Executor) -> None:
+    executor.terminate(_terminated())
+    if not executor.on_loop():
+        executor.ended.wait()
 
 
-def _end(dispatcher: Dispatcher) -> None:
-    dispatcher.terminate(
-        FiberError(
-            "the pool was terminated before this result was there: close() and join() it "
-            "to wait for what was asked"
-        )
+def _terminated() -> FiberError:
+    return FiberError(
+        "the pool was terminated before this result was there: close() and join() it "
+        "to wait for what was asked"
     )
-    if not dispatcher.on_loop():
-        dispatcher.ended.wait()
 
 
-def _abandon(dispatcher: Dispatcher) -> None:
+def _abandon(executor: Executor) -> None:
     """The program ends, or has forgotten the pool."""
     if util.is_exiting():
-        _end(dispatcher)
+        _end(executor)
     else:
-        # The garbage collector runs anywhere, even where a lock is held that this needs.
-        dispatcher.soon(_end, dispatcher)
+        # The garbage collector runs anywhere: nothing may be waited for here.
+        executor.terminate(_terminated())

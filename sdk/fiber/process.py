@@ -16,7 +16,16 @@ from multiprocessing.process import (
 )
 from typing import Any
 
-__all__ = ["BaseProcess", "Process", "active_children", "current_process", "parent_process"]
+__all__ = [
+    "BaseProcess",
+    "ForkProcess",
+    "ForkServerProcess",
+    "Process",
+    "SpawnProcess",
+    "active_children",
+    "current_process",
+    "parent_process",
+]
 
 
 class Process(BaseProcess):
@@ -49,6 +58,30 @@ class Process(BaseProcess):
         # The child has them now; here they would keep the target's arguments alive.
         del self._target, self._args, self._kwargs  # type: ignore[attr-defined]
         _mp._children.add(self)  # type: ignore[attr-defined]
+
+
+class ForkProcess(Process):
+    """A process forked from the zygote."""
+
+    _start_method = "fork"
+
+
+class ForkServerProcess(Process):
+    """A process forked from the zygote."""
+
+    _start_method = "forkserver"
+
+
+class SpawnProcess(Process):
+    """A process in a new interpreter."""
+
+    _start_method = "spawn"
+
+
+def process_type(method: str) -> type[Process]:
+    """The class of processes of a start method."""
+    types: tuple[type[Process], ...] = (ForkProcess, ForkServerProcess, SpawnProcess)
+    return {cls._start_method or "": cls for cls in types}[method]
 
 
 def _disown() -> None:

@@ -13,17 +13,22 @@ import types
 from collections import deque
 from collections.abc import Callable, Iterator
 from multiprocessing import TimeoutError
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-from fiber._runtime.outcome import Encoded, Failure, decode, is_failure
-
-if TYPE_CHECKING:
-    from fiber._runtime.reader import Reader
-    from fiber.pool import Pool
+from fiber._runtime.input_stream import InputStream
+from fiber._runtime.latch import Latch, Waiters, as_lock_timeout
+from fiber._runtime.outcome import Failure, Pickled, decode, is_failure
 
 __all__ = ["ApplyResult", "AsyncResult", "IMapIterator", "IMapUnorderedIterator", "MapResult"]
 
 _Callback = Callable[[Any], object]
+
+
+class Owner(Protocol):
+    """What a result needs of its pool, which it keeps while there is something to wait for."""
+
+    def _call_back(self, action: Callable[[], None]) -> bool:
+        """Have a callback run; False if none runs any more."""
 
 
 class ApplyResult:
@@ -31,72 +36,63 @@ class ApplyResult:
 
     def __init__(
         self,
-        pool: Pool,
+        pool: Owner,
         callback: _Callback | None = None,
         error_callback: _Callback | None = None,
     ) -> None:
         # Keeps the pool while there is something to wait for, as in multiprocessing.
-        self._pool: Pool | None = pool
+        self._pool: Owner | None = pool
         self._callback = callback
         self._error_callback = error_callback
         self._outcome: Any = None
         self._mixed = False
-        self._done = False
-        self._settling = threading.Lock()
-        # Locks of those who wait, each its own: one that is interrupted leaves nothing half done.
-        self._waiters: list[threading.Lock] = []
+        self._done = Latch()
+        # Reentrant: unpickling runs the user's code, which may ask for this very result.
+        self._settling = threading.RLock()
 
     def ready(self) -> bool:
         """Whether the call has completed."""
-        return self._done
+        return self._done.is_set()
 
     def successful(self) -> bool:
         """Whether it completed without raising; ValueError if it has not completed."""
-        if not self._done:
+        if not self.ready():
             raise ValueError(f"{self!r} not ready")
         return type(self._settled()) is not Failure
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the result is there or ``timeout`` seconds are over."""
-        if self._done:
-            return
-        waiter = threading.Lock()
-        waiter.acquire()
-        self._waiters.append(waiter)
-        # ``_complete`` notes first that it is done and looks for waiters then.
-        if not self.ready() and not waiter.acquire(True, _patience(timeout)):
-            with contextlib.suppress(ValueError):  # it is there this very moment
-                self._waiters.remove(waiter)
+        self._done.wait(timeout)
 
     def get(self, timeout: float | None = None) -> Any:
         """The result, or the exception that the call raised; TimeoutError if there is neither."""
         self.wait(timeout)
-        if not self._done:
+        if not self.ready():
             raise _too_late(timeout)
         outcome = self._settled()
         if type(outcome) is Failure:
             raise outcome.error
         return outcome
 
-    # What the dispatcher says
+    # What the executor says
 
-    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
         """Take the outcome."""
         self._outcome = outcomes[0]
         self._mixed = mixed
 
-    def end(self) -> None:
+    def set_done(self) -> None:
         """All outcomes are there: call back, then let those go on who wait."""
         wanted = self._callback is not None or self._error_callback is not None
         pool = self._pool
         if not wanted or pool is None or not pool._call_back(self._run_callback):
             self._complete()
 
-    def abort(self, error: BaseException) -> None:
+    def set_exception(self, error: BaseException) -> None:
         """There will be no outcome."""
         self._outcome = Failure(error)
         self._mixed = False
-        self._complete()
+        self.set_done()
 
     def _run_callback(self) -> None:
         try:
@@ -110,9 +106,7 @@ class ApplyResult:
 
     def _complete(self) -> None:
         self._pool = None
-        self._done = True
-        while self._waiters:
-            self._waiters.pop().release()
+        self._done.set()
 
     def _settled(self) -> Any:
         if self._mixed:
@@ -132,11 +126,6 @@ class ApplyResult:
 AsyncResult = ApplyResult
 
 
-def _patience(timeout: float | None) -> float:
-    """``timeout`` as locks want it."""
-    return -1 if timeout is None else min(max(0, timeout), threading.TIMEOUT_MAX)
-
-
 def _too_late(timeout: float | None) -> TimeoutError:
     return TimeoutError(
         f"no result within {timeout} s; its task goes on, and its result can still be waited for"
@@ -151,7 +140,7 @@ class MapResult(ApplyResult):
 
     def __init__(
         self,
-        pool: Pool,
+        pool: Owner,
         callback: _Callback | None = None,
         error_callback: _Callback | None = None,
     ) -> None:
@@ -159,7 +148,7 @@ class MapResult(ApplyResult):
         self._outcome = []
         self._first: Any = None
 
-    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
         """Take outcomes."""
         values = self._outcome
         if start > len(values):
@@ -178,7 +167,7 @@ class MapResult(ApplyResult):
         else:
             values = self._outcome
             for at, value in enumerate(values):
-                if type(value) is Encoded:
+                if type(value) is Pickled:
                     values[at] = value.decode()
                     if type(values[at]) is Failure:
                         self._outcome = values[at]
@@ -187,72 +176,65 @@ class MapResult(ApplyResult):
 
 
 class _Buffer:
-    """Results on their way to an iterator: what the dispatcher fills and the iterator empties."""
+    """Results on their way to an iterator: what the executor fills and the iterator empties."""
 
-    def __init__(self, pool: Pool) -> None:
+    def __init__(self, pool: Owner) -> None:
         self.items: deque[Any] = deque()
         self.finished = False
-        self.reader: Reader | None = None
-        self.pool: Pool | None = pool
-        self._arrived = threading.Condition(threading.Lock())
-        self._waiting = 0
+        self.stream: InputStream | None = None
+        """What reads no more than is consumed, if that was asked for."""
+        self.pool: Owner | None = pool
+        self._waiters = Waiters()
 
-    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
         """Take outcomes."""
         self.items.extend(outcomes)
-        self._wake()
+        self._waiters.wake()
 
-    def end(self) -> None:
+    def set_done(self) -> None:
         """All outcomes are there."""
         self.finished = True
         self.pool = None
-        self._wake()
+        self._waiters.wake()
 
-    def abort(self, error: BaseException) -> None:
+    def set_exception(self, error: BaseException) -> None:
         """There will be no more outcomes."""
         self.items.append(Failure(error))
-        self.end()
-
-    def _wake(self) -> None:
-        # Who waits says so first and looks at the items then.
-        if self._waiting:
-            with self._arrived:
-                self._arrived.notify_all()
+        self.set_done()
 
     def wait(self, timeout: float | None) -> Any:
         """The next outcome; StopIteration at the end, TimeoutError if it takes too long."""
-        patience = threading.TIMEOUT_MAX if timeout is None else timeout
-        deadline = time.monotonic() + patience
-        with self._arrived:
-            self._waiting += 1
-            try:
-                while True:
-                    finished = self.finished  # the last items come before it
-                    with contextlib.suppress(IndexError):  # other threads take them, too
-                        return self.items.popleft()
-                    if finished:
-                        raise StopIteration
-                    left = deadline - time.monotonic()
-                    if left <= 0:
-                        raise _too_late(timeout)
-                    self._arrived.wait(min(left, threading.TIMEOUT_MAX))
-            finally:
-                self._waiting -= 1
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            waiter = self._waiters.join()
+            finished = self.finished  # the last items come before it
+            with contextlib.suppress(IndexError):  # other threads take them, too
+                outcome = self.items.popleft()
+                self._waiters.leave(waiter)
+                return outcome
+            if finished:
+                self._waiters.leave(waiter)
+                raise StopIteration
+            left = None if deadline is None else deadline - time.monotonic()
+            if not waiter.acquire(True, as_lock_timeout(left)):
+                self._waiters.leave(waiter)
+                if left is not None and left <= 0:
+                    raise _too_late(timeout)
 
 
 class _OrderedBuffer(_Buffer):
-    def __init__(self, pool: Pool) -> None:
+    def __init__(self, pool: Owner) -> None:
         super().__init__(pool)
         self._next = 0
         self._early: dict[int, list[Any]] = {}
 
-    def put(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
         """Take outcomes; pass on what is next in order."""
         self._early[start] = outcomes
         while (ready := self._early.pop(self._next, None)) is not None:
             self.items.extend(ready)
             self._next += len(ready)
-        self._wake()
+        self._waiters.wake()
 
 
 class IMapIterator:
@@ -260,7 +242,7 @@ class IMapIterator:
 
     _buffer_type: type[_Buffer] = _OrderedBuffer
 
-    def __init__(self, pool: Pool) -> None:
+    def __init__(self, pool: Owner) -> None:
         self._buffer = self._buffer_type(pool)
         self._cancel: Callable[[], None] | None = None
 
@@ -274,9 +256,9 @@ class IMapIterator:
             outcome = buffer.items.popleft()
         except IndexError:
             outcome = buffer.wait(timeout)
-        if buffer.reader is not None:
-            buffer.reader.consume(1)
-        if type(outcome) is Encoded:
+        if buffer.stream is not None:
+            buffer.stream.consume()
+        if type(outcome) is Pickled:
             outcome = outcome.decode()
         if type(outcome) is Failure:
             raise outcome.error

@@ -54,7 +54,7 @@ MASTER = """
             for link in links:
                 link.send(Shutdown(0.0).encode())
             listener.close("the master ended", then=loop.stop)
-        loop.interrupt(act)
+        loop.call_soon(act)
 
     loop = Loop()
     signal.signal(signal.SIGTERM, end)

@@ -232,7 +232,7 @@ def test_a_call_after_the_end_writes_into_nobody_elses_descriptor(late: str) -> 
 
 def test_a_signal_handler_interrupts_the_loop_of_the_main_thread() -> None:
     loop = Loop()
-    before = signal.signal(signal.SIGALRM, lambda *_: loop.interrupt(loop.stop))
+    before = signal.signal(signal.SIGALRM, lambda *_: loop.call_soon(loop.stop))
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.01)
         loop.run()

@@ -26,9 +26,12 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from fiber._engine.chunks import Pace
-from fiber._engine.roster import PATIENCE, Roster
+from fiber._engine.load import PATIENCE, WorkersByLoad
 from fiber._engine.spans import Span, Waiting
 from fiber._engine.tasks import Batch, Job, Loss, Receipt, Worker
+
+LOOKAHEAD = 4
+"""Jobs whose turn it is that may be passed over for one whose tasks may queue."""
 
 __all__ = ["PATIENCE", "Batch", "Job", "Ledger", "Loss", "Receipt", "Span", "Worker"]
 
@@ -44,9 +47,10 @@ class Ledger:
         self.workers: set[Worker] = set()
         self.batches: dict[int, Batch] = {}
         self.starting = 0
+        self._open_tasks = 0  # fed and not done, of jobs that count
         self._seq = itertools.count(1)
         self._turns: deque[Job] = deque()
-        self._roster = Roster()
+        self._load = WorkersByLoad()
         self._pins: dict[Worker, None] = {}
         self._homeless: list[tuple[Job, Span]] = []
         self._cancelled: set[Batch] = set()
@@ -82,7 +86,7 @@ class Ledger:
         if job not in self.jobs or not len(items):
             return
         job.waiting.append(Span(job.fed, items, job.alone))
-        job.fed += len(items)
+        self._fed(job, len(items))
         self._list(job)
 
     def pin(self, job: Job, worker: Worker | None, item: Any) -> None:
@@ -91,7 +95,7 @@ class Ledger:
         If the worker is lost, one that comes after it takes its place.
         """
         span = Span(job.fed, [item], alone=True, pin=True)
-        job.fed += 1
+        self._fed(job, 1)
         if worker is None:
             self._homeless.append((job, span))
         else:
@@ -100,6 +104,7 @@ class Ledger:
     def _pin(self, job: Job, worker: Worker, span: Span) -> None:
         worker.pinned.append((job, span))
         self._pins[worker] = None
+        job.pins[worker] = None
 
     def close(self, job: Job) -> bool:
         """No more tasks will be fed; True if the job is finished by that."""
@@ -108,8 +113,8 @@ class Ledger:
 
     def unfinished(self, job: Job) -> list[Any]:
         """The items of its tasks that are not done."""
-        spans = [batch.rest() for batch in self.batches.values() if batch.job is job]
-        pinned = itertools.chain(self._homeless, *(worker.pinned for worker in self._pins))
+        spans = [batch.rest() for batch in job.batches]
+        pinned = itertools.chain(self._homeless, *(worker.pinned for worker in job.pins))
         spans += [span for owner, span in pinned if owner is job]
         return [*job.waiting.items(), *itertools.chain.from_iterable(s.items for s in spans)]
 
@@ -119,20 +124,30 @@ class Ledger:
         Returns the workers that hold unread batches of it, worth a recall.
         """
         job.waiting = Waiting()
-        self.jobs.discard(job)
+        if job in self.jobs:
+            self.jobs.discard(job)
+            self._open_tasks -= job.fed - job.done
         holders = []
-        for batch in self.batches.values():
-            if batch.job is job:
-                batch.job = None
-                self._cancelled.add(batch)
-                if batch.worker.queue[0] is not batch:
-                    holders.append(batch.worker)
-        for worker in list(self._pins):
+        for batch in job.batches:
+            batch.job = None
+            self._cancelled.add(batch)
+            if batch.worker.queue[0] is not batch:
+                holders.append(batch.worker)
+        job.batches.clear()
+        for worker in job.pins:
             worker.pinned = deque(pinned for pinned in worker.pinned if pinned[0] is not job)
             if not worker.pinned:
-                del self._pins[worker]
-        self._homeless = [pinned for pinned in self._homeless if pinned[0] is not job]
+                self._pins.pop(worker, None)
+        job.pins.clear()
+        if self._homeless:
+            self._homeless = [pinned for pinned in self._homeless if pinned[0] is not job]
         return holders
+
+    def pause(self, job: Job, paused: bool) -> None:
+        """Give out none of its tasks, or go on with them."""
+        job.paused = paused
+        if not paused and job.waiting:
+            self._list(job)
 
     # Workers
 
@@ -142,7 +157,7 @@ class Ledger:
         worker.since = now
         self.workers.add(worker)
         self._adopt(worker)
-        self._roster.sort(worker)
+        self._load.sort(worker)
         return worker
 
     def _adopt(self, worker: Worker) -> None:
@@ -160,14 +175,14 @@ class Ledger:
         if worker.queue or worker.pinned:
             return False
         self._fence(worker)
-        self._roster.spent.pop(worker, None)
+        self._load.spent.pop(worker, None)
         return True
 
     def spent(self) -> list[Worker]:
         """Workers that did all that they may do, each once; they are given nothing more."""
-        if not self._roster.spent:
+        if not self._load.spent:
             return []
-        spent, self._roster.spent = list(self._roster.spent), {}
+        spent, self._load.spent = list(self._load.spent), {}
         for worker in spent:
             self._fence(worker)
         return spent
@@ -178,27 +193,35 @@ class Ledger:
         self._homeless += worker.pinned
         worker.pinned.clear()
         self._pins.pop(worker, None)
-        self._roster.sort(worker)
+        self._load.sort(worker)
 
-    def homeless(self) -> list[Job]:
-        """The jobs of tasks that only a new worker may run, as often as there are such tasks."""
-        return [job for job, _ in self._homeless]
+    def newcomers_wanted(self) -> int:
+        """How many tasks only a new worker may run."""
+        return len(self._homeless)
+
+    def jobs_for_newcomers(self) -> set[Job]:
+        """The jobs that have such tasks."""
+        return {job for job, _ in self._homeless}
 
     def idle(self) -> list[Worker]:
         """Workers with nothing to do, the one that has been so for longest first."""
-        return list(self._roster.idle)
+        return list(self._load.idle)
 
     def longest_idle(self) -> Worker | None:
         """The first of them."""
-        return next(iter(self._roster.idle), None)
+        return next(iter(self._load.idle), None)
 
     def hungry(self) -> bool:
         """Whether somebody could be given something."""
-        return bool(self._roster.idle or self._roster.single)
+        return bool(self._load.idle or self._load.single)
 
     def demand(self) -> int:
         """Tasks that wait or run; of cancelled ones, the batches that still hold up a worker."""
-        return sum(job.fed - job.done for job in self.jobs) + len(self._cancelled)
+        return self._open_tasks + len(self._cancelled)
+
+    def waits(self) -> bool:
+        """Whether there are tasks that some worker could be given."""
+        return bool(self._turns or self._pins)
 
     # Giving
 
@@ -213,15 +236,16 @@ class Ledger:
         if not turns or not self.hungry():
             return None
         passed = 0
-        while passed < len(turns) and passed <= len(self._roster.single):
+        while passed < len(turns) and passed <= min(len(self._load.single), LOOKAHEAD):
             job = turns[passed]
-            worker = self._worker_for(job, passed) if job.waiting else None
-            if worker is None and job.waiting:
+            waits = bool(job.waiting) and not job.paused
+            worker = self._worker_for(job, passed) if waits else None
+            if worker is None and waits:
                 passed += 1  # it keeps its place, and a worker from being given more
                 continue
             del turns[passed]
             batch = self._cut(job, worker, now) if worker is not None else None
-            job.listed = bool(job.waiting)
+            job.listed = bool(job.waiting) and not job.paused
             if job.listed:
                 turns.append(job)
             if batch is not None:
@@ -229,13 +253,14 @@ class Ledger:
         return None
 
     def _assign_pinned(self, now: float) -> Batch | None:
-        for worker in self._pins:
-            if worker in self._roster.idle:
-                job, span = worker.pinned.popleft()
-                if not worker.pinned:
-                    del self._pins[worker]
-                return self._send(job, worker, span, now)
-        return None
+        fewer, more = sorted((self._pins, self._load.idle), key=len)
+        worker = next((worker for worker in fewer if worker in more), None)
+        if worker is None:
+            return None
+        job, span = worker.pinned.popleft()
+        if not worker.pinned:
+            del self._pins[worker]
+        return self._send(job, worker, span, now)
 
     def _worker_for(self, job: Job, passed: int) -> Worker | None:
         """Who may be given tasks of ``job``.
@@ -243,7 +268,7 @@ class Ledger:
         ``passed`` jobs whose turn it was wait for a worker that has nothing else to do, so as many
         of those that will have it soon are spared.
         """
-        idle = self._roster.last_idle()
+        idle = self._load.last_idle()
         if idle is not None:
             return idle
         if job.waiting.first_alone() or not job.pace.may_queue(len(job.waiting)):
@@ -251,7 +276,7 @@ class Ledger:
         # What a worker that is about to start can run should not queue behind something else.
         if self.starting and len(job.waiting) <= self.starting:
             return None
-        return self._roster.single_after(passed)
+        return self._load.single_after(passed)
 
     def _cut(self, job: Job, worker: Worker, now: float) -> Batch:
         waiting = len(job.waiting)
@@ -264,15 +289,59 @@ class Ledger:
         return self._send(job, worker, job.waiting.take(size), now)
 
     def _send(self, job: Job, worker: Worker, span: Span, now: float) -> Batch:
-        batch = Batch(next(self._seq), job, worker, span)
+        batch = Batch(self.next_seq(), job, worker, span)
+        if worker.left is not None:
+            worker.left -= min(batch.units, worker.left)
+        self._hold(batch, now)
+        return batch
+
+    def _hold(self, batch: Batch, now: float) -> None:
+        worker = batch.worker
         self.batches[batch.seq] = batch
+        if batch.job is not None:
+            batch.job.batches[batch] = None
         if not worker.queue:
             worker.since = now
         worker.queue.append(batch)
-        if worker.left is not None:
-            worker.left -= min(batch.units, worker.left)
-        self._roster.sort(worker)
-        return batch
+        self._load.sort(worker)
+
+    # Lending
+
+    def next_seq(self) -> int:
+        """A sequence number that nobody else has; on any thread."""
+        return next(self._seq)
+
+    def lend(self, worker: Worker) -> bool:
+        """Leave an idle worker to a caller, who gives it calls directly; False if it is not idle.
+
+        As Ray's callers do with a worker that they lease.
+        """
+        if worker not in self._load.idle or worker.left is not None:
+            return False
+        worker.lent = True
+        self._load.sort(worker)
+        return True
+
+    def return_idle(self, worker: Worker, now: float) -> None:
+        """A lent worker is back, and has nothing to do."""
+        worker.lent = False
+        worker.since = now
+        self._load.sort(worker)
+
+    def return_busy(self, worker: Worker, seq: int, job: Job | None, item: Any, now: float) -> None:
+        """A lent worker is back while it runs a call that was sent as ``seq``.
+
+        From now on that is a task of ``job``, or nobody's if that is None.
+        """
+        worker.lent = False
+        start = 0
+        if job is not None:
+            start = job.fed
+            self._fed(job, 1)
+        batch = Batch(seq, job, worker, Span(start, [item], alone=True))
+        if job is None:
+            self._cancelled.add(batch)
+        self._hold(batch, now)
 
     # Taking
 
@@ -297,7 +366,7 @@ class Ledger:
         job = batch.job
         batch.received = received = offset + count
         if job is not None:
-            job.done += count
+            self._did(job, count)
             job.pace.observe(count, seconds)
         if kept is not None:
             self._cut_short(batch, max(kept, received))
@@ -321,15 +390,20 @@ class Ledger:
             self._return(batch.job, rest)
 
     def _close_batch(self, batch: Batch, now: float) -> None:
-        del self.batches[batch.seq]
-        self._cancelled.discard(batch)
+        self._drop(batch)
         worker = batch.worker
         if worker.queue[0] is batch:
             worker.since = now
             worker.queue.popleft()
         else:
             worker.queue.remove(batch)
-        self._roster.sort(worker)
+        self._load.sort(worker)
+
+    def _drop(self, batch: Batch) -> None:
+        del self.batches[batch.seq]
+        self._cancelled.discard(batch)
+        if batch.job is not None:
+            batch.job.batches.pop(batch, None)
 
     def retry(self, receipt: Receipt, index: int) -> bool:
         """Run a task again whose result is not good enough.  False: it had its tries."""
@@ -338,8 +412,10 @@ class Ledger:
             return False  # cancelled
         if not self._charge(job, index):
             return False
-        job.done -= 1
-        self.jobs.add(job)
+        if job not in self.jobs:  # what was its last task is not done after all
+            self.jobs.add(job)
+            self._open_tasks += job.fed - job.done
+        self._did(job, -1)
         span = Span(index, [receipt.item(index)], True, receipt.batch.pin)
         if span.pin:
             self._pin(job, receipt.batch.worker, span)
@@ -356,6 +432,8 @@ class Ledger:
             self._withdraw(batch, now)
             if batch.job is not None:
                 self._return(batch.job, batch.rest())
+        if len(worker.queue) > 1:
+            self._load.sort(worker)
 
     def split(self, seq: int, now: float) -> Receipt | None:
         """The worker cannot read the message: send its tasks again, one by one.
@@ -385,23 +463,24 @@ class Ledger:
         job, batch.job = batch.job, None
         if job is None:
             return None
-        job.done += 1
+        job.batches.pop(batch, None)
+        self._did(job, 1)
         self._finish(job)
         return Receipt(job, batch.start, 1, batch)
 
     def uneven(self) -> bool:
         """Whether somebody has nothing to do while others have more than they can do at once."""
-        return bool(self._roster.idle and self._roster.deep)
+        return bool(self._load.idle and self._load.deep)
 
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for the batch that they have not read, since others have nothing to do."""
         if any(job.waiting for job in self._turns):
             return []
-        return self._roster.recall(now)
+        return self._load.recall(now)
 
     def next_recall(self) -> float | None:
         """When ``recall`` could next return something, if nothing else happens."""
-        return self._roster.next_recall()
+        return self._load.next_recall()
 
     # Losing
 
@@ -418,14 +497,13 @@ class Ledger:
         guilty = _in_progress(worker, set(unread), running)
         losses: list[Loss] = []
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):
-            del self.batches[batch.seq]
-            self._cancelled.discard(batch)
+            self._drop(batch)
             if batch.job is not None:
                 suspects = batch.suspects(running) if batch is guilty else range(0)
                 losses += self._lose_batch(batch.job, batch.rest(), suspects)
         worker.queue.clear()
         self._fence(worker)
-        self._roster.spent.pop(worker, None)
+        self._load.spent.pop(worker, None)
         return losses[::-1]
 
     def _lose_batch(self, job: Job, rest: Span, suspects: range) -> list[Loss]:
@@ -433,7 +511,7 @@ class Ledger:
         for span in reversed(_around(rest, suspects)):
             if span.start in suspects and not self._charge(job, span.start):
                 losses.append(Loss(job, span.start, job.attempts.pop(span.start), span.items[0]))
-                job.done += 1
+                self._did(job, 1)
             elif span.pin:
                 self._homeless.append((job, span))
             else:
@@ -442,6 +520,15 @@ class Ledger:
         return losses
 
     # Inside
+
+    def _fed(self, job: Job, tasks: int) -> None:
+        job.fed += tasks
+        self._open_tasks += tasks
+
+    def _did(self, job: Job, tasks: int) -> None:
+        job.done += tasks
+        if job in self.jobs:
+            self._open_tasks -= tasks
 
     def _withdraw(self, batch: Batch, now: float) -> None:
         if batch.worker.left is not None:
@@ -458,7 +545,7 @@ class Ledger:
         self._list(job)
 
     def _list(self, job: Job) -> None:
-        if not job.listed:
+        if not job.listed and not job.paused:
             job.listed = True
             self._turns.append(job)
 

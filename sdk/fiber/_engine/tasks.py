@@ -15,6 +15,7 @@ class Job:
     __slots__ = (
         "alone",
         "attempts",
+        "batches",
         "closed",
         "done",
         "exact",
@@ -22,6 +23,8 @@ class Job:
         "listed",
         "owner",
         "pace",
+        "paused",
+        "pins",
         "retries",
         "unit",
         "waiting",
@@ -37,11 +40,14 @@ class Job:
         self.exact = exact
         self.alone = alone or retries == 0
         self.waiting = Waiting()
+        self.batches: dict[Batch, None] = {}  # those of its tasks that were given out
+        self.pins: dict[Worker, None] = {}  # who holds pinned tasks of it
         self.attempts: dict[int, int] = {}
         self.fed = 0
         self.done = 0
         self.closed = False
         self.listed = False  # whether it is in the ledger's round of turns
+        self.paused = False  # whether its tasks wait until somebody takes results of it
 
     @property
     def target(self) -> float:
@@ -74,16 +80,16 @@ class Batch:
         "worker",
     )
 
-    def __init__(self, seq: int, job: Job, worker: Worker, span: Span) -> None:
+    def __init__(self, seq: int, job: Job | None, worker: Worker, span: Span) -> None:
         self.seq = seq
-        self.job: Job | None = job
+        self.job = job
         self.worker = worker
         self.start = span.start
         self.items = span.items
         self.alone = span.alone
         self.pin = span.pin
-        self.stride = 1 if job.exact else job.pace.stride()
-        self.unit = job.unit
+        self.stride = 1 if job is None or job.exact else job.pace.stride()
+        self.unit = 1 if job is None else job.unit
         self.received = 0
 
     @property
@@ -116,7 +122,7 @@ class Batch:
 class Worker:
     """What one worker holds.  ``left``: units that it may still be given (maxtasksperchild)."""
 
-    __slots__ = ("key", "leaving", "left", "pinned", "queue", "recalled", "since")
+    __slots__ = ("key", "leaving", "left", "lent", "pinned", "queue", "recalled", "since")
 
     def __init__(self, key: Any, left: int | None) -> None:
         self.key = key
@@ -126,6 +132,7 @@ class Worker:
         self.since = 0.0  # when it began what it does now
         self.recalled = False
         self.leaving = False
+        self.lent = False  # a caller uses it directly
 
 
 class Receipt(NamedTuple):

@@ -46,7 +46,7 @@ class Hub:
         self._loop = loop
         self._parent = directory
         self._poller = Poller(loop)
-        self.registry = Registry(self._host_object, self._discard, loop.interrupt)
+        self.registry = Registry(self._host_object, self._discard, loop.call_soon)
         self._switch = Switch(host, self._accept)
         self._sessions: set[Session] = set()
         self._streams: weakref.WeakSet[SocketStream] = weakref.WeakSet()

@@ -4,13 +4,30 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 from fiber import config, cpu
+from fiber.process import Process
 
 LARGEST_CHUNK = 2**32 - 1
 """What a message can say; more than anybody has."""
+
+
+class PoolOptions(NamedTuple):
+    """What a pool promises its workers and callers; ``fiber.pool.Pool`` says what each means."""
+
+    process_type: type[Process] = Process
+    """The class of processes of the start method."""
+    initializer: Callable[..., object] | None = None
+    initargs: tuple[Any, ...] = ()
+    minimum: int = 1
+    maximum: int = 1
+    max_tasks: int | None = None
+    """Tasks, or chunks of them, after which a worker is replaced."""
+    retries: int = 3
+    retryable: tuple[type[BaseException], ...] = ()
+    idle_timeout: float = 60.0
 
 
 def whole(name: str, value: Any) -> int:

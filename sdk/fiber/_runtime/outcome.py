@@ -1,4 +1,4 @@
-"""What became of a task, as the dispatcher hands it on.
+"""What became of a task, as the executor hands it on.
 
 The loop's thread never runs the user's code, and unpickling may: so what is not plain stays pickled
 until whoever wants it asks, in a thread of theirs.
@@ -22,7 +22,7 @@ class Failure:
         self.error = error
 
 
-class Encoded:
+class Pickled:
     """A value or an error, still pickled."""
 
     __slots__ = ("buffers", "data", "kind")
@@ -49,12 +49,12 @@ class Encoded:
 def is_failure(outcome: Any) -> bool:
     """Whether a task failed; a value that does not unpickle is not known to."""
     kind = type(outcome)
-    return kind is Failure or (kind is Encoded and outcome.failed)
+    return kind is Failure or (kind is Pickled and outcome.failed)
 
 
 def decode(outcome: Any) -> Any:
     """A plain value as it is; what is pickled as its value or a Failure."""
-    return outcome.decode() if type(outcome) is Encoded else outcome
+    return outcome.decode() if type(outcome) is Pickled else outcome
 
 
 def outcomes(
@@ -63,7 +63,7 @@ def outcomes(
     """A worker's answer with what is pickled in its place."""
     used = 0
     for position, kind, data, count in odd:
-        values[position] = Encoded(kind, data, buffers[used : used + count])
+        values[position] = Pickled(kind, data, buffers[used : used + count])
         used += count
     return values
 

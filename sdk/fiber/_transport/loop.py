@@ -17,6 +17,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol
 
 from fiber.errors import FiberError
@@ -52,17 +53,32 @@ class Timer:
         self.callback = None
 
 
+class _Wakeup:
+    """An eventfd that lives for as long as somebody could write to it."""
+
+    def __init__(self) -> None:
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+
+    def __del__(self) -> None:
+        os.close(self.fd)
+
+
 class Loop:
-    """An epoll loop.  ``register`` and ``unregister`` may be called from any thread."""
+    """An epoll loop.  ``register`` and ``unregister`` may be called from any thread.
+
+    ``call_soon`` may be called from anywhere: another thread, a signal handler, a finalizer that
+    the garbage collector runs at any line, of this module too.  It takes no lock, and what it
+    changes it changes in single steps.
+    """
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._epoll.register(self._wake, select.EPOLLIN)
-        self._wake_lock = threading.Lock()
-        self._readers: dict[int, Callback] = {self._wake: self._woken}
+        self._wakeup = _Wakeup()
+        self._epoll.register(self._wakeup.fd, select.EPOLLIN)
+        self._asleep = False
+        self._readers: dict[int, Callback] = {self._wakeup.fd: self._woken}
         self._writers: dict[int, Callback] = {}
-        self._ready: deque[Callback] = deque()
+        self._ready: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._timers: list[tuple[float, int, Timer]] = []
         self._sequence = itertools.count()
         self._sweep_at = _MANY_TIMERS
@@ -92,10 +108,10 @@ class Loop:
 
         It is held weakly.
         """
-        with self._wake_lock:
-            if self._failure is not None:
-                raise self._failure
-            self._dependents.add(dependent)
+        # Both sides note first and look then: one of both sees the other.
+        self._dependents.add(dependent)
+        if self._failure is not None:
+            raise self._failure
 
     @staticmethod
     def now() -> float:
@@ -103,24 +119,16 @@ class Loop:
         return time.monotonic()
 
     def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
-        """Call it on the loop's thread, after what was asked before."""
-        self._ready.append(_bound(callback, args))
-        if threading.get_ident() != self._ident:
-            with self._wake_lock:
-                if not self._closed:
-                    os.eventfd_write(self._wake, 1)
-
-    def interrupt(self, callback: Callable[..., object], *args: Any) -> None:
-        """``call_soon`` for a signal handler, which may run on the loop's own thread while it
-        waits.
-        """
-        self._ready.append(_bound(callback, args))
-        if not self._closed:
-            os.eventfd_write(self._wake, 1)
+        """Call it on the loop's thread, after what was asked before; from anywhere."""
+        self._ready.append((callback, args))
+        # The loop notes that it goes to sleep and looks for calls then.  Only the loop takes that
+        # back: whoever is interrupted here, by a signal that raises, has changed nothing.
+        if self._asleep:
+            os.eventfd_write(self._wakeup.fd, 1)
 
     def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
         """Call it once, ``seconds`` from now, on the loop's thread."""
-        timer = Timer(self.now() + seconds, _bound(callback, args))
+        timer = Timer(self.now() + seconds, partial(callback, *args) if args else callback)
         if self.on_thread():
             self._add_timer(timer)
         else:
@@ -172,10 +180,17 @@ class Loop:
         self._close()
 
     def _run_once(self) -> None:
+        timeout = self._timeout()
+        if timeout:
+            self._asleep = True
+            if self._ready:
+                timeout = 0.0
         try:
-            events = self._epoll.poll(self._timeout())
+            events = self._epoll.poll(timeout)
         except InterruptedError:
             return
+        finally:
+            self._asleep = False
         self._dispatch(events)
         self._run_ready()
         self._run_timers()
@@ -189,11 +204,9 @@ class Loop:
         )
         failure.__cause__ = error
         self._running = False
-        with self._wake_lock:
-            self._failure = failure
-            dependents = list(self._dependents)
-        for dependent in dependents:
-            _call(lambda told=dependent: told.broken(failure))  # type: ignore[misc]
+        self._failure = failure
+        for dependent in list(self._dependents):
+            _call(dependent.broken, failure)
         with contextlib.suppress(OSError):  # the descriptors may be what it failed for
             self._close()
 
@@ -233,7 +246,8 @@ class Loop:
 
     def _run_ready(self) -> None:
         for _ in range(len(self._ready)):
-            _call(self._ready.popleft())
+            callback, args = self._ready.popleft()
+            _call(callback, *args)
 
     def _run_timers(self) -> None:
         now = self.now()
@@ -251,24 +265,18 @@ class Loop:
         heapq.heappush(self._timers, (timer.due, next(self._sequence), timer))
 
     def _woken(self) -> None:
-        os.eventfd_read(self._wake)
+        os.eventfd_read(self._wakeup.fd)
 
     def _close(self) -> None:
-        with self._wake_lock:  # a late ``call_soon`` must not write into a descriptor used anew
-            self._closed = True
-            self._epoll.close()
-            os.close(self._wake)
+        self._closed = True
+        self._epoll.close()
         self._readers.clear()
         self._writers.clear()
 
 
-def _bound(callback: Callable[..., object], args: tuple[Any, ...]) -> Callback:
-    return (lambda: callback(*args)) if args else callback
-
-
-def _call(callback: Callback) -> None:
+def _call(callback: Callable[..., object], *args: Any) -> None:
     try:
-        callback()
+        callback(*args)
     except Exception:
         # One broken callback must not stop the others, nor go unseen.
         sys.excepthook(*sys.exc_info())

@@ -5,40 +5,41 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import threading
-from collections.abc import Iterable
 from multiprocessing import process as mp_process
 from typing import Any, Protocol
 
 from fiber._agent.port import ChildPort, ExitReport
 from fiber._engine.ledger import Worker
+from fiber._runtime.latch import Latch
 from fiber._runtime.methods import zygote_method
-from fiber._runtime.state import runtime
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.process import Process
 
 
 class Supervisor(Protocol):
-    """Who hears what workers say; on the loop's thread."""
+    """Who hears what becomes of workers; on the loop's thread."""
 
-    def heard(self, link: Link, message: Message) -> None:
+    def on_message(self, handle: WorkerHandle, message: Message) -> None:
         """A packet from a worker."""
 
-    def recalled(self, link: Link, seqs: list[int]) -> None:
+    def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
         """The worker will never see these."""
 
-    def lost(self, link: Link, report: ExitReport) -> None:
+    def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
         """The worker is gone."""
 
 
-class Link:
-    """One worker's process as its pool sees it; also the ``Popen`` behind its Process object."""
+class WorkerHandle:
+    """One worker's process as its pool sees it; also the ``Popen`` behind its Process object.
+
+    The scheduler knows it as a ``Member`` of the pool's worker set.
+    """
 
     sentinel = -1
     """What a Process asks for when it starts; ``PoolProcess`` has a real one, if wanted."""
 
-    def __init__(self, supervisor: Supervisor) -> None:
+    def __init__(self, supervisor: Supervisor, host: Any) -> None:
         self.process: PoolProcess | None = None
         """Once it is started."""
         self.port: ChildPort | None = None
@@ -52,9 +53,10 @@ class Link:
         """It was told to go, or will be at once."""
         self.returncode: int | None = None
         self._supervisor = supervisor
+        self._host = host
         self._pid: int | None = None
-        self._born = threading.Event()
-        self._exited = threading.Event()
+        self._born = Latch()
+        self._exited = Latch()
         self._exit: int | None = None
 
     @property
@@ -64,7 +66,7 @@ class Link:
 
     def launch(self, process: PoolProcess, method: str) -> None:
         """Start the process; returns before it exists."""
-        self.port = runtime().start(process, self, tasks=True, method=method)
+        self.port = self._host.start(process, self, tasks=True, method=method)
 
     # What the agent says, on the loop's thread
 
@@ -75,11 +77,11 @@ class Link:
 
     def said(self, message: Message) -> None:
         """It sent a packet."""
-        self._supervisor.heard(self, message)
+        self._supervisor.on_message(self, message)
 
     def taken_back(self, seqs: list[int]) -> None:
         """It will never see these."""
-        self._supervisor.recalled(self, seqs)
+        self._supervisor.on_recalled(self, seqs)
 
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
@@ -89,15 +91,15 @@ class Link:
         if self._exit is not None:
             os.eventfd_write(self._exit, 1)
         mp_process._children.discard(self.process)  # type: ignore[attr-defined]
-        self._supervisor.lost(self, report)
+        self._supervisor.on_exit(self, report)
 
     # What its Process object asks
 
     @property
     def pid(self) -> int | None:
         """Its pid; waits until it has one."""
-        if self._pid is None and not runtime().loop.on_thread():
-            self._born.wait(min(runtime().config.start_timeout, threading.TIMEOUT_MAX))
+        if self._pid is None and not self._host.loop.on_thread():
+            self._born.wait(self._host.config.start_timeout)
         return self._pid
 
     def exit_descriptor(self) -> int:
@@ -114,7 +116,7 @@ class Link:
 
     def wait(self, timeout: float | None = None) -> int | None:
         """Wait for the exit code."""
-        self._exited.wait(None if timeout is None else min(timeout, threading.TIMEOUT_MAX))
+        self._exited.wait(timeout)
         return self.returncode
 
     def signal(self, signum: int) -> None:
@@ -123,6 +125,11 @@ class Link:
             # A program that has closed our descriptors has to hear of that, not of this.
             with contextlib.suppress(OSError):
                 self.port.signal(signum)
+
+    def dismiss(self) -> None:
+        """Tell it to end once it has read this."""
+        if self.port is not None:
+            self.port.deliver(0, work.STOP_MESSAGE)
 
     def terminate(self) -> None:
         """SIGTERM."""
@@ -145,33 +152,27 @@ class Link:
 class PoolProcess(Process):
     """The Process object of a pool worker."""
 
-    def __init__(self, link: Link | None, context: Any, **options: Any) -> None:
+    def __init__(
+        self, handle: WorkerHandle | None, process_type: type[Any], **options: Any
+    ) -> None:
         super().__init__(**options)
-        base = context.Process
-        self._start_method = getattr(base, "_start_method", None)
-        role = base.__name__.replace("Process", "PoolWorker")
+        self._start_method = getattr(process_type, "_start_method", None)
+        role = process_type.__name__.replace("Process", "PoolWorker")
         self.name = self.name.replace(type(self).__name__, role)
         self.daemon = True
-        self._link = link
+        self._handle = handle
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_link": None}
+        return self.__dict__ | {"_handle": None}
 
-    def _Popen(self) -> Link:
-        assert self._link is not None
-        self._link.launch(self, zygote_method(self._start_method))
-        return self._link
+    def _Popen(self) -> WorkerHandle:
+        assert self._handle is not None
+        self._handle.launch(self, zygote_method(self._start_method))
+        return self._handle
 
     @property
     def sentinel(self) -> int:
         """As in multiprocessing."""
         self._check_closed()  # type: ignore[attr-defined]
-        assert self._link is not None
-        return self._link.exit_descriptor()
-
-
-def dismiss(links: Iterable[Link]) -> None:
-    """Tell workers that are leaving to end once they have read this."""
-    for link in links:
-        if link.port is not None:
-            link.port.deliver(0, work.STOP_MESSAGE)
+        assert self._handle is not None
+        return self._handle.exit_descriptor()

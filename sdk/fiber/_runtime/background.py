@@ -1,4 +1,4 @@
-"""A pool's helper thread, for what the loop must not do: run the user's code, start processes."""
+"""A thread for what the loop must not do: run the user's code, start processes."""
 
 from __future__ import annotations
 
@@ -9,33 +9,35 @@ from collections.abc import Callable
 from typing import Any
 
 
-class Pump:
-    """Does one thing after the other on a thread of its own, which starts when first needed."""
+class BackgroundThread:
+    """Does one thing after the other on a thread of its own, which starts when first needed.
+
+    As ``ThreadPoolExecutor(1)``, with two differences: the thread is a daemon, so that what hangs
+    in it cannot keep the program from ending, and ``stop`` does not wait.  Only the loop's thread
+    submits, so nothing here needs a lock.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._queue: queue.SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]] | None]
         self._queue = queue.SimpleQueue()
-        self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._stopped = False
 
-    def post(self, action: Callable[..., object], *args: Any) -> bool:
-        """Have it done, after what was posted before; False: it has been stopped, and drops it."""
-        with self._lock:
-            if self._stopped:
-                return False
-            self._queue.put((action, args))
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-                self._thread.start()
+    def submit(self, action: Callable[..., object], *args: Any) -> bool:
+        """Have it done, after what came before; False: it has been stopped, and drops it."""
+        if self._stopped:
+            return False
+        self._queue.put((action, args))
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+            self._thread.start()
         return True
 
     def stop(self) -> None:
-        """End once everything posted is done."""
-        with self._lock:
-            self._stopped = True
-            self._queue.put(None)
+        """End once everything submitted is done."""
+        self._stopped = True
+        self._queue.put(None)
 
     def join(self) -> None:
         """Wait until it has ended; nothing when called by what it is doing."""

@@ -1,9 +1,8 @@
-"""Who may be given work: the ready workers, sorted by how much each holds."""
+"""Who may be given work: the ready workers, by how much each holds."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 
 from fiber._engine.tasks import Worker
 
@@ -11,13 +10,19 @@ PATIENCE = 2e-3
 """Seconds that a worker's current batch may take before idle ones ask for what lies behind it."""
 
 
-class Roster:
-    """The ready workers.  Dicts serve as sets that remember the order of insertion."""
+class WorkersByLoad:
+    """The ready workers.  Dicts serve as sets that remember the order of insertion.
+
+    ``idle`` hold nothing, ``single`` one batch, and could be given another.  ``deep`` hold two, of
+    which the second could be recalled, and is in those of ``recalled``.  ``spent`` did all that
+    they may do.  Who is lent or leaves is in none of them.
+    """
 
     def __init__(self) -> None:
         self.idle: dict[Worker, None] = {}
         self.single: dict[Worker, None] = {}
         self.deep: dict[Worker, None] = {}
+        self.recalled: dict[Worker, None] = {}
         self.spent: dict[Worker, None] = {}
 
     def sort(self, worker: Worker) -> None:
@@ -27,11 +32,18 @@ class Roster:
         queue = worker.queue
         if len(queue) < 2:
             self.deep.pop(worker, None)
+            self.recalled.pop(worker, None)
+        elif worker.recalled:
+            self.deep.pop(worker, None)
+            self.recalled[worker] = None
         elif worker not in self.deep:
+            self.recalled.pop(worker, None)
             self.deep[worker] = None
         if worker.leaving or worker.left == 0:
             if not queue and not worker.leaving:
                 self.spent[worker] = None
+            return
+        if worker.lent:
             return
         if not queue:
             self.idle[worker] = None
@@ -51,11 +63,12 @@ class Roster:
         victims = [worker for worker in self._candidates() if now >= worker.since + PATIENCE]
         for worker in victims:
             worker.recalled = True
+            self.sort(worker)
         return victims
 
     def next_recall(self) -> float | None:
         """When ``recall`` could next return something, if nothing else happens."""
         return min((worker.since + PATIENCE for worker in self._candidates()), default=None)
 
-    def _candidates(self) -> Iterator[Worker]:
-        return itertools.islice((w for w in self.deep if not w.recalled), len(self.idle))
+    def _candidates(self) -> list[Worker]:
+        return list(itertools.islice(self.deep, len(self.idle)))

@@ -1,0 +1,814 @@
+"""The executor: does what a pool's scheduler decides, and tells it what happens.
+
+::
+
+    any thread          the loop's thread                                   worker
+    call, submit, … ──► take in ─► Scheduler.decide ─► _act ─► encode ─► pack ──► run
+                           ▲                             │       ▲                 │
+                           │      the background thread ─┴───────┘ (user's code)   │
+                           └──────── on_message ◄──────────────────────────────────┘
+                                         │
+                                         └─► Future.add_results, set_done
+
+Everything that changes happens on the loop's thread, one thing at a time: no lock guards it.  Who
+asks for something, in whatever thread, finalizer or signal handler, puts it into the loop's queue
+and wakes the loop; nothing of the asker's can be left half done, and nothing can deadlock.  Nothing
+on the loop's thread runs the user's code: a batch whose pickling could goes to the background
+thread, values whose unpickling could stay ``Pickled``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import pickle
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol
+
+from fiber import reduction
+from fiber._agent import worker
+from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._engine.chunks import FLOOR, Pace
+from fiber._engine.ledger import Batch, Job, Loss, Receipt
+from fiber._engine.scheduler import Decisions, Scheduler
+from fiber._engine.worker_set import StartFailure
+from fiber._runtime.background import BackgroundThread
+from fiber._runtime.input_stream import InputStream
+from fiber._runtime.latch import Latch
+from fiber._runtime.options import PoolOptions
+from fiber._runtime.outcome import Failure, Pickled, outcomes
+from fiber._runtime.work_items import (
+    Call,
+    Encoded,
+    Function,
+    Future,
+    WorkItem,
+    blame_items,
+    encode,
+    name_of,
+    pack,
+    pickle_call,
+    pickles_without_user_code,
+)
+from fiber._runtime.worker_handle import PoolProcess, WorkerHandle
+from fiber._transport.loop import Timer
+from fiber._wire import work
+from fiber._wire.packet import Message
+from fiber.errors import FiberError, TimeoutError, WorkerDied
+
+FUNCTIONS = 128
+"""Functions that are recognized when they come again."""
+
+FUNCTION_SIZE = 1 << 16
+"""Bytes of a pickled function up to which it is."""
+
+KILL_AFTER = 2.0
+"""Seconds between SIGTERM and SIGKILL for workers that are to end at once."""
+
+TICK = 1e-4
+"""Seconds that any timer waits: less, by a rounding error, would be too early again and again."""
+
+
+class Loop(Protocol):
+    """What an executor needs of ``fiber._transport.loop.Loop``."""
+
+    def now(self) -> float:
+        """Monotonic seconds."""
+
+    def on_thread(self) -> bool:
+        """Whether the caller is the loop's own thread."""
+
+    def depend(self, dependent: Any) -> None:
+        """Tell ``dependent`` if the loop fails."""
+
+    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
+        """Call it on the loop's thread; from anywhere."""
+
+    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
+        """Call it once, later."""
+
+
+class Host(Protocol):
+    """What an executor needs of the runtime."""
+
+    loop: Any
+    config: Any
+
+    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildPort:
+        """Start a worker's process."""
+
+
+class Executor:
+    """The working half of a pool; ``fiber.pool.Pool`` is its face, and may be forgotten first."""
+
+    def __init__(
+        self,
+        options: PoolOptions,
+        host: Host,
+        *,
+        thread: Callable[[str], BackgroundThread] = BackgroundThread,
+    ) -> None:
+        self.options = options
+        self.callbacks = thread("fiber-pool-callbacks")
+        """Runs the callbacks of results."""
+        self.ended = Latch()
+        """Nobody is left."""
+        self._host = host
+        self._loop: Loop = host.loop
+        self._background = thread("fiber-pool")
+        self._scheduler = Scheduler(
+            options.minimum,
+            options.maximum,
+            max_tasks=options.max_tasks,
+            idle_timeout=options.idle_timeout,
+        )
+        self._ledger = self._scheduler.ledger
+        self._functions: dict[bytes, Function] = {}
+        self._function_ids = itertools.count(1)
+        self._calls = WorkItem(work.CALLS, exact=True)
+        self._open(self._calls)
+        self._called: deque[Call] = deque()
+        self._took_calls = -math.inf
+        self._unsent: set[int] = set()
+        """Batches that are assigned and not sent: nobody can have run them."""
+        self._streams: set[WorkItem] = set()
+        self._deadlines: dict[int, Timer] = {}
+        self._wake: Timer | None = None
+        self._kill: Timer | None = None
+        self._acting = False
+        self._again = False
+
+    # What is asked of it, on any thread
+
+    def start(self) -> None:
+        """Start the first workers; raises what stands in the way of one."""
+        self._loop.depend(self)
+        handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
+        self._loop.call_soon(self._begin, handles)
+        started = 0
+        try:
+            for handle in handles:
+                self._launch(handle)
+                started += 1
+        except BaseException as error:
+            self._loop.call_soon(self._never_started, handles[started:])
+            self.terminate(error)
+            raise
+
+    def call(
+        self,
+        future: Future,
+        function: Callable[..., Any],
+        args: Iterable[Any],
+        kwargs: Mapping[str, Any],
+        timeout: float | None = None,
+        *,
+        blocking: bool = False,
+    ) -> None:
+        """One call of a function.  ``blocking``: this thread will do nothing but wait for it."""
+        call = pickle_call(future, function, args, kwargs)
+        if call is None:
+            return
+        self._check()
+        call.blocking = blocking
+        if not blocking:
+            call.copy_buffers()
+        if timeout is None:
+            self._called.append(call)
+            self._loop.call_soon(self._take_calls)
+        else:
+            self._loop.call_soon(self._take, WorkItem(work.CALLS, timeout=timeout), (call,))
+
+    def broadcast(self, future: Future, function: Callable[..., Any], args: Sequence[Any]) -> None:
+        """The same call on every worker, present or starting; an outcome of each."""
+        call = pickle_call(future, function, args, {})
+        if call is not None:
+            self._check()
+            self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
+
+    def function(self, function: Callable[..., Any]) -> Function:
+        """``function``, pickled; one that pickles as an earlier one did is the same."""
+        try:
+            data, buffers, grants = reduction.encode_reusable(function)
+        except reduction.REFUSALS as error:
+            what = f"the function {name_of(function)}"
+            raise reduction.blame({what: function}, error) from error
+        known = self._functions.get(data)
+        if known is not None:
+            return known
+        made = Function(next(self._function_ids), name_of(function), data, buffers, grants)
+        if not buffers and grants is None and len(data) <= FUNCTION_SIZE:
+            if len(self._functions) >= FUNCTIONS:
+                self._functions.clear()  # one step: several threads may be here
+            self._functions[data] = made
+        return made
+
+    def submit(self, item: WorkItem, tasks: Sequence[Any]) -> None:
+        """Run all of ``tasks``, which must not change until they are done."""
+        self._check()
+        self._loop.call_soon(self._take, item, tasks)
+
+    def open_stream(self, item: WorkItem, limit: int | None = None) -> InputStream:
+        """Run what the stream will read; to be ended by ``finish`` or ``cancel``.
+
+        ``limit``: tasks read and not consumed, at most.
+        """
+        self._check()
+        loop = self._loop
+        stream = InputStream(item.unit, limit, lambda: loop.call_soon(self._refill, item))
+        item.stream = stream
+        loop.call_soon(self._take, item, None)
+        return stream
+
+    def finish(self, item: WorkItem, error: BaseException | None = None) -> None:
+        """Its stream has no more tasks; ``error``, if any, takes the place of the next one."""
+        self._loop.call_soon(self._finish, item, error)
+
+    def cancel(self, item: WorkItem) -> None:
+        """Nobody wants the rest of it any more; what runs is left to end.
+
+        Nothing if it was never submitted, or is done.
+        """
+        self._loop.call_soon(self._cancel, item)
+
+    def close(self) -> None:
+        """Take no more requests; the workers leave once those that are there are done."""
+        self._loop.call_soon(self._close)
+
+    def terminate(self, error: BaseException) -> None:
+        """End the workers now; ``error`` is what those hear who wait for a result."""
+        self._loop.call_soon(self._terminate, error)
+
+    def join(self) -> None:
+        """Wait until all workers and threads are gone; after ``close`` or ``terminate``."""
+        self._loop.call_soon(self._lift_limits)
+        self.ended.wait()
+        self._background.join()
+        self.callbacks.join()
+
+    def on_loop(self) -> bool:
+        """Whether this is the loop's thread, which must not wait."""
+        return self._loop.on_thread()
+
+    def processes(self) -> list[PoolProcess]:
+        """The processes of the workers that are there."""
+        handles: list[Any] = list(self._scheduler.workers.members)
+        return [handle.process for handle in handles if handle.process is not None]
+
+    def _check(self) -> None:
+        """Refuse at once what can be seen from here to be of no use."""
+        error = self._refusal()
+        if error is not None:
+            raise error
+
+    def _refusal(self) -> BaseException | None:
+        if self._scheduler.workers.error is not None:
+            return self._scheduler.workers.error
+        return ValueError("Pool not running") if self._scheduler.closing else None
+
+    # Requests.  From here on all happens on the loop's thread.
+
+    def _open(self, item: WorkItem) -> None:
+        function = item.function
+        pace = Pace(function.pace if function is not None else None)
+        if function is not None:
+            function.pace = pace
+        item.job = self._ledger.open(
+            item,
+            pace=pace,
+            retries=self.options.retries,
+            unit=item.unit,
+            alone=item.timeout is not None,
+            exact=item.exact,
+        )
+
+    def _take_calls(self) -> None:
+        """Calls have come.  Of many short ones in a row, several travel together.
+
+        Each would else wake a worker, which costs more than the call.
+        """
+        called, job = self._called, self._calls.job
+        if not called:
+            return
+        calls = [called.popleft() for _ in range(len(called))]
+        refusal = self._refusal()
+        if refusal is not None or job is None:
+            for call in calls:
+                call.future.set_exception(refusal or ValueError("Pool not running"))
+            return
+        now = self._loop.now()
+        hurried = now - self._took_calls < FLOOR and job.pace.short
+        self._took_calls = now
+        busy = job.fed - job.done >= self._scheduler.workers.size
+        self._ledger.feed(job, calls)
+        if hurried and busy and not calls[-1].blocking:
+            self._wake_at(now + TICK)
+        else:
+            self._advance()
+
+    def _take(self, item: WorkItem, tasks: Sequence[Any] | None) -> None:
+        """A map, a call with a deadline, or (None) a stream."""
+        refusal = self._refusal()
+        if refusal is not None:
+            if item.stream is not None:
+                item.stream.end()
+            future = item.future or (tasks or ())[0].future
+            future.set_exception(refusal)
+            return
+        self._open(item)
+        assert item.job is not None
+        if tasks is None:
+            self._streams.add(item)
+            self._top_up(item)
+        else:
+            self._ledger.feed(item.job, tasks)
+            self._ledger.close(item.job)
+            self._check_finished(item.job)
+        self._advance()
+
+    def _broadcast(self, item: WorkItem, call: Call) -> None:
+        assert item.future is not None
+        refusal = self._refusal()
+        if refusal is not None:
+            item.future.set_exception(refusal)
+            return
+        self._open(item)
+        assert item.job is not None
+        self._scheduler.pin_everywhere(item.job, call)
+        self._ledger.close(item.job)
+        self._check_finished(item.job)
+        self._advance()
+
+    def _refill(self, item: WorkItem) -> None:
+        """A stream has input, or room."""
+        if item in self._streams:
+            self._top_up(item)
+            self._advance()
+
+    def _top_up(self, item: WorkItem) -> bool:
+        """Take from a stream what was read, and let it read on; whether there was something."""
+        stream, job, ledger = item.stream, item.job, self._ledger
+        assert stream is not None
+        assert job is not None
+        tasks = stream.take()
+        if not tasks and not job.waiting:
+            stream.await_input()
+            tasks = stream.take()
+        ledger.feed(job, tasks)
+        stream.grant(len(job.waiting), len(ledger.workers), job.pace, job.target)
+        return bool(tasks)
+
+    def _finish(self, item: WorkItem, error: BaseException | None) -> None:
+        job = item.job
+        if item not in self._streams or item.stream is None or job is None:
+            return  # failed or cancelled meanwhile
+        self._ledger.feed(job, item.stream.take())
+        if error is not None and item.future is not None:
+            item.future.add_results(job.fed, [Failure(error)], True)
+        self._ledger.close(job)
+        self._check_finished(job)
+        self._streams.discard(item)
+        self._advance()
+
+    def _cancel(self, item: WorkItem) -> None:
+        if item.job is not None and item.job.owner is item:
+            for held in self._ledger.cancel(item.job):
+                held.key.port.take_back()
+            self._over(item)
+            self._advance()
+
+    def _lift_limits(self) -> None:
+        for item in self._streams:
+            if item.stream is not None:
+                item.stream.lift_limit()
+                self._top_up(item)
+        self._advance()
+
+    # What follows
+
+    def _advance(self) -> None:
+        """Do all that follows from what happened."""
+        if self._acting:
+            self._again = True
+            return
+        self._acting = True
+        try:
+            while True:
+                self._again = False
+                self._act(self._scheduler.decide(self._loop.now()))
+                if not self._again:
+                    return
+        finally:
+            self._acting = False
+
+    def _act(self, decisions: Decisions) -> None:
+        for job, error in decisions.failed:
+            self._fail(job, error)
+        handle: Any
+        for handle in decisions.end:
+            handle.terminate()
+        for held in decisions.recall:
+            held.key.port.take_back()
+        for handle in decisions.dismiss:
+            handle.dismiss()
+        if decisions.start:
+            self._start_workers(decisions.start)
+        for batch in decisions.assign:
+            self._send(batch)
+        if self._streams and decisions.assign:
+            given = {batch.job.owner for batch in decisions.assign if batch.job is not None}
+            for item in given & self._streams:
+                self._again |= self._top_up(item)
+        if decisions.wake_at < math.inf:
+            self._wake_at(decisions.wake_at)
+        if decisions.over:
+            self._end()
+
+    def _wake_at(self, due: float) -> None:
+        """Decide again then, if not before."""
+        if self._wake is not None:
+            if self._wake.due <= due:
+                return
+            self._wake.cancel()
+        delay = max(due - self._loop.now(), TICK)
+        self._wake = self._loop.call_later(delay, self._time_has_come)
+
+    def _time_has_come(self) -> None:
+        self._wake = None
+        self._advance()
+
+    def _end(self) -> None:
+        """Nobody is left."""
+        if self.ended.is_set():
+            return
+        for timer in (self._wake, self._kill, *self._deadlines.values()):
+            if timer is not None:
+                timer.cancel()
+        self._deadlines.clear()
+        self._background.stop()
+        self.callbacks.stop()
+        self.ended.set()
+
+    # Giving
+
+    def _send(self, batch: Batch) -> None:
+        """Send a batch, or have it encoded where the user's code may run."""
+        assert batch.job is not None
+        item: WorkItem = batch.job.owner
+        if not pickles_without_user_code(item, batch):
+            self._unsent.add(batch.seq)
+            self._background.submit(self._encode, item, batch)
+            return
+        try:
+            encoded = encode(item, batch, plain=True)
+        except Exception as error:  # no memory
+            self._unsendable(item, batch, error)
+        else:
+            self._deliver(item, batch, encoded)
+
+    def _encode(self, item: WorkItem, batch: Batch) -> None:
+        """On the background thread: pickle what may run the user's code."""
+        encoded: Encoded | None = None
+        error: BaseException | None = None
+        if batch.job is not None:
+            try:
+                encoded = encode(item, batch, plain=False)
+            except Exception as raised:
+                error = blame_items(item, batch, raised)
+            except BaseException as raised:  # whatever the user's pickler raises is its own
+                error = raised
+        self._loop.call_soon(self._encoded, item, batch, encoded, error)
+
+    def _encoded(
+        self, item: WorkItem, batch: Batch, encoded: Encoded | None, error: BaseException | None
+    ) -> None:
+        if self._ledger.batches.get(batch.seq) is not batch:
+            return  # its worker is gone
+        if batch.job is None:
+            self._unsent.discard(batch.seq)
+            self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
+        elif encoded is None:
+            assert error is not None
+            self._unsendable(item, batch, error)
+        else:
+            self._deliver(item, batch, encoded)
+        self._advance()
+
+    def _deliver(self, item: WorkItem, batch: Batch, encoded: Encoded) -> None:
+        handle: WorkerHandle = batch.worker.key
+        assert handle.port is not None
+        seq = batch.seq
+        if item.timeout is not None:
+            self._deadlines[seq] = self._loop.call_later(item.timeout, self._expired, seq)
+        try:
+            taken = handle.port.deliver(seq, *pack(item, batch, encoded, handle.known))
+        except Exception as error:  # the system has no memory or descriptor for it
+            self._unsendable(item, batch, error)
+            return
+        if taken:
+            self._unsent.discard(seq)
+        else:
+            self._unsent.add(seq)  # its worker is gone, as ``on_exit`` is about to hear
+
+    def _unsendable(self, item: WorkItem, batch: Batch, error: BaseException) -> None:
+        """This concerns the tasks of this batch only."""
+        self._unsent.discard(batch.seq)
+        self._cancel_deadline(batch.seq)
+        self._split(batch.seq, Failure(error))
+        self._advance()
+
+    # Taking
+
+    def on_message(self, handle: WorkerHandle, message: Message) -> None:
+        """A packet from a worker."""
+        words = pickle.loads(message.payload)
+        buffers = message.buffers
+        message.release()
+        kind = words[0]
+        if type(kind) is int:
+            self._answered(words, buffers)
+        elif kind == work.READY:
+            self._ready(handle)
+        elif kind == work.BIRTH:
+            handle.complaint = words[1]
+        elif kind == work.UNKNOWN:
+            self.on_recalled(handle, [words[1]])
+        else:
+            self._unreadable(kind, words[1], Pickled(work.ERROR, words[2], ()))
+
+    def _answered(self, words: tuple[Any, ...], buffers: list[memoryview]) -> None:
+        seq, offset, kept, seconds, values, odd = words
+        results = outcomes(values, odd, buffers) if odd else values
+        receipt = self._ledger.receive(
+            seq, offset, len(results), self._loop.now(), seconds=seconds, kept=kept
+        )
+        self._scheduler.workers.did_something()
+        if receipt is not None:
+            if odd and self.options.retryable:
+                self._put_or_retry(receipt, results)
+            else:
+                self._put(receipt, results, mixed=bool(odd))
+            self._check_finished(receipt.job)
+        if self._deadlines:
+            self._cancel_deadline(seq)
+        self._advance()
+
+    def _put(self, receipt: Receipt, results: list[Any], *, mixed: bool = True) -> None:
+        """Hand results on."""
+        item: WorkItem = receipt.job.owner
+        if item.future is not None:
+            item.future.add_results(receipt.start, results, mixed)
+            return
+        for task, outcome in enumerate(results, receipt.start):
+            future = receipt.item(task).future
+            future.add_results(0, [outcome], mixed)
+            future.set_done()
+
+    def _put_or_retry(self, receipt: Receipt, results: list[Any]) -> None:
+        """Hand results on but those whose tasks get another try."""
+        start = receipt.start
+        for at, result in enumerate(results):
+            again = type(result) is Pickled and result.kind == work.AGAIN
+            if not (again and self._ledger.retry(receipt, start + at)):
+                self._put(receipt._replace(start=start + at), [result])
+
+    def _check_finished(self, job: Job) -> None:
+        if job.finished and job.owner is not None:
+            item: WorkItem = job.owner
+            self._over(item)
+            if item.future is not None:
+                item.future.set_done()
+
+    def _over(self, item: WorkItem) -> None:
+        """Its job is finished, or nobody wants the rest."""
+        if item in self._streams and item.stream is not None:
+            self._streams.discard(item)
+            item.stream.end()
+        if item.job is not None:
+            item.job.owner = None
+        item.grants.clear()
+
+    def _unreadable(self, kind: str, seq: int, error: Pickled) -> None:
+        """A worker cannot unpickle a batch, or its function: then no task of its job can run."""
+        batch = self._ledger.batches.get(seq)
+        self._cancel_deadline(seq)
+        if kind == work.UNREADABLE:
+            self._split(seq, error)
+        elif batch is not None:
+            if batch.job is not None:
+                self._fail(batch.job, error.decode().error)
+            self._ledger.put_back(batch.worker, (seq,), self._loop.now())
+        self._advance()
+
+    def _split(self, seq: int, failure: Any) -> None:
+        """Send the tasks of a batch one by one; of a single one, that is its outcome."""
+        receipt = self._ledger.split(seq, self._loop.now())
+        if receipt is not None:
+            self._put(receipt, [failure])
+            self._check_finished(receipt.job)
+
+    def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
+        """A worker will never see these batches."""
+        if handle.worker is None:
+            return
+        for seq in seqs:
+            self._cancel_deadline(seq)
+            batch = self._ledger.batches.get(seq)
+            if batch is not None and batch.job is not None:
+                function = batch.job.owner.function
+                if function is not None:
+                    handle.known.pop(function.id, None)
+        self._ledger.put_back(handle.worker, seqs, self._loop.now())
+        self._advance()
+
+    # Deadlines
+
+    def _expired(self, seq: int) -> None:
+        """A task had its time."""
+        batch = self._ledger.batches.get(seq)
+        if self._deadlines.pop(seq, None) is None or batch is None:
+            return
+        handle: WorkerHandle = batch.worker.key
+        receipt = self._ledger.expire(seq)
+        if receipt is not None:
+            item: WorkItem = receipt.job.owner
+            name = item.task_name(receipt.start, receipt.item(receipt.start))
+            error = TimeoutError(
+                f"{name} took longer than its timeout of {item.timeout:g} s; "
+                f"its worker {handle.name!r} was killed"
+            )
+            self._put(receipt, [Failure(error)])
+            self._check_finished(receipt.job)
+        self._scheduler.let_go(handle)
+        handle.kill()
+        self._advance()
+
+    def _cancel_deadline(self, seq: int) -> None:
+        timer = self._deadlines.pop(seq, None)
+        if timer is not None:
+            timer.cancel()
+
+    # Workers come and go
+
+    def _begin(self, handles: list[WorkerHandle]) -> None:
+        for handle in handles:
+            self._scheduler.starting(handle)
+
+    def _start_workers(self, count: int) -> None:
+        handles = [WorkerHandle(self, self._host) for _ in range(count)]
+        self._begin(handles)
+        for handle in handles:
+            # Not on the loop's thread: the user's arguments are pickled, and agents may need it.
+            self._background.submit(self._launch_safely, handle)
+
+    def _launch(self, handle: WorkerHandle) -> None:
+        options = self.options
+        process = PoolProcess(
+            handle,
+            options.process_type,
+            target=worker.run,
+            args=(options.initializer, options.initargs, options.retryable),
+        )
+        process.start()
+        handle.process = process
+        if handle.leaving:  # it was told to before it could be reached
+            self._loop.call_soon(handle.dismiss)
+            if self._scheduler.terminated:
+                handle.kill()
+
+    def _launch_safely(self, handle: WorkerHandle) -> None:
+        """On the background thread."""
+        error = None
+        if not handle.leaving:
+            try:
+                self._launch(handle)
+                return
+            except Exception as raised:  # want of descriptors or memory, mostly
+                error = raised
+        self._loop.call_soon(self._never_started, (handle,), error)
+
+    def _never_started(
+        self, handles: Iterable[WorkerHandle], error: Exception | None = None
+    ) -> None:
+        failure = None
+        if error is not None:
+            failure = StartFailure("a pool worker", str(error), killed=True, cause=error)
+        for handle in handles:
+            self._lost(handle, failure)
+        self._advance()
+
+    def _ready(self, handle: WorkerHandle) -> None:
+        """A worker is initialized."""
+        if handle.port is None:  # whoever started it is still about to note how to reach it
+            self._loop.call_soon(self._ready, handle)
+            return
+        self._scheduler.ready(handle, self._loop.now())
+        self._advance()
+
+    def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
+        """A worker is gone, with or without having been told to."""
+        failure = None
+        if not report.reason.startswith("agent "):  # a lost host says nothing of the worker
+            text = handle.complaint or "\n".join(report.log)
+            reason = "it raised an error" if handle.complaint else report.reason
+            killed = not handle.complaint and report.exitcode < 0
+            failure = StartFailure(f"pool worker {handle.name!r}", reason, text, killed)
+        self._lost(handle, failure, report)
+        self._advance()
+
+    def _lost(
+        self, handle: WorkerHandle, failure: StartFailure | None, report: ExitReport | None = None
+    ) -> None:
+        now = self._loop.now()
+        held = [batch.seq for batch in handle.worker.queue] if handle.worker is not None else []
+        unread = self._unsent.intersection(held)
+        self._unsent.difference_update(held)
+        running = None
+        if report is not None:
+            unread.update(report.unread)
+            running = report.running
+        for seq in held:
+            self._cancel_deadline(seq)
+        losses = self._scheduler.gone(handle, now, unread=unread, running=running, failure=failure)
+        if report is not None:
+            for loss in losses:
+                self._put_loss(loss, handle, report)
+            for job in {loss.job for loss in losses}:
+                self._check_finished(job)
+        if failure is not None and (news := self._scheduler.workers.news(failure, now)):
+            self._background.submit(_say, news)
+
+    def _put_loss(self, loss: Loss, handle: WorkerHandle, report: ExitReport) -> None:
+        item: WorkItem = loss.job.owner
+        error = WorkerDied(
+            task=item.task_name(loss.task, loss.item),
+            worker=handle.name,
+            host=report.host,
+            pid=handle.pid,
+            exitcode=report.exitcode,
+            reason=report.reason,
+            log=report.log,
+            attempts=loss.attempts,
+        )
+        if item.future is not None:
+            item.future.add_results(loss.task, [Failure(error)], True)
+        else:
+            loss.item.future.add_results(0, [Failure(error)], True)
+            loss.item.future.set_done()
+
+    # The end
+
+    def _fail(self, job: Job, error: BaseException) -> None:
+        """Nothing that is not done of a job will be."""
+        item: WorkItem | None = job.owner
+        if item is None:
+            return
+        if item.future is not None:
+            item.future.set_exception(error)
+        else:
+            for call in self._ledger.unfinished(job):
+                call.future.set_exception(error)
+        self._ledger.cancel(job)
+        self._over(item)
+
+    def _close(self) -> None:
+        self._take_calls()
+        self._scheduler.close()
+        if self._calls.job is not None and self._calls.job.owner is not None:
+            self._ledger.close(self._calls.job)
+            self._check_finished(self._calls.job)
+        self._advance()
+
+    def _terminate(self, error: BaseException) -> None:
+        self._take_calls()
+        self.callbacks.stop()
+        for job in list(self._ledger.jobs):
+            self._fail(job, error)
+        handles: list[Any] = list(self._scheduler.terminate())
+        for handle in handles:
+            handle.terminate()
+        if handles and self._kill is None:
+            self._kill = self._loop.call_later(KILL_AFTER, _kill_all, handles)
+        self._advance()
+
+    def broken(self, error: FiberError) -> None:
+        """The loop has failed: nobody will hear of the workers any more."""
+        handles: list[Any] = list(self._scheduler.workers.members)
+        self._scheduler.workers.error = error
+        self._terminate(error)
+        for handle in handles:
+            handle.kill()
+            handle.exited(ExitReport(UNKNOWN, str(error)))
+
+
+def _kill_all(handles: list[WorkerHandle]) -> None:
+    for handle in handles:
+        handle.kill()
+
+
+def _say(news: str) -> None:
+    """On the background thread: a slow terminal must not hold up the loop."""
+    import sys
+
+    print(f"fiber: {news}", file=sys.stderr, flush=True)

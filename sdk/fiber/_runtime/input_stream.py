@@ -1,0 +1,118 @@
+"""Reading tasks from an iterator no faster than they are worked off, so that memory stays flat.
+
+A bounded queue between the thread that reads (the caller's own, or a feeder's) and the executor.
+The bound is kept by credit: the executor grants as many items as it wants to hold, the reader waits
+at a semaphore (a SimpleQueue, whose entries are the grants) when it has used them up.
+"""
+
+from __future__ import annotations
+
+import itertools
+import queue
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from fiber._engine.chunks import Pace
+
+AHEAD = 3
+"""Messages worth of tasks that are read ahead for each worker."""
+
+
+class InputStream:
+    """The input of one job.  ``limit``: tasks that may be read and not yet consumed by the user.
+
+    ``notify`` is called, on the reading thread or the user's, when there is something that the
+    executor waits for: input, or room below the limit.
+    """
+
+    def __init__(self, unit: int, limit: int | None, notify: Callable[[], None]) -> None:
+        self.ended = False
+        """Nothing is read any more."""
+        self._unit = unit
+        self._limit = None if limit is None else max(limit, unit)
+        self._notify = notify
+        self._items: deque[Any] = deque()
+        self._credit: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._granted = 0
+        self._taken = 0
+        self._consumed = 0
+        self._consumptions: deque[None] = deque()
+        self._awaited = True
+        self._limited = False
+
+    # The reading thread
+
+    def read(self, iterable: Iterable[Any]) -> None:
+        """Read it all; raises what the iterable raises."""
+        iterator = iter(iterable)
+        items, unit = self._items, self._unit
+        chunk: list[Any] = []
+        while (credit := self._credit.get()) > 0:
+            left = credit
+            for item in itertools.islice(iterator, credit):
+                left -= 1
+                chunk.append(item)
+                if len(chunk) == unit:
+                    items.extend(chunk)
+                    chunk.clear()
+                    if self._awaited:
+                        self._awaited = False
+                        self._notify()
+                if self.ended:
+                    return
+            if left:
+                items.extend(chunk)
+                return
+
+    # The user's thread
+
+    def consume(self) -> None:
+        """The user took one result."""
+        self._consumptions.append(None)
+        if self._limited:
+            self._limited = False
+            self._notify()
+
+    # The executor
+
+    def take(self) -> list[Any]:
+        """What has been read."""
+        items = self._items
+        taken = [items.popleft() for _ in range(len(items))]
+        self._taken += len(taken)
+        return taken
+
+    def await_input(self) -> None:
+        """Notify when there is something.  Take once more after this: it may have come before."""
+        self._awaited = True
+
+    def grant(self, waiting: int, workers: int, pace: Pace, target: float) -> None:
+        """Let the reader go on if little is left: ``waiting`` tasks that nobody has yet."""
+        bound = AHEAD * max(workers, 1) * max(pace.message_size(target), self._unit)
+        ahead = waiting + self._granted - self._taken
+        if self.ended or 2 * ahead > bound:
+            return
+        units = -(-(bound - ahead) // self._unit)
+        if self._limit is not None:
+            self._limited = True  # first: who consumes after the count sees it
+            units = min(units, self._room(self._limit) // self._unit)
+            self._limited = not units
+        if units:
+            self._granted += units * self._unit
+            self._credit.put(units * self._unit)
+
+    def _room(self, limit: int) -> int:
+        while self._consumptions:
+            self._consumptions.popleft()
+            self._consumed += 1
+        return limit - (self._granted - self._consumed)
+
+    def lift_limit(self) -> None:
+        """Whoever waits for all to be done cannot consume."""
+        self._limit = None
+
+    def end(self) -> None:
+        """Read no more."""
+        self.ended = True
+        self._credit.put(0)

@@ -1,0 +1,76 @@
+"""Waiting for something that happens once, with signals and finalizers about.
+
+``threading.Event`` has a lock that all who wait and whoever sets it share.  A signal handler that
+raises while one is between taking and releasing it leaves it in a state that nobody can wait at any
+more, and one that itself waits or sets finds it taken, by its own thread.  Here each who waits has
+a lock of its own, which nobody else waits for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+
+
+class Waiters:
+    """Those who wait, each with a lock of its own."""
+
+    __slots__ = ("_locks",)
+
+    def __init__(self) -> None:
+        self._locks: list[threading.Lock] = []
+
+    def join(self) -> threading.Lock:
+        """A lock that ``wake`` will release.  Look after this whether there is still a need."""
+        lock = threading.Lock()
+        lock.acquire()
+        self._locks.append(lock)
+        return lock
+
+    def leave(self, lock: threading.Lock) -> None:
+        """It is not waited for any more."""
+        with contextlib.suppress(ValueError):  # it is being released this very moment
+            self._locks.remove(lock)
+
+    def wake(self) -> None:
+        """Let all go on; on any thread."""
+        locks = self._locks
+        while locks:
+            try:
+                lock = locks.pop()
+            except IndexError:  # another thread wakes them as well
+                return
+            lock.release()
+
+
+class Latch:
+    """Something that happens once."""
+
+    __slots__ = ("_set", "_waiters")
+
+    def __init__(self) -> None:
+        self._set = False
+        self._waiters = Waiters()
+
+    def is_set(self) -> bool:
+        """Whether it has happened."""
+        return self._set
+
+    def set(self) -> None:
+        """It happens now; on any thread, in a finalizer or signal handler too."""
+        self._set = True  # noted first: who joins later sees it
+        self._waiters.wake()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait for it; False if ``timeout`` seconds are over first."""
+        if self.is_set():
+            return True
+        lock = self._waiters.join()
+        if not self.is_set() and not lock.acquire(True, as_lock_timeout(timeout)):
+            self._waiters.leave(lock)
+        return self.is_set()
+
+
+def as_lock_timeout(timeout: float | None) -> float:
+    """Seconds as locks want them: -1 stands for no limit."""
+    return -1 if timeout is None else min(max(0, timeout), threading.TIMEOUT_MAX)

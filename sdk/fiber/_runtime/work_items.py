@@ -1,0 +1,230 @@
+"""What is asked of a pool, calls and maps, and how it becomes messages.
+
+As in ``concurrent.futures``, a work item holds what to run and the future that gets the outcome;
+here one item may be a map of a million tasks.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
+from typing import Any, Protocol
+
+from fiber import reduction
+from fiber._engine.chunks import Pace
+from fiber._engine.ledger import Batch, Job
+from fiber._hub.grants import GrantSet
+from fiber._runtime.input_stream import InputStream
+from fiber._wire import work
+
+
+class Future(Protocol):
+    """Where the outcomes of a work item, or of one call, go.  Called on the loop's thread."""
+
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+        """Outcomes of the tasks from ``start`` on.  Each task's comes once, in any order.
+
+        Unless ``mixed`` they are all plain values.
+        """
+
+    def set_done(self) -> None:
+        """All tasks have theirs."""
+
+    def set_exception(self, error: BaseException) -> None:
+        """There will be no more, because of ``error``."""
+
+
+class Function:
+    """A function that workers are asked to apply, pickled once."""
+
+    __slots__ = ("buffers", "data", "grants", "id", "name", "pace")
+
+    def __init__(
+        self,
+        id_: int,
+        name: str,
+        data: bytes,
+        buffers: Sequence[memoryview],
+        grants: GrantSet | None,
+        pace: Pace | None = None,
+    ) -> None:
+        self.grants = grants
+        self.id = id_
+        self.name = name
+        self.data = data
+        self.buffers = buffers
+        self.pace = pace
+
+
+class Call:
+    """One function call, pickled: a task by itself."""
+
+    __slots__ = ("blocking", "buffers", "data", "future", "grants", "name")
+
+    def __init__(
+        self,
+        name: str,
+        data: bytes,
+        buffers: Sequence[memoryview],
+        grants: GrantSet | None,
+        future: Future,
+    ) -> None:
+        self.grants = grants
+        self.name = name
+        self.data = data
+        self.buffers = buffers
+        self.future = future
+        self.blocking = False
+        """Whether a thread does nothing but wait for it."""
+
+    def copy_buffers(self) -> None:
+        """Keep what was passed as it is now: the caller goes on before it is sent."""
+        if self.buffers:
+            self.buffers = [memoryview(bytes(buffer)) for buffer in self.buffers]
+
+    def message(self) -> bytes:
+        """It alone as a message, its buffers beside."""
+        return work.pack_calls([(self.data, self.buffers)])
+
+
+class WorkItem:
+    """A job of the ledger, and all that the ledger need not know of it.
+
+    Without a ``future`` each of its tasks is a Call with its own.  A job and its work item know
+    each other; ``Executor._over`` parts them, so that results are freed when the user lets go of
+    them, not when the collector comes.
+    """
+
+    __slots__ = (
+        "exact",
+        "function",
+        "future",
+        "grants",
+        "job",
+        "kind",
+        "stream",
+        "timeout",
+        "unit",
+    )
+
+    def __init__(
+        self,
+        kind: int,
+        *,
+        function: Function | None = None,
+        future: Future | None = None,
+        unit: int = 1,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> None:
+        self.kind = kind
+        self.function = function
+        self.future = future
+        self.unit = unit
+        self.exact = exact
+        self.timeout = timeout
+        self.job: Job | None = None
+        """Once the executor has taken it."""
+        self.stream: InputStream | None = None
+        self.grants: list[GrantSet] = []
+        """What lets workers unpickle the pipes and queues among the items."""
+
+    def task_name(self, task: int, item: Any) -> str:
+        """How errors call a task."""
+        if isinstance(item, Call):
+            return f"the call of {item.name}()"
+        assert self.function is not None
+        return f"task {task} of {self.function.name}()"
+
+
+def name_of(function: Any) -> str:
+    """What a person calls a function."""
+    return getattr(function, "__qualname__", None) or repr(function)
+
+
+def pickle_call(
+    future: Future, function: Callable[..., Any], args: Iterable[Any], kwargs: Mapping[str, Any]
+) -> Call | None:
+    """A call, pickled; None if it does not pickle, which the future is told."""
+    try:
+        data, buffers, grants = reduction.encode_reusable((function, args, kwargs))
+        if len(buffers) > work.BUFFERS:
+            data, buffers = reduction.dumps((function, args, kwargs), 5), []
+    except Exception as error:
+        future.set_exception(_blame_call(function, args, kwargs, error))
+        return None
+    return Call(name_of(function), data, buffers, grants, future)
+
+
+def _blame_call(
+    function: Callable[..., Any],
+    args: Iterable[Any],
+    kwargs: Mapping[str, Any],
+    error: Exception,
+) -> Exception:
+    """What the caller hears of a call that does not pickle."""
+    name = name_of(function)
+    if not isinstance(args, Sequence) or not isinstance(kwargs, Mapping):
+        args, kwargs = (), {}
+    parts = {f"argument {at} of {name}()": value for at, value in enumerate(args)}
+    parts |= {f"argument {key!r} of {name}()": value for key, value in kwargs.items()}
+    parts[f"the function {name}"] = function
+    return reduction.blame(parts, error, f"the call of {name}()")
+
+
+def blame_items(item: WorkItem, batch: Batch, error: Exception) -> Exception:
+    """What the caller hears of tasks that cannot be sent."""
+    if len(batch.items) != 1 or item.function is None:
+        return error
+    name = item.task_name(batch.start, batch.items[0])
+    return reduction.blame({f"the item of {name}": batch.items[0]}, error)
+
+
+def pickles_without_user_code(item: WorkItem, batch: Batch) -> bool:
+    """Whether ``encode`` may run where the user's code must not."""
+    items = batch.items
+    return item.kind == work.CALLS or type(items) in (range, str, bytes) or work.is_plain(items)
+
+
+Encoded = tuple[bytes, Sequence[memoryview]]
+"""Pickled items, and the buffers beside them."""
+
+
+def encode(item: WorkItem, batch: Batch, *, plain: bool) -> Encoded:
+    """The items of a batch; ``plain`` says that pickling them runs none of the user's code."""
+    if item.kind == work.CALLS:
+        calls: list[Call] = list(batch.items)
+        if len(calls) == 1:
+            return calls[0].message(), calls[0].buffers
+        buffers = list(chain.from_iterable(call.buffers for call in calls))
+        return work.pack_calls([(call.data, call.buffers) for call in calls]), buffers
+    if plain:
+        return pickle.dumps(batch.items, 5), []
+    data, buffers, grants = reduction.encode_reusable(batch.items)
+    if grants is not None:
+        item.grants.append(grants)
+    if len(buffers) > work.BUFFERS:
+        return reduction.dumps(batch.items, 5), []
+    return data, buffers
+
+
+def pack(item: WorkItem, batch: Batch, encoded: Encoded, known: dict[int, None]) -> Encoded:
+    """The whole message for a batch; ``known`` are the functions that its worker was sent."""
+    data, buffers = encoded
+    function = item.function
+    if function is None:
+        return encoded
+    carry = function.id not in known
+    head = work.Head(
+        item.kind,
+        0 if item.exact else batch.stride,
+        item.unit,
+        function.id,
+        len(function.data) if carry else 0,
+        len(function.buffers) if carry else 0,
+    )
+    if not carry:
+        return work.pack_batch(head, b"", data), buffers
+    known[function.id] = None
+    return work.pack_batch(head, function.data, data), [*function.buffers, *buffers]
