@@ -73,10 +73,11 @@ class Loop:
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        self._wakeup = _Wakeup()
-        self._epoll.register(self._wakeup.fd, select.EPOLLIN)
+        wakeup = _Wakeup()
+        self._wakeup: _Wakeup | None = wakeup
+        self._epoll.register(wakeup.fd, select.EPOLLIN)
         self._asleep = False
-        self._readers: dict[int, Callback] = {self._wakeup.fd: self._woken}
+        self._readers: dict[int, Callback] = {wakeup.fd: partial(os.eventfd_read, wakeup.fd)}
         self._writers: dict[int, Callback] = {}
         self._ready: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._timers: list[tuple[float, int, Timer]] = []
@@ -123,8 +124,9 @@ class Loop:
         self._ready.append((callback, args))
         # The loop notes that it goes to sleep and looks for calls then.  Only the loop takes that
         # back: whoever is interrupted here, by a signal that raises, has changed nothing.
-        if self._asleep:
-            os.eventfd_write(self._wakeup.fd, 1)
+        wakeup = self._wakeup  # held until this is over, so that it is nobody else's meanwhile
+        if self._asleep and wakeup is not None:
+            os.eventfd_write(wakeup.fd, 1)
 
     def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
         """Call it once, ``seconds`` from now, on the loop's thread."""
@@ -264,12 +266,10 @@ class Loop:
             self._sweep_at = max(_MANY_TIMERS, 2 * len(self._timers))
         heapq.heappush(self._timers, (timer.due, next(self._sequence), timer))
 
-    def _woken(self) -> None:
-        os.eventfd_read(self._wakeup.fd)
-
     def _close(self) -> None:
         self._closed = True
         self._epoll.close()
+        self._wakeup = None
         self._readers.clear()
         self._writers.clear()
 
