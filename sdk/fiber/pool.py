@@ -142,8 +142,7 @@ class Pool:
         """
         self._check_running()
         result = AsyncResult(self)
-        self._executor.call(result, func, args, kwds, self._limit(timeout), blocking=True)
-        return result.get()
+        return self._executor.call_and_wait(result, func, args, kwds, self._limit(timeout))
 
     def apply_async(
         self,

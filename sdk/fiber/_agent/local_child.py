@@ -1,18 +1,18 @@
 """One child of this host, as its agent holds it: its channel, its signals, its end.
 
 ``deliver``, ``take_back`` and ``signal`` come from any thread and only append to outboxes; what
-arrives is handled on the loop's thread, or by whoever attends to it.
+arrives is handled on the loop's thread, or by whoever uses its channel directly.
 """
 
 from __future__ import annotations
 
 import os
 import resource
+import select
 import signal
 import socket
 import struct
-import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from fiber._agent import zygote
@@ -23,14 +23,12 @@ from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
 from fiber._hub.access import Access
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
-from fiber._transport.unix import naming_the_limit, socketpair, wait_readable
+from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire import packet
-from fiber._wire.packet import BytesLike
+from fiber._wire.packet import BytesLike, Message
 from fiber.errors import TooManyOpenFiles
 
 _SEQ = struct.Struct("<Q")
-_ATTENTION = 5e-3
-"""Seconds that a caller waits for a worker itself before it leaves the answer to the loop."""
 
 
 class Owner(Protocol):
@@ -63,7 +61,7 @@ class LocalChild:
         self._ours: socket.socket | None = None
         self._theirs: socket.socket | None = None
         self._outbox: Outbox | None = None
-        self._hearing = threading.Lock()
+        self._lent = False
         try:
             if spec.tasks:
                 self._open_channel()
@@ -128,22 +126,25 @@ class LocalChild:
         outbox = self._outbox
         return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
 
-    def attend(self) -> bool:
-        """Wait for its answer in place of the loop."""
-        ours = self._ours
-        if ours is None or self._loop.on_thread() or not self._hearing.acquire(blocking=False):
-            return False
+    def lend(self) -> Channel | None:
+        """Its channel for direct use; None if it has none, or no descriptor is left for it."""
+        if self._ours is None or self._ours.fileno() < 0:
+            return None
         try:
-            fd = ours.fileno()
-            if fd < 0:
-                return False
-            self._loop.pause(fd)
-            try:
-                return wait_readable(fd, _ATTENTION) and self._hear()
-            finally:
-                self._loop.resume(fd)
-        finally:
-            self._hearing.release()
+            # Of its own: what whoever uses it waits for must not be closed and become another's.
+            fd = os.dup(self._ours.fileno())
+        except OSError:
+            return None
+        self._loop.pause(self._ours.fileno())
+        self._lent = True
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd)
+        return Channel(sock, self.condemn)
+
+    def reclaim(self) -> None:
+        """Hear what it says again."""
+        self._lent = False
+        if self._ours is not None and self._ours.fileno() >= 0:
+            self._loop.resume(self._ours.fileno())
 
     def take_back(self) -> None:
         """Recall unread packets; answered on the loop."""
@@ -166,14 +167,13 @@ class LocalChild:
         self.release_descriptors()
         if self._ours is None or self._theirs is None or self._outbox is None:
             return ()
-        with self._hearing:
-            while self._hear():
-                pass
-            unread = self._recall()
-            self._loop.unregister(self._ours.fileno())
-            self._outbox.close()
-            self._ours.close()
-            self._theirs.close()
+        while self._hear():
+            pass
+        unread = self._recall()
+        self._loop.unregister(self._ours.fileno())
+        self._outbox.close()
+        self._ours.close()
+        self._theirs.close()
         return tuple(unread)
 
     def _answer_take_back(self) -> None:
@@ -181,12 +181,8 @@ class LocalChild:
             self.observer.taken_back(self._recall())
 
     def _receive(self) -> None:
-        # Whoever attends to it already hears it, in order.
-        if self._hearing.acquire(blocking=False):
-            try:
-                self._hear()
-            finally:
-                self._hearing.release()
+        if not self._lent:  # it came before, and is for whoever uses the channel now
+            self._hear()
 
     def _hear(self) -> bool:
         assert self._ours is not None
@@ -219,3 +215,36 @@ class LocalChild:
             seqs.append(_SEQ.unpack_from(message.payload)[0])
             message.release()
         return seqs + [_SEQ.unpack_from(payload)[0] for payload in self._outbox.recall()]
+
+
+class Channel:
+    """The task channel of a child, for direct use; a ``DirectChannel``."""
+
+    def __init__(self, sock: socket.socket, condemn: Callable[[Exception], None]) -> None:
+        self._sock = sock
+        self._condemn = condemn
+        self._poller = select.poll()
+        self._poller.register(sock, select.POLLIN)
+
+    def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a packet, or raise OSError."""
+        packet.send(self._sock, b"".join((_SEQ.pack(seq), payload)), buffers)
+
+    def receive(self, timeout: float) -> Message | None:
+        """The next packet, None after ``timeout`` seconds, EOFError at the end."""
+        if not self._poller.poll(timeout * 1000):
+            return None
+        try:
+            return packet.receive(self._sock)
+        except BlockingIOError:  # its agent took it, which is burying the child
+            return None
+        except TooManyOpenFiles as error:
+            self._condemn(error)
+            raise
+
+    def close(self) -> None:
+        """Close this descriptor of it."""
+        self._sock.close()
+
+    def __del__(self) -> None:
+        self._sock.close()

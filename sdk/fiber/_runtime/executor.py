@@ -36,8 +36,9 @@ from fiber._engine.worker_set import StartFailure
 from fiber._runtime.background import BackgroundThread
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.latch import Latch
+from fiber._runtime.leases import ADOPTED, NO_OP_MESSAGE, UNAVAILABLE, UNUSED, Leases
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.outcome import Failure, Pickled, outcomes
+from fiber._runtime.outcome import Failure, Pickled, decode, outcomes
 from fiber._runtime.work_items import (
     Call,
     Encoded,
@@ -89,6 +90,13 @@ class Loop(Protocol):
         """Call it once, later."""
 
 
+class Waitable(Future, Protocol):
+    """A future to wait for."""
+
+    def get(self) -> Any:
+        """Wait for the result, or the exception."""
+
+
 class Host(Protocol):
     """What an executor needs of the runtime."""
 
@@ -130,12 +138,19 @@ class Executor:
         self._open(self._calls)
         self._called: deque[Call] = deque()
         self._took_calls = -math.inf
+        self._leases = Leases(self)
+        self._lends = options.max_tasks is None and not options.retryable
+        self._exits: dict[WorkerHandle, ExitReport] = {}
+        """Ends of workers that callers are using."""
         self._unsent: set[int] = set()
         """Batches that are assigned and not sent: nobody can have run them."""
         self._streams: set[WorkItem] = set()
         self._deadlines: dict[int, Timer] = {}
         self._wake: Timer | None = None
         self._kill: Timer | None = None
+        self._lease_check: Timer | None = None
+        self._failure: BaseException | None = None
+        """What those hear whose calls are not done when the pool is terminated."""
         self._acting = False
         self._again = False
 
@@ -163,17 +178,42 @@ class Executor:
         args: Iterable[Any],
         kwargs: Mapping[str, Any],
         timeout: float | None = None,
-        *,
-        blocking: bool = False,
     ) -> None:
-        """One call of a function.  ``blocking``: this thread will do nothing but wait for it."""
+        """One call of a function."""
         call = pickle_call(future, function, args, kwargs)
         if call is None:
             return
         self._check()
-        call.blocking = blocking
-        if not blocking:
-            call.copy_buffers()
+        call.copy_buffers()
+        self._enqueue(call, timeout)
+
+    def call_and_wait(
+        self,
+        future: Waitable,
+        function: Callable[..., Any],
+        args: Iterable[Any],
+        kwargs: Mapping[str, Any],
+        timeout: float | None = None,
+    ) -> Any:
+        """The result of one call, which this thread waits for, or its exception."""
+        call = pickle_call(future, function, args, kwargs)
+        if call is None:
+            return future.get()
+        self._check()
+        outcome = UNAVAILABLE
+        if timeout is None and self._lends:
+            call.blocking = True
+            outcome = self._leases.run(call)
+        if outcome is UNAVAILABLE:
+            self._enqueue(call, timeout)
+        elif outcome is not ADOPTED:
+            outcome = decode(outcome)
+            if type(outcome) is Failure:
+                raise outcome.error
+            return outcome
+        return future.get()
+
+    def _enqueue(self, call: Call, timeout: float | None) -> None:
         if timeout is None:
             self._called.append(call)
             self._loop.call_soon(self._take_calls)
@@ -396,6 +436,8 @@ class Executor:
         try:
             while True:
                 self._again = False
+                if self._scheduler.needs_lent():
+                    self._leases.recall()
                 self._act(self._scheduler.decide(self._loop.now()))
                 if not self._again:
                     return
@@ -442,7 +484,7 @@ class Executor:
         """Nobody is left."""
         if self.ended.is_set():
             return
-        for timer in (self._wake, self._kill, *self._deadlines.values()):
+        for timer in (self._wake, self._kill, self._lease_check, *self._deadlines.values()):
             if timer is not None:
                 timer.cancel()
         self._deadlines.clear()
@@ -545,6 +587,8 @@ class Executor:
         )
         self._scheduler.workers.did_something()
         if receipt is not None:
+            if receipt.job is self._calls.job and receipt.item(receipt.start).blocking:
+                self._offer(receipt.batch.worker.key)  # first: who waited may call again at once
             if odd and self.options.retryable:
                 self._put_or_retry(receipt, results)
             else:
@@ -621,6 +665,64 @@ class Executor:
                     handle.known.pop(function.id, None)
         self._ledger.put_back(handle.worker, seqs, self._loop.now())
         self._advance()
+
+    # Lending
+
+    def _offer(self, handle: WorkerHandle) -> None:
+        """Lend a worker that has become idle, if nobody else needs it."""
+        if handle.worker is None or not self._scheduler.lend(handle.worker):
+            return
+        if not self._leases.offer(handle):
+            self._scheduler.return_idle(handle.worker, self._loop.now())
+        elif self._lease_check is None:
+            self._lease_check = self._loop.call_later(UNUSED, self._check_leases)
+
+    def _check_leases(self) -> None:
+        left = self._leases.recall_unused()
+        self._lease_check = self._loop.call_later(UNUSED, self._check_leases) if left else None
+        self._advance()
+
+    def next_seq(self) -> int:
+        """A sequence number that nobody else has; on any thread."""
+        return self._ledger.next_seq()
+
+    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
+        """Have it done on the loop's thread; on any thread."""
+        self._loop.call_soon(callback, *args)
+
+    def returned(self, handle: WorkerHandle) -> None:
+        """A lent worker is back, idle."""
+        if handle.worker is not None:
+            self._scheduler.return_idle(handle.worker, self._loop.now())
+        self._back(handle)
+
+    def adopt(self, handle: WorkerHandle, seq: int, call: Call) -> None:
+        """A lent worker is back, and may be running ``call``."""
+        item = WorkItem(work.CALLS, exact=True)
+        self._open(item)
+        assert item.job is not None
+        assert handle.worker is not None
+        self._scheduler.return_busy(handle.worker, seq, item.job, call, self._loop.now())
+        self._ledger.close(item.job)
+        if self._scheduler.terminated or self._scheduler.workers.error is not None:
+            self._fail(item.job, self._failure or ValueError("Pool not running"))
+        self._back(handle)
+
+    def abandon(self, handle: WorkerHandle) -> None:
+        """A lent worker is back, and may be running something that nobody wants."""
+        assert handle.worker is not None
+        seq = self.next_seq()
+        self._scheduler.return_busy(handle.worker, seq, None, None, self._loop.now())
+        if handle.port is not None:
+            handle.port.deliver(seq, NO_OP_MESSAGE)
+        self._back(handle)
+
+    def _back(self, handle: WorkerHandle) -> None:
+        report = self._exits.pop(handle, None)
+        if report is not None:
+            self.on_exit(handle, report)
+        else:
+            self._advance()
 
     # Deadlines
 
@@ -708,6 +810,11 @@ class Executor:
 
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
         """A worker is gone, with or without having been told to."""
+        if handle.worker is not None and handle.worker.lent:
+            if not self._leases.recall_one(handle):
+                self._exits[handle] = report  # whoever uses it notices, and brings it back
+                return
+            self._scheduler.return_idle(handle.worker, self._loop.now())
         failure = None
         if not report.reason.startswith("agent "):  # a lost host says nothing of the worker
             text = handle.complaint or "\n".join(report.log)
@@ -782,6 +889,7 @@ class Executor:
 
     def _terminate(self, error: BaseException) -> None:
         self._take_calls()
+        self._failure = error
         self.callbacks.stop()
         for job in list(self._ledger.jobs):
             self._fail(job, error)
