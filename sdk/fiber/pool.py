@@ -318,6 +318,7 @@ class Pool:
         item = self._item(work.MAP, func, buffer, options.chunksize(chunksize), timeout)
         if item is None:
             return iterator
+        buffer.resume = partial(executor.resume, item)
         if buffersize is None and isinstance(iterable, (*_SLICEABLE, list)):
             self._submit(item, iterable, chunksize)
             return iterator
@@ -409,7 +410,8 @@ class Pool:
 
     def terminate(self) -> None:
         """End the workers at once.  Whoever waits for a result gets an error."""
-        self._check_owner()
+        if os.getpid() != self._owner:
+            return  # a copy that came here by a fork: nothing of the pool is here to end
         util.debug("terminating pool")
         self._state = TERMINATE
         self._terminate.cancel()

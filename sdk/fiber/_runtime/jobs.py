@@ -78,11 +78,22 @@ class Jobs:
         """The same for those of some items that are streams."""
         if not self._streams:
             return False
-        streams = {item for item in items if item is not None and item.stream is not None}
-        return any([self.top_up(item) for item in streams])
+        found = False
+        for item in {item for item in items if item is not None and item.stream is not None}:
+            found |= self.top_up(item)
+        return found
+
+    def resume(self, item: WorkItem) -> None:
+        """Its results are being read again."""
+        if item.job is not None:
+            self._ledger.pause(item.job, False)
 
     def lift_limits(self) -> None:
-        """Nobody will consume any more."""
+        """Nobody will consume any more, or read results."""
+        for job in self._ledger.jobs:
+            if job.owner.future is not None:
+                job.owner.future.lift_bound()
+            self._ledger.pause(job, False)
         for item in list(self._streams):
             if item.stream is not None:
                 item.stream.lift_limit()
@@ -116,7 +127,8 @@ class Jobs:
     def _put(self, receipt: Receipt, results: list[Any], mixed: bool) -> None:
         item: WorkItem = receipt.job.owner
         if item.future is not None:
-            item.future.add_results(receipt.start, results, mixed)
+            if item.future.add_results(receipt.start, results, mixed):
+                self._ledger.pause(receipt.job, True)
             return
         for task, outcome in enumerate(results, receipt.start):
             future = receipt.item(task).future

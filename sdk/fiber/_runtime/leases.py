@@ -21,18 +21,15 @@ import pickle
 import weakref
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fiber._agent.port import DirectChannel
 from fiber._engine.scheduler import Scheduler
+from fiber._runtime.host import Loop, Timer
 from fiber._runtime.outcome import outcomes
 from fiber._runtime.work_items import Call
 from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
-
-if TYPE_CHECKING:
-    from fiber._runtime.executor import Loop
-    from fiber._transport.loop import Timer
 
 ATTENTION = 5e-3
 """Seconds that a caller waits for a worker itself before it leaves the answer to the loop."""

@@ -7,10 +7,11 @@ thread.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from fiber._engine.ledger import Batch, Ledger, Worker
 from fiber._runtime.background import BackgroundThread
+from fiber._runtime.host import Loop, Timer
+from fiber._runtime.jobs import Jobs
 from fiber._runtime.outcome import Failure
 from fiber._runtime.work_items import (
     Encoded,
@@ -20,12 +21,7 @@ from fiber._runtime.work_items import (
     pack,
     pickles_without_user_code,
 )
-
-if TYPE_CHECKING:
-    from fiber._runtime.executor import Loop
-    from fiber._runtime.jobs import Jobs
-    from fiber._runtime.worker_handle import WorkerHandle
-    from fiber._transport.loop import Timer
+from fiber._runtime.worker_handle import WorkerHandle
 
 
 class Sender:
