@@ -162,7 +162,7 @@ def _modules_of(process: Any) -> list[str]:
 _OURS = ("fiber.connection", "fiber.queues", "fiber.synchronize", "fiber._agent.worker")
 
 
-_lock = threading.Lock()
+_lock = threading.RLock()  # a finalizer may come back here while one is made
 _runtime: Runtime | None = None
 
 
@@ -173,8 +173,12 @@ def runtime() -> Runtime:
         with _lock:
             if _runtime is None:
                 with naming_the_limit("starting Fiber"):
-                    _runtime = Runtime()
-                util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
+                    made = Runtime()
+                if _runtime is None:
+                    _runtime = made
+                    util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
+                else:  # it did
+                    made.close()
     return _runtime
 
 
@@ -190,7 +194,7 @@ def shutdown() -> None:
 def _forget() -> None:
     """In a process forked by someone else: the loop's thread did not come along."""
     global _runtime, _lock
-    _runtime, _lock = None, threading.Lock()
+    _runtime, _lock = None, threading.RLock()
 
 
 os.register_at_fork(after_in_child=_forget)

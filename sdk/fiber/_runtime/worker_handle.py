@@ -51,6 +51,8 @@ class WorkerHandle:
         """What its initializer, or its birth, failed with."""
         self.leaving = False
         """It was told to go, or will be at once."""
+        self.unwanted = False
+        """It was told to end at once, whatever it does."""
         self.returncode: int | None = None
         self._supervisor = supervisor
         self._host = host
@@ -133,6 +135,7 @@ class WorkerHandle:
 
     def terminate(self) -> None:
         """SIGTERM."""
+        self.unwanted = True
         self.signal(signal.SIGTERM)
 
     def kill(self) -> None:
