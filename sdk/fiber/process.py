@@ -14,7 +14,10 @@ from multiprocessing.process import (
     current_process,
     parent_process,
 )
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fiber._runtime.worker_handle import WorkerHandle
 
 __all__ = [
     "BaseProcess",
@@ -76,6 +79,38 @@ class SpawnProcess(Process):
     """A process in a new interpreter."""
 
     _start_method = "spawn"
+
+
+class PoolProcess(Process):
+    """The Process object of a pool worker, which ``handle`` starts and watches.
+
+    Its name and start method are those of ``like``, the class of the start method.
+    """
+
+    def __init__(self, handle: WorkerHandle, like: type[BaseProcess], **options: Any) -> None:
+        super().__init__(**options)
+        self._start_method = getattr(like, "_start_method", None)
+        role = like.__name__.replace("Process", "PoolWorker")
+        self.name = self.name.replace(type(self).__name__, role)
+        self.daemon = True
+        self._handle: WorkerHandle | None = handle
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_handle": None}
+
+    def _Popen(self) -> WorkerHandle:
+        from fiber._runtime.methods import zygote_method
+
+        assert self._handle is not None
+        self._handle.launch(self, zygote_method(self._start_method))
+        return self._handle
+
+    @property
+    def sentinel(self) -> int:
+        """As in multiprocessing."""
+        self._check_closed()  # type: ignore[attr-defined]
+        assert self._handle is not None
+        return self._handle.exit_descriptor()
 
 
 def process_type(method: str) -> type[Process]:

@@ -25,6 +25,7 @@ import pickle
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from fiber._agent.port import UNKNOWN, ExitReport
@@ -43,7 +44,7 @@ from fiber._runtime.options import PoolOptions
 from fiber._runtime.outcome import Failure, Pickled, decode, outcomes
 from fiber._runtime.sender import Sender
 from fiber._runtime.work_items import Call, Future, WorkItem, pickle_call
-from fiber._runtime.worker_handle import PoolProcess, WorkerHandle
+from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import FiberError
@@ -246,7 +247,7 @@ class Executor:
         """Whether this is the loop's thread, which must not wait."""
         return self._loop.on_thread()
 
-    def processes(self) -> list[PoolProcess]:
+    def processes(self) -> list[BaseProcess]:
         """The processes of the workers that are there."""
         handles: list[Any] = list(self._scheduler.workers.members)
         return [handle.process for handle in handles if handle.process is not None]

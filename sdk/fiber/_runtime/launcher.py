@@ -8,7 +8,7 @@ from fiber._agent import worker
 from fiber._runtime.background import BackgroundThread
 from fiber._runtime.host import Loop
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.worker_handle import PoolProcess, WorkerHandle
+from fiber._runtime.worker_handle import WorkerHandle
 
 
 class Launcher:
@@ -35,9 +35,8 @@ class Launcher:
     def launch(self, handle: WorkerHandle) -> None:
         """Start one now, on the calling thread; raises what stands in the way."""
         options = self._options
-        process = PoolProcess(
+        process = options.new_process(
             handle,
-            options.process_type,
             target=worker.run,
             args=(options.initializer, options.initargs, options.retryable),
         )

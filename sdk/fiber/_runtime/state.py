@@ -168,18 +168,22 @@ _runtime: Runtime | None = None
 
 def runtime() -> Runtime:
     """The runtime of this process; made at the first call."""
-    global _runtime
     if _runtime is None:
         with _lock:
             if _runtime is None:
                 with naming_the_limit("starting Fiber"):
-                    made = Runtime()
-                if _runtime is None:
-                    _runtime = made
-                    util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
-                else:  # it did
-                    made.close()
+                    _adopt(Runtime())
+    assert _runtime is not None
     return _runtime
+
+
+def _adopt(made: Runtime) -> None:
+    global _runtime
+    if _runtime is not None:  # a finalizer was faster
+        made.close()
+        return
+    _runtime = made
+    util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
 
 
 def shutdown() -> None:

@@ -6,15 +6,14 @@ import contextlib
 import os
 import signal
 from multiprocessing import process as mp_process
+from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from fiber._agent.port import ChildPort, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._runtime.latch import Latch
-from fiber._runtime.methods import zygote_method
 from fiber._wire import work
 from fiber._wire.packet import Message
-from fiber.process import Process
 
 
 class Supervisor(Protocol):
@@ -37,10 +36,10 @@ class WorkerHandle:
     """
 
     sentinel = -1
-    """What a Process asks for when it starts; ``PoolProcess`` has a real one, if wanted."""
+    """What a Process asks for when it starts; a real one is made if it is wanted."""
 
     def __init__(self, supervisor: Supervisor, host: Any) -> None:
-        self.process: PoolProcess | None = None
+        self.process: BaseProcess | None = None
         """Once it is started."""
         self.port: ChildPort | None = None
         self.worker: Worker | None = None
@@ -66,7 +65,7 @@ class WorkerHandle:
         """The worker's name."""
         return self.port.name if self.port is not None else "?"
 
-    def launch(self, process: PoolProcess, method: str) -> None:
+    def launch(self, process: BaseProcess, method: str) -> None:
         """Start the process; returns before it exists."""
         self.port = self._host.start(process, self, tasks=True, method=method)
 
@@ -150,32 +149,3 @@ class WorkerHandle:
 
     def __del__(self) -> None:
         self.close()
-
-
-class PoolProcess(Process):
-    """The Process object of a pool worker."""
-
-    def __init__(
-        self, handle: WorkerHandle | None, process_type: type[Any], **options: Any
-    ) -> None:
-        super().__init__(**options)
-        self._start_method = getattr(process_type, "_start_method", None)
-        role = process_type.__name__.replace("Process", "PoolWorker")
-        self.name = self.name.replace(type(self).__name__, role)
-        self.daemon = True
-        self._handle = handle
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_handle": None}
-
-    def _Popen(self) -> WorkerHandle:
-        assert self._handle is not None
-        self._handle.launch(self, zygote_method(self._start_method))
-        return self._handle
-
-    @property
-    def sentinel(self) -> int:
-        """As in multiprocessing."""
-        self._check_closed()  # type: ignore[attr-defined]
-        assert self._handle is not None
-        return self._handle.exit_descriptor()
