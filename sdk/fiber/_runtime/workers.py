@@ -56,6 +56,7 @@ class Link:
         self._born = threading.Event()
         self._exited = threading.Event()
         self._exit: int | None = None
+        self._launched: PoolProcess | None = None
 
     @property
     def name(self) -> str:
@@ -64,6 +65,7 @@ class Link:
 
     def launch(self, process: PoolProcess, method: str) -> None:
         """Start the process; returns before it exists."""
+        self._launched = process
         self.port = runtime().start(process, self, tasks=True, method=method)
 
     # What the agent says, on the loop's thread
@@ -88,7 +90,8 @@ class Link:
         self._born.set()
         if self._exit is not None:
             os.eventfd_write(self._exit, 1)
-        mp_process._children.discard(self.process)  # type: ignore[attr-defined]
+        # Its caller adds it, and looks at ``returncode`` afterwards.
+        mp_process._children.discard(self._launched)  # type: ignore[attr-defined]
         self._supervisor.lost(self, report)
 
     # What its Process object asks
