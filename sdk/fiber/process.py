@@ -7,6 +7,10 @@ The class is multiprocessing's own BaseProcess underneath, so that ``current_pro
 from __future__ import annotations
 
 import os
+import weakref
+from collections import deque
+from collections.abc import Callable
+from functools import partial
 from multiprocessing import process as _mp
 from multiprocessing.process import (
     BaseProcess,
@@ -30,6 +34,12 @@ __all__ = [
     "parent_process",
 ]
 
+_ended: deque[weakref.ref[BaseProcess]] = deque()
+"""Processes that ended, to be dropped from ``_children`` at the next start.
+
+Fiber's own thread only appends: a process that is dropped may run the user's finalizers.
+"""
+
 
 class Process(BaseProcess):
     """A process that Fiber starts: a subprocess on a laptop, a child in a pod on a cluster.
@@ -44,7 +54,11 @@ class Process(BaseProcess):
         from fiber._runtime.methods import zygote_method
         from fiber._runtime.popen import Popen
 
-        return Popen(self, zygote_method(self._start_method))
+        return Popen(self, zygote_method(self._start_method), self._on_exit())
+
+    def _on_exit(self) -> Callable[[], None]:
+        """What its ``Popen`` calls once ``returncode`` is set."""
+        return partial(_ended.append, weakref.ref(self))
 
     def start(self) -> None:
         """Start it; returns when it has a pid."""
@@ -55,12 +69,24 @@ class Process(BaseProcess):
         )
         if getattr(current_process(), "_inheriting", False):
             raise RuntimeError(UNGUARDED_MAIN)
-        _mp._cleanup()  # type: ignore[attr-defined]
+        _drop_ended()
         self._popen: Any = self._Popen()
         self._sentinel = self._popen.sentinel
         # The child has them now; here they would keep the target's arguments alive.
         del self._target, self._args, self._kwargs  # type: ignore[attr-defined]
         _mp._children.add(self)  # type: ignore[attr-defined]
+        if self._popen.returncode is not None:  # its end came first, and found nothing to drop
+            _mp._children.discard(self)  # type: ignore[attr-defined]
+
+
+def _drop_ended() -> None:
+    """What multiprocessing's ``_cleanup`` does by asking every child, whatever became of it."""
+    while _ended:
+        try:
+            process = _ended.popleft()()
+        except IndexError:  # another thread was faster
+            return
+        _mp._children.discard(process)  # type: ignore[attr-defined]
 
 
 class ForkProcess(Process):

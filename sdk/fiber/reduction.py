@@ -7,6 +7,7 @@ pickle there, travel by value.
 
 from __future__ import annotations
 
+import copyreg
 import io
 import os
 import pickle
@@ -283,7 +284,7 @@ class _Forking(ForkingPickler):
 
     def __init__(self, file: Any, protocol: int | None, **options: Any) -> None:
         pickle.Pickler.__init__(self, file, protocol, **options)
-        self.dispatch_table = self._copyreg_dispatch.new_child(self._extra_reducers)  # type: ignore[attr-defined]
+        self.dispatch_table = copyreg.dispatch_table | self._extra_reducers  # type: ignore[attr-defined]
 
 
 def _by_value_pickler() -> Any:

@@ -9,10 +9,11 @@ from multiprocessing import process as mp_process
 from types import SimpleNamespace
 from typing import Any
 
-from fiber._backends.remote import RemoteChild
-from fiber._engine import ledger as engine
 from fiber._runtime.dispatcher import Terms
 from fiber._runtime.requests import Call, Function, Request
+
+from fiber._backends.remote import RemoteChild
+from fiber._engine import ledger as engine
 from fiber._wire import work
 from fiber.errors import StartError
 from simulation.agents import Child

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from fiber._runtime.outcome import Encoded, Failure
 from fiber._runtime.requests import Request
+
+from fiber._runtime.outcome import Encoded, Failure
 from fiber._wire import work
 from fiber.errors import StartError, TimeoutError, WorkerDied
 from simulation.oracle import Account, Violation

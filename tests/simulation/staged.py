@@ -16,11 +16,12 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from unittest import mock
 
+from fiber._runtime.dispatcher import Dispatcher, Terms
+
 from fiber._agent import service
 from fiber._backends.remote import RemoteChild
 from fiber._engine.ledger import Batch
 from fiber._runtime import dispatcher, exchange, workers
-from fiber._runtime.dispatcher import Dispatcher, Terms
 from fiber.process import Process
 from simulation.agents import Child
 from simulation.remote_hosts import NoCapture, RemoteHost

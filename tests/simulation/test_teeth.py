@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from fiber._runtime.workers import Link
 
 from fiber._engine.ledger import Batch, Job, Ledger, Loss, Receipt, Worker
-from fiber._runtime.workers import Link
 from simulation.dispatcher_master import DispatcherMaster
 from simulation.explore import Failure, Suite, examine, first_failure, run
 from simulation.ledger_master import LedgerMaster

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import threading
+from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 
 from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
@@ -21,8 +22,9 @@ class Popen:
     Attributes and methods as multiprocessing's Process expects them.
     """
 
-    def __init__(self, process: BaseProcess, method: str) -> None:
+    def __init__(self, process: BaseProcess, method: str, on_exit: Callable[[], None]) -> None:
         self._name = process.name
+        self._on_exit = on_exit
         self.returncode: int | None = None
         self.report: ExitReport | None = None
         self.pid: int | None = None
@@ -78,6 +80,7 @@ class Popen:
                 os.eventfd_write(self.sentinel, 1)
         # From here on its Process may be closed.
         self.returncode = report.exitcode
+        self._on_exit()
         self._exited.set()
         self._born.set()
         # Each held the other; the sentinel's descriptor goes when the last user of this lets go.

@@ -59,6 +59,7 @@ class WorkerHandle:
         self._born = Latch()
         self._exited = Latch()
         self._exit: int | None = None
+        self._launched: BaseProcess | None = None
 
     @property
     def name(self) -> str:
@@ -67,6 +68,7 @@ class WorkerHandle:
 
     def launch(self, process: BaseProcess, method: str) -> None:
         """Start the process; returns before it exists."""
+        self._launched = process
         self.port = self._host.start(process, self, tasks=True, method=method)
 
     # What the agent says, on the loop's thread
@@ -91,7 +93,8 @@ class WorkerHandle:
         self._born.set()
         if self._exit is not None:
             os.eventfd_write(self._exit, 1)
-        mp_process._children.discard(self.process)  # type: ignore[attr-defined]
+        # Its caller adds it, and looks at ``returncode`` afterwards.
+        mp_process._children.discard(self._launched)  # type: ignore[attr-defined]
         self._supervisor.on_exit(self, report)
 
     # What its Process object asks
