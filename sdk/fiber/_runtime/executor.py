@@ -521,7 +521,8 @@ class Executor:
         if not report.reason.startswith("agent "):  # a lost host says nothing of the worker
             text = handle.complaint or "\n".join(report.log)
             reason = "it raised an error" if handle.complaint else report.reason
-            killed = not handle.complaint and report.exitcode < 0
+            refused = report.reason.startswith("could not be started")
+            killed = refused or (not handle.complaint and report.exitcode < 0)
             failure = StartFailure(f"pool worker {handle.name!r}", reason, text, killed)
         self._lost(handle, failure, report)
         self._advance()

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import threading
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 
 from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._runtime.latch import Latch
 from fiber._runtime.state import runtime
+from fiber._transport.loop import Wakeup
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.packet import Message
 from fiber.errors import FiberError, StartError
@@ -28,14 +28,13 @@ class Popen:
         self.returncode: int | None = None
         self.report: ExitReport | None = None
         self.pid: int | None = None
-        self._closed = True
         self._port: ChildPort | None = None
-        self._born = threading.Event()
-        self._exited = threading.Event()
-        self._lock = threading.Lock()
+        self._born = Latch()
+        self._exited = Latch()
         with naming_the_limit("starting a process"):
-            self.sentinel = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._closed = False
+            # Held by whoever writes to it meanwhile, so that it is closed, but never another's.
+            self._at_exit: Wakeup | None = Wakeup()
+        self.sentinel = self._at_exit.fd
         try:
             runtime().loop.depend(self)
             port = runtime().start(process, self, method=method)
@@ -50,7 +49,7 @@ class Popen:
 
     def _wait_for_birth(self, host: str) -> None:
         timeout = runtime().config.start_timeout
-        if not self._born.wait(min(timeout, threading.TIMEOUT_MAX)):
+        if not self._born.wait(timeout):
             raise StartError(
                 f"process {self._name!r}",
                 f"its agent on host {host!r} did not start it within {timeout:g} s (start_timeout)",
@@ -75,9 +74,9 @@ class Popen:
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
         self.report = report
-        with self._lock:
-            if not self._closed:
-                os.eventfd_write(self.sentinel, 1)
+        at_exit = self._at_exit
+        if at_exit is not None:
+            at_exit.set()
         # From here on its Process may be closed.
         self.returncode = report.exitcode
         self._on_exit()
@@ -102,7 +101,7 @@ class Popen:
 
     def wait(self, timeout: float | None = None) -> int | None:
         """Wait for the exit code."""
-        self._exited.wait(None if timeout is None else min(timeout, threading.TIMEOUT_MAX))
+        self._exited.wait(timeout)
         return self.returncode
 
     def terminate(self) -> None:
@@ -120,10 +119,4 @@ class Popen:
 
     def close(self) -> None:
         """Give the sentinel's descriptor back."""
-        with self._lock:
-            if not self._closed:
-                self._closed = True
-                os.close(self.sentinel)
-
-    def __del__(self) -> None:
-        self.close()
+        self._at_exit = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 from multiprocessing import process as mp_process
 from multiprocessing.process import BaseProcess
@@ -12,6 +11,7 @@ from typing import Any, Protocol
 from fiber._agent.port import ChildPort, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._runtime.latch import Latch
+from fiber._transport.loop import Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
 
@@ -58,7 +58,7 @@ class WorkerHandle:
         self._pid: int | None = None
         self._born = Latch()
         self._exited = Latch()
-        self._exit: int | None = None
+        self._at_exit: Wakeup | None = None
         self._launched: BaseProcess | None = None
 
     @property
@@ -91,8 +91,9 @@ class WorkerHandle:
         self.returncode = report.exitcode
         self._exited.set()
         self._born.set()
-        if self._exit is not None:
-            os.eventfd_write(self._exit, 1)
+        at_exit = self._at_exit
+        if at_exit is not None:
+            at_exit.set()
         # Its caller adds it, and looks at ``returncode`` afterwards.
         mp_process._children.discard(self._launched)  # type: ignore[attr-defined]
         self._supervisor.on_exit(self, report)
@@ -108,11 +109,11 @@ class WorkerHandle:
 
     def exit_descriptor(self) -> int:
         """A descriptor that becomes readable when it is gone; made when first asked for."""
-        if self._exit is None:
-            self._exit = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        if self._at_exit is None:
+            self._at_exit = Wakeup()
             if self.returncode is not None:
-                os.eventfd_write(self._exit, 1)
-        return self._exit
+                self._at_exit.set()
+        return self._at_exit.fd
 
     def poll(self) -> int | None:
         """The exit code, None while it runs."""
@@ -146,9 +147,4 @@ class WorkerHandle:
 
     def close(self) -> None:
         """Give the descriptor back."""
-        descriptor, self._exit = self._exit, None
-        if descriptor is not None:
-            os.close(descriptor)
-
-    def __del__(self) -> None:
-        self.close()
+        self._at_exit = None
