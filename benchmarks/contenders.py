@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
-_PROCESSES = frozenset({"pipes", "start"})
+_PROCESSES = frozenset({"pipes", "start", "cold start"})
+_AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ ALL = (
         "fiber",
         "Fiber",
         ("fiber",),
-        _POOL | _PROCESSES | {"import"},
+        _POOL | _PROCESSES | _AGAINST_BASELINE | {"fake workers"},
         "#0072B2",
         "o",
         environment={"FIBER_BACKEND": "local"},
@@ -61,12 +62,17 @@ ALL = (
         "multiprocessing",
         "multiprocessing, fork",
         (),
-        _POOL | _PROCESSES | {"import"},
+        _POOL | _PROCESSES | _AGAINST_BASELINE,
         "#000000",
         "D",
     ),
     Contender(
-        "forkserver", "multiprocessing, forkserver", (), frozenset({"start"}), "#666666", "d"
+        "forkserver",
+        "multiprocessing, forkserver",
+        (),
+        frozenset({"start", "cold start"}),
+        "#666666",
+        "d",
     ),
     Contender(
         "concurrent.futures",

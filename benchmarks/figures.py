@@ -10,7 +10,7 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-from benchmarks import latency, overhead, pipes, startup, throughput
+from benchmarks import agents, coldstart, latency, overhead, pipes, startup, throughput, workers
 from benchmarks.contenders import BY_NAME
 from benchmarks.model import Metric, Run
 from benchmarks.samples import Summary, in_words, summary
@@ -108,12 +108,50 @@ def _startup(run: Run, path: Path) -> None:
     _finish(figure, path)
 
 
+def _coldstart(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 2, figsize=(12, 4), sharey=True)
+    names = [case.name for case in coldstart.cases(run.about["size"])]
+    for panel, metric, title in (
+        (panels[0], coldstart.READY, "Until all workers are ready"),
+        (panels[1], coldstart.MAP, "Until the first map has returned"),
+    ):
+        _rows(panel, run, names, metric)
+        panel.set(title=title, xlabel="time since the interpreter was started")
+    _finish(figure, path)
+
+
+def _workers(run: Run, path: Path) -> None:
+    figure, panel = plt.subplots(figsize=(9, 4))
+    points = [(float(count), workers.workers(count)) for count in workers.WORKERS]
+    _lines(panel, run, points, workers.COST)
+    panel.set(title="The master's processor time to start a worker", xlabel="workers of the pool")
+    _finish(figure, path)
+
+
+def _agents(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 3, figsize=(14, 5))
+    points = [(float(count), agents.agents(count)) for count in agents.AGENTS]
+    for panel, metric, title in (
+        (panels[0], agents.JOINED, "Until all have joined"),
+        (panels[1], agents.MEMORY, "Memory of the master for a link"),
+        (panels[2], agents.DEFAULT, "No-op tasks a second, default chunks"),
+    ):
+        _lines(panel, run, points, metric)
+        panel.set(title=title, xlabel="agents", xticks=agents.AGENTS)
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        panel.xaxis.set_minor_formatter(NullFormatter())
+    _finish(figure, path)
+
+
 DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "overhead": _overhead,
     "throughput": _throughput,
     "latency": _latency,
     "pipes": _pipes,
     "startup": _startup,
+    "coldstart": _coldstart,
+    "workers": _workers,
+    "agents": _agents,
 }
 
 

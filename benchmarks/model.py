@@ -50,13 +50,15 @@ Series = list[float | None]
 class Run:
     """What one run of one measure gave.
 
-    For each case, contender and metric one value a round, None where there is none.
+    For each case, contender and metric one value a round, None where there is none. `in_use`: the
+    share of the processors' time that others used in a moment before each round.
     """
 
     about: dict[str, Any]
     values: dict[str, dict[str, dict[str, Series]]] = field(default_factory=dict)
     failures: dict[str, dict[str, str]] = field(default_factory=dict)
     unfinished: dict[str, dict[str, float]] = field(default_factory=dict)
+    in_use: list[float] = field(default_factory=list)
 
     def add(self, case: str, contender: str, turn: int, sample: Mapping[str, float]) -> None:
         """Note the sample of round `turn`, counted from 0."""

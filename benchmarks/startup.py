@@ -79,7 +79,7 @@ def run(bench: Bench, workers: int = 0, interpreters: int = 0) -> dict[str, floa
         }
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    with _meeting_point() as (path, fd):
+    with meeting_point() as (path, fd):
         begin = time.perf_counter()
         pool = bench.processes.Pool(workers, initializer=announce, initargs=(path,))
         try:
@@ -96,7 +96,7 @@ def run(bench: Bench, workers: int = 0, interpreters: int = 0) -> dict[str, floa
 
 
 @contextlib.contextmanager
-def _meeting_point() -> Iterator[tuple[str, int]]:
+def meeting_point() -> Iterator[tuple[str, int]]:
     """A named pipe into which every worker writes one byte."""
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder, "workers"))
