@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from benchmarks.fake_agents import FakeAgent, TaskRunner
+
 from fiber._agent.service import AgentService
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer

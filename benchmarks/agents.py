@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from benchmarks import throughput
 from benchmarks.model import BASELINE, Case, Metric
@@ -23,12 +23,14 @@ run and answer their tasks by the code of a real worker, in turn. Master and age
 machine's processors, which a thousand pods would not.
 
 Joined: from the order to dial, when the four processes wait with everything imported, until the
-master has the last link. Memory: what the joining of all added to the PSS of the master, and of
-the agents' processes, by links. Tasks a second: no-ops through `map` on a pool of as many workers,
-100,000 in default chunks and 10,000 with chunksize 1; multiprocessing has as many forked processes.
-The limit of open files is raised to the hard one."""
+master has the last link; and the processor time that the master needed for it. Memory: what the
+joining of all added to the PSS of the master, and of the agents' processes, by links. Tasks a
+second: no-ops through `map` on a pool of as many workers, 100,000 in default chunks and 10,000 with
+chunksize 1, when all workers are there and have done the same once; multiprocessing has as many
+forked processes. The limit of open files is raised to the hard one."""
 
 JOINED = Metric("joined", "joined", "s")
+JOINING = Metric("joining", "processor time to join, master", "s")
 MEMORY = Metric("memory", "memory a link, master", "B")
 AGENT_MEMORY = Metric("agent memory", "memory a link, agent", "B")
 DEFAULT = Metric("default chunks", "tasks a second, default chunks", "1/s")
@@ -52,7 +54,7 @@ def cases(size: float) -> list[Case]:
             group="agents",
             needs="agents",
             params={"agents": max(_SMALLEST, round(n * min(1.0, 4 * size))), "size": size},
-            metrics=(JOINED, MEMORY, AGENT_MEMORY, DEFAULT, SINGLE),
+            metrics=(JOINED, JOINING, MEMORY, AGENT_MEMORY, DEFAULT, SINGLE),
             limit=120.0,
             fresh=True,
         )
@@ -72,6 +74,7 @@ def run(bench: Bench, agents: int, size: float) -> dict[str, float]:
 def _with_links(bench: Bench, agents: int, size: float) -> dict[str, float]:
     # Here, as only Fiber's process needs it installed.
     from benchmarks.fake_cluster import FakeCluster, agent_hosts
+
     from fiber._runtime.state import runtime, shutdown
 
     with agent_hosts() as hosts:
@@ -83,6 +86,7 @@ def _with_links(bench: Bench, agents: int, size: float) -> dict[str, float]:
             cluster.join()
             return {
                 JOINED.name: cluster.joined,
+                JOINING.name: cluster.joining,
                 MEMORY.name: cluster.master_memory,
                 AGENT_MEMORY.name: cluster.agent_memory,
                 **_rates(bench, agents, size),
@@ -94,14 +98,21 @@ def _with_links(bench: Bench, agents: int, size: float) -> dict[str, float]:
 def _rates(bench: Bench, workers: int, size: float) -> dict[str, float]:
     pool = bench.processes.Pool(workers)
     try:
-        pool.map(no_op, range(4 * workers), 1)
+        if bench.contender != BASELINE:
+            pool.broadcast(no_op, 0)  # multiprocessing's workers are there when its pool is
         return {
-            metric.name: throughput.rate(
-                lambda n: pool.map(no_op, range(n), chunksize),  # noqa: B023  # called at once
-                max(100, round(tasks * size)),
-            )
+            metric.name: _rate(pool, max(100, round(tasks * size)), chunksize)
             for metric, tasks, chunksize in _MAPS
         }
     finally:
         pool.terminate()
         pool.join()
+
+
+def _rate(pool: Any, tasks: int, chunksize: int | None) -> float:
+    def batch(count: int) -> list[int]:
+        results: list[int] = pool.map(no_op, range(count), chunksize)
+        return results
+
+    batch(tasks)
+    return throughput.rate(batch, tasks)

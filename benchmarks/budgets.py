@@ -162,9 +162,9 @@ def _start() -> Iterator[Budget]:
         )
     yield Budget("import fiber", "startup", startup.IMPORT_NAME, startup.IMPORT.name, 0.5)
     case = startup.workers(1024)
-    for metric, bound, what in ((startup.START, 4, "started"), (startup.MEMORY, 3.5e9, "memory")):
-        what = f"1,024 local workers, {what}"
-        yield Budget(what, "startup", case, metric.name, bound, unit=metric.unit)
+    for metric, bound in ((startup.START, 4), (startup.MEMORY, 3.5e9)):
+        label = f"1,024 local workers, {metric.label}"
+        yield Budget(label, "startup", case, metric.name, bound, unit=metric.unit)
 
 
 def _remote() -> Iterator[Budget]:

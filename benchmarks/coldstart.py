@@ -24,7 +24,7 @@ TITLE = "Cold start"
 ABOUT = """\
 A program of its own, started as a user starts one: `python program.py`. It imports the library,
 makes `Pool(n)` with an initializer, and maps a no-op over n items in default chunks. Times count
-from the moment at which the interpreter is started, its own start included (about 15 ms of all).
+from the moment at which the interpreter is started, so its own start is contained.
 Ready: the last of the n workers has run its initializer. First map: `map` has returned. The value
 of a round is the median of its programs. Bytecode is cached, but for the last case, in which no
 module of anybody has any, the standard library's neither: what a first run on a new machine may
@@ -106,7 +106,7 @@ def _times_of_one(contender: str, workers: int, environment: Mapping[str, str]) 
 
 def times_from(begin: int, stamps: Sequence[tuple[str, int]]) -> dict[str, float]:
     """Seconds from `begin` to the last worker and to the end of the map; all in nanoseconds."""
-    moments = {what: at for what, at in sorted(stamps, key=lambda stamp: stamp[1])}
+    moments = dict(sorted(stamps, key=lambda stamp: stamp[1]))  # the last of each kind remains
     return {
         READY.name: (moments["worker"] - begin) / 1e9,
         MAP.name: (moments["map"] - begin) / 1e9,

@@ -32,10 +32,18 @@ class Contender:
 
     def missing(self) -> str:
         """What must be installed before it can take part; empty if nothing."""
-        wanting = [name for name in self.modules if not importlib.util.find_spec(name)]
+        wanting = [name for name in self.modules if not _found(name)]
         if self.program and not shutil.which(self.program):
             wanting.append(self.program)
         return ", ".join(wanting)
+
+
+def _found(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        # It would be part of a package that is not there.
+        return False
 
 
 # Colours: Okabe and Ito's set, told apart by colour-blind readers, and Tol's wine.

@@ -9,11 +9,12 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import TypeAlias
 
 from benchmarks import processes
 from benchmarks.agent_host import Order
+
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._runtime.state import Runtime
@@ -26,6 +27,7 @@ HOSTS = 4
 
 _PATIENCE = 60.0
 _END = 10.0
+_LOOK = 0.1
 
 Host: TypeAlias = subprocess.Popen[str]
 
@@ -33,8 +35,9 @@ Host: TypeAlias = subprocess.Popen[str]
 class FakeCluster:
     """A `Backend` whose agents live in `hosts`; its children go to each of them in turn.
 
-    `joined` are the seconds that it took all agents to join, from the order to dial;
-    `master_memory` and `agent_memory` the bytes that a link costs either side, as PSS.
+    `joined` are the seconds that it took all agents to join, from the order to dial, and `joining`
+    those of a processor that this process used meanwhile; `master_memory` and `agent_memory` the
+    bytes that a link costs either side, as PSS.
     """
 
     name = "fake"
@@ -61,36 +64,46 @@ class FakeCluster:
             on_agent=self._link,
             on_refused=self._fail,
         )
-        self.joined = self.master_memory = self.agent_memory = 0.0
+        self.joined = self.joining = self.master_memory = self.agent_memory = 0.0
 
     def join(self) -> None:
         """Have all agents dial, and wait until the last of them has its link."""
         names = list(self._agents)
         before = self._memory()
-        begin = time.perf_counter()
+        begin, used = time.perf_counter(), time.process_time()
         for number, host in enumerate(self._hosts):
             share = names[number :: len(self._hosts)]
             order = Order(self._listener.address, self._credentials, share, _PATIENCE)
             assert host.stdin is not None
             host.stdin.write(order.to_line())
             host.stdin.flush()
-        if not self._all_joined.wait(_PATIENCE) or self._problem:
-            raise RuntimeError(self._problem or f"{self._missing} agents did not join")
+        self._wait_for_all(begin + _PATIENCE)
         self.joined = time.perf_counter() - begin
+        self.joining = time.process_time() - used
         self.master_memory, self.agent_memory = (
             (after - was) / len(names) for was, after in zip(before, self._memory(), strict=True)
         )
+
+    def _wait_for_all(self, end: float) -> None:
+        while not self._all_joined.wait(_LOOK):
+            ended = [host.returncode for host in self._hosts if host.poll() is not None]
+            if ended or time.perf_counter() > end:
+                why = f"hosts ended with exit statuses {ended}" if ended else "too slow"
+                raise RuntimeError(f"{self._missing} agents did not join: {why}")
+        if self._problem:
+            raise RuntimeError(self._problem)
 
     def place(self) -> RemoteAgent:
         """The agent whose turn it is."""
         return next(self._turns)
 
     def close(self) -> None:
-        """End the agents, and with them their hosts."""
+        """End the agents, and with them their hosts; those that never began do not matter."""
         for agent in self._agents.values():
             agent.close()
         for host in self._hosts:
-            host.wait(_END)
+            with suppress(subprocess.TimeoutExpired):
+                host.wait(_END if not self._missing else 0)
         done = threading.Event()
         self._listener.close("the master ended", then=done.set)
         done.wait(_END)

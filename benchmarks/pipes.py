@@ -21,8 +21,8 @@ Round trip: this process sends, a process at the other end of a `Pipe()` receive
 back, this process receives and touches every page of what came. From 28 KB (an Atari
 observation) up the message is a NumPy array. The value of a round is the median of its round
 trips. Where the kernel puts the two processes decides much of it, so it is measured too with both
-held on one processor, and with one on each of two. Vector step: one `step` of Gymnasium's AsyncVectorEnv with
-`shared_memory=False` over environments that do nothing; Fiber runs it by
+held on one processor, and with one on each of two. Vector step: one `step` of Gymnasium's
+AsyncVectorEnv with `shared_memory=False` over environments that do nothing; Fiber runs it by
 `fiber.adopt("gymnasium.vector.async_vector_env")`."""
 
 ROUND_TRIP = Metric("round trip", "round trip", "s")
@@ -60,7 +60,7 @@ def cases(size: float) -> list[Case]:
     trips = [
         (TRIPS, name, ROUND_TRIP, {"nbytes": nbytes}, count) for name, nbytes, count in MESSAGES
     ]
-    placed = [
+    in_places = [
         (PLACED, placed(name, place), ROUND_TRIP, {"nbytes": nbytes, "processors": number}, count)
         for name, nbytes, count in MESSAGES
         for place, number in PLACES.items()
@@ -80,7 +80,7 @@ def cases(size: float) -> list[Case]:
             metrics=(metric,),
             fresh=True,
         )
-        for group, name, metric, params, count in [*trips, *placed, *steps]
+        for group, name, metric, params, count in [*trips, *in_places, *steps]
     ]
 
 

@@ -53,6 +53,7 @@ def cases(size: float) -> list[Case]:
 def run(bench: Bench, workers: int, pools: int) -> dict[str, float]:
     """Seconds of a processor for one worker, from so many pools of so many."""
     from benchmarks.fake_agents import FakeAgent, FakeBackend, TaskRunner
+
     from fiber._runtime.state import runtime, shutdown
 
     ours = runtime()
