@@ -77,20 +77,36 @@ def _latency(run: Run, path: Path) -> None:
 
 
 def _pipes(run: Run, path: Path) -> None:
-    figure, panels = plt.subplots(1, 2, figsize=(12, 5), width_ratios=(3, 2))
-    cases = pipes.cases(run.about["size"])
-    trips, steps = (
-        [case.name for case in cases if case.group == group] for group in (pipes.TRIPS, pipes.STEPS)
+    figure, panels = plt.subplots(2, 2, figsize=(12, 9))
+    messages = [name for name, _, _ in pipes.MESSAGES]
+    _pipe_panel(panels[0, 0], run, messages, messages, "where the kernel puts both")
+    for panel, place in zip((panels[0, 1], panels[1, 0]), pipes.PLACES, strict=True):
+        cases = [pipes.placed(name, place) for name in messages]
+        _pipe_panel(panel, run, messages, cases, f"both on {place}")
+    steps = [case.name for case in pipes.cases(run.about["size"]) if case.group == pipes.STEPS]
+    _lines(panels[1, 1], run, list(enumerate(steps)), pipes.STEP, log_x=False)
+    panels[1, 1].set(
+        title="One step of Gymnasium's AsyncVectorEnv",
+        ylabel="time",
+        xticks=range(len(steps)),
+        xticklabels=steps,
+        xlim=(-0.5, len(steps) - 0.5),
     )
-    for panel, names, metric in (
-        (panels[0], trips, pipes.ROUND_TRIP),
-        (panels[1], steps, pipes.STEP),
-    ):
-        _lines(panel, run, list(enumerate(names)), metric, log_x=False)
-        panel.set(xticks=range(len(names)), xticklabels=names, xlim=(-0.5, len(names) - 0.5))
-    panels[0].set(title="Round trip through a Pipe", xlabel="message", ylabel="time")
-    panels[1].set(title="One step of Gymnasium's AsyncVectorEnv", ylabel="time")
     _finish(figure, path)
+
+
+def _pipe_panel(
+    panel: Any, run: Run, messages: Sequence[str], cases: Sequence[str], where: str
+) -> None:
+    _lines(panel, run, list(enumerate(cases)), pipes.ROUND_TRIP, log_x=False)
+    panel.set(
+        title=f"Round trip through a Pipe, {where}",
+        xlabel="message",
+        ylabel="time",
+        xticks=range(len(messages)),
+        xticklabels=messages,
+        xlim=(-0.5, len(messages) - 0.5),
+    )
 
 
 def _startup(run: Run, path: Path) -> None:
@@ -182,6 +198,8 @@ def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool 
                     fontsize=12,
                     horizontalalignment="center",
                 )
+    if not panel.lines:
+        return  # nobody took part, and an axis without values has no logarithms
     panel.margins(y=0.12)
     if log_x:
         panel.set_xscale("log")
