@@ -6,7 +6,7 @@ import resource
 from typing import TYPE_CHECKING, Any
 
 from benchmarks import throughput
-from benchmarks.model import BASELINE, Case, Metric
+from benchmarks.model import BASELINE, Case, Metric, rounds_with
 from benchmarks.tasks import no_op
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ def cases(size: float) -> list[Case]:
             metrics=(JOINED, JOINING, MEMORY, AGENT_MEMORY, DEFAULT, SINGLE),
             limit=120.0,
             fresh=True,
+            rounds=rounds_with(n),
         )
         for n in AGENTS
     ]

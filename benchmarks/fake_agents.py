@@ -20,6 +20,9 @@ from fiber._wire.packet import BytesLike, Message
 
 _READY = pickle.dumps((work.READY,))
 _BOARD = 16
+_BIRTH = 0.01
+"""Seconds until a child is there, about those of a real one: no process is ready before the call
+that starts it has returned, and the master need not be quick about one that is."""
 
 
 class FakeBackend:
@@ -56,9 +59,9 @@ class FakeAgent:
         self._numbers = itertools.count(1)
 
     def start(self, spec: ChildSpec, observer: ChildObserver) -> FakeChild:
-        """Start a child, which is ready at the loop's next turn."""
+        """Start a child, which is ready soon."""
         child = FakeChild(self, spec.name, next(self._numbers), observer)
-        self.loop.call_soon(child.begin)
+        self.loop.call_later(_BIRTH, child.begin)
         return child
 
     def close(self) -> None:
@@ -78,7 +81,9 @@ class FakeChild:
         self._gone = False
 
     def begin(self) -> None:
-        """It is there, and ready. On the loop's thread, as all that follows of it."""
+        """It is there, and ready, if it lives. On the loop's thread, as all that follows of it."""
+        if self._gone:
+            return
         self.pid = self._number
         self._observer.started(self._number)
         self.send(_READY)

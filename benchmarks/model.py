@@ -12,6 +12,8 @@ from typing import Any
 
 WORKERS = 5
 BASELINE = "multiprocessing"
+MANY = 1000
+MANY_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -23,13 +25,18 @@ class Metric:
     unit: str
 
 
+def rounds_with(workers: int) -> int | None:
+    """At most so many rounds with so many workers; None if there is no such bound."""
+    return MANY_ROUNDS if workers >= MANY else None
+
+
 @dataclass(frozen=True)
 class Case:
     """One thing that every able contender does once in every round.
 
     `limit`: seconds after which it counts as not finished and is not tried again.
     `fresh`: needs a contender process that has done nothing before.
-    `rounds`: at most so many, for cases that take long.
+    `rounds`: at most so many, however long they take.
     """
 
     measure: str

@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks import budgets, figures
 from benchmarks.contenders import BY_NAME
-from benchmarks.model import BASELINE, Case, Metric, Run
+from benchmarks.model import BASELINE, MANY, MANY_ROUNDS, Case, Metric, Run
 from benchmarks.rounds import LONG, SERVER_ROUNDS
 from benchmarks.samples import Summary, in_words, is_idle, ratio, summary, times
 from benchmarks.suite import MEASURES
@@ -178,8 +178,9 @@ def _reading(run: Run) -> str:
     rounds = run.about["rounds"]
     text = (
         f"Median of {rounds} round{'s' if rounds > 1 else ''}; contenders with servers of their "
-        f"own take part in at most {SERVER_ROUNDS}, and what takes more than {LONG:g} s is "
-        "measured once. The ratio is to multiprocessing in the same round: its median, least and "
+        f"own take part in at most {SERVER_ROUNDS}, cases with {MANY:,} workers and more are "
+        f"measured in at most {MANY_ROUNDS}, and what else takes more than {LONG:g} s is measured "
+        "once. The ratio is to multiprocessing in the same round: its median, least and "
         "greatest."
     )
     if run.in_use:

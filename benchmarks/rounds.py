@@ -99,7 +99,7 @@ class Rounds:
             run.fail(case.name, contender.name, str(failure), failure.after)
             self._say(f"{where}  failed: {failure}")
             return
-        if time.monotonic() - begin > LONG:
+        if case.rounds is None and time.monotonic() - begin > LONG:
             self._finished.add(key)
         run.add(case.name, contender.name, turn, sample)
         self._say(f"{where}  " + "  ".join(f"{name} {value:.6g}" for name, value in sample.items()))

@@ -8,7 +8,7 @@ import time
 from statistics import median
 from typing import TYPE_CHECKING
 
-from benchmarks.model import Case, Metric
+from benchmarks.model import Case, Metric, rounds_with
 
 if TYPE_CHECKING:
     from benchmarks.contender import Bench
@@ -48,6 +48,7 @@ def cases(size: float) -> list[Case]:
             metrics=(COST,),
             limit=_PATIENCE + 20,
             fresh=True,
+            rounds=rounds_with(n),
         )
         for n, number in numbers.items()
     ]

@@ -23,13 +23,13 @@ from benchmarks import (  # noqa: E402
     machine,
     processes,
     report,
+    rounds,
     samples,
     workers,
 )
 from benchmarks.agent_host import Order  # noqa: E402
 from benchmarks.fake_agents import FakeAgent, TaskRunner  # noqa: E402
 from benchmarks.model import Case, Run  # noqa: E402
-from benchmarks.rounds import Rounds  # noqa: E402
 from benchmarks.session import Session  # noqa: E402
 from benchmarks.tasks import no_op  # noqa: E402
 
@@ -85,7 +85,7 @@ def test_each_measure_looks_at_the_machine_before_each_of_its_rounds(tmp_path: P
     runs = {name: Run(dict(ABOUT)) for name in ("overhead", "latency")}
     names = ("overhead", "overhead", "latency")
     cases = [Case(name, str(n), "", "", {}, ()) for n, name in enumerate(names)]
-    Rounds(tmp_path, runs, in_use=lambda: next(shares)).play(cases, [], 2)
+    rounds.Rounds(tmp_path, runs, in_use=lambda: next(shares)).play(cases, [], 2)
     assert (runs["overhead"].in_use, runs["latency"].in_use) == ([0.1, 0.3], [0.2, 0.4])
 
 
@@ -98,6 +98,21 @@ def test_each_measure_looks_at_the_machine_before_each_of_its_rounds(tmp_path: P
 )
 def test_the_page_says_whether_the_machine_was_idle(in_use: list[float], words: str) -> None:
     assert words in report.page("latency", Run(dict(ABOUT), in_use=in_use))
+
+
+def test_a_case_with_rounds_of_its_own_has_them_however_long_they_take(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rounds, "LONG", 0.0)
+    runs = {"latency": Run(dict(ABOUT))}
+    params = {"calls": 20, "seconds": 1.0}
+    metrics = latency.cases(0.01)[0].metrics
+    short = Case("latency", "once", "", "apply", params, metrics)
+    many = Case("latency", "twice", "", "apply", params, metrics, rounds=2)
+    contender = contenders.BY_NAME["multiprocessing"]
+    rounds.Rounds(tmp_path, runs, in_use=lambda: 0.0).play([short, many], [contender], 3)
+    assert len(runs["latency"].series("once", contender.name, "p50")) == 1
+    assert len(runs["latency"].series("twice", contender.name, "p50")) == 2
 
 
 def test_a_run_from_before_that_was_looked_at_can_be_read() -> None:
@@ -159,6 +174,9 @@ class Turns:
     def call_soon(self, callback: Callable[..., Any], *args: Any) -> None:
         self.calls.append((callback, args))
 
+    def call_later(self, seconds: float, callback: Callable[..., Any], *args: Any) -> None:
+        self.call_soon(callback, *args)
+
     def run(self) -> None:
         while self.calls:
             callback, args = self.calls.pop(0)
@@ -216,6 +234,16 @@ def test_a_fake_child_ends_once_when_told_to_or_killed() -> None:
     child.deliver(8, work.STOP_MESSAGE)
     loop.run()
     assert heard.words[2:] == [(-signal.SIGKILL, "host-1")]
+
+
+def test_a_fake_child_that_was_killed_before_it_was_there_never_is() -> None:
+    loop, heard = Turns(), Heard()
+    agent = FakeAgent(loop, "host-1", TaskRunner())  # type: ignore[arg-type]  # all that it uses
+    child = agent.start(SPEC, heard)
+    child.signal(signal.SIGKILL)
+    loop.calls.reverse()
+    loop.run()
+    assert heard.words == [(-signal.SIGKILL, "host-1")]
 
 
 def test_what_was_taken_back_was_run_before() -> None:
