@@ -29,8 +29,8 @@ class Order:
     """Which agents to be, and for which master."""
 
     address: str
-    credentials: str
-    """As text: `Credentials.to_environment`."""
+    credentials: dict[str, str]
+    """The fields of `Credentials`."""
     names: list[str]
     timeout: float
 
@@ -62,7 +62,7 @@ class AgentHost:
         self._runner = TaskRunner()
         self._left = len(order.names)
         self._services: list[AgentService] = []
-        credentials = Credentials.from_environment(order.credentials)
+        credentials = Credentials(**order.credentials)
         self._dialers = [
             AgentDialer(
                 loop,

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from typing import TypeAlias
 
 from benchmarks import processes
@@ -56,7 +57,7 @@ class FakeCluster:
         self._all_joined = threading.Event()
         self._problem = ""
         credentials = make_credentials("fake")
-        self._credentials = credentials.agent_half().to_environment()
+        self._credentials = asdict(credentials.agent_half())
         self._listener = MasterListener(
             runtime.loop,
             "127.0.0.1:0",

@@ -255,7 +255,7 @@ def test_what_was_taken_back_was_run_before() -> None:
 
 
 def test_an_order_survives_its_line() -> None:
-    order = Order("127.0.0.1:1", "secret", ["a", "b"], 3.0)
+    order = Order("127.0.0.1:1", {"key": "secret"}, ["a", "b"], 3.0)
     assert Order.from_line(order.to_line()) == order
 
 
