@@ -2,8 +2,8 @@
 
 The links are real, from dialling to the last frame, and so is `AgentService`, which does what the
 master's frames say. Only the children are fake. It reads one JSON object from standard input, what
-`Order` holds, says "up" before that on standard output, and ends when all its agents have ended,
-or when standard input does.
+`Order` holds, and ends when all its agents have ended, or when standard input does. Standard output
+says "up" before it reads, and why an agent could not join, which ends the process.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class AgentHost:
 
 
 def _give_up(error: Exception) -> None:
-    print(error, file=sys.stderr, flush=True)
+    print(f"{type(error).__name__}: {error}", flush=True)
     os._exit(1)
 
 

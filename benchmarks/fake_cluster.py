@@ -87,10 +87,11 @@ class FakeCluster:
 
     def _wait_for_all(self, end: float) -> None:
         while not self._all_joined.wait(_LOOK):
-            ended = [host.returncode for host in self._hosts if host.poll() is not None]
-            if ended or time.perf_counter() > end:
-                why = f"hosts ended with exit statuses {ended}" if ended else "too slow"
-                raise RuntimeError(f"{self._missing} agents did not join: {why}")
+            for host in self._hosts:
+                if host.poll() is not None:
+                    raise RuntimeError(f"{self._missing} agents did not join: {_last_words(host)}")
+            if time.perf_counter() > end:
+                raise TimeoutError(f"{self._missing} agents did not join in {_PATIENCE:g} s")
         if self._problem:
             raise RuntimeError(self._problem)
 
@@ -155,3 +156,8 @@ def _host() -> Iterator[Host]:
             yield host
         finally:
             host.kill()
+
+
+def _last_words(host: Host) -> str:
+    assert host.stdout is not None
+    return host.stdout.read().strip() or f"a host ended with exit status {host.returncode}"
