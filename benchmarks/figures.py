@@ -82,7 +82,7 @@ def _pipes(run: Run, path: Path) -> None:
     _pipe_panel(panels[0, 0], run, messages, messages, "where the kernel puts both")
     for panel, place in zip((panels[0, 1], panels[1, 0]), pipes.PLACES, strict=True):
         cases = [pipes.placed(name, place) for name in messages]
-        _pipe_panel(panel, run, messages, cases, f"both on {place}")
+        _pipe_panel(panel, run, messages, cases, f"on {place}")
     steps = [case.name for case in pipes.cases(run.about["size"]) if case.group == pipes.STEPS]
     _lines(panels[1, 1], run, list(enumerate(steps)), pipes.STEP, log_x=False)
     panels[1, 1].set(
@@ -119,8 +119,7 @@ def _startup(run: Run, path: Path) -> None:
     ):
         _lines(panel, run, points, metric)
         panel.set(title=title, xlabel="workers", xticks=startup.WORKERS, xlim=(0.7, 1500))
-        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        panel.xaxis.set_minor_formatter(NullFormatter())
+        _counts(panel.xaxis)
     _finish(figure, path)
 
 
@@ -140,7 +139,12 @@ def _workers(run: Run, path: Path) -> None:
     figure, panel = plt.subplots(figsize=(9, 4))
     points = [(float(count), workers.workers(count)) for count in workers.WORKERS]
     _lines(panel, run, points, workers.COST)
-    panel.set(title="The master's processor time to start a worker", xlabel="workers of the pool")
+    panel.set(
+        title="The master's processor time to start a worker",
+        xlabel="workers of the pool",
+        xticks=workers.WORKERS,
+    )
+    _counts(panel.xaxis)
     _finish(figure, path)
 
 
@@ -154,8 +158,7 @@ def _agents(run: Run, path: Path) -> None:
     ):
         _lines(panel, run, points, metric)
         panel.set(title=title, xlabel="agents", xticks=agents.AGENTS)
-        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        panel.xaxis.set_minor_formatter(NullFormatter())
+        _counts(panel.xaxis)
     _finish(figure, path)
 
 
@@ -256,6 +259,11 @@ def _unit(axis: Any, unit: str, ticks: Sequence[float] | None = None) -> None:
         # A decade or two alone would leave one or no number on the axis.
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value, unit)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _counts(axis: Any) -> None:
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     axis.set_minor_formatter(NullFormatter())
 
 
