@@ -66,6 +66,7 @@ class Agent:
                 raise RuntimeError(_ENDING)
             child.start(self._zygote(), self._access())
         except Exception as error:
+            child.start_error = error
             self._gone(child, 1, f"could not be started: {error}")
 
     def close(self) -> None:

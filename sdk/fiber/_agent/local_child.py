@@ -51,6 +51,7 @@ class LocalChild:
         self.host = owner.host
         self.pid: int | None = None
         self.slot: int | None = None
+        self.start_error: Exception | None = None
         self.fault: Exception | None = None
         self.zygote: ZygoteLink | None = None
         self.observer = observer

@@ -84,7 +84,7 @@ class Scheduler:
 
     def ready(self, member: Member, now: float) -> None:
         """It is ready for work, unless it was told to go."""
-        if not member.leaving:
+        if not member.leaving and member.worker is None:
             self.workers.ready(member, self.ledger.add(member, now, self._max_tasks))
 
     def gone(

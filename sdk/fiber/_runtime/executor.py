@@ -98,7 +98,11 @@ class Executor:
             on_timeout=self._timed_out,
         )
         self._launcher = Launcher(
-            options, self._loop, self._background, on_failed=self._never_started
+            options,
+            self._loop,
+            self._background,
+            on_failed=self._never_started,
+            on_late=self._ready,
         )
         self._leases = Leases(
             self._scheduler, self._loop, on_adopted=self._adopt, on_back=self._back
@@ -125,13 +129,9 @@ class Executor:
         self._loop.depend(self)
         handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
         self._loop.call_soon(self._begin, handles)
-        started = 0
         try:
-            for handle in handles:
-                self._launcher.launch(handle)
-                started += 1
+            self._launcher.launch_now(handles, self._host.config.start_timeout)
         except BaseException as error:
-            self._loop.call_soon(self._never_started, handles[started:], None)
             self.terminate(error)
             raise
 
@@ -505,8 +505,8 @@ class Executor:
 
     def _ready(self, handle: WorkerHandle) -> None:
         """A worker is initialized."""
-        if handle.port is None:  # whoever started it is still about to note how to reach it
-            self._loop.call_soon(self._ready, handle)
+        handle.is_ready = True
+        if handle.port is None:  # whoever started it is about to note how to reach it, and calls
             return
         self._scheduler.ready(handle, self._loop.now())
         self._advance()

@@ -40,21 +40,24 @@ class Popen:
             port = runtime().start(process, self, method=method)
             if self.returncode is None:
                 self._port = port
-            self._wait_for_birth(port.host)
+            self._wait_for_birth(port)
         except BaseException:
             # Whoever asked does not know of it: it must not go on.
             self.kill()
             self.close()
             raise
 
-    def _wait_for_birth(self, host: str) -> None:
+    def _wait_for_birth(self, port: ChildPort) -> None:
         timeout = runtime().config.start_timeout
         if not self._born.wait(timeout):
             raise StartError(
                 f"process {self._name!r}",
-                f"its agent on host {host!r} did not start it within {timeout:g} s (start_timeout)",
+                f"its agent on host {port.host!r} did not start it within {timeout:g} s "
+                "(start_timeout)",
             )
         if self.pid is None and self.report is not None:
+            if port.start_error is not None:
+                raise port.start_error
             raise StartError(f"process {self._name!r}", self.report.reason)
 
     # What the agent says, on the loop's thread

@@ -50,6 +50,8 @@ class WorkerHandle:
         """What its initializer, or its birth, failed with."""
         self.leaving = False
         """It was told to go, or will be at once."""
+        self.is_ready = False
+        """It said so."""
         self.unwanted = False
         """It was told to end at once, whatever it does."""
         self.returncode: int | None = None
