@@ -243,7 +243,7 @@ def test_the_start_during_the_import_of_main_is_refused(monkeypatch: pytest.Monk
 
 
 class Port:
-    name, host, pid = "p", "elsewhere", None
+    name, host, pid, start_error = "p", "elsewhere", None, None
 
     def __init__(self) -> None:
         self.signals: list[int] = []
