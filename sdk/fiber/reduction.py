@@ -280,7 +280,8 @@ def _importable(name: str | None, file: str | None) -> bool:
         # To import the one of a package, folder or archive is to run it: few have a guard.
         return name.rpartition(".")[2] != "__main__"
     # A program that came by standard input calls its file <stdin>.
-    return file is not None and os.path.isfile(os.path.join(mp_process.ORIGINAL_DIR or "", file))
+    started_in: str = mp_process.ORIGINAL_DIR or ""  # type: ignore[attr-defined]
+    return file is not None and os.path.isfile(os.path.join(started_in, file))
 
 
 def readers_are_remote(remote: bool) -> None:
