@@ -266,11 +266,11 @@ def main_is_out_of_reach() -> bool:
     """Whether those who read our pickles cannot import our ``__main__``, or must not: it goes by
     value.
     """
-    if _readers_are_remote or hasattr(sys, "ps1"):  # what an interactive session adds has no file
+    if _readers_are_remote or "ps1" in vars(sys):  # what an interactive session adds has no file
         return True
-    main = sys.modules.get("__main__")
-    spec = getattr(main, "__spec__", None)
-    return not _importable(getattr(spec, "name", None), getattr(main, "__file__", None))
+    main = vars(sys.modules["__main__"])
+    spec = main.get("__spec__")
+    return not _importable(spec and spec.name, main.get("__file__"))
 
 
 @lru_cache(maxsize=1)

@@ -38,8 +38,7 @@ class Programs:
             **os.environ,
             "FIBER_BACKEND": backend,
             "PYTHONPATH": os.pathsep.join([str(TESTS), *filter(None, sys.path)]),
-            "IPYTHONDIR": str(folder / "ipython"),
-            "JUPYTER_RUNTIME_DIR": str(folder / "jupyter"),
+            "HOME": str(folder),  # sessions keep their history there, and kernels their files
         }
 
     def run(self, *arguments: str, **options: Any) -> str:
