@@ -94,6 +94,8 @@ class Runtime:
         return agent.start(spec, observer)
 
     def _preparation(self, process: Any, agent: AgentPort, same_host: bool) -> bytes:
+        # pdb leaves its program a main module without one, which multiprocessing does not expect.
+        vars(sys.modules["__main__"]).setdefault("__spec__", None)
         try:
             data = spawn.get_preparation_data(process.name)
         except FileNotFoundError as error:
@@ -113,6 +115,7 @@ class Runtime:
             data["preload"] = [*methods.preload, *_modules_of(process)]
         else:
             data["preload"] = ["cloudpickle"]
+        if reduction.main_is_out_of_reach():
             data.pop("init_main_from_name", None)
             data.pop("init_main_from_path", None)
         return pickle.dumps(data)
