@@ -11,12 +11,15 @@ import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from fiber._hub.access import Access
 from fiber._hub.client import Line, Reply, Unreachable
 from fiber._hub.protocol import ONE, TWO, Op, Status
 from fiber._transport.unix import wait_readable
+from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
+from fiber.errors import ConnectionClosed
 
 
 class RemoteObject:
@@ -120,6 +123,10 @@ class RemoteChannel(RemoteObject):
         assert message is not None
         return message
 
+    def recv_object(self) -> Any:
+        """The next message, unpickled."""
+        return packet.loads(self.recv())
+
     def try_recv(self) -> Message | None:
         """The next message if one is there; EOFError at the end."""
         return self._receive(Op.TRY_RECV)
@@ -128,7 +135,7 @@ class RemoteChannel(RemoteObject):
         with self.line() as line:
             reply = self._late.popleft() if self._late else line.ask(operation)
         if reply.status is Status.EOF:
-            raise EOFError("the other end is closed")
+            raise ConnectionClosed()
         if reply.status is Status.NO:
             return None
         (more,) = reply.values

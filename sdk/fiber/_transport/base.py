@@ -7,7 +7,7 @@ Both have two implementations: kernel objects for holders on the host where the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from fiber._wire.packet import BytesLike, Message
 
@@ -22,7 +22,10 @@ class Channel(Protocol):
         """Send one message; BrokenPipeError when nobody can ever read it."""
 
     def recv(self) -> Message:
-        """The next message; EOFError when nobody can ever send one."""
+        """The next message; ConnectionClosed when nobody can ever send one."""
+
+    def recv_object(self) -> Any:
+        """The same, unpickled."""
 
     def try_recv(self) -> Message | None:
         """The next message if one is there."""
