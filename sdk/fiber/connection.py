@@ -191,7 +191,7 @@ class Connection:
         process = getattr(spawning, "process", None)
         if process is not None:
             self._given_to.append(weakref.ref(process))
-        return _rebuild, (handles.lend(self._channel), self._readable, self._writable)
+        return _rebuild, (handles.handle_for(self._channel), self._readable, self._writable)
 
     def _misuse(self, wrong_way: str = "") -> OSError:
         if self._channel is None:

@@ -23,9 +23,9 @@ from fiber._agent import zygote
 from fiber._agent.board import Board
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
-from fiber._hub import access
-from fiber._hub.access import Access
+from fiber._hub import client as hub_client
 from fiber._hub.hub import Hub
+from fiber._hub.protocol import HubAddress
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
 from fiber._transport.unix import naming_the_limit, socketpair, wait_readable
@@ -79,13 +79,16 @@ class Agent:
             link.quit()
         self._loop.call_soon(self._board.close)
 
-    def access(self) -> Access | None:
+    def access(self) -> HubAddress | None:
         """What our children are told of this host's hub."""
-        return self._hub.access if self._hub is not None else access.told()
+        if self._hub is None:
+            return hub_client.inherited_address()
+        return self._hub.address_or_problem
 
     def _zygote(self, *, preload: bool = True) -> ZygoteLink:
         if not self._zygotes or not preload:
-            directory = None if self._hub is None else os.path.dirname(self._hub.access.address)
+            self.access()  # makes the hub's directory, if there is to be one
+            directory = None if self._hub is None else self._hub.directory
             self._zygotes.append(
                 ZygoteLink(self, self._loop, self._board.fd, directory, preload=preload)
             )

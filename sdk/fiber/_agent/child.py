@@ -18,8 +18,8 @@ from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
 from fiber._agent.board import Board
-from fiber._hub import access
-from fiber._hub.access import Access
+from fiber._hub import client as hub_client
+from fiber._hub.protocol import HubAddress
 from fiber._transport.unix import UnixChannel
 
 _PR_SET_PDEATHSIG = 1
@@ -50,7 +50,7 @@ class Start(NamedTuple):
     """Whether its output goes to its agent, which wants it line by line."""
     open_files: tuple[int, int]
     """Its limits of descriptors, soft and hard: those of its agent's process."""
-    hub: Access | None
+    hub: HubAddress | None
     """Where it finds the hub of its host."""
     elders: tuple[int, ...]
     """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
@@ -124,7 +124,7 @@ def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
 def _load(start: Start) -> Any:
     data: dict[str, Any] = pickle.loads(start.preparation)
     if start.hub is not None:
-        access.install(start.hub)
+        hub_client.set_hub_address(start.hub)
     prepare_paths(data)
     _prepare_environment(data)
     with inheriting():

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from fiber import reduction
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Batch, Job
-from fiber._hub.grants import GrantSet
+from fiber._hub.handles import GrantSet
 from fiber._runtime.reader import Reader
 from fiber._wire import work
 
