@@ -272,7 +272,8 @@ def main_is_out_of_reach() -> bool:
     if _readers_are_remote:
         return True
     main = sys.modules.get("__main__")
-    return getattr(main, "__file__", None) is None and getattr(main, "__spec__", None) is None
+    names = main.__dict__ if main is not None else {}  # getattr takes a microsecond for what is not
+    return names.get("__file__") is None and names.get("__spec__") is None
 
 
 def readers_are_remote(remote: bool) -> None:

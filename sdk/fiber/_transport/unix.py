@@ -44,19 +44,22 @@ def _block(sock: socket.socket) -> None:
         sock.settimeout(None)
 
 
-_LOOK = 50e-6 * float(os.environ.get("SPIN", "1"))
-"""Seconds for which an answer is looked for before its receiver sleeps."""
+# How a receiver looks for an answer before it sleeps (decision 15)
+
+_LOOK = 50e-6
+"""Seconds that it looks: more than it takes to wake a processor on which the other end sleeps."""
 
 _SOON = 15e-6
-"""Seconds in which it has to come so that looking goes on."""
+"""Seconds in which the answer has to come, so that looking for the next one is worth it."""
 
 _TRIES = 8
-"""How often it may come later than that."""
+"""Answers in a row that may come later than that, while the other end wakes up."""
 
 _SLEEPS = 255
-"""How often a receiver sleeps at once before it looks again."""
+"""Answers for which it sleeps at once after looking was not worth it."""
 
 _last_asked = 0
+"""The id of the channel on which this process sent last."""
 
 
 class UnixChannel:
@@ -97,14 +100,11 @@ class UnixChannel:
             poller.poll()
 
     def recv(self) -> Message:
-        """The next message, EOFError at the end."""
+        """The next message, ConnectionClosed at the end."""
         return packet.receive(self._sock)
 
     def recv_object(self) -> Any:
-        """The next message, unpickled; EOFError at the end.
-
-        Who has just sent something looks for the answer a while before it sleeps (decision 15).
-        """
+        """The next message, unpickled; ConnectionClosed at the end."""
         if _last_asked == id(self):
             if self._sleeps:
                 self._sleeps -= 1
@@ -113,7 +113,7 @@ class UnixChannel:
         return packet.receive_object(self._sock)
 
     def _look(self) -> Message | None:
-        """What comes soon."""
+        """The answer, if it comes soon."""
         begin = time.perf_counter()
         while (message := self.try_recv()) is None:
             if time.perf_counter() - begin > _LOOK:
