@@ -14,7 +14,7 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.program import PATIENCE, Program, stop_and_wait
+from faults.program import PATIENCE, stop_and_wait
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -177,35 +177,6 @@ def test_a_connection_sent_through_a_connection_outlives_its_sender(
         inner.recv()
     inner.close()
     outer.close()
-
-
-UNTAKEN = """
-    import {library} as library
-    if __name__ == "__main__":
-        process = library.Process(target=int)
-        process.start()
-        process.join()
-        outer, outer_theirs = library.Pipe()
-        ours, theirs = library.Pipe()
-        outer.send(theirs)  # never received
-        for end in theirs, outer_theirs, outer:
-            end.close()
-        print(ours.poll(0.3), flush=True)
-"""
-
-
-@pytest.mark.parametrize("library", ["multiprocessing", "fiber"])
-def test_a_handle_that_nobody_took_holds_its_end_as_long_as_multiprocessings(
-    launch_on: Callable[..., Program], library: str
-) -> None:
-    """Nobody hears that the kernel threw a message away together with its pipe.
-
-    So whoever has lent an end keeps it for the taker that may come, until the program ends.
-    """
-    program = launch_on(UNTAKEN.format(library=library))
-    assert program.line() == "False"
-    assert program.wait() == 0
-    assert program.left() == []
 
 
 def test_a_stopped_reader_holds_up_its_own_pipe_only(start: Callable[..., Any]) -> None:

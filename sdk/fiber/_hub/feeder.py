@@ -111,7 +111,7 @@ class Feeder:
         self._on_error = on_error
         self._close_outbox = close
         self._unsent: deque[tuple[bytes, list[memoryview]]] = deque()
-        # One True for each item, False for the end.
+        # True when there are items, False at the end.
         self._wake: SimpleQueue[bool] = SimpleQueue()
         self._sending = False
         # What a thread takes out before it feeds.  Whoever finds it there starts a thread; of two,
@@ -153,8 +153,10 @@ class Feeder:
         """Take no more; let go of the channel once everything is sent."""
         if self._vacancy and not self._unsent:
             self._close_outbox()
-        else:
-            self._wake.put(False)
+            return
+        if self._vacancy:  # a ``put`` was interrupted before it started the thread
+            self._start_thread()
+        self._wake.put(False)
 
     def join(self) -> None:
         """Wait until everything is sent."""
@@ -180,13 +182,13 @@ class Feeder:
             self._vacancy.pop()
         except IndexError:
             return
-        while self._wake.get():
+        more = True
+        while more:
+            more = self._wake.get()
             self._sending = True
-            try:
-                if self._unsent:
-                    self._send(*self._unsent.popleft())
-            finally:
-                self._sending = False
+            while self._unsent:
+                self._send(*self._unsent.popleft())
+            self._sending = False
         self._close_outbox()
 
     def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
