@@ -21,7 +21,7 @@ from multiprocessing.context import (
 from typing import TYPE_CHECKING, Any
 
 from fiber import config, cpu
-from fiber._hub.absent import absent
+from fiber._hub.unsupported import unsupported
 from fiber._runtime import methods
 from fiber.process import ForkProcess, ForkServerProcess, Process, SpawnProcess
 
@@ -58,15 +58,15 @@ class BaseContext:
     Process: type[Process] = Process
 
     # What multiprocessing has and Fiber has not yet: each says what to use instead.
-    Lock = staticmethod(absent("Lock"))
-    RLock = staticmethod(absent("RLock"))
-    Condition = staticmethod(absent("Condition"))
-    Barrier = staticmethod(absent("Barrier"))
-    Value = staticmethod(absent("Value"))
-    Array = staticmethod(absent("Array"))
-    RawValue = staticmethod(absent("RawValue"))
-    RawArray = staticmethod(absent("RawArray"))
-    Manager = staticmethod(absent("Manager"))
+    Lock = staticmethod(unsupported("Lock"))
+    RLock = staticmethod(unsupported("RLock"))
+    Condition = staticmethod(unsupported("Condition"))
+    Barrier = staticmethod(unsupported("Barrier"))
+    Value = staticmethod(unsupported("Value"))
+    Array = staticmethod(unsupported("Array"))
+    RawValue = staticmethod(unsupported("RawValue"))
+    RawArray = staticmethod(unsupported("RawArray"))
+    Manager = staticmethod(unsupported("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)

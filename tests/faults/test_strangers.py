@@ -152,7 +152,7 @@ def door() -> Iterator[str]:
         queue = fiber.Queue()
         queue.put(1)
         assert runtime.hub is not None
-        yield runtime.hub.access.address
+        yield runtime.hub.address.path
 
 
 def test_the_door_is_in_a_directory_that_only_this_user_can_enter(door: str) -> None:

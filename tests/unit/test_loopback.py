@@ -20,7 +20,7 @@ from fiber._agent.port import ChildSpec
 from fiber._backends import loopback
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
-from fiber._hub.access import Access
+from fiber._hub.protocol import HubAddress
 from fiber._runtime import state
 from fiber._wire import messages
 from fiber.errors import LinkError, StartError
@@ -188,7 +188,7 @@ class Silent:
 
     def __init__(self) -> None:
         self.sent: list[Any] = []
-        self.access = Access("local", "nowhere", b"")
+        self.access = HubAddress("local", "nowhere", b"")
 
     def link(self, *_: Any, **__: Any) -> Silent:
         return self

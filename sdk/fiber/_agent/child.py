@@ -19,8 +19,8 @@ from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
 from fiber._agent.board import Board
-from fiber._hub import access
-from fiber._hub.access import Access
+from fiber._hub import client as hub_client
+from fiber._hub.protocol import HubAddress
 from fiber._transport.unix import UnixChannel
 
 _PR_SET_PDEATHSIG = 1
@@ -51,7 +51,7 @@ class Start(NamedTuple):
     """Whether its output goes to its agent, which wants it line by line."""
     open_files: tuple[int, int]
     """Its limits of descriptors, soft and hard: those of its agent's process."""
-    hub: Access | None
+    hub: HubAddress | None
     """Where it finds the hub of its host."""
     elders: tuple[int, ...]
     """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
@@ -141,7 +141,7 @@ def _load_and_run(start: Start, agent: int) -> int:
 def _load(start: Start) -> Any:
     data: dict[str, Any] = pickle.loads(start.preparation)
     if start.hub is not None:
-        access.install(start.hub)
+        hub_client.set_hub_address(start.hub)
     prepare_paths(data)
     _prepare_environment(data)
     with inheriting():

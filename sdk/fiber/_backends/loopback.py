@@ -98,7 +98,7 @@ class LoopbackBackend:
             "FIBER_AGENT_CREDENTIALS": self._credentials,
             "FIBER_AGENT_NAME": name,
             "FIBER_AGENT_PARENT": str(os.getpid()),
-            "FIBER_AGENT_INHERITS": os.path.dirname(self._hub.access.address),
+            "FIBER_AGENT_INHERITS": os.path.dirname(self._hub.address_or_problem.path),
             "FIBER_START_TIMEOUT": str(self._config.start_timeout),
         }
 
