@@ -23,7 +23,7 @@ AGENT = """
 
 MASTER = """
     import pickle, signal, sys
-    from fiber._transport.link import Patience
+    from fiber._transport.link import Keepalive
     from fiber._transport.listener import MasterListener
     from fiber._transport.loop import Loop
     from fiber._wire.messages import Shutdown, TakeBack
@@ -61,7 +61,7 @@ MASTER = """
     listener = MasterListener(
         loop, sys.argv[2], pickle.load(open(sys.argv[1], "rb")),
         on_agent=joined, on_refused=lambda reason: None,
-        patience=Patience(0.2, 0.5, 1.0), lost_grace=float(sys.argv[3]) if sys.argv[3:] else None,
+        keepalive=Keepalive(0.2, 0.5, 1.0), lost_grace=float(sys.argv[3]) if sys.argv[3:] else None,
     )
     print("listens", flush=True)
     loop.run()

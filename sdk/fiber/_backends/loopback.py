@@ -16,7 +16,7 @@ from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._hub.hub import Hub
 from fiber._transport.credentials import make_credentials
-from fiber._transport.link import Link, Patience
+from fiber._transport.link import Link, Keepalive
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber.config import Config
@@ -50,7 +50,7 @@ class LoopbackBackend:
             credentials,
             on_agent=self._joined,
             on_refused=self._refused,
-            patience=Patience(config.heartbeat_interval, config.suspect_after, config.lost_after),
+            keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
         )
         self._launched = 0
         self._processes = [self._launch() for _ in range(config.agents)]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fiber._transport.session import (
+from fiber._transport.stream import (
     ACK_DELAY,
     BUDGET,
     HEARTBEAT,

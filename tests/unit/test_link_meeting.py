@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 
-from fiber._transport import dialer
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport import dialer, tls
+from fiber._transport.credentials import Credentials, MasterCredentials, make_credentials
 from fiber._transport.handshake import Hello, Identity
-from fiber._transport.link import Patience
-from fiber._transport.nng import Socket, url_of
+from fiber._transport.link import Keepalive
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
-from unit.nng_site import Site, free_port, port_of
+from unit.link_site import DEADLINE, Site, free_port, port_of, vanish
+
+T = TypeVar("T")
 
 
 @pytest.fixture(scope="module")
@@ -109,15 +111,15 @@ def test_a_host_that_vanishes_before_the_welcome_is_dialled_anew(
     address = f"127.0.0.1:{free_port()}"
     with contextlib.ExitStack() as held:
         if before == "another welcome":
-            listener, _ = site.listener(address, Patience())
+            listener, former = site.listener(address, Keepalive())
             _, agent = site.dialer(address)
-            assert agent.link
-            site.on_loop(listener._socket.close)
+            agent.wait(lambda: agent.link.statistics().datagrams_received)
+            assert former.link
+            site.on_loop(lambda: vanish(listener))
         silent = held.enter_context(socket.create_server(("127.0.0.1", port_of(address))))
         if before == "the first welcome":
             _, agent = site.dialer(address, timeout=None)
-        for _ in range(2):  # one to see whether somebody is there, then the one that matters
-            held.enter_context(silent.accept()[0])
+        held.enter_context(silent.accept()[0])
         silent.close()
         _, master = site.listener(address)
         if before == "the first welcome":
@@ -194,19 +196,32 @@ def test_another_patch_level_of_python_will_do(site: Site) -> None:
     assert agent.link is not master.link
 
 
+def say(address: str, credentials: Credentials, words: bytes) -> bytes:
+    """What a master answers to the first words of somebody with the right credentials."""
+    sock = socket.create_connection(("127.0.0.1", port_of(address)))
+    exchange = tls.Exchange(
+        sock, tls.context_of(credentials, listens=False), credentials.server_name
+    )
+    try:
+        return complete(exchange, exchange.ask(words))
+    finally:
+        exchange.close()
+
+
+def complete(exchange: tls.Exchange, steps: Generator[int, None, T]) -> T:
+    poller = select.poll()
+    while True:
+        try:
+            poller.register(exchange.sock, next(steps))
+        except StopIteration as finished:
+            return finished.value
+        assert poller.poll(DEADLINE * 1000)
+
+
 def test_who_is_no_agent_is_refused(site: Site) -> None:
     listener, master = site.listener()
-    stranger = Socket(
-        site.loop,
-        site.credentials.agent_half(),
-        dials=True,
-        on_message=lambda *_: None,
-        on_gone=lambda _: None,
-        on_pipe=lambda pipe: pipe.put(b"GET / HTTP/1.1"),
-    )
-    stranger.dial(url_of(listener.address))
+    say(listener.address, site.credentials.agent_half(), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
-    site.on_loop(stranger.close)
     assert "no agent of Fiber" in master.refusals[0]
 
 

@@ -12,17 +12,17 @@ import pynng
 from fiber._transport.credentials import Credentials, MasterCredentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
-from fiber._transport.link import Link, Patience
+from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
-from fiber._transport.session import Frame
+from fiber._transport.stream import Frame
 
 # Once used, nng keeps threads and two descriptors for as long as the process lives.  The census of
 # what tests leave behind begins after the collection, and so after this.
 pynng.Pair1().close()
 
 DEADLINE = 10.0
-SHORT = Patience(heartbeat=0.1, suspect_after=0.8, lost_after=2.0)
+SHORT = Keepalive(heartbeat=0.1, suspect_after=0.8, lost_after=2.0)
 
 
 class Notes:
@@ -83,7 +83,7 @@ class Site:
         self._closing: list[Callable[[], None]] = []
 
     def listener(
-        self, address: str = "127.0.0.1:0", patience: Patience = SHORT
+        self, address: str = "127.0.0.1:0", keepalive: Keepalive = SHORT
     ) -> tuple[MasterListener, Notes]:
         notes = Notes()
         listener = MasterListener(
@@ -92,7 +92,7 @@ class Site:
             self.credentials,
             on_agent=notes.on_link,
             on_refused=notes.on_refused,
-            patience=patience,
+            keepalive=keepalive,
         )
         self._closing.append(lambda: self.close(listener, linger=0.1))
         return listener, notes
@@ -151,6 +151,17 @@ def port_of(address: str) -> int:
     return int(address.rpartition(":")[2])
 
 
+def wires_of(listener: MasterListener) -> list[Any]:
+    return [link._wire for link in listener._links.values() if link._wire is not None]
+
+
 def break_connections(listener: MasterListener) -> None:
-    for pipe in list(listener._socket._pipes.values()):
-        pipe.close()
+    for wire in wires_of(listener):
+        wire.break_off()
+
+
+def vanish(listener: MasterListener) -> None:
+    """As a killed process would."""
+    for wire in wires_of(listener):
+        wire.close()
+    listener._acceptor.close()
