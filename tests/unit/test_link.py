@@ -121,8 +121,8 @@ def test_a_broken_connection_loses_and_repeats_nothing(site: Site, times: int) -
 def test_a_master_that_began_anew_refuses_the_old_session(site: Site) -> None:
     listener, former = site.listener(keepalive=Keepalive())
     _, agent = site.dialer(listener.address)
-    agent.wait(lambda: agent.link.statistics().datagrams_received)
-    assert former.link
+    former.link.send(b"known")
+    agent.wait(lambda: agent.frames)
     site.on_loop(lambda: vanish(listener))
     _, successor = site.listener(listener.address)
     agent.wait(lambda: agent.events)

@@ -113,8 +113,8 @@ def test_a_host_that_vanishes_before_the_welcome_is_dialled_anew(
         if before == "another welcome":
             listener, former = site.listener(address, Keepalive())
             _, agent = site.dialer(address)
-            agent.wait(lambda: agent.link.statistics().datagrams_received)
-            assert former.link
+            former.link.send(b"known")
+            agent.wait(lambda: agent.frames)
             site.on_loop(lambda: vanish(listener))
         silent = held.enter_context(socket.create_server(("127.0.0.1", port_of(address))))
         if before == "the first welcome":

@@ -10,7 +10,7 @@ What nng does behind one's back, and what follows from it:
 * It tells of a connection's beginning and end on a thread of its own; the callbacks only leave a
   note.
 * Closed while it still exchanges its greeting (eight bytes each way), it may forget to close the
-  descriptor.  So such a connection is ended first, which nng notices, and closed a little later.
+  descriptor.  So such a connection is ended first, which nng notices in a moment, and then closed.
 * A socket does not survive a fork: in the child it is made harmless, not closed.
 * pynng copies a message twice on its way; here it is sealed right into nng's memory, and opened
   right out of it.
@@ -22,6 +22,7 @@ import atexit
 import contextlib
 import os
 import socket
+import time
 import weakref
 from collections.abc import Callable
 from multiprocessing import util
@@ -46,8 +47,8 @@ _LARGEST = LARGEST + OVERHEAD + 4
 _QUEUE = 2 * WINDOW
 """Messages that nng keeps for the connection: a link's window, and its acknowledgements."""
 
-_GREETING = 1.0
-"""Seconds after the end of a connection within which nng has surely noticed it."""
+_NOTICES = 0.1
+"""Seconds for nng to notice the end of a connection; it takes a fraction of a millisecond."""
 
 _lib, _ffi = _nng.lib, _nng.ffi
 
@@ -75,6 +76,7 @@ class Connection:
         self._on_gone = on_gone
         self._closed = False
         self._message = _ffi.new("nng_msg **")
+        self._descriptor = descriptor
         self._greeting: socket.socket | None = _duplicate(descriptor)
         self._socket = _pair(
             descriptor,
@@ -111,13 +113,9 @@ class Connection:
         if not self._closed:
             self._closed = True
             self._loop.unregister(self._fd)
-            if self._greeting is None:
-                self._socket.close()
-                return
-            with contextlib.suppress(OSError):  # it is broken already
-                self._greeting.shutdown(socket.SHUT_RDWR)
-            self._greeting.close()
-            self._loop.call_later(_GREETING, self._socket.close)
+            if self._greeting is not None:
+                self._end_greeting(self._greeting)
+            self._socket.close()
 
     def abandon_after_fork(self) -> None:
         """Let the parent keep what both share; nng aborts a child that touches it."""
@@ -129,6 +127,17 @@ class Connection:
         if self._greeting is not None and not self._closed:
             self._greeting.close()
             self._greeting = None
+
+    def _end_greeting(self, ours: socket.socket) -> None:
+        """Have nng give up a connection that it has not made a pipe of, and see it let go."""
+        with contextlib.suppress(OSError):  # it is broken already
+            ours.shutdown(socket.SHUT_RDWR)
+        connection = os.fstat(ours.fileno()).st_ino
+        ours.close()
+        until = time.monotonic() + _NOTICES
+        with contextlib.suppress(OSError):  # which says that it is closed
+            while os.fstat(self._descriptor).st_ino == connection and time.monotonic() < until:
+                time.sleep(0.0005)
 
     def _went(self) -> None:
         # What it brought before it broke comes first.
