@@ -75,6 +75,8 @@ class Pool:
         self.credentials: MasterCredentials = make_credentials("warm")
         self._path = folder / "credentials"
         self._path.write_bytes(pickle.dumps(self.credentials))
+        self._folder = folder / "agent"
+        self.credentials.agent_half().to_directory(self._folder)
         self._launch = launch
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
@@ -83,7 +85,7 @@ class Pool:
     def agent(self, grace: float, **env: str) -> Program:
         told = {
             "FIBER_AGENT_ADDRESS": self.address,
-            "FIBER_AGENT_CREDENTIALS": self.credentials.agent_half().to_environment(),
+            "FIBER_AGENT_CREDENTIALS": str(self._folder),
             "FIBER_AGENT_NAME": "warm-0",
             "FIBER_AGENT_PARENT": str(os.getpid()),
             "FIBER_AGENT_LOST_GRACE": str(grace),

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import select
 import socket
 import threading
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Generator
+from typing import Any, TypeVar
 
 import pynng
 
+from fiber._transport import tls
 from fiber._transport.credentials import Credentials, MasterCredentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
@@ -21,6 +23,7 @@ from fiber._transport.stream import Frame
 # what tests leave behind begins after the collection, and so after this.
 pynng.Pair1().close()
 
+T = TypeVar("T")
 DEADLINE = 10.0
 SHORT = Keepalive(heartbeat=0.1, suspect_after=0.8, lost_after=2.0)
 
@@ -125,8 +128,14 @@ class Site:
         return master, agent
 
     def on_loop(self, function: Callable[[], Any]) -> Any:
-        done, results = threading.Event(), []
-        self.loop.call_soon(lambda: (results.append(function()), done.set())[0])
+        done = threading.Event()
+        results: list[Any] = []
+
+        def call() -> None:
+            results.append(function())
+            done.set()
+
+        self.loop.call_soon(call)
         assert done.wait(DEADLINE)
         return results[0]
 
@@ -165,3 +174,26 @@ def vanish(listener: MasterListener) -> None:
     for wire in wires_of(listener):
         wire.close()
     listener._acceptor.close()
+
+
+def say(address: str, credentials: Credentials, words: bytes) -> bytes:
+    """What a master answers to the first words of somebody with the right credentials."""
+    sock = socket.create_connection(("127.0.0.1", port_of(address)))
+    exchange = tls.Exchange(
+        sock, tls.context_of(credentials, listens=False), credentials.server_name
+    )
+    try:
+        return complete(exchange, exchange.ask(words))
+    finally:
+        exchange.close()
+
+
+def complete(exchange: tls.Exchange, steps: Generator[int, None, T]) -> T:
+    poller = select.poll()
+    while True:
+        try:
+            poller.register(exchange.sock, next(steps))
+        except StopIteration as finished:
+            value: T = finished.value
+            return value
+        assert poller.poll(DEADLINE * 1000)

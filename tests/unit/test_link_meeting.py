@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import select
 import socket
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 
-from fiber._transport import dialer, tls
-from fiber._transport.credentials import Credentials, MasterCredentials, make_credentials
+from fiber._transport import dialer
+from fiber._transport.credentials import MasterCredentials, make_credentials
 from fiber._transport.handshake import Hello, Identity
 from fiber._transport.link import Keepalive
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
-from unit.link_site import DEADLINE, Site, free_port, port_of, vanish
-
-T = TypeVar("T")
+from unit.link_site import Site, free_port, port_of, say, vanish
 
 
 @pytest.fixture(scope="module")
@@ -194,28 +191,6 @@ def test_another_patch_level_of_python_will_do(site: Site) -> None:
     minor = ".".join(ours.python.split(".")[:2])
     _, agent = site.dialer(listener.address, identity=replace(ours, python=f"{minor}.99"))
     assert agent.link is not master.link
-
-
-def say(address: str, credentials: Credentials, words: bytes) -> bytes:
-    """What a master answers to the first words of somebody with the right credentials."""
-    sock = socket.create_connection(("127.0.0.1", port_of(address)))
-    exchange = tls.Exchange(
-        sock, tls.context_of(credentials, listens=False), credentials.server_name
-    )
-    try:
-        return complete(exchange, exchange.ask(words))
-    finally:
-        exchange.close()
-
-
-def complete(exchange: tls.Exchange, steps: Generator[int, None, T]) -> T:
-    poller = select.poll()
-    while True:
-        try:
-            poller.register(exchange.sock, next(steps))
-        except StopIteration as finished:
-            return finished.value
-        assert poller.poll(DEADLINE * 1000)
 
 
 def test_who_is_no_agent_is_refused(site: Site) -> None:

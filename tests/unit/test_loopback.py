@@ -17,7 +17,7 @@ import census
 import fiber
 from fiber import config
 from fiber._agent.port import ChildSpec
-from fiber._backends import loopback
+from fiber._backends import agent_process, loopback
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._hub.access import Access
@@ -86,7 +86,7 @@ def test_nothing_secret_is_on_a_command_line_or_in_the_environment_of_children(
     shared: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
     child = start()
-    agents = [process._process.pid for process in shared._processes]
+    agents = [process.process.pid for process in shared._processes]
     for found in census.everything():
         if found.pid in agents or found.parent in agents or found.pid == child.pid:
             assert shared._listener.address not in found.command
@@ -127,7 +127,7 @@ def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() ->
         child = start()
         pid = child.pid
         process = backend._processes[0]
-        os.kill(process._process.pid, signal.SIGKILL)
+        os.kill(process.process.pid, signal.SIGKILL)
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL
         assert "agent loopback-0 lost" in child._popen.report.reason
@@ -141,7 +141,7 @@ def test_agents_that_die_before_they_join_are_not_started_for_ever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     dies = [sys.executable, "-c", "raise SystemExit(3)"]
-    monkeypatch.setattr(loopback, "interpreter_arguments", lambda *_: dies)
+    monkeypatch.setattr(agent_process, "interpreter_arguments", lambda *_: dies)
     with running(start_timeout=PATIENCE) as backend:
         with pytest.raises(StartError, match="its process ended with status 3"):
             start()

@@ -81,8 +81,8 @@ class Credentials:
         except (OSError, ValueError, KeyError, TypeError):
             # Whatever else a descriptor may bring.
             raise ConfigError(
-                f"the credentials on descriptor {descriptor} cannot be read: it is not open, or what "
-                "it brings is cut short or not Fiber's. Hand them over as the master made them."
+                f"the credentials on descriptor {descriptor} cannot be read: it is not open, or "
+                "brings what is cut short or not Fiber's. Hand them over as the master made them."
             ) from None
 
     def expires(self) -> datetime.datetime:
