@@ -78,7 +78,7 @@ class Credentials:
             with open(descriptor, "rb") as file:
                 values = json.loads(file.read())
             return cls(**{name: str(values[name]) for name in _FILES})
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, OverflowError, ValueError, KeyError, TypeError):
             # Whatever else a descriptor may bring.
             raise ConfigError(
                 f"the credentials on descriptor {descriptor} cannot be read: it is not open, or "
