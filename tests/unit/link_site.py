@@ -107,6 +107,7 @@ class Site:
         credentials: Credentials | None = None,
         identity: Identity | None = None,
         timeout: float | None = DEADLINE,
+        connect: Callable[[str], socket.socket] | None = None,
     ) -> tuple[AgentDialer, Notes]:
         notes = Notes()
         dialling = AgentDialer(
@@ -117,6 +118,7 @@ class Site:
             on_link=notes.on_link,
             on_failed=notes.on_failed,
             timeout=timeout,
+            connect=connect,
         )
         self._closing.append(dialling.close)
         return dialling, notes

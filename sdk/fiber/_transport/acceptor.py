@@ -136,7 +136,10 @@ class Acceptor:
             sock.close()
             return
         self._newcomers.add(newcomer)
-        newcomer.start(sock)
+        try:
+            newcomer.start(sock)
+        except tls.HungUp:
+            self.forget(newcomer)
 
     def _close(self) -> None:
         if self._door.fileno() >= 0:
@@ -157,11 +160,11 @@ class Newcomer:
         self._watched: int | None = None
 
     def start(self, sock: socket.socket) -> None:
-        """Prove each other and hear its first words."""
-        self._timer = self._loop.call_later(_DEADLINE, self._too_late)
-        with contextlib.suppress(OSError):  # no TCP, or broken already: then reading tells
+        """Prove each other and hear its first words; HungUp if it has gone already."""
+        with contextlib.suppress(OSError):  # no TCP, or broken already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._exchange = tls.Exchange(sock, self._acceptor.context)
+        self._timer = self._loop.call_later(_DEADLINE, self._too_late)
         self._run(self._exchange.listen(), lambda hello: self._acceptor.on_hello(self, hello))
 
     def welcome(self, greeting: bytes, then: Callable[[int, Secrets], None]) -> None:

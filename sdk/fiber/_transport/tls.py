@@ -78,7 +78,9 @@ def _load_own(context: ssl.SSLContext, credentials: Credentials) -> None:
 
 
 class Exchange:
-    """One side's part on ``sock``, which it makes non-blocking and takes over."""
+    """One side's part on ``sock``, which it makes non-blocking and takes over; HungUp if that is
+    broken already.
+    """
 
     def __init__(
         self, sock: socket.socket, context: ssl.SSLContext, server_name: str | None = None
@@ -86,17 +88,21 @@ class Exchange:
         """``server_name`` is what the other side's certificate must bear; None on the master's
         side, whose agents all bear the same.
         """
-        sock.setblocking(False)
         self._for_master = server_name is None
         self._ours = os.urandom(SECRET_SIZE)
         self._theirs = b""
-        self.sock = context.wrap_socket(
-            sock,
-            server_side=self._for_master,
-            server_hostname=server_name,
-            do_handshake_on_connect=False,
-            suppress_ragged_eofs=False,
-        )
+        try:
+            sock.setblocking(False)
+            self.sock = context.wrap_socket(
+                sock,
+                server_side=self._for_master,
+                server_hostname=server_name,
+                do_handshake_on_connect=False,
+                suppress_ragged_eofs=False,
+            )
+        except OSError as error:
+            sock.close()
+            raise HungUp(_words(error)) from error
 
     def ask(self, hello: bytes) -> Steps[bytes]:
         """The agent's part: prove each other, say ``hello``, and return the answer."""
