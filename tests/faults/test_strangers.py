@@ -7,7 +7,8 @@ import os
 import pickle
 import socket
 import ssl
-from collections.abc import Iterator
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.program import PATIENCE, wait_for
+from faults.program import LOOPBACK, PATIENCE, Program, wait_for
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 from fiber._transport import tls
@@ -84,6 +85,42 @@ def test_strangers_that_say_nothing_and_stay_hold_nobody_up(backend: LoopbackBac
     works()  # by an agent that had to come in past them
     for stranger in strangers:
         stranger.close()
+
+
+CROWDED = """
+    import resource, fiber
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, 256))
+    from fiber._runtime import state
+
+    if __name__ == "__main__":
+        with fiber.Pool(1) as pool:
+            assert pool.map(abs, range(3)) == [0, 1, 2]
+            print(state.runtime().backend._listener.address, flush=True)
+            while input() == "go on":
+                assert pool.apply(abs, (-1,)) == 1
+                with open("/dev/null"), fiber.Pool(1) as another:  # there are descriptors left
+                    print(another.apply(abs, (-2,)), flush=True)
+"""
+
+
+def test_a_crowd_of_strangers_does_not_take_the_masters_descriptors(
+    launch: Callable[..., Program],
+) -> None:
+    program = launch(CROWDED, env=LOOPBACK, stdin=subprocess.PIPE)
+    host, _, port = program.line().rpartition(":")
+    with contextlib.ExitStack() as crowd:
+        for _ in range(300):
+            crowd.enter_context(socket.create_connection((host, int(port)), PATIENCE))
+        assert program.process.stdin is not None
+        program.process.stdin.write(b"go on\n")
+        program.process.stdin.flush()
+        assert program.line() == "2"
+        descriptors = len(os.listdir(f"/proc/{program.pid}/fd"))
+        assert descriptors < 150
+    program.process.stdin.write(b"end\n")
+    program.process.stdin.close()
+    program.finish()
+    assert program.stderr.count("too many come at the same time") <= 1
 
 
 def test_tls_without_a_certificate_gets_no_word(backend: LoopbackBackend) -> None:

@@ -82,7 +82,7 @@ class Pool:
             free.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{free.getsockname()[1]}"
 
-    def agent(self, grace: float, **env: str) -> Program:
+    def agent(self, grace: float, pass_fds: tuple[int, ...] = (), **env: str) -> Program:
         told = {
             "FIBER_AGENT_ADDRESS": self.address,
             "FIBER_AGENT_CREDENTIALS": str(self._folder),
@@ -91,7 +91,7 @@ class Pool:
             "FIBER_AGENT_LOST_GRACE": str(grace),
             "FIBER_START_TIMEOUT": "0.2",
         }
-        return self._launch(AGENT, env={**told, **env})
+        return self._launch(AGENT, env={**told, **env}, pass_fds=pass_fds)
 
     def master(self, *grace: str) -> Program:
         master = self._launch(MASTER, str(self._path), self.address, *grace)
@@ -126,6 +126,17 @@ def test_it_serves_one_master_after_the_other_and_keeps_nothing_of_them(pool: Po
         f"fiber agent warm-0: the master at {pool.address} refused this agent: "
         "this master is ending"
     }
+
+
+def test_credentials_from_a_descriptor_serve_for_all_its_masters(pool: Pool) -> None:
+    descriptor = pool.credentials.agent_half().to_descriptor()
+    told = {"FIBER_AGENT_CREDENTIALS": f"fd:{descriptor}"}
+    pool.agent(30, pass_fds=(descriptor,), **told)
+    os.close(descriptor)
+    for _ in range(3):
+        master = pool.master()
+        assert master.line() == "joined warm-0"
+        master.kill()
 
 
 def test_it_finds_the_next_master_when_the_last_was_killed(pool: Pool) -> None:

@@ -93,6 +93,7 @@ class Exchange:
         self._theirs = b""
         try:
             sock.setblocking(False)
+            sock.getpeername()  # of one that is broken already, wrap_socket would leave a rest
             self.sock = context.wrap_socket(
                 sock,
                 server_side=self._for_master,
