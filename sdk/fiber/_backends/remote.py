@@ -157,20 +157,18 @@ class RemoteChild:
         self.start_error: Exception | None = None
         self.observer = observer
         self._agent = agent
-        self._lock = threading.Lock()
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._gone = False
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to its task channel; False if its end is known."""
-        with self._lock:
-            if self._gone:
-                return False
-            self._delivered += 1
-            self._latest.append(seq)
-            self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
-            return True
+        if self._gone:
+            return False
+        self._delivered += 1
+        self._latest.append(seq)
+        self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
+        return True
 
     def lend(self) -> None:
         """Its channel is elsewhere."""
@@ -203,7 +201,6 @@ class RemoteChild:
 
     def end(self, report: ExitReport, crossed: int = 0) -> None:
         """It is gone; the last ``crossed`` packets met the news of that on their way."""
-        with self._lock:
-            self._gone = True
-            missed = list(self._latest)[len(self._latest) - crossed :]
+        self._gone = True
+        missed = list(self._latest)[len(self._latest) - crossed :]
         self.observer.exited(report._replace(unread=(*report.unread, *missed)))
