@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from fiber import config, cpu
 from fiber._hub.absent import absent
-from fiber._runtime import methods
+from fiber._runtime import early, methods
 from fiber.process import Process
 
 if TYPE_CHECKING:
@@ -168,6 +168,7 @@ class BaseContext:
         idle_timeout: float | None = 60.0,
     ) -> Pool:
         """A pool of workers; ``fiber.pool.Pool`` says what the options mean."""
+        early.start_zygote()
         from fiber.pool import Pool
 
         return Pool(

@@ -9,7 +9,6 @@ import multiprocessing.spawn
 import os
 import pickle
 import signal
-import subprocess
 import sys
 import traceback
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
 from fiber._agent.board import Board
+from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import access
 from fiber._hub.access import Access
 from fiber._transport.unix import UnixChannel
@@ -224,14 +224,6 @@ def _exec(start: Start, fds: list[int], board: Board, agent: int) -> None:
         os.execv(executable, interpreter_arguments(executable, statement))
     except OSError as error:
         raise OSError(error.errno, error.strerror, executable) from None
-
-
-def interpreter_arguments(executable: str, statement: str) -> list[str]:
-    """The command line of a fresh interpreter with our flags that can import this package."""
-    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    code = f"import sys; sys.path.insert(0, {root!r}); {statement}"
-    interpreter_flags: list[str] = cast("Any", subprocess)._args_from_interpreter_flags()
-    return [executable, *interpreter_flags, "-c", code]
 
 
 def spawned(plan_fd: int) -> None:

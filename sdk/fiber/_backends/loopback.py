@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 
-from fiber._agent.child import interpreter_arguments
+from fiber._agent.zygote_process import interpreter_arguments
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._hub.hub import Hub

@@ -154,6 +154,7 @@ def _modules_of(process: Any) -> list[str]:
     """What the zygote may import once for all: where class and target live, and our own modules."""
     target = getattr(process, "_target", None)
     names = {type(process).__module__, str(getattr(target, "__module__", ""))}
+    names = {name for name in names if not name.startswith("fiber._runtime.")}  # they stay here
     return sorted(names & sys.modules.keys() - {"__main__"}) + [
         name for name in _OURS if name in sys.modules
     ]

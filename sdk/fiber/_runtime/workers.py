@@ -157,8 +157,11 @@ class PoolProcess(Process):
         self.daemon = True
         self._link = link
 
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_link": None}
+    def __reduce__(self) -> tuple[Any, ...]:
+        # In its own process it is a Process like any other: a worker that had to import this class
+        # would import the whole runtime, and start much later.
+        state = {name: value for name, value in vars(self).items() if name != "_link"}
+        return object.__new__, (Process,), state
 
     def _Popen(self) -> Link:
         assert self._link is not None
