@@ -311,6 +311,13 @@ class TestCurrent:
         config.install(parents)
         assert config.current() == Config(backend="loopback", agents=4)
 
+    def test_a_child_has_its_parents_once_it_asks(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(inherited, "_configuration", None)
+        inherited.keep(pickle.dumps(Config(agents=7)))
+        assert config.current() == Config(agents=7)
+        config.init(agents=8)
+        assert config.current().agents == 8
+
 
 class TestInit:
     def test_sets_and_returns_the_configuration(self) -> None:

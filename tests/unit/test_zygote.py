@@ -435,3 +435,13 @@ def test_the_first_pool_starts_it_before_it_imports_the_rest(backend: str, zygot
     """
     environ = {**os.environ, "FIBER_BACKEND": backend}
     assert int(_run(script, expect=0, env=environ)) == zygotes
+
+
+def test_a_worker_imports_nothing_that_it_does_not_need() -> None:
+    script = """
+        import fiber
+        heavy = {"cloudpickle", "dataclasses", "fiber.config", "fiber._runtime.state", "traceback"}
+        with fiber.Pool(1) as pool:
+            print(pool.apply(eval, (f"{heavy} & __import__('sys').modules.keys()",)))
+    """
+    assert _run(script, expect=0) == "set()\n"

@@ -10,7 +10,6 @@ import os
 import pickle
 import signal
 import sys
-import traceback
 from collections.abc import Iterator
 from multiprocessing import process as mp_process
 from multiprocessing import util
@@ -119,6 +118,8 @@ def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
     try:
         process = _load(start)
     except BaseException:
+        import traceback  # rarely needed, and long to import
+
         traceback.print_exc()
         _report_birth_failure()
         util._flush_std_streams()  # type: ignore[attr-defined]
@@ -206,6 +207,8 @@ def _adopt_stdio(fds: list[int], *, captured: bool) -> None:
 
 def _report_birth_failure() -> None:
     if _task_channel is not None:
+        import traceback
+
         with contextlib.suppress(OSError):
             _task_channel.send(pickle.dumps(("birth", traceback.format_exc())))
 

@@ -25,7 +25,6 @@ import signal
 import socket
 import threading
 import time
-import traceback
 import warnings
 from typing import Any, NoReturn
 
@@ -169,6 +168,8 @@ class Zygote:
             code = child_module.run(start, fds, self._board, self._elders[0])
         except BaseException:
             # The user's own errors do not come here: these are of the system, or Fiber's.
+            import traceback  # rarely needed, and long to import
+
             traceback.print_exc()
         finally:
             os._exit(code)
@@ -249,8 +250,7 @@ def main(control: int, agent: int) -> None:
         # In a container nobody else would reap them: the agent waits for what it started only.
         child_module.adopt_orphans()
     # What every child needs, while the program that started us early is busy with its own imports.
-    import fiber._agent.worker
-    import fiber.config  # noqa: F401
+    import fiber._agent.worker  # noqa: F401
 
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control)
     try:

@@ -31,6 +31,7 @@ def start_early() -> None:
     global _early
     if _early is None:
         _early = _start()
+        atexit.register(discard_early)
 
 
 def launch() -> ZygoteProcess:
@@ -115,4 +116,3 @@ def _forget_early() -> None:
 
 
 os.register_at_fork(after_in_child=_forget_early)
-atexit.register(discard_early)

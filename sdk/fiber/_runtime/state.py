@@ -15,7 +15,7 @@ from multiprocessing import process as mp_process
 from multiprocessing import spawn, util
 from typing import TYPE_CHECKING, Any
 
-from fiber import config, reduction
+from fiber import config, inherited, reduction
 from fiber._agent import child
 from fiber._agent.port import AgentPort, ChildObserver, ChildPort, ChildSpec, ExitReport
 from fiber._hub import access
@@ -103,7 +103,7 @@ class Runtime:
         data["host"] = agent.host
         # What such a process starts itself runs on its own host.
         data["calls"] = [
-            (config.install, (replace(self.config, backend="local"),)),
+            (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (methods.inherit, (methods.chosen, methods.preload)),
         ]
         del data["start_method"]
