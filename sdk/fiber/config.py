@@ -153,7 +153,7 @@ _used = False  # something that is no part of the runtime was built on it, such 
 
 
 def current() -> Config:
-    """The configuration in force, at the first call read from its sources; in a child its parent's."""
+    """The configuration in force: at the first call read from its sources, or a parent's."""
     global _current
     if _current is None:
         with _lock:

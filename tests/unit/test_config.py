@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fiber import agent, config
+from fiber import agent, config, inherited
 from fiber.config import Config, load
 from fiber.errors import ConfigError, FiberError
 
