@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from fiber import config, cpu
 from fiber._hub.unsupported import unsupported
-from fiber._runtime import methods
+from fiber._runtime import early, methods
 from fiber.process import ForkProcess, ForkServerProcess, Process, SpawnProcess
 
 if TYPE_CHECKING:
@@ -150,6 +150,7 @@ class BaseContext:
         idle_timeout: float | None = 60.0,
     ) -> Pool:
         """A pool of workers; ``fiber.pool.Pool`` says what the options mean."""
+        early.start_zygote()
         from fiber.pool import Pool
 
         return Pool(

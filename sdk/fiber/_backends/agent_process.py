@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 
-from fiber._agent.child import interpreter_arguments
+from fiber._agent.zygote_process import interpreter_arguments
 from fiber._transport.credentials import Credentials
 from fiber._transport.loop import Loop
 

@@ -15,7 +15,7 @@ from multiprocessing import process as mp_process
 from multiprocessing import spawn, util
 from typing import TYPE_CHECKING, Any
 
-from fiber import config, reduction
+from fiber import config, inherited, reduction
 from fiber._agent import child
 from fiber._agent.port import AgentPort, ChildObserver, ChildPort, ChildSpec, ExitReport
 from fiber._hub import client as hub_client
@@ -105,7 +105,7 @@ class Runtime:
         data["host"] = agent.host
         # What such a process starts itself runs on its own host.
         data["calls"] = [
-            (config.install, (replace(self.config, backend="local"),)),
+            (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (methods.inherit, (methods.chosen, methods.preload)),
         ]
         del data["start_method"]
@@ -157,6 +157,7 @@ def _modules_of(process: Any) -> list[str]:
     """What the zygote may import once for all: where class and target live, and our own modules."""
     target = getattr(process, "_target", None)
     names = {type(process).__module__, str(getattr(target, "__module__", ""))}
+    names = {name for name in names if not name.startswith("fiber._runtime.")}  # they stay here
     return sorted(names & sys.modules.keys() - {"__main__"}) + [
         name for name in _OURS if name in sys.modules
     ]
