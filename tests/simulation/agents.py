@@ -108,7 +108,7 @@ class Agent:
         """The master knows that ``child`` is gone, or believes so."""
         if not self.lost:
             self._children.remove(child)
-        self.world.oracle.lost(child.worker, was_heard=child.was_heard, reported=not self.lost)
+        self.world.oracle.lost(child.worker)
 
     def _lose(self, cut_number: int) -> None:
         if not self.up.is_cut or cut_number != self._cut_number:
@@ -148,7 +148,6 @@ class Child:
         self.inbox: deque[tuple[int, Any, Sequence[memoryview]]] = deque()
         self.gone = False
         """The master knows, or believes."""
-        self.was_heard = False
         self._observer = observer
         self._unread: dict[int, None] = {}
 
@@ -216,7 +215,6 @@ class Child:
         if self.gone:
             self.agent.world.heard_late(self, message)
         else:
-            self.was_heard = True
             self.agent.world.note("%s says %s", self.name, message)
             self._observer.said(self.agent.world.language.message(message))
 

@@ -1,10 +1,11 @@
-"""The least that a dispatcher does: what the ledger says, followed to the letter, and checked."""
+"""The least that an executor does: what the ledger says, followed to the letter, and checked."""
 
 from __future__ import annotations
 
 import random
 import signal
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from fiber._agent.port import ExitReport
@@ -14,9 +15,15 @@ from fiber._engine.ledger import Ledger
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation
-from simulation.schedule import Act
+from simulation.schedule import Act, Famine, Schedule
 from simulation.workers import Ready, Ref, Results, Unreadable, Work, Worker
 from simulation.world import World
+
+
+def for_ledger(schedule: Schedule) -> Schedule:
+    """Whoever drives it starts workers without a pause, so that there must be some that can."""
+    faults = tuple(fault for fault in schedule.faults if not isinstance(fault, Famine))
+    return replace(schedule, faults=faults)
 
 
 class Plain:
@@ -315,7 +322,7 @@ class LedgerMaster:
     def _scale(self) -> None:
         staying = sum(not member.leaving for member in self._members.values())
         schedule, wanted = self.world.schedule, self._wanted()
-        newcomers = len(self.ledger.homeless()) - self.ledger.starting
+        newcomers = self.ledger.newcomers_wanted() - self.ledger.starting
         if not self._terminated:
             missing = max(wanted - staying, min(newcomers, schedule.max_workers - staying))
             for _ in range(missing):

@@ -1,6 +1,6 @@
 """What must hold: compares what the user sees with what truly happened to each task.
 
-The oracle knows what no dispatcher can know: when each simulated worker began and ended each task.
+The oracle knows what no executor can know: when each simulated worker began and ended each task.
 """
 
 from __future__ import annotations
@@ -17,6 +17,12 @@ if TYPE_CHECKING:
 
 class Violation(AssertionError):
     """A promise was broken."""
+
+
+def require(condition: bool, otherwise: str) -> None:
+    """Violation unless ``condition`` holds."""
+    if not condition:
+        raise Violation(otherwise)
 
 
 class Account:
@@ -53,7 +59,6 @@ class Oracle:
         self.accounts = [Account(number, plan) for number, plan in enumerate(schedule.jobs)]
         self._left = schedule.left
         self._lost: set[Worker] = set()
-        self.stillborn = 0
 
     # What truly happens
 
@@ -76,13 +81,9 @@ class Oracle:
         """How often a task was begun."""
         return len(self.accounts[ref.job].runs[ref.task])
 
-    def lost(self, worker: Worker, *, was_heard: bool, reported: bool) -> None:
-        """The master knows, or believes, that a worker is gone.
-
-        ``was_heard``: it was ready before.  ``reported``: its agent says so.
-        """
+    def lost(self, worker: Worker) -> None:
+        """The master knows, or believes, that a worker is gone."""
         self._lost.add(worker)
-        self.stillborn += reported and not was_heard
         if self._left is not None and worker.units > self._left:
             raise Violation(f"{worker.name} ran {worker.units} units, more than {self._left}")
 

@@ -1,10 +1,10 @@
-"""The dispatcher's own messages, as a worker reads and writes them."""
+"""The executor's own messages, as a worker reads and writes them."""
 
 from __future__ import annotations
 
 import pickle
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from fiber._wire import work
@@ -12,7 +12,23 @@ from fiber._wire.packet import Message
 from simulation.schedule import Act
 from simulation.workers import Broken, Ready, Ref, Results, Unknown, Unreadable, Work, Worker
 
-ERROR = pickle.dumps(ValueError("as planned"))
+
+class PlannedError(ValueError):
+    """What tasks raise; unpickling it is the user's code."""
+
+    unpickled: Callable[[], None] = staticmethod(lambda: None)
+    """Called by that."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _planned_error, ()
+
+
+def _planned_error() -> PlannedError:
+    PlannedError.unpickled()
+    return PlannedError("as planned")
+
+
+ERROR = pickle.dumps(PlannedError())
 
 
 def perform(job: int, index: int) -> int:
@@ -35,7 +51,7 @@ def value_of(ref: Ref) -> int:
 
 
 class Wire:
-    """The dispatcher's own messages, from the worker's side."""
+    """The executor's own messages, from the worker's side."""
 
     def __init__(self, seed: int) -> None:
         self._rng = random.Random(f"{seed} wire")

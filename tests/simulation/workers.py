@@ -114,6 +114,8 @@ class Worker:
     def _initialize(self) -> None:
         if self._still_born:
             self.die(1)
+        elif exitcode := self._world.famine():
+            self.die(exitcode)
         elif self._reach("while it starts"):
             self._awake = True
             self._say(Ready())
