@@ -142,8 +142,7 @@ class Pool:
         """
         self._check_running()
         result = AsyncResult(self)
-        self._executor.call(result, func, args, kwds, self._limit(timeout), blocking=True)
-        return result.get()
+        return self._executor.call_and_wait(result, func, args, kwds, self._limit(timeout))
 
     def apply_async(
         self,
@@ -319,6 +318,7 @@ class Pool:
         item = self._item(work.MAP, func, buffer, options.chunksize(chunksize), timeout)
         if item is None:
             return iterator
+        buffer.resume = partial(executor.resume, item)
         if buffersize is None and isinstance(iterable, (*_SLICEABLE, list)):
             self._submit(item, iterable, chunksize)
             return iterator
@@ -410,7 +410,8 @@ class Pool:
 
     def terminate(self) -> None:
         """End the workers at once.  Whoever waits for a result gets an error."""
-        self._check_owner()
+        if os.getpid() != self._owner:
+            return  # a copy that came here by a fork: nothing of the pool is here to end
         util.debug("terminating pool")
         self._state = TERMINATE
         self._terminate.cancel()

@@ -7,6 +7,7 @@ terminated or cannot go on raises an error instead of waiting for ever.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 import time
 import types
@@ -76,10 +77,14 @@ class ApplyResult:
 
     # What the executor says
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
         """Take the outcome."""
         self._outcome = outcomes[0]
         self._mixed = mixed
+        return False
+
+    def lift_bound(self) -> None:
+        """There is none: whoever wants it wants all of it."""
 
     def set_done(self) -> None:
         """All outcomes are there: call back, then let those go on who wait."""
@@ -148,7 +153,7 @@ class MapResult(ApplyResult):
         self._outcome = []
         self._first: Any = None
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
         """Take outcomes."""
         values = self._outcome
         if start > len(values):
@@ -158,6 +163,7 @@ class MapResult(ApplyResult):
             self._mixed = True
             if self._first is None:
                 self._first = next(filter(is_failure, outcomes), None)
+        return False
 
     def _settle(self) -> None:
         if not self._mixed:
@@ -175,6 +181,11 @@ class MapResult(ApplyResult):
         self._mixed = False
 
 
+HELD = 64 << 20
+"""Bytes of results that an iterator holds for somebody who does not read them.  Then no more tasks
+are begun until half of them are read."""
+
+
 class _Buffer:
     """Results on their way to an iterator: what the executor fills and the iterator empties."""
 
@@ -184,12 +195,47 @@ class _Buffer:
         self.stream: InputStream | None = None
         """What reads no more than is consumed, if that was asked for."""
         self.pool: Owner | None = pool
+        self.resume: Callable[[], None] | None = None
+        """Asks for more results, after ``add_results`` has asked for no more."""
         self._waiters = Waiters()
+        self._bounded = True
+        self._came = 0  # bytes, since it was looked last how many are held
+        self._resume_at = -1  # results that are left then; -1: nothing is held back
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
         """Take outcomes."""
-        self.items.extend(outcomes)
+        self._keep(start, outcomes)
         self._waiters.wake()
+        return self._is_full(outcomes) if mixed else False
+
+    def _keep(self, start: int, outcomes: list[Any]) -> None:
+        self.items.extend(outcomes)
+
+    def _early_results(self) -> list[Any]:
+        return []
+
+    def _is_full(self, outcomes: list[Any]) -> bool:
+        self._came += sum(map(_size, outcomes))
+        if self._came < HELD or not self._bounded or self.resume is None:
+            return False
+        # Noted first: whoever takes results while they are counted asks for more.
+        self._resume_at = len(self.items) // 2
+        self._came = sum(map(_size, [*self.items, *self._early_results()]))
+        if self._came < HELD:
+            self._resume_at = -1
+        return self._came >= HELD
+
+    def lift_bound(self) -> None:
+        """Take all that comes."""
+        self._bounded = False
+
+    def taken(self) -> None:
+        """The user took one."""
+        if self.stream is not None:
+            self.stream.consume()
+        if self._resume_at >= len(self.items) and self.resume is not None:
+            self._resume_at = -1
+            self.resume()
 
     def set_done(self) -> None:
         """All outcomes are there."""
@@ -228,13 +274,15 @@ class _OrderedBuffer(_Buffer):
         self._next = 0
         self._early: dict[int, list[Any]] = {}
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
-        """Take outcomes; pass on what is next in order."""
+    def _keep(self, start: int, outcomes: list[Any]) -> None:
+        """Pass on what is next in order."""
         self._early[start] = outcomes
         while (ready := self._early.pop(self._next, None)) is not None:
             self.items.extend(ready)
             self._next += len(ready)
-        self._waiters.wake()
+
+    def _early_results(self) -> list[Any]:
+        return list(itertools.chain.from_iterable(self._early.values()))
 
 
 class IMapIterator:
@@ -256,8 +304,7 @@ class IMapIterator:
             outcome = buffer.items.popleft()
         except IndexError:
             outcome = buffer.wait(timeout)
-        if buffer.stream is not None:
-            buffer.stream.consume()
+        buffer.taken()
         if type(outcome) is Pickled:
             outcome = outcome.decode()
         if type(outcome) is Failure:
@@ -276,3 +323,10 @@ class IMapUnorderedIterator(IMapIterator):
     """Iterator over the results of ``imap_unordered``, as they come."""
 
     _buffer_type = _Buffer
+
+
+def _size(outcome: Any) -> int:
+    """Bytes that a result holds, if that is worth counting."""
+    if type(outcome) is not Pickled:
+        return 0
+    return len(outcome.data) + sum(buffer.nbytes for buffer in outcome.buffers)

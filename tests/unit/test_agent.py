@@ -17,7 +17,8 @@ import pytest
 import census
 from fiber import reduction
 from fiber._agent import zygote_link
-from fiber._agent.agent import Agent, LocalChild
+from fiber._agent.agent import Agent
+from fiber._agent.local_child import LocalChild
 from fiber._agent.port import ChildSpec
 from fiber._transport.loop import Loop
 from fiber.errors import TooManyOpenFiles
@@ -122,7 +123,7 @@ def test_a_signal_to_one_that_is_gone_is_nothing(shared: Agent) -> None:
     child.signal(signal.SIGKILL)
     child.take_back()
     child.deliver(1, b"nobody reads this")
-    settled(shared._loop)
+    settled(shared.loop)
     assert observer.events == ["started", "exited"]
 
 
@@ -291,7 +292,7 @@ def test_a_zygote_that_cannot_be_launched_is_an_error_of_the_start(
         broken.setattr(zygote_link, "_launch", refuse)
         with pytest.raises(FileNotFoundError, match="no interpreter"):
             begin(own, os._exit, 0, tasks=True, fds=(os.dup(1),))
-    settled(own._loop)
+    settled(own.loop)
     assert len(os.listdir("/proc/self/fd")) == before
     _, observer = begin(own, os._exit, 0)
     assert observer.wait_for_exit().exitcode == 0
@@ -302,12 +303,12 @@ def test_no_descriptor_left_is_a_clear_error_and_leaks_none(shared: Agent, spare
     begin(shared, os._exit, 0)[1].wait_for_exit()  # its zygote runs
     handed = os.dup(1)
     before = len(os.listdir("/proc/self/fd"))
-    slots = len(shared._board._free)
+    slots = len(shared.board._free)
     with few_descriptors(spare), pytest.raises(TooManyOpenFiles, match="ulimit -n"):
         begin(shared, run_forever, tasks=True, fds=(handed,))
-    settled(shared._loop)
+    settled(shared.loop)
     assert len(os.listdir("/proc/self/fd")) == before - 1, "what was handed over is closed"
-    assert len(shared._board._free) >= slots
+    assert len(shared.board._free) >= slots
     _, observer = begin(shared, os._exit, 0)
     assert observer.wait_for_exit().exitcode == 0
 

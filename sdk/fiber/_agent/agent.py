@@ -13,29 +13,18 @@ from __future__ import annotations
 import itertools
 import os
 import signal
-import socket
-import struct
 import threading
-from collections.abc import Sequence
 from typing import Any
 
 from fiber._agent import zygote
 from fiber._agent.board import Board
+from fiber._agent.local_child import LocalChild
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
-from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
+from fiber._agent.zygote_link import ZygoteLink, close_all
 from fiber._hub import access
 from fiber._hub.access import Access
 from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
-from fiber._transport.outbox import Outbox
-from fiber._transport.unix import naming_the_limit, socketpair, wait_readable
-from fiber._wire import packet
-from fiber._wire.packet import BytesLike
-from fiber.errors import TooManyOpenFiles
-
-_SEQ = struct.Struct("<Q")
-_ATTENTION = 5e-3
-"""Seconds that a caller waits for a worker itself before it leaves the answer to the loop."""
 
 
 class Agent:
@@ -43,13 +32,13 @@ class Agent:
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None = None) -> None:
         self.host = host
+        self.loop = loop
+        self.board = Board()
         self._hub = hub
-        self._loop = loop
         self._lock = threading.Lock()
         self._ids = itertools.count(1)
         self._children: dict[int, LocalChild] = {}
         self._forsaken: dict[int, int | None] = {}
-        self._board = Board()
         self._zygotes: list[ZygoteLink] = []
         self._closed = False
 
@@ -62,11 +51,10 @@ class Agent:
             child = LocalChild(self, next(self._ids), spec, observer)
             self._children[child.id] = child
             try:
-                child.zygote = self._zygote()
-                child.zygote.request(child)
+                child.start(self._zygote(), self._access())
             except BaseException:
                 del self._children[child.id]
-                self._loop.call_soon(self._bury, child)
+                self.loop.call_soon(self._bury, child)
                 raise
         return child
 
@@ -77,9 +65,9 @@ class Agent:
             zygotes, self._zygotes = self._zygotes, []
         for link in zygotes:
             link.quit()
-        self._loop.call_soon(self._board.close)
+        self.loop.call_soon(self.board.close)
 
-    def access(self) -> Access | None:
+    def _access(self) -> Access | None:
         """What our children are told of this host's hub."""
         return self._hub.access if self._hub is not None else access.told()
 
@@ -87,7 +75,7 @@ class Agent:
         if not self._zygotes or not preload:
             directory = None if self._hub is None else os.path.dirname(self._hub.access.address)
             self._zygotes.append(
-                ZygoteLink(self, self._loop, self._board.fd, directory, preload=preload)
+                ZygoteLink(self, self.loop, self.board.fd, directory, preload=preload)
             )
         return self._zygotes[-1]
 
@@ -119,7 +107,7 @@ class Agent:
         if answer[0] == zygote.STARTED:
             link.send(zygote.SIGNAL, answer[1], signal.SIGKILL)
         elif (slot := self._forsaken.pop(answer[1], None)) is not None:
-            self._board.release(slot)  # it can no longer write there
+            self.board.release(slot)  # it can no longer write there
 
     def zygote_gone(self, link: ZygoteLink) -> None:
         """A zygote died, and its children with it."""
@@ -140,8 +128,7 @@ class Agent:
                 if self._closed:
                     return  # and the end of its zygote is its own
                 old = child.zygote
-                child.zygote = self._zygote(preload=self._zygotes[-1] is not old)
-                child.zygote.request(child)
+                child.start(self._zygote(preload=self._zygotes[-1] is not old), self._access())
                 deserted = all(other.zygote is not old for other in self._children.values())
         except Exception as error:
             self._gone(child, 1, f"could not be started: {error}")
@@ -162,168 +149,9 @@ class Agent:
         unread = child.hang_up()
         if child.slot is None:
             return unread, None
-        running = self._board.running(child.slot)
-        self._board.release(child.slot)
+        running = self.board.running(child.slot)
+        self.board.release(child.slot)
         return unread, running
-
-
-class LocalChild:
-    """One child of this host; a ``ChildPort``."""
-
-    def __init__(self, agent: Agent, id_: int, spec: ChildSpec, observer: ChildObserver) -> None:
-        self.id = id_
-        self.name = spec.name
-        self.host = agent.host
-        self.pid: int | None = None
-        self.slot: int | None = None
-        self.fault: Exception | None = None
-        self.zygote: ZygoteLink | None = None
-        self.observer = observer
-        self.spec = spec
-        self._fds = spec.fds
-        self._agent = agent
-        self._loop = agent._loop
-        self._ours: socket.socket | None = None
-        self._theirs: socket.socket | None = None
-        self._outbox: Outbox | None = None
-        self._hearing = threading.Lock()
-        try:
-            if spec.tasks:
-                self._open_channel(agent)
-        except BaseException:
-            self.release_descriptors()
-            raise
-
-    def _open_channel(self, agent: Agent) -> None:
-        slot = agent._board.claim()
-        try:
-            ours, theirs = socketpair("starting a pool worker")
-        except BaseException:
-            agent._board.release(slot)
-            raise
-        ours.setblocking(False)
-        self.slot = slot
-        # We keep the child's end too: what it has not read when it dies, or when another worker is
-        # idle, is read from there.  The kernel gives each packet to exactly one reader.
-        self._ours, self._theirs = ours, theirs
-        self._outbox = Outbox(self._loop, ours)
-        self._loop.register(ours.fileno(), self._receive)
-
-    def descriptors(self) -> list[int]:
-        """New descriptors for the child: stdout, stderr, task channel, and those of its handles."""
-        ours = [] if self._theirs is None else [self._theirs.fileno()]
-        fds: list[int] = []
-        try:
-            with naming_the_limit("starting a process"):
-                if self.spec.stdio is None:
-                    fds += map(dup_or_null, (1, 2))
-                fds += map(os.dup, [*(self.spec.stdio or ()), *ours, *self._fds])
-        except BaseException:
-            close_all(fds)
-            raise
-        return fds
-
-    def release_descriptors(self) -> None:
-        """It has its own now: the other end must see EOF when the child lets go."""
-        fds, self._fds = self._fds, ()
-        close_all(fds)
-
-    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
-        """Send a packet to the worker; False if it is gone."""
-        outbox = self._outbox
-        return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
-
-    def attend(self) -> bool:
-        """Wait for its answer in place of the loop."""
-        ours = self._ours
-        if ours is None or self._loop.on_thread() or not self._hearing.acquire(blocking=False):
-            return False
-        try:
-            fd = ours.fileno()
-            if fd < 0:
-                return False
-            self._loop.pause(fd)
-            try:
-                return wait_readable(fd, _ATTENTION) and self._hear()
-            finally:
-                self._loop.resume(fd)
-        finally:
-            self._hearing.release()
-
-    def take_back(self) -> None:
-        """Recall unread packets; answered on the loop."""
-        self._loop.call_soon(self._answer_take_back)
-
-    def signal(self, signum: int) -> None:
-        """Signal the child through its zygote."""
-        if self.zygote is not None:
-            self.zygote.send(zygote.SIGNAL, self.id, signum)
-        if signum == signal.SIGKILL and self.pid is None:
-            self._loop.call_soon(self._agent.forsake, self)
-
-    def condemn(self, fault: Exception) -> None:
-        """Something to or from it is lost for good: only its end can tell the master so."""
-        self.fault = self.fault or fault
-        self.signal(signal.SIGKILL)
-
-    def hang_up(self) -> tuple[int, ...]:
-        """It is gone: hear its last words, recall what it never read.  On the loop."""
-        self.release_descriptors()
-        if self._ours is None or self._theirs is None or self._outbox is None:
-            return ()
-        with self._hearing:
-            while self._hear():
-                pass
-            unread = self._recall()
-            self._loop.unregister(self._ours.fileno())
-            self._outbox.close()
-            self._ours.close()
-            self._theirs.close()
-        return tuple(unread)
-
-    def _answer_take_back(self) -> None:
-        if self._theirs is not None and self._theirs.fileno() >= 0:
-            self.observer.taken_back(self._recall())
-
-    def _receive(self) -> None:
-        # Whoever attends to it already hears it, in order.
-        if self._hearing.acquire(blocking=False):
-            try:
-                self._hear()
-            finally:
-                self._hearing.release()
-
-    def _hear(self) -> bool:
-        assert self._ours is not None
-        try:
-            message = packet.receive(self._ours)
-        except (BlockingIOError, EOFError):
-            return False
-        except TooManyOpenFiles as error:
-            self.condemn(error)
-            return True
-        try:
-            self.observer.said(message)
-        except Exception as error:
-            self.condemn(error)
-            raise
-        return True
-
-    def _recall(self) -> list[int]:
-        assert self._theirs is not None
-        assert self._outbox is not None
-        seqs = []
-        while True:
-            try:
-                message = packet.receive(self._theirs, wait=False)
-            except (BlockingIOError, EOFError):
-                break
-            except TooManyOpenFiles as error:
-                self.condemn(error)
-                continue
-            seqs.append(_SEQ.unpack_from(message.payload)[0])
-            message.release()
-        return seqs + [_SEQ.unpack_from(payload)[0] for payload in self._outbox.recall()]
 
 
 def describe(exitcode: int) -> str:

@@ -56,6 +56,11 @@ class Start(NamedTuple):
     """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
 
 
+def lineage() -> tuple[int, ...]:
+    """This process's pid and those of the processes that it ends with."""
+    return os.getpid(), *elders
+
+
 def task_channel() -> UnixChannel:
     """In a pool worker: the channel that brings tasks and takes results."""
     if _task_channel is None:

@@ -68,6 +68,22 @@ class ChildObserver(Protocol):
         """It is gone, or never came to be.  Exactly once, and last."""
 
 
+class DirectChannel(Protocol):
+    """The task channel of a pool worker, lent to the threads of the master."""
+
+    def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a packet, as ``ChildPort.deliver`` does; OSError, and nothing sent, if it cannot."""
+
+    def receive(self, timeout: float) -> Message | None:
+        """The next packet that it sends; None after ``timeout`` seconds, EOFError at its end.
+
+        OSError: a packet came, and the system had no room for it: the worker will be killed.
+        """
+
+    def close(self) -> None:
+        """Let go of it."""
+
+
 class ChildPort(Protocol):
     """What the master holds of one child.  Any thread; nothing blocks."""
 
@@ -81,12 +97,15 @@ class ChildPort(Protocol):
         False: the child is gone and never saw it, and no report names it among the unread.
         """
 
-    def attend(self) -> bool:
-        """Wait for its answer on the calling thread, for some milliseconds.
+    def lend(self) -> DirectChannel | None:
+        """Its task channel for direct use by one thread at a time, until ``reclaim``.
 
-        True: something came and the observer was told, on this thread.  Where the answer is near
-        this saves waking the loop, and the loop waking the caller.
+        None where it is not on this host.  On the loop's thread; the observer hears nothing that
+        it says until then, but of its end.
         """
+
+    def reclaim(self) -> None:
+        """Hear what it says again.  On the loop's thread."""
 
     def take_back(self) -> None:
         """Recall the packets that it has not read; the observer hears which."""

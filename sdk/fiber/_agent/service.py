@@ -7,8 +7,9 @@ import signal
 from collections.abc import Callable
 from dataclasses import replace
 
-from fiber._agent.agent import Agent, LocalChild
+from fiber._agent.agent import Agent
 from fiber._agent.capture import Capture
+from fiber._agent.local_child import LocalChild
 from fiber._agent.port import ChildSpec, ExitReport
 from fiber._hub.hub import Hub
 from fiber._transport.link import Link

@@ -5,34 +5,45 @@ from __future__ import annotations
 import fcntl
 import os
 import pickle
-import resource
 import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-from fiber._agent import child as child_module
 from fiber._agent import zygote
-from fiber._agent.child import Start, interpreter_arguments
+from fiber._agent.child import Start, interpreter_arguments, lineage
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
 from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire import packet
 
-if TYPE_CHECKING:
-    from fiber._agent.agent import Agent, LocalChild
-
 _QUIT_TIMEOUT = 10.0
+
+
+class ZygoteObserver(Protocol):
+    """Hears what a zygote says; on the loop's thread."""
+
+    def heard(self, link: ZygoteLink, answer: tuple[Any, ...]) -> None:
+        """What became of a child."""
+
+    def zygote_gone(self, link: ZygoteLink) -> None:
+        """The zygote died, and its children with it.  Once, and last."""
 
 
 class ZygoteLink:
     """Our side of one zygote process."""
 
     def __init__(
-        self, agent: Agent, loop: Loop, board: int, heirloom: str | None, *, preload: bool
+        self,
+        observer: ZygoteObserver,
+        loop: Loop,
+        board: int,
+        heirloom: str | None,
+        *,
+        preload: bool,
     ) -> None:
-        self._agent = agent
+        self._observer = observer
         self._loop = loop
         self._gone = threading.Event()
         self._answered = False
@@ -49,25 +60,12 @@ class ZygoteLink:
         self._outbox = Outbox(loop, self._sock)
         loop.register(self._sock.fileno(), self._receive)
 
-    def request(self, child: LocalChild) -> None:
-        """Ask for a child."""
-        spec = child.spec
-        fds = child.descriptors()
+    def start(self, child: int, request: Start, fds: list[int]) -> None:
+        """Ask for a child that gets ``fds``, which are this object's from now on."""
         while len(fds) > packet.MAX_DESCRIPTORS:
             some, fds = fds[: packet.MAX_DESCRIPTORS], fds[packet.MAX_DESCRIPTORS :]
-            self._outbox.send(pickle.dumps((zygote.DESCRIPTORS, child.id)), fds=some)
-        start = Start(
-            spec.method,
-            spec.preparation,
-            spec.payload,
-            child.slot,
-            spec.executable,
-            captured=spec.stdio is not None,
-            open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
-            hub=self._agent.access(),
-            elders=_elders(),
-        )
-        self._outbox.send(pickle.dumps((zygote.START, child.id, tuple(start)), protocol=5), fds=fds)
+            self._outbox.send(pickle.dumps((zygote.DESCRIPTORS, child)), fds=some)
+        self._outbox.send(pickle.dumps((zygote.START, child, tuple(request)), protocol=5), fds=fds)
 
     def send(self, *request: Any) -> None:
         """Ask for something else."""
@@ -99,15 +97,11 @@ class ZygoteLink:
             self._outbox.close()
             self._sock.close()
             self._process.wait()
-            self._agent.zygote_gone(self)
+            self._observer.zygote_gone(self)
             self._gone.set()
             return
         self._answered = True
-        self._agent.heard(self, answer)
-
-
-def _elders() -> tuple[int, ...]:
-    return os.getpid(), *child_module.elders
+        self._observer.heard(self, answer)
 
 
 def _launch(
@@ -116,7 +110,7 @@ def _launch(
     # A program that closed its standard streams may have their numbers under ours; the zygote and
     # its children must not.
     fds = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 3) for fd in (control, board)]
-    arguments = f"{fds[0]}, {fds[1]}, {_elders()}, {preload}, {heirloom!r}"
+    arguments = f"{fds[0]}, {fds[1]}, {lineage()}, {preload}, {heirloom!r}"
     try:
         return subprocess.Popen(
             interpreter_arguments(

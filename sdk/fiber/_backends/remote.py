@@ -163,9 +163,11 @@ class RemoteChild:
             self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
             return True
 
-    def attend(self) -> bool:
-        """Its answer is never near."""
-        return False
+    def lend(self) -> None:
+        """Its channel is elsewhere."""
+
+    def reclaim(self) -> None:
+        """It is never lent."""
 
     def take_back(self) -> None:
         """Recall unread packets."""

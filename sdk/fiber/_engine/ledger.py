@@ -144,7 +144,7 @@ class Ledger:
         return holders
 
     def pause(self, job: Job, paused: bool) -> None:
-        """Give out none of its tasks, or go on with them."""
+        """Give out none of its tasks but those that come back, or go on with all."""
         job.paused = paused
         if not paused and job.waiting:
             self._list(job)
@@ -238,14 +238,14 @@ class Ledger:
         passed = 0
         while passed < len(turns) and passed <= min(len(self._load.single), LOOKAHEAD):
             job = turns[passed]
-            waits = bool(job.waiting) and not job.paused
+            waits = job.has_next
             worker = self._worker_for(job, passed) if waits else None
             if worker is None and waits:
                 passed += 1  # it keeps its place, and a worker from being given more
                 continue
             del turns[passed]
             batch = self._cut(job, worker, now) if worker is not None else None
-            job.listed = bool(job.waiting) and not job.paused
+            job.listed = job.has_next
             if job.listed:
                 turns.append(job)
             if batch is not None:
@@ -300,6 +300,7 @@ class Ledger:
         self.batches[batch.seq] = batch
         if batch.job is not None:
             batch.job.batches[batch] = None
+            batch.job.reached = max(batch.job.reached, batch.stop)
         if not worker.queue:
             worker.since = now
         worker.queue.append(batch)
@@ -474,7 +475,7 @@ class Ledger:
 
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for the batch that they have not read, since others have nothing to do."""
-        if any(job.waiting for job in self._turns):
+        if any(job.has_next for job in self._turns):
             return []
         return self._load.recall(now)
 
@@ -545,7 +546,7 @@ class Ledger:
         self._list(job)
 
     def _list(self, job: Job) -> None:
-        if not job.listed and not job.paused:
+        if not job.listed:
             job.listed = True
             self._turns.append(job)
 

@@ -90,6 +90,11 @@ class Waiting:
         for stock in self._stocks:
             yield from stock.items[stock.position :]
 
+    def first(self) -> int:
+        """The index of the next task."""
+        stock = self._stocks[0]
+        return stock.start + stock.position
+
     def first_alone(self) -> bool:
         """The next task travels alone."""
         return self._stocks[0].alone

@@ -25,6 +25,7 @@ class Job:
         "pace",
         "paused",
         "pins",
+        "reached",
         "retries",
         "unit",
         "waiting",
@@ -46,6 +47,7 @@ class Job:
         self.fed = 0
         self.done = 0
         self.closed = False
+        self.reached = 0  # the index behind the last task that was given out
         self.listed = False  # whether it is in the ledger's round of turns
         self.paused = False  # whether its tasks wait until somebody takes results of it
 
@@ -53,6 +55,12 @@ class Job:
     def target(self) -> float:
         """Seconds of work that a message of it should carry."""
         return PROMPT if self.exact else TARGET
+
+    @property
+    def has_next(self) -> bool:
+        """Whether a task of it may be given out."""
+        waiting = self.waiting
+        return bool(waiting) and not (self.paused and waiting.first() >= self.reached)
 
     @property
     def finished(self) -> bool:

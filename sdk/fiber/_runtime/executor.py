@@ -2,13 +2,14 @@
 
 ::
 
-    any thread          the loop's thread                                   worker
-    call, submit, … ──► take in ─► Scheduler.decide ─► _act ─► encode ─► pack ──► run
-                           ▲                             │       ▲                 │
-                           │      the background thread ─┴───────┘ (user's code)   │
-                           └──────── on_message ◄──────────────────────────────────┘
-                                         │
-                                         └─► Future.add_results, set_done
+    any thread           the loop's thread                                     worker
+    call, submit, … ───► Jobs ──► Scheduler.decide ──► _act ──► Sender ───────► run
+                          ▲                                       │ ▲            │
+                          │                  background thread ◄──┘ │            │
+                          │                  (the user's picklers) ─┘            │
+                          └─────────── on_message ◄──────────────────────────────┘
+                          │
+                          └──► Future.add_results, set_done
 
 Everything that changes happens on the loop's thread, one thing at a time: no lock guards it.  Who
 asks for something, in whatever thread, finalizer or signal handler, puts it into the loop's queue
@@ -22,40 +23,31 @@ from __future__ import annotations
 import itertools
 import math
 import pickle
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 from fiber import reduction
 from fiber._agent import worker
-from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
-from fiber._engine.chunks import FLOOR, Pace
-from fiber._engine.ledger import Batch, Job, Loss, Receipt
+from fiber._agent.port import UNKNOWN, ExitReport
+from fiber._engine.chunks import FLOOR
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import StartFailure
 from fiber._runtime.background import BackgroundThread
+from fiber._runtime.host import Host, Loop, Timer
 from fiber._runtime.input_stream import InputStream
+from fiber._runtime.jobs import Jobs
 from fiber._runtime.latch import Latch
+from fiber._runtime.leases import ADOPTED, UNAVAILABLE, Leases
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.outcome import Failure, Pickled, outcomes
-from fiber._runtime.work_items import (
-    Call,
-    Encoded,
-    Function,
-    Future,
-    WorkItem,
-    blame_items,
-    encode,
-    name_of,
-    pack,
-    pickle_call,
-    pickles_without_user_code,
-)
+from fiber._runtime.outcome import Failure, Pickled, decode, outcomes
+from fiber._runtime.sender import Sender
+from fiber._runtime.work_items import Call, Function, Future, WorkItem, name_of, pickle_call
 from fiber._runtime.worker_handle import PoolProcess, WorkerHandle
-from fiber._transport.loop import Timer
 from fiber._wire import work
 from fiber._wire.packet import Message
-from fiber.errors import FiberError, TimeoutError, WorkerDied
+from fiber.errors import FiberError
 
 FUNCTIONS = 128
 """Functions that are recognized when they come again."""
@@ -70,33 +62,11 @@ TICK = 1e-4
 """Seconds that any timer waits: less, by a rounding error, would be too early again and again."""
 
 
-class Loop(Protocol):
-    """What an executor needs of ``fiber._transport.loop.Loop``."""
+class Waitable(Future, Protocol):
+    """A future to wait for."""
 
-    def now(self) -> float:
-        """Monotonic seconds."""
-
-    def on_thread(self) -> bool:
-        """Whether the caller is the loop's own thread."""
-
-    def depend(self, dependent: Any) -> None:
-        """Tell ``dependent`` if the loop fails."""
-
-    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
-        """Call it on the loop's thread; from anywhere."""
-
-    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
-        """Call it once, later."""
-
-
-class Host(Protocol):
-    """What an executor needs of the runtime."""
-
-    loop: Any
-    config: Any
-
-    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildPort:
-        """Start a worker's process."""
+    def get(self) -> Any:
+        """Wait for the result, or the exception."""
 
 
 class Executor:
@@ -124,18 +94,31 @@ class Executor:
             idle_timeout=options.idle_timeout,
         )
         self._ledger = self._scheduler.ledger
+        self._jobs = Jobs(self._ledger, options.retries, retry=bool(options.retryable))
+        self._sender = Sender(
+            self._loop,
+            self._background,
+            self._ledger,
+            self._jobs,
+            advance=self._advance,
+            on_timeout=self._timed_out,
+        )
+        self._leases = Leases(
+            self._scheduler, self._loop, on_adopted=self._adopt, on_back=self._back
+        )
+        self._lends = options.max_tasks is None and not options.retryable
+        self._exits: dict[WorkerHandle, ExitReport] = {}
+        """Ends of workers that callers are using."""
         self._functions: dict[bytes, Function] = {}
         self._function_ids = itertools.count(1)
         self._calls = WorkItem(work.CALLS, exact=True)
-        self._open(self._calls)
+        self._jobs.open(self._calls)
         self._called: deque[Call] = deque()
         self._took_calls = -math.inf
-        self._unsent: set[int] = set()
-        """Batches that are assigned and not sent: nobody can have run them."""
-        self._streams: set[WorkItem] = set()
-        self._deadlines: dict[int, Timer] = {}
         self._wake: Timer | None = None
         self._kill: Timer | None = None
+        self._ended_by: BaseException | None = None
+        """What those hear whose calls are not done when the pool is terminated."""
         self._acting = False
         self._again = False
 
@@ -163,22 +146,48 @@ class Executor:
         args: Iterable[Any],
         kwargs: Mapping[str, Any],
         timeout: float | None = None,
-        *,
-        blocking: bool = False,
     ) -> None:
-        """One call of a function.  ``blocking``: this thread will do nothing but wait for it."""
+        """One call of a function."""
         call = pickle_call(future, function, args, kwargs)
         if call is None:
             return
         self._check()
-        call.blocking = blocking
-        if not blocking:
-            call.copy_buffers()
+        call.copy_buffers()
+        self._enqueue(call, timeout)
+
+    def call_and_wait(
+        self,
+        future: Waitable,
+        function: Callable[..., Any],
+        args: Iterable[Any],
+        kwargs: Mapping[str, Any],
+        timeout: float | None = None,
+    ) -> Any:
+        """The result of one call, which this thread waits for, or its exception."""
+        call = pickle_call(future, function, args, kwargs)
+        if call is None:
+            return future.get()
+        self._check()
+        outcome = UNAVAILABLE
+        if timeout is None and self._lends:
+            call.blocking = True
+            outcome = self._leases.run(call)
+        if outcome is UNAVAILABLE:
+            self._enqueue(call, timeout)
+        elif outcome is not ADOPTED:
+            outcome = decode(outcome)
+            if type(outcome) is Failure:
+                raise outcome.error
+            return outcome
+        return future.get()
+
+    def _enqueue(self, call: Call, timeout: float | None) -> None:
         if timeout is None:
             self._called.append(call)
             self._loop.call_soon(self._take_calls)
         else:
-            self._loop.call_soon(self._take, WorkItem(work.CALLS, timeout=timeout), (call,))
+            item = WorkItem(work.CALLS, timeout=timeout)
+            self._loop.call_soon(self._take, item, (call,))
 
     def broadcast(self, future: Future, function: Callable[..., Any], args: Sequence[Any]) -> None:
         """The same call on every worker, present or starting; an outcome of each."""
@@ -232,6 +241,10 @@ class Executor:
         """
         self._loop.call_soon(self._cancel, item)
 
+    def resume(self, item: WorkItem) -> None:
+        """Results of it are read again, after its future had asked for no more."""
+        self._loop.call_soon(self._resume, item)
+
     def close(self) -> None:
         """Take no more requests; the workers leave once those that are there are done."""
         self._loop.call_soon(self._close)
@@ -269,33 +282,18 @@ class Executor:
 
     # Requests.  From here on all happens on the loop's thread.
 
-    def _open(self, item: WorkItem) -> None:
-        function = item.function
-        pace = Pace(function.pace if function is not None else None)
-        if function is not None:
-            function.pace = pace
-        item.job = self._ledger.open(
-            item,
-            pace=pace,
-            retries=self.options.retries,
-            unit=item.unit,
-            alone=item.timeout is not None,
-            exact=item.exact,
-        )
-
     def _take_calls(self) -> None:
         """Calls have come.  Of many short ones in a row, several travel together.
 
         Each would else wake a worker, which costs more than the call.
         """
         called, job = self._called, self._calls.job
-        if not called:
-            return
         calls = [called.popleft() for _ in range(len(called))]
         refusal = self._refusal()
-        if refusal is not None or job is None:
+        if refusal is not None:
             for call in calls:
-                call.future.set_exception(refusal or ValueError("Pool not running"))
+                call.future.set_exception(refusal)
+        if not calls or refusal is not None or job is None:
             return
         now = self._loop.now()
         hurried = now - self._took_calls < FLOOR and job.pace.short
@@ -315,74 +313,41 @@ class Executor:
                 item.stream.end()
             future = item.future or (tasks or ())[0].future
             future.set_exception(refusal)
-            return
-        self._open(item)
-        assert item.job is not None
-        if tasks is None:
-            self._streams.add(item)
-            self._top_up(item)
+        elif tasks is None:
+            self._jobs.open_stream(item)
         else:
-            self._ledger.feed(item.job, tasks)
-            self._ledger.close(item.job)
-            self._check_finished(item.job)
+            self._jobs.run(item, tasks)
         self._advance()
 
     def _broadcast(self, item: WorkItem, call: Call) -> None:
-        assert item.future is not None
         refusal = self._refusal()
-        if refusal is not None:
+        if refusal is None:
+            self._scheduler.pin_everywhere(self._jobs.open(item), call)
+            self._jobs.close(item)
+        elif item.future is not None:
             item.future.set_exception(refusal)
-            return
-        self._open(item)
-        assert item.job is not None
-        self._scheduler.pin_everywhere(item.job, call)
-        self._ledger.close(item.job)
-        self._check_finished(item.job)
         self._advance()
 
     def _refill(self, item: WorkItem) -> None:
         """A stream has input, or room."""
-        if item in self._streams:
-            self._top_up(item)
-            self._advance()
-
-    def _top_up(self, item: WorkItem) -> bool:
-        """Take from a stream what was read, and let it read on; whether there was something."""
-        stream, job, ledger = item.stream, item.job, self._ledger
-        assert stream is not None
-        assert job is not None
-        tasks = stream.take()
-        if not tasks and not job.waiting:
-            stream.await_input()
-            tasks = stream.take()
-        ledger.feed(job, tasks)
-        stream.grant(len(job.waiting), len(ledger.workers), job.pace, job.target)
-        return bool(tasks)
+        self._jobs.top_up(item)
+        self._advance()
 
     def _finish(self, item: WorkItem, error: BaseException | None) -> None:
-        job = item.job
-        if item not in self._streams or item.stream is None or job is None:
-            return  # failed or cancelled meanwhile
-        self._ledger.feed(job, item.stream.take())
-        if error is not None and item.future is not None:
-            item.future.add_results(job.fed, [Failure(error)], True)
-        self._ledger.close(job)
-        self._check_finished(job)
-        self._streams.discard(item)
+        self._jobs.end_stream(item, error)
         self._advance()
 
     def _cancel(self, item: WorkItem) -> None:
-        if item.job is not None and item.job.owner is item:
-            for held in self._ledger.cancel(item.job):
-                held.key.port.take_back()
-            self._over(item)
-            self._advance()
+        for held in self._jobs.cancel(item):
+            held.key.port.take_back()
+        self._advance()
+
+    def _resume(self, item: WorkItem) -> None:
+        self._jobs.resume(item)
+        self._advance()
 
     def _lift_limits(self) -> None:
-        for item in self._streams:
-            if item.stream is not None:
-                item.stream.lift_limit()
-                self._top_up(item)
+        self._jobs.lift_limits()
         self._advance()
 
     # What follows
@@ -396,6 +361,8 @@ class Executor:
         try:
             while True:
                 self._again = False
+                if self._scheduler.needs_lent():
+                    self._leases.recall()
                 self._act(self._scheduler.decide(self._loop.now()))
                 if not self._again:
                     return
@@ -404,7 +371,7 @@ class Executor:
 
     def _act(self, decisions: Decisions) -> None:
         for job, error in decisions.failed:
-            self._fail(job, error)
+            self._jobs.fail(job, error)
         handle: Any
         for handle in decisions.end:
             handle.terminate()
@@ -415,11 +382,13 @@ class Executor:
         if decisions.start:
             self._start_workers(decisions.start)
         for batch in decisions.assign:
-            self._send(batch)
-        if self._streams and decisions.assign:
-            given = {batch.job.owner for batch in decisions.assign if batch.job is not None}
-            for item in given & self._streams:
-                self._again |= self._top_up(item)
+            if batch.job is not None:
+                self._sender.send(batch)
+            else:  # it failed just now
+                self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
+                self._again = True
+        given = (batch.job.owner for batch in decisions.assign if batch.job is not None)
+        self._again |= self._jobs.top_up_all(given)
         if decisions.wake_at < math.inf:
             self._wake_at(decisions.wake_at)
         if decisions.over:
@@ -438,87 +407,7 @@ class Executor:
         self._wake = None
         self._advance()
 
-    def _end(self) -> None:
-        """Nobody is left."""
-        if self.ended.is_set():
-            return
-        for timer in (self._wake, self._kill, *self._deadlines.values()):
-            if timer is not None:
-                timer.cancel()
-        self._deadlines.clear()
-        self._background.stop()
-        self.callbacks.stop()
-        self.ended.set()
-
-    # Giving
-
-    def _send(self, batch: Batch) -> None:
-        """Send a batch, or have it encoded where the user's code may run."""
-        assert batch.job is not None
-        item: WorkItem = batch.job.owner
-        if not pickles_without_user_code(item, batch):
-            self._unsent.add(batch.seq)
-            self._background.submit(self._encode, item, batch)
-            return
-        try:
-            encoded = encode(item, batch, plain=True)
-        except Exception as error:  # no memory
-            self._unsendable(item, batch, error)
-        else:
-            self._deliver(item, batch, encoded)
-
-    def _encode(self, item: WorkItem, batch: Batch) -> None:
-        """On the background thread: pickle what may run the user's code."""
-        encoded: Encoded | None = None
-        error: BaseException | None = None
-        if batch.job is not None:
-            try:
-                encoded = encode(item, batch, plain=False)
-            except Exception as raised:
-                error = blame_items(item, batch, raised)
-            except BaseException as raised:  # whatever the user's pickler raises is its own
-                error = raised
-        self._loop.call_soon(self._encoded, item, batch, encoded, error)
-
-    def _encoded(
-        self, item: WorkItem, batch: Batch, encoded: Encoded | None, error: BaseException | None
-    ) -> None:
-        if self._ledger.batches.get(batch.seq) is not batch:
-            return  # its worker is gone
-        if batch.job is None:
-            self._unsent.discard(batch.seq)
-            self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
-        elif encoded is None:
-            assert error is not None
-            self._unsendable(item, batch, error)
-        else:
-            self._deliver(item, batch, encoded)
-        self._advance()
-
-    def _deliver(self, item: WorkItem, batch: Batch, encoded: Encoded) -> None:
-        handle: WorkerHandle = batch.worker.key
-        assert handle.port is not None
-        seq = batch.seq
-        if item.timeout is not None:
-            self._deadlines[seq] = self._loop.call_later(item.timeout, self._expired, seq)
-        try:
-            taken = handle.port.deliver(seq, *pack(item, batch, encoded, handle.known))
-        except Exception as error:  # the system has no memory or descriptor for it
-            self._unsendable(item, batch, error)
-            return
-        if taken:
-            self._unsent.discard(seq)
-        else:
-            self._unsent.add(seq)  # its worker is gone, as ``on_exit`` is about to hear
-
-    def _unsendable(self, item: WorkItem, batch: Batch, error: BaseException) -> None:
-        """This concerns the tasks of this batch only."""
-        self._unsent.discard(batch.seq)
-        self._cancel_deadline(batch.seq)
-        self._split(batch.seq, Failure(error))
-        self._advance()
-
-    # Taking
+    # What workers say
 
     def on_message(self, handle: WorkerHandle, message: Message) -> None:
         """A packet from a worker."""
@@ -544,76 +433,33 @@ class Executor:
             seq, offset, len(results), self._loop.now(), seconds=seconds, kept=kept
         )
         self._scheduler.workers.did_something()
+        self._sender.settled(seq)
         if receipt is not None:
-            if odd and self.options.retryable:
-                self._put_or_retry(receipt, results)
-            else:
-                self._put(receipt, results, mixed=bool(odd))
-            self._check_finished(receipt.job)
-        if self._deadlines:
-            self._cancel_deadline(seq)
+            item: WorkItem = receipt.job.owner
+            if self._lends and item.future is None and receipt.item(receipt.start).blocking:
+                # First: who waited for it may call again at once.
+                self._leases.offer(receipt.batch.worker.key)
+            self._jobs.put(receipt, results, mixed=bool(odd))
         self._advance()
-
-    def _put(self, receipt: Receipt, results: list[Any], *, mixed: bool = True) -> None:
-        """Hand results on."""
-        item: WorkItem = receipt.job.owner
-        if item.future is not None:
-            item.future.add_results(receipt.start, results, mixed)
-            return
-        for task, outcome in enumerate(results, receipt.start):
-            future = receipt.item(task).future
-            future.add_results(0, [outcome], mixed)
-            future.set_done()
-
-    def _put_or_retry(self, receipt: Receipt, results: list[Any]) -> None:
-        """Hand results on but those whose tasks get another try."""
-        start = receipt.start
-        for at, result in enumerate(results):
-            again = type(result) is Pickled and result.kind == work.AGAIN
-            if not (again and self._ledger.retry(receipt, start + at)):
-                self._put(receipt._replace(start=start + at), [result])
-
-    def _check_finished(self, job: Job) -> None:
-        if job.finished and job.owner is not None:
-            item: WorkItem = job.owner
-            self._over(item)
-            if item.future is not None:
-                item.future.set_done()
-
-    def _over(self, item: WorkItem) -> None:
-        """Its job is finished, or nobody wants the rest."""
-        if item in self._streams and item.stream is not None:
-            self._streams.discard(item)
-            item.stream.end()
-        if item.job is not None:
-            item.job.owner = None
-        item.grants.clear()
 
     def _unreadable(self, kind: str, seq: int, error: Pickled) -> None:
         """A worker cannot unpickle a batch, or its function: then no task of its job can run."""
         batch = self._ledger.batches.get(seq)
-        self._cancel_deadline(seq)
+        self._sender.settled(seq)
         if kind == work.UNREADABLE:
-            self._split(seq, error)
+            self._sender.split(seq, error)
         elif batch is not None:
             if batch.job is not None:
-                self._fail(batch.job, error.decode().error)
+                self._jobs.fail(batch.job, error.decode().error)
             self._ledger.put_back(batch.worker, (seq,), self._loop.now())
         self._advance()
-
-    def _split(self, seq: int, failure: Any) -> None:
-        """Send the tasks of a batch one by one; of a single one, that is its outcome."""
-        receipt = self._ledger.split(seq, self._loop.now())
-        if receipt is not None:
-            self._put(receipt, [failure])
-            self._check_finished(receipt.job)
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
         """A worker will never see these batches."""
         if handle.worker is None:
             return
         for seq in seqs:
-            self._cancel_deadline(seq)
+            self._sender.settled(seq)
             batch = self._ledger.batches.get(seq)
             if batch is not None and batch.job is not None:
                 function = batch.job.owner.function
@@ -622,32 +468,36 @@ class Executor:
         self._ledger.put_back(handle.worker, seqs, self._loop.now())
         self._advance()
 
-    # Deadlines
-
-    def _expired(self, seq: int) -> None:
+    def _timed_out(self, seq: int) -> None:
         """A task had its time."""
         batch = self._ledger.batches.get(seq)
-        if self._deadlines.pop(seq, None) is None or batch is None:
+        if batch is None:
             return
         handle: WorkerHandle = batch.worker.key
         receipt = self._ledger.expire(seq)
         if receipt is not None:
-            item: WorkItem = receipt.job.owner
-            name = item.task_name(receipt.start, receipt.item(receipt.start))
-            error = TimeoutError(
-                f"{name} took longer than its timeout of {item.timeout:g} s; "
-                f"its worker {handle.name!r} was killed"
-            )
-            self._put(receipt, [Failure(error)])
-            self._check_finished(receipt.job)
+            self._jobs.put_timeout(receipt, handle.name)
         self._scheduler.let_go(handle)
         handle.kill()
         self._advance()
 
-    def _cancel_deadline(self, seq: int) -> None:
-        timer = self._deadlines.pop(seq, None)
-        if timer is not None:
-            timer.cancel()
+    def _adopt(self, handle: WorkerHandle, seq: int, call: Call) -> None:
+        """A caller sent this worker a call, and leaves the answer to us."""
+        item = WorkItem(work.CALLS, exact=True)
+        job = self._jobs.open(item)
+        assert handle.worker is not None
+        self._scheduler.return_busy(handle.worker, seq, job, call, self._loop.now())
+        self._jobs.close(item)
+        if self._ended_by is not None:
+            self._jobs.fail(job, self._ended_by)
+
+    def _back(self, handle: WorkerHandle) -> None:
+        """A worker is not lent any more."""
+        report = self._exits.pop(handle, None)
+        if report is not None:
+            self.on_exit(handle, report)
+        else:
+            self._advance()
 
     # Workers come and go
 
@@ -708,6 +558,10 @@ class Executor:
 
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
         """A worker is gone, with or without having been told to."""
+        lent = handle.worker is not None and handle.worker.lent
+        if lent and not self._leases.recall_one(handle):
+            self._exits[handle] = report  # whoever uses it notices, and brings it back
+            return
         failure = None
         if not report.reason.startswith("agent "):  # a lost host says nothing of the worker
             text = handle.complaint or "\n".join(report.log)
@@ -721,70 +575,35 @@ class Executor:
         self, handle: WorkerHandle, failure: StartFailure | None, report: ExitReport | None = None
     ) -> None:
         now = self._loop.now()
-        held = [batch.seq for batch in handle.worker.queue] if handle.worker is not None else []
-        unread = self._unsent.intersection(held)
-        self._unsent.difference_update(held)
+        unread: set[int] = set()
         running = None
+        if handle.worker is not None:
+            unread = self._sender.lost(handle.worker)
         if report is not None:
             unread.update(report.unread)
             running = report.running
-        for seq in held:
-            self._cancel_deadline(seq)
+            if running is not None:
+                unread.discard(running[0])
         losses = self._scheduler.gone(handle, now, unread=unread, running=running, failure=failure)
         if report is not None:
-            for loss in losses:
-                self._put_loss(loss, handle, report)
-            for job in {loss.job for loss in losses}:
-                self._check_finished(job)
+            self._jobs.put_losses(losses, handle.name, handle.pid, report)
         if failure is not None and (news := self._scheduler.workers.news(failure, now)):
             self._background.submit(_say, news)
 
-    def _put_loss(self, loss: Loss, handle: WorkerHandle, report: ExitReport) -> None:
-        item: WorkItem = loss.job.owner
-        error = WorkerDied(
-            task=item.task_name(loss.task, loss.item),
-            worker=handle.name,
-            host=report.host,
-            pid=handle.pid,
-            exitcode=report.exitcode,
-            reason=report.reason,
-            log=report.log,
-            attempts=loss.attempts,
-        )
-        if item.future is not None:
-            item.future.add_results(loss.task, [Failure(error)], True)
-        else:
-            loss.item.future.add_results(0, [Failure(error)], True)
-            loss.item.future.set_done()
-
     # The end
-
-    def _fail(self, job: Job, error: BaseException) -> None:
-        """Nothing that is not done of a job will be."""
-        item: WorkItem | None = job.owner
-        if item is None:
-            return
-        if item.future is not None:
-            item.future.set_exception(error)
-        else:
-            for call in self._ledger.unfinished(job):
-                call.future.set_exception(error)
-        self._ledger.cancel(job)
-        self._over(item)
 
     def _close(self) -> None:
         self._take_calls()
         self._scheduler.close()
-        if self._calls.job is not None and self._calls.job.owner is not None:
-            self._ledger.close(self._calls.job)
-            self._check_finished(self._calls.job)
+        self._jobs.close(self._calls)
         self._advance()
 
     def _terminate(self, error: BaseException) -> None:
         self._take_calls()
+        self._ended_by = error
         self.callbacks.stop()
         for job in list(self._ledger.jobs):
-            self._fail(job, error)
+            self._jobs.fail(job, error)
         handles: list[Any] = list(self._scheduler.terminate())
         for handle in handles:
             handle.terminate()
@@ -801,6 +620,19 @@ class Executor:
             handle.kill()
             handle.exited(ExitReport(UNKNOWN, str(error)))
 
+    def _end(self) -> None:
+        """Nobody is left."""
+        if self.ended.is_set():
+            return
+        for timer in (self._wake, self._kill):
+            if timer is not None:
+                timer.cancel()
+        self._sender.close()
+        self._leases.close()
+        self._background.stop()
+        self.callbacks.stop()
+        self.ended.set()
+
 
 def _kill_all(handles: list[WorkerHandle]) -> None:
     for handle in handles:
@@ -809,6 +641,4 @@ def _kill_all(handles: list[WorkerHandle]) -> None:
 
 def _say(news: str) -> None:
     """On the background thread: a slow terminal must not hold up the loop."""
-    import sys
-
     print(f"fiber: {news}", file=sys.stderr, flush=True)

@@ -22,11 +22,15 @@ from fiber._wire import work
 class Future(Protocol):
     """Where the outcomes of a work item, or of one call, go.  Called on the loop's thread."""
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
         """Outcomes of the tasks from ``start`` on.  Each task's comes once, in any order.
 
-        Unless ``mixed`` they are all plain values.
+        Unless ``mixed`` they are all plain values.  True asks for no more than must be, since
+        nobody reads them: until it says otherwise, by what it was given for that.
         """
+
+    def lift_bound(self) -> None:
+        """Take all that comes: whoever would read them waits for the rest."""
 
     def set_done(self) -> None:
         """All tasks have theirs."""

@@ -1,0 +1,250 @@
+"""One child of this host, as its agent holds it: its channel, its signals, its end.
+
+``deliver``, ``take_back`` and ``signal`` come from any thread and only append to outboxes; what
+arrives is handled on the loop's thread, or by whoever uses its channel directly.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import select
+import signal
+import socket
+import struct
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from fiber._agent import zygote
+from fiber._agent.board import Board
+from fiber._agent.child import Start, lineage
+from fiber._agent.port import ChildObserver, ChildSpec
+from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
+from fiber._hub.access import Access
+from fiber._transport.loop import Loop
+from fiber._transport.outbox import Outbox
+from fiber._transport.unix import naming_the_limit, socketpair
+from fiber._wire import packet
+from fiber._wire.packet import BytesLike, Message
+from fiber.errors import TooManyOpenFiles
+
+_SEQ = struct.Struct("<Q")
+
+
+class Owner(Protocol):
+    """What a child needs of the agent that runs it."""
+
+    host: str
+    loop: Loop
+    board: Board
+
+    def forsake(self, child: LocalChild) -> None:
+        """It was killed before it was born.  On the loop's thread."""
+
+
+class LocalChild:
+    """One child of this host; a ``ChildPort``."""
+
+    def __init__(self, owner: Owner, id_: int, spec: ChildSpec, observer: ChildObserver) -> None:
+        self.id = id_
+        self.name = spec.name
+        self.host = owner.host
+        self.pid: int | None = None
+        self.slot: int | None = None
+        self.fault: Exception | None = None
+        self.zygote: ZygoteLink | None = None
+        self.observer = observer
+        self._spec = spec
+        self._fds = spec.fds
+        self._owner = owner
+        self._loop = owner.loop
+        self._ours: socket.socket | None = None
+        self._theirs: socket.socket | None = None
+        self._outbox: Outbox | None = None
+        self._lent = False
+        try:
+            if spec.tasks:
+                self._open_channel()
+        except BaseException:
+            self.release_descriptors()
+            raise
+
+    def _open_channel(self) -> None:
+        slot = self._owner.board.claim()
+        try:
+            ours, theirs = socketpair("starting a pool worker")
+        except BaseException:
+            self._owner.board.release(slot)
+            raise
+        ours.setblocking(False)
+        self.slot = slot
+        # We keep the child's end too: what it has not read when it dies, or when another worker is
+        # idle, is read from there.  The kernel gives each packet to exactly one reader.
+        self._ours, self._theirs = ours, theirs
+        self._outbox = Outbox(self._loop, ours)
+        self._loop.register(ours.fileno(), self._receive)
+
+    def start(self, zygote: ZygoteLink, hub: Access | None) -> None:
+        """Have ``zygote`` start it; ``hub`` is what it is told of its host's hub."""
+        self.zygote = zygote
+        spec = self._spec
+        fds = self._descriptors()
+        request = Start(
+            spec.method,
+            spec.preparation,
+            spec.payload,
+            self.slot,
+            spec.executable,
+            captured=spec.stdio is not None,
+            open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
+            hub=hub,
+            elders=lineage(),
+        )
+        zygote.start(self.id, request, fds)
+
+    def _descriptors(self) -> list[int]:
+        """New descriptors for the child: stdout, stderr, task channel, and those of its handles."""
+        ours = [] if self._theirs is None else [self._theirs.fileno()]
+        fds: list[int] = []
+        try:
+            with naming_the_limit("starting a process"):
+                if self._spec.stdio is None:
+                    fds += map(dup_or_null, (1, 2))
+                fds += map(os.dup, [*(self._spec.stdio or ()), *ours, *self._fds])
+        except BaseException:
+            close_all(fds)
+            raise
+        return fds
+
+    def release_descriptors(self) -> None:
+        """It has its own now: the other end must see EOF when the child lets go."""
+        fds, self._fds = self._fds, ()
+        close_all(fds)
+
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send a packet to the worker; False if it is gone."""
+        outbox = self._outbox
+        return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
+
+    def lend(self) -> Channel | None:
+        """Its channel for direct use; None if it has none, or no descriptor is left for it."""
+        if self._ours is None or self._ours.fileno() < 0:
+            return None
+        try:
+            # Of its own: what whoever uses it waits for must not be closed and become another's.
+            fd = os.dup(self._ours.fileno())
+        except OSError:
+            return None
+        self._loop.pause(self._ours.fileno())
+        self._lent = True
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd)
+        return Channel(sock, self.condemn)
+
+    def reclaim(self) -> None:
+        """Hear what it says again."""
+        self._lent = False
+        if self._ours is not None and self._ours.fileno() >= 0:
+            self._loop.resume(self._ours.fileno())
+
+    def take_back(self) -> None:
+        """Recall unread packets; answered on the loop."""
+        self._loop.call_soon(self._answer_take_back)
+
+    def signal(self, signum: int) -> None:
+        """Signal the child through its zygote."""
+        if self.zygote is not None:
+            self.zygote.send(zygote.SIGNAL, self.id, signum)
+        if signum == signal.SIGKILL and self.pid is None:
+            self._loop.call_soon(self._owner.forsake, self)
+
+    def condemn(self, fault: Exception) -> None:
+        """Something to or from it is lost for good: only its end can tell the master so."""
+        self.fault = self.fault or fault
+        self.signal(signal.SIGKILL)
+
+    def hang_up(self) -> tuple[int, ...]:
+        """It is gone: hear its last words, recall what it never read.  On the loop."""
+        self.release_descriptors()
+        if self._ours is None or self._theirs is None or self._outbox is None:
+            return ()
+        while self._hear():
+            pass
+        unread = self._recall()
+        self._loop.unregister(self._ours.fileno())
+        self._outbox.close()
+        self._ours.close()
+        self._theirs.close()
+        return tuple(unread)
+
+    def _answer_take_back(self) -> None:
+        if self._theirs is not None and self._theirs.fileno() >= 0:
+            self.observer.taken_back(self._recall())
+
+    def _receive(self) -> None:
+        if not self._lent:  # it came before, and is for whoever uses the channel now
+            self._hear()
+
+    def _hear(self) -> bool:
+        assert self._ours is not None
+        try:
+            message = packet.receive(self._ours)
+        except (BlockingIOError, EOFError):
+            return False
+        except TooManyOpenFiles as error:
+            self.condemn(error)
+            return True
+        try:
+            self.observer.said(message)
+        except Exception as error:
+            self.condemn(error)
+            raise
+        return True
+
+    def _recall(self) -> list[int]:
+        assert self._theirs is not None
+        assert self._outbox is not None
+        seqs = []
+        while True:
+            try:
+                message = packet.receive(self._theirs, wait=False)
+            except (BlockingIOError, EOFError):
+                break
+            except TooManyOpenFiles as error:
+                self.condemn(error)
+                continue
+            seqs.append(_SEQ.unpack_from(message.payload)[0])
+            message.release()
+        return seqs + [_SEQ.unpack_from(payload)[0] for payload in self._outbox.recall()]
+
+
+class Channel:
+    """The task channel of a child, for direct use; a ``DirectChannel``."""
+
+    def __init__(self, sock: socket.socket, condemn: Callable[[Exception], None]) -> None:
+        self._sock = sock
+        self._condemn = condemn
+        self._poller = select.poll()
+        self._poller.register(sock, select.POLLIN)
+
+    def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a packet, or raise OSError."""
+        packet.send(self._sock, b"".join((_SEQ.pack(seq), payload)), buffers)
+
+    def receive(self, timeout: float) -> Message | None:
+        """The next packet, None after ``timeout`` seconds, EOFError at the end."""
+        if not self._poller.poll(timeout * 1000):
+            return None
+        try:
+            return packet.receive(self._sock)
+        except BlockingIOError:  # its agent took it, which is burying the child
+            return None
+        except TooManyOpenFiles as error:
+            self._condemn(error)
+            raise
+
+    def close(self) -> None:
+        """Close this descriptor of it."""
+        self._sock.close()
+
+    def __del__(self) -> None:
+        self._sock.close()

@@ -1,0 +1,51 @@
+"""What a pool needs of the runtime of its process: so little that a test has it in a few lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from fiber._agent.port import ChildPort
+
+
+class Timer(Protocol):
+    """A call that is due."""
+
+    due: float
+
+    def cancel(self) -> None:
+        """Never call it."""
+
+
+class Loop(Protocol):
+    """The part of ``fiber._transport.loop.Loop`` that pools use."""
+
+    def now(self) -> float:
+        """Monotonic seconds."""
+
+    def on_thread(self) -> bool:
+        """Whether the caller is the loop's own thread."""
+
+    def depend(self, dependent: Any) -> None:
+        """Tell ``dependent`` if the loop fails."""
+
+    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
+        """Call it on the loop's thread, in order; from anywhere."""
+
+    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
+        """Call it once, later."""
+
+
+class Host(Protocol):
+    """The part of ``fiber._runtime.state.Runtime`` that pools use."""
+
+    @property
+    def loop(self) -> Loop:
+        """Its loop."""
+
+    @property
+    def config(self) -> Any:
+        """Its configuration, of which ``start_timeout`` is wanted."""
+
+    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildPort:
+        """Start a worker's process."""

@@ -1,0 +1,210 @@
+"""The work items of a pool that are not done: their jobs in the ledger, their input, their futures.
+
+On the loop's thread only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from fiber._agent.port import ExitReport
+from fiber._engine.chunks import Pace
+from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
+from fiber._runtime.outcome import Failure, Pickled
+from fiber._runtime.work_items import Call, WorkItem
+from fiber._wire import work
+from fiber.errors import TimeoutError, WorkerDied
+
+
+class Jobs:
+    """Opens, feeds and ends jobs, and hands their outcomes to futures."""
+
+    def __init__(self, ledger: Ledger, retries: int, *, retry: bool) -> None:
+        self._ledger = ledger
+        self._retries = retries
+        self._retry = retry
+        self._streams: dict[WorkItem, None] = {}
+
+    def open(self, item: WorkItem) -> Job:
+        """Begin with it."""
+        function = item.function
+        pace = Pace(function.pace if function is not None else None)
+        if function is not None:
+            function.pace = pace
+        item.job = job = self._ledger.open(
+            item,
+            pace=pace,
+            retries=self._retries,
+            unit=item.unit,
+            alone=item.timeout is not None,
+            exact=item.exact,
+        )
+        return job
+
+    def run(self, item: WorkItem, tasks: Sequence[Any]) -> None:
+        """Begin with all of its tasks."""
+        self._ledger.feed(self.open(item), tasks)
+        self.close(item)
+
+    def close(self, item: WorkItem) -> None:
+        """No task of it will come any more."""
+        if item.job is not None and item.job.owner is item:
+            self._ledger.close(item.job)
+            self.check_finished(item.job)
+
+    # Streams
+
+    def open_stream(self, item: WorkItem) -> None:
+        """Begin with a stream."""
+        self.open(item)
+        self._streams[item] = None
+        self.top_up(item)
+
+    def top_up(self, item: WorkItem) -> bool:
+        """Take from a stream what was read, and let it read on; whether there was something."""
+        stream, job, ledger = item.stream, item.job, self._ledger
+        if item not in self._streams or stream is None or job is None:
+            return False
+        tasks = stream.take()
+        if not tasks and not job.waiting:
+            stream.await_input()
+            tasks = stream.take()
+        ledger.feed(job, tasks)
+        stream.grant(len(job.waiting), len(ledger.workers), job.pace, job.target)
+        return bool(tasks)
+
+    def top_up_all(self, items: Iterable[WorkItem | None]) -> bool:
+        """The same for those of some items that are streams."""
+        if not self._streams:
+            return False
+        found = False
+        for item in {item for item in items if item is not None and item.stream is not None}:
+            found |= self.top_up(item)
+        return found
+
+    def resume(self, item: WorkItem) -> None:
+        """Its results are being read again."""
+        if item.job is not None:
+            self._ledger.pause(item.job, False)
+
+    def lift_limits(self) -> None:
+        """Nobody will consume any more, or read results."""
+        for job in self._ledger.jobs:
+            if job.owner.future is not None:
+                job.owner.future.lift_bound()
+            self._ledger.pause(job, False)
+        for item in list(self._streams):
+            if item.stream is not None:
+                item.stream.lift_limit()
+                self.top_up(item)
+
+    def end_stream(self, item: WorkItem, error: BaseException | None) -> None:
+        """It has no more tasks; ``error``, if any, takes the place of the next one."""
+        job = item.job
+        if item not in self._streams or item.stream is None or job is None:
+            return  # failed or cancelled meanwhile
+        self._ledger.feed(job, item.stream.take())
+        if error is not None and item.future is not None:
+            item.future.add_results(job.fed, [Failure(error)], True)
+        self.close(item)
+        self._streams.pop(item, None)
+
+    # Outcomes
+
+    def put(self, receipt: Receipt, results: list[Any], *, mixed: bool = True) -> None:
+        """Hand results on, but for those whose tasks get another try."""
+        if mixed and self._retry:
+            for at, result in enumerate(results):
+                again = type(result) is Pickled and result.kind == work.AGAIN
+                index = receipt.start + at
+                if not (again and self._ledger.retry(receipt, index)):
+                    self._put(receipt._replace(start=index), [result], True)
+        else:
+            self._put(receipt, results, mixed)
+        self.check_finished(receipt.job)
+
+    def _put(self, receipt: Receipt, results: list[Any], mixed: bool) -> None:
+        item: WorkItem = receipt.job.owner
+        if item.future is not None:
+            if item.future.add_results(receipt.start, results, mixed):
+                self._ledger.pause(receipt.job, True)
+            return
+        for task, outcome in enumerate(results, receipt.start):
+            future = receipt.item(task).future
+            future.add_results(0, [outcome], mixed)
+            future.set_done()
+
+    def put_timeout(self, receipt: Receipt, worker: str) -> None:
+        """A task took too long."""
+        item: WorkItem = receipt.job.owner
+        name = item.task_name(receipt.start, receipt.item(receipt.start))
+        error = TimeoutError(
+            f"{name} took longer than its timeout of {item.timeout:g} s; "
+            f"its worker {worker!r} was killed"
+        )
+        self.put(receipt, [Failure(error)])
+
+    def put_losses(
+        self, losses: list[Loss], worker: str, pid: int | None, report: ExitReport
+    ) -> None:
+        """Tasks have killed as many workers as they may."""
+        for loss in losses:
+            item: WorkItem = loss.job.owner
+            error = WorkerDied(
+                task=item.task_name(loss.task, loss.item),
+                worker=worker,
+                host=report.host,
+                pid=pid,
+                exitcode=report.exitcode,
+                reason=report.reason,
+                log=report.log,
+                attempts=loss.attempts,
+            )
+            if item.future is not None:
+                item.future.add_results(loss.task, [Failure(error)], True)
+            else:
+                loss.item.future.add_results(0, [Failure(error)], True)
+                loss.item.future.set_done()
+        for job in {loss.job for loss in losses}:
+            self.check_finished(job)
+
+    # The end
+
+    def check_finished(self, job: Job) -> None:
+        """If all is done, say so."""
+        item: WorkItem | None = job.owner
+        if job.finished and item is not None:
+            self._over(item)
+            if item.future is not None:
+                item.future.set_done()
+
+    def fail(self, job: Job, error: BaseException) -> None:
+        """Nothing that is not done of a job will be."""
+        item: WorkItem | None = job.owner
+        if item is None:
+            return
+        if item.future is not None:
+            item.future.set_exception(error)
+        else:
+            call: Call
+            for call in self._ledger.unfinished(job):
+                call.future.set_exception(error)
+        self._ledger.cancel(job)
+        self._over(item)
+
+    def cancel(self, item: WorkItem) -> list[Worker]:
+        """Nobody wants the rest of it; workers to ask for what they have not read of it."""
+        if item.job is None or item.job.owner is not item:
+            return []  # it was never submitted, or is done
+        holders = self._ledger.cancel(item.job)
+        self._over(item)
+        return holders
+
+    def _over(self, item: WorkItem) -> None:
+        if item in self._streams and item.stream is not None:
+            del self._streams[item]
+            item.stream.end()
+        if item.job is not None:
+            item.job.owner = None
+        item.grants.clear()

@@ -1,0 +1,236 @@
+"""Calls that a waiting thread gives to a worker itself, without the loop in between.
+
+An ``apply`` that went through the loop would wake two threads that only pass it on.  So the
+scheduler lends an idle worker: whoever calls next takes it, sends it the call, waits for the answer
+and leaves it for the next one.  Ray's callers lease workers in the same way.  ::
+
+    loop's thread                  any thread                         worker
+    offer ──► idle leases ──pop──► run ─────────── send, receive ───► │
+                  ▲                 ├── answered: append ──┘
+    recall ◄──────┘                 ├── takes longer, or its worker is gone: adopt
+                                    └── interrupted: abandon
+
+A lease belongs to whoever popped it; nothing else is shared, so an interruption at any line leaves
+at most a lease that nobody returns.  Of that a weak reference tells, in one step of the
+interpreter's own, and the loop takes the worker back.
+"""
+
+from __future__ import annotations
+
+import pickle
+import weakref
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from fiber._agent.port import DirectChannel
+from fiber._engine.scheduler import Scheduler
+from fiber._runtime.host import Loop, Timer
+from fiber._runtime.outcome import outcomes
+from fiber._runtime.work_items import Call
+from fiber._runtime.worker_handle import WorkerHandle
+from fiber._wire import work
+
+ATTENTION = 5e-3
+"""Seconds that a caller waits for a worker itself before it leaves the answer to the loop."""
+
+UNUSED = 0.05
+"""Seconds without a call after which a lease ends: its worker may leave, or be given other work."""
+
+NO_OP_MESSAGE = work.pack_calls([(pickle.dumps((bool, (), {})), ())])
+"""A call whose answer says that all before it is answered."""
+
+
+class Pending:
+    """In place of an outcome: there is none yet."""
+
+
+UNAVAILABLE = Pending()
+"""No worker was to be had."""
+
+ADOPTED = Pending()
+"""The loop has taken over, and will tell the call's future."""
+
+
+class Lease:
+    """An idle worker for direct use."""
+
+    __slots__ = ("__weakref__", "channel", "handle", "used")
+
+    def __init__(self, handle: WorkerHandle, channel: DirectChannel) -> None:
+        self.handle = handle
+        self.channel = channel
+        self.used = True
+        """Since somebody looked last."""
+
+
+class Leases:
+    """The workers of one pool that are lent.
+
+    ``on_adopted`` is called, on the loop's thread, with a call that its caller leaves to the loop,
+    ``on_back`` with each worker that is back.
+    """
+
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        loop: Loop,
+        *,
+        on_adopted: Callable[[WorkerHandle, int, Call], None],
+        on_back: Callable[[WorkerHandle], None],
+    ) -> None:
+        self._scheduler = scheduler
+        self._loop = loop
+        self._on_adopted = on_adopted
+        self._on_back = on_back
+        self._check: Timer | None = None
+        self._idle: deque[Lease] = deque()
+        self._lent: dict[weakref.ref[Lease], WorkerHandle] = {}
+        self._dropped: deque[weakref.ref[Lease]] = deque()
+        self._recalled = False
+
+    # Any thread
+
+    def run(self, call: Call) -> Any:
+        """The outcome of a call; UNAVAILABLE if it was not sent, ADOPTED if that takes longer."""
+        try:
+            lease = self._idle.pop()
+        except IndexError:
+            return UNAVAILABLE
+        lease.used = True
+        try:
+            seq = self._scheduler.ledger.next_seq()
+            answer = self._exchange(lease.channel, seq, call)
+            if answer is ADOPTED:
+                self._loop.call_soon(self._adopt, lease, seq, call)
+                return ADOPTED
+        except BaseException:
+            self._loop.call_soon(self._abandon, lease)
+            raise
+        self._put_back(lease)
+        if answer is UNAVAILABLE:
+            return UNAVAILABLE
+        (*_, values, odd), buffers = answer
+        return outcomes(values, odd, buffers)[0] if odd else values[0]
+
+    def _exchange(self, channel: DirectChannel, seq: int, call: Call) -> Any:
+        try:
+            channel.send(seq, call.message(), call.buffers)
+        except OSError:  # whoever sends it in our place will see why
+            return UNAVAILABLE
+        while True:
+            try:
+                message = channel.receive(ATTENTION)
+            except (EOFError, OSError):  # it is gone, as the loop is about to hear
+                return ADOPTED
+            if message is None:
+                return ADOPTED
+            words, buffers = pickle.loads(message.payload), message.buffers
+            message.release()
+            if words[0] == seq:
+                return words, buffers
+
+    def _put_back(self, lease: Lease) -> None:
+        self._idle.append(lease)
+        # The loop notes that it wants them back and takes what is there then.
+        if self._recalled:
+            self._loop.call_soon(self.recall)
+
+    # The loop's thread
+
+    def offer(self, handle: WorkerHandle) -> None:
+        """Lend a worker that has become idle, if nobody else needs it."""
+        if handle.worker is None or handle.port is None:
+            return
+        if not self._scheduler.lend(handle.worker):
+            return
+        channel = handle.port.lend()
+        if channel is None:
+            self._scheduler.return_idle(handle.worker, self._loop.now())
+            return
+        lease = Lease(handle, channel)
+        self._lent[weakref.ref(lease, self._dropped.append)] = handle
+        self._recalled = False
+        self._idle.append(lease)
+        if self._check is None:
+            self._check = self._loop.call_later(UNUSED, self._recall_unused)
+
+    def recall(self) -> None:
+        """Take back those that nobody uses, and the others as soon as they are left."""
+        self._recalled = True
+        while self._idle:
+            try:
+                lease = self._idle.pop()
+            except IndexError:  # somebody was faster, and will bring it back
+                break
+            self._return_idle(lease)
+        self._find_dropped()
+
+    def recall_one(self, handle: WorkerHandle) -> bool:
+        """Take this one back; False if somebody uses it, and will bring it back."""
+        for lease in list(self._idle):
+            if lease.handle is handle:
+                try:
+                    self._idle.remove(lease)
+                except ValueError:  # somebody was faster
+                    return False
+                self._return_idle(lease)
+                return True
+        return False
+
+    def close(self) -> None:
+        """Nobody is left."""
+        if self._check is not None:
+            self._check.cancel()
+
+    def _recall_unused(self) -> None:
+        """Take back those that nobody used since this was called last."""
+        self._check = None
+        for lease in list(self._idle):
+            if not lease.used:
+                self.recall_one(lease.handle)
+            lease.used = False
+        self._find_dropped()
+        if self._lent:
+            self._check = self._loop.call_later(UNUSED, self._recall_unused)
+
+    def _return_idle(self, lease: Lease) -> None:
+        handle = self._end(lease)
+        if handle.worker is not None:
+            self._scheduler.return_idle(handle.worker, self._loop.now())
+        self._on_back(handle)
+
+    def _adopt(self, lease: Lease, seq: int, call: Call) -> None:
+        handle = self._end(lease)
+        self._on_adopted(handle, seq, call)
+        self._on_back(handle)
+
+    def _abandon(self, lease: Lease) -> None:
+        if weakref.ref(lease) in self._lent:  # else it was adopted
+            self._return_abandoned(self._end(lease))
+
+    def _find_dropped(self) -> None:
+        while self._dropped:
+            handle = self._lent.pop(self._dropped.popleft(), None)
+            if handle is not None:
+                self._take_over(handle)
+                self._return_abandoned(handle)
+
+    def _return_abandoned(self, handle: WorkerHandle) -> None:
+        """It may be running something that nobody wants any more."""
+        assert handle.worker is not None
+        assert handle.port is not None
+        seq = self._scheduler.ledger.next_seq()
+        self._scheduler.return_busy(handle.worker, seq, None, None, self._loop.now())
+        handle.port.deliver(seq, NO_OP_MESSAGE)
+        self._on_back(handle)
+
+    def _end(self, lease: Lease) -> WorkerHandle:
+        self._lent.pop(weakref.ref(lease), None)
+        lease.channel.close()
+        self._take_over(lease.handle)
+        return lease.handle
+
+    def _take_over(self, handle: WorkerHandle) -> None:
+        if handle.port is not None:
+            handle.port.reclaim()

@@ -1,0 +1,147 @@
+"""From a batch to a packet on its way: pickled where that may be done, within its time.
+
+On the loop's thread, but for ``_encode``, which may run the user's code and so has the background
+thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fiber._engine.ledger import Batch, Ledger, Worker
+from fiber._runtime.background import BackgroundThread
+from fiber._runtime.host import Loop, Timer
+from fiber._runtime.jobs import Jobs
+from fiber._runtime.outcome import Failure
+from fiber._runtime.work_items import (
+    Encoded,
+    WorkItem,
+    blame_items,
+    encode,
+    pack,
+    pickles_without_user_code,
+)
+from fiber._runtime.worker_handle import WorkerHandle
+
+
+class Sender:
+    """Sends batches.  ``advance`` is called when something follows, ``on_timeout`` with the number
+    of a batch whose task has had its time."""
+
+    def __init__(
+        self,
+        loop: Loop,
+        background: BackgroundThread,
+        ledger: Ledger,
+        jobs: Jobs,
+        *,
+        advance: Callable[[], None],
+        on_timeout: Callable[[int], None],
+    ) -> None:
+        self._loop = loop
+        self._background = background
+        self._ledger = ledger
+        self._jobs = jobs
+        self._advance = advance
+        self._on_timeout = on_timeout
+        self._unsent: set[int] = set()
+        """Batches that are assigned and not sent: nobody can have run them."""
+        self._deadlines: dict[int, Timer] = {}
+
+    def send(self, batch: Batch) -> None:
+        """Send a batch, or have it encoded where the user's code may run."""
+        assert batch.job is not None
+        item: WorkItem = batch.job.owner
+        if not pickles_without_user_code(item, batch):
+            self._unsent.add(batch.seq)
+            self._background.submit(self._encode, item, batch)
+            return
+        try:
+            encoded = encode(item, batch, plain=True)
+        except Exception as error:  # no memory
+            self._unsendable(batch, error)
+        else:
+            self._deliver(item, batch, encoded)
+
+    def _encode(self, item: WorkItem, batch: Batch) -> None:
+        encoded: Encoded | None = None
+        error: BaseException | None = None
+        if batch.job is not None:
+            try:
+                encoded = encode(item, batch, plain=False)
+            except Exception as raised:
+                error = blame_items(item, batch, raised)
+            except BaseException as raised:  # whatever the user's pickler raises is its own
+                error = raised
+        self._loop.call_soon(self._encoded, item, batch, encoded, error)
+
+    def _encoded(
+        self, item: WorkItem, batch: Batch, encoded: Encoded | None, error: BaseException | None
+    ) -> None:
+        if self._ledger.batches.get(batch.seq) is not batch:
+            return  # its worker is gone
+        if batch.job is None:  # cancelled
+            self._unsent.discard(batch.seq)
+            self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
+        elif encoded is not None:
+            self._deliver(item, batch, encoded)
+        elif error is not None:
+            self._unsendable(batch, error)
+        self._advance()
+
+    def _deliver(self, item: WorkItem, batch: Batch, encoded: Encoded) -> None:
+        handle: WorkerHandle = batch.worker.key
+        assert handle.port is not None
+        seq = batch.seq
+        if item.timeout is not None:
+            self._deadlines[seq] = self._loop.call_later(item.timeout, self._expire, seq)
+        try:
+            taken = handle.port.deliver(seq, *pack(item, batch, encoded, handle.known))
+        except Exception as error:  # the system has no memory or descriptor for it
+            self._unsendable(batch, error)
+            return
+        if taken:
+            self._unsent.discard(seq)
+        else:
+            self._unsent.add(seq)  # its worker is gone, as will be heard
+
+    def _unsendable(self, batch: Batch, error: BaseException) -> None:
+        """This concerns the tasks of this batch only."""
+        self._unsent.discard(batch.seq)
+        self.settled(batch.seq)
+        self.split(batch.seq, Failure(error))
+        self._advance()
+
+    def split(self, seq: int, failure: object) -> None:
+        """Send the tasks of a batch one by one; of a single one, ``failure`` is the outcome."""
+        receipt = self._ledger.split(seq, self._loop.now())
+        if receipt is not None:
+            self._jobs.put(receipt, [failure])
+
+    def lost(self, worker: Worker) -> set[int]:
+        """A worker is gone; those of its batches that were not sent."""
+        held = {batch.seq for batch in worker.queue}
+        for seq in held:
+            self.settled(seq)
+        unsent = self._unsent & held
+        self._unsent -= held
+        return unsent
+
+    # Deadlines
+
+    def settled(self, seq: int) -> None:
+        """What becomes of a batch is known: its deadline, if it has one, is off."""
+        if self._deadlines:
+            timer = self._deadlines.pop(seq, None)
+            if timer is not None:
+                timer.cancel()
+
+    def close(self) -> None:
+        """Nothing is waited for any more."""
+        for timer in self._deadlines.values():
+            timer.cancel()
+        self._deadlines.clear()
+
+    def _expire(self, seq: int) -> None:
+        if self._deadlines.pop(seq, None) is not None:
+            self._on_timeout(seq)
