@@ -450,6 +450,7 @@ class Executor:
         if kind == work.UNREADABLE:
             self._sender.split(seq, error)
         elif batch is not None:
+            self._sender.dropped(batch)
             self._background.submit(self._unpickle_fault, batch, error)
         self._advance()
 
@@ -463,7 +464,7 @@ class Executor:
             return  # its worker is gone
         if batch.job is not None:
             self._jobs.fail(batch.job, error)
-        self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
+        self._sender.take_back(batch)
         self._advance()
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
