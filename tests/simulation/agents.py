@@ -159,6 +159,12 @@ class Child:
         self.agent.down.send(self._put, seq, payload, buffers)
         return True
 
+    def lend(self) -> None:
+        """Nobody may use its channel directly."""
+
+    def reclaim(self) -> None:
+        """Nobody does."""
+
     def take_back(self) -> None:
         """Recall the packets that it has not read."""
         self.agent.world.note("%s is asked for its unread batches", self.name)

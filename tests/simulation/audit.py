@@ -88,6 +88,7 @@ class Audit:
             for worker in self._ledger._pins
             for job, span in worker.pinned
         }
+        reached = {job: job.reached for job in self._ledger.jobs if job.paused}
         batch: Batch | None = self._real.assign(now)
         if batch is not None:
             worker = batch.worker
@@ -100,6 +101,8 @@ class Audit:
                 batch.stop,
             )
             self._check_tasks(batch, batch.job)
+            back = batch.start < reached.get(batch.job, batch.stop)
+            require(back or batch.pin, "a task is begun though nobody reads results")
             require(worker in self._ledger.workers, "a worker that is gone is given a batch")
             require(not worker.leaving, "a worker that leaves is given a batch")
             require(not worker.key.leaving, "a worker that was told to stop is given a batch")
@@ -116,7 +119,7 @@ class Audit:
         workers = self._ledger.workers
         # Another one with a single batch is kept free for whoever needs an idle worker.
         passed = not any(len(worker.queue) == 1 for worker in workers if worker is not given)
-        waiting = [other for other in self._ledger.jobs if other.waiting and other is not job]
+        waiting = [other for other in self._ledger.jobs if other.has_next and other is not job]
         fair = PASSES * (len(self._ledger.jobs) + len(workers))
         self._patience = {other: self._patience.get(other, fair) - passed for other in waiting}
         least = min(self._patience.values(), default=0)
@@ -291,7 +294,7 @@ class Audit:
             return
         since = [worker.since for worker in idle]
         require(since == sorted(since), "the idle are not in the order in which they became so")
-        waiting = any(job.waiting for job in self._ledger.jobs)
+        waiting = any(job.has_next for job in self._ledger.jobs)
         require(not waiting, "a task waits though a worker is idle")
         require(not any(worker.pinned for worker in idle), "a pinned task waits for nothing")
         now = self._world.loop.now()

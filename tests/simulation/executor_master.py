@@ -153,13 +153,12 @@ class ExecutorMaster:
         account.closed = stop == len(plan.tasks)
         self._open_calls[account.number] = self._open_calls.get(account.number, 0) + stop - start
         self.world.oracle.fed(account.number, stop - start)
-        blocking = self._rng.random() < 0.5
         for index in range(start, stop):
             one = Outcomes(self, account, index)
             item: Any = (account.number, index)
             if plan.tasks[index].act is Act.UNSENDABLE:
                 item = (self._stage.bad_item(item),)
-            self._executor.call(one, perform, item, {}, plan.timeout, blocking=blocking)
+            self._executor.call(one, perform, item, {}, plan.timeout)
         if not account.closed:
             self._later(plan.pause, account, self._go_on_calling, account, future, stop)
         elif not plan.tasks:
@@ -189,6 +188,7 @@ class ExecutorMaster:
     def refused_call(self, account: Account, call: int) -> None:
         """A call came when the pool was closed already; and so did all after it."""
         account.fed = min(account.fed, call)
+        account.delivered &= account.everything  # some of those after it could not be sent
         account.closed = account.refused = True
         if self.ended_call(account):
             self.world.oracle.finished(account.number)
@@ -279,6 +279,20 @@ class ExecutorMaster:
         if not self._pool.joined:
             future.consumed += 1
             future.item.stream.consume()
+
+    def holds_back(self, item: WorkItem) -> bool:
+        """Whether the user has more results than it reads; until a little later."""
+        future: Any = item.future
+        if self._pool.joined or self._rng.random() >= 0.05:
+            return False
+        self.world.note("job %d is held back", future.account.number)
+        wait = self._rng.choice((0.0, 1e-3, 0.5))
+        self._later(wait, future.account, self._executor.resume, item)
+        return True
+
+    def waits_for_all(self, account: Account) -> None:
+        """Nobody reads the results of a job: all are taken."""
+        require(self._pool.joined, f"job {account.number} is not held back any more")
 
     def _cancel(self, account: Account) -> None:
         item = self._futures[account.number].item

@@ -35,8 +35,8 @@ class Outcomes:
         self._oracle = master.world.oracle
         self._ended = False
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
-        """Outcomes of tasks from ``start`` on."""
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+        """Outcomes of tasks from ``start`` on; sometimes nobody reads them for a while."""
         if not mixed and any(type(outcome) in (Failure, Pickled) for outcome in outcomes):
             raise Violation(f"job {self.account.number} has results that are not plain")
         for index, outcome in enumerate(outcomes, start if self.call is None else self.call):
@@ -44,6 +44,11 @@ class Outcomes:
         if self.limit is not None:
             for _ in outcomes:
                 self._master.consume_soon(self)
+        return self.item is not None and self._master.holds_back(self.item)
+
+    def lift_bound(self) -> None:
+        """Whoever would read the results waits for the rest."""
+        self._master.waits_for_all(self.account)
 
     def _put(self, ref: Ref, outcome: Any) -> None:
         error = outcome.error if type(outcome) is Failure else None

@@ -69,26 +69,21 @@ class PoolAudit:
         self._since: dict[Any, float] = {}
         self._readings: list[Reading] = []
         self._real = SimpleNamespace(
-            advance=executor._advance,
             decide=self._scheduler.decide,
             ready=self._scheduler.ready,
             gone=self._scheduler.gone,
             news=self._workers.news,
         )
-        vars(executor)["_advance"] = self._advance
         vars(self._scheduler).update(decide=self._decide, ready=self._ready, gone=self._gone)
         vars(self._workers)["news"] = self._news
         world.loop.after_turn = self._after_turn
 
     # What it does
 
-    def _advance(self) -> None:
-        require(self._world.loop.on_thread(), "the executor acts on another thread")
-        self._moved = True
-        self._real.advance()
-
     def _decide(self, now: float) -> Decisions:
+        require(self._world.loop.on_thread(), "the executor acts on another thread")
         self._world.count()
+        self._moved = True
         decisions: Decisions = self._real.decide(now)
         return decisions
 
@@ -139,7 +134,7 @@ class PoolAudit:
             self._check_size()
             for reading in self._readings:
                 self._check_reading(reading)
-        elif self._ledger._load.idle and any(job.waiting for job in self._ledger.jobs):
+        elif self._ledger._load.idle and any(job.has_next for job in self._ledger.jobs):
             wake, now = self._executor._wake, self._world.loop.now()
             soon = wake is not None and wake.due <= now + 2 * TICK
             require(soon, "a task waits though a worker is idle, and nobody will look")
@@ -156,8 +151,8 @@ class PoolAudit:
 
     def _check_messages(self) -> None:
         held = self._ledger.batches.keys()
-        require(self._executor._unsent <= held, "what is not sent is not held by anybody")
-        require(self._executor._deadlines.keys() <= held, "a deadline is nobody's")
+        require(self._executor._sender._unsent <= held, "what is not sent is not held by anybody")
+        require(self._executor._sender._deadlines.keys() <= held, "a deadline is nobody's")
 
     def _check_news(self) -> None:
         if self._failures and self._workers.error is None and not self._told:
@@ -226,7 +221,7 @@ class PoolAudit:
         item, stream, actor, outcomes = reading
         job = item.job
         hungry = (
-            item in self._executor._streams
+            item in self._executor._jobs._streams
             and job is not None
             and not job.waiting
             and actor.starves
@@ -253,9 +248,9 @@ class PoolAudit:
             self._workers.members,
             self._ledger.demand(),
             self._ledger.batches,
-            executor._deadlines,
-            executor._unsent,
-            executor._streams,
+            executor._sender._deadlines,
+            executor._sender._unsent,
+            executor._jobs._streams,
             executor._called,
         )
         require(not any(left), "the pool leaves something behind")

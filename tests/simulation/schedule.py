@@ -291,9 +291,11 @@ class _Draw:
         if rng.random() < 0.05:
             yield Terminate(self.time())
         if rng.random() < 0.06:
-            at = rng.choice((0.0, self.time()))
+            at = rng.choice((0.0, 5e-3, self.time()))
             exitcode = rng.choice((1, -9, Famine.REFUSED))
             yield Famine(at, rng.choice((0.3, 3.0, 15.0, 100.0)), exitcode)
+            if at:
+                yield Kill(rng.randrange(workers), at + self.time())
 
 
 def simpler(schedule: Schedule) -> Iterator[Schedule]:
