@@ -54,6 +54,7 @@ class Audit:
         self._left: dict[Worker, int] = {}
         """Units that each may do, less those that it has done."""
         self._jobs: set[Job] = set()
+        self._lent: set[Worker] = set()
         watched = {
             "open": self._open,
             "add": self._add,
@@ -65,6 +66,9 @@ class Audit:
             "recall": self._recall,
             "put_back": self._put_back,
             "lose": self._lose,
+            "lend": self._lend,
+            "return_idle": self._return_idle,
+            "return_busy": self._return_busy,
         }
         self._real = SimpleNamespace(**{name: getattr(ledger, name) for name in watched})
         vars(ledger).update(watched)
@@ -105,6 +109,7 @@ class Audit:
             require(back or batch.pin, "a task is begun though nobody reads results")
             require(worker in self._ledger.workers, "a worker that is gone is given a batch")
             require(not worker.leaving, "a worker that leaves is given a batch")
+            require(not worker.lent, "a worker that is lent is given a batch")
             require(not worker.key.leaving, "a worker that was told to stop is given a batch")
             require(worker.queue[-1] is batch, "a batch is not the last one of its worker")
             pinned_to = pins.get((batch.job, batch.start))
@@ -221,6 +226,30 @@ class Audit:
                 self._world.note("%s is given up", ref)
         return losses
 
+    def _lend(self, worker: Worker) -> bool:
+        idle = worker in self._ledger.idle()
+        lent: bool = self._real.lend(worker)
+        require(idle or not lent, "a worker is lent that is not idle")
+        if lent:
+            self._lent.add(worker)
+        return lent
+
+    def _return_idle(self, worker: Worker, now: float) -> None:
+        self._check_return(worker)
+        self._real.return_idle(worker, now)
+
+    def _return_busy(
+        self, worker: Worker, seq: int, job: Job | None, item: Any, now: float
+    ) -> None:
+        self._check_return(worker)
+        require(seq not in self._ledger.batches, "two batches have the same number")
+        self._real.return_busy(worker, seq, job, item, now)
+
+    def _check_return(self, worker: Worker) -> None:
+        require(worker in self._lent, "a worker is returned that was not lent")
+        require(worker in self._ledger.workers, "a worker is returned that is gone")
+        self._lent.discard(worker)
+
     def _check_charge(self, child: Child, seq: int, offset: int, ref: Ref, charged: bool) -> None:
         if charged:
             self._world.oracle.blamed(child, seq, offset, ref)
@@ -272,7 +301,9 @@ class Audit:
         for worker in self._ledger.workers:
             held += len(worker.queue)
             child = self._names.child(worker)
-            require(not child.gone, f"{child.name} is gone, but not lost")
+            # Whoever uses it finds that out.
+            require(worker.lent or not child.gone, f"{child.name} is gone, but not lost")
+            require(not (worker.lent and worker.queue), f"{child.name} is lent and has a batch")
             require(len(worker.queue) <= 2, f"{child.name} has too many batches")
             for batch in worker.queue:
                 require(self._ledger.batches.get(batch.seq) is batch, "an unknown batch is held")

@@ -14,17 +14,18 @@ from fiber._engine import ledger as engine
 from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.options import PoolOptions
+from fiber._runtime.outcome import Pickled
 from fiber._runtime.work_items import Call, Function, WorkItem
 from fiber._wire import work
 from fiber.errors import StartError
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation, require
-from simulation.outcomes import BrokenInput, Outcomes
+from simulation.outcomes import HEARD, BrokenInput, Outcomes
 from simulation.pool_audit import PoolAudit, Reading
 from simulation.schedule import Act, Job, Schedule, Task
-from simulation.staged import Actor, Stage, StagedProcess
-from simulation.wire import Wire, perform, perform_nowhere, perform_other
+from simulation.staged import Actor, Interrupted, Stage, StagedProcess
+from simulation.wire import ERROR, PlannedError, Wire, perform, perform_nowhere, perform_other
 from simulation.workers import Ref
 from simulation.world import World
 
@@ -124,9 +125,11 @@ class ExecutorMaster:
     def _open(self, account: Account) -> None:
         plan = account.plan
         future = self._futures[account.number] = Outcomes(self, account)
-        style = "broadcast" if plan.everywhere else "call" if self._rng.random() < 0.3 else "map"
+        style = "broadcast" if plan.everywhere else "call" if self._rng.random() < 0.4 else "map"
         if plan.bite < len(plan.tasks) and style == "map":
             style = "stream"
+        if style == "call" and self._rng.random() < 0.7:
+            style = "apply"
         self.world.note("the user opens job %d, a %s", account.number, style)
         try:
             getattr(self, f"_{style}")(account, future)
@@ -179,6 +182,49 @@ class ExecutorMaster:
             account.closed = account.refused = True
             if not self._open_calls[account.number]:
                 future.set_done()
+
+    def _apply(self, account: Account, future: Outcomes) -> None:
+        """One call after the other has its result."""
+        if account.plan.tasks:
+            body = partial(self._apply_all, account)
+            self._stage.act(_user(account), body).start()
+        else:
+            account.closed = True
+            future.set_done()
+
+    def _apply_all(self, account: Account, actor: Actor) -> None:
+        plan = account.plan
+        self._open_calls[account.number] = 0
+        for index, task in enumerate(plan.tasks):
+            item: Any = (account.number, index)
+            if task.act is Act.UNSENDABLE:
+                item = (self._stage.bad_item(item),)
+            account.fed += 1
+            account.closed = account.fed == len(plan.tasks)
+            self._open_calls[account.number] += 1
+            self._apply_one(Outcomes(self, account, index, actor), item)
+            if account.cancelled or account.refused:
+                return
+            if account.fed % plan.bite == 0 and plan.pause:
+                actor.sleep(plan.pause)
+
+    def _apply_one(self, one: Outcomes, item: Any) -> None:
+        account = one.account
+        try:
+            outcome = self._executor.call_and_wait(one, perform, item, {}, account.plan.timeout)
+        except PlannedError:
+            one.answered(Pickled(work.ERROR, ERROR, ()))
+        except Interrupted:
+            one.interrupted()
+        except (ValueError, StartError) as error:
+            self._expect_refusal(error)
+            self.world.note("job %d goes no further: %s", account.number, type(error).__name__)
+            account.fed -= 1
+            account.closed = account.refused = True
+            self.world.oracle.finished(account.number)
+        else:
+            if outcome is not HEARD:
+                one.answered(outcome)
 
     def ended_call(self, account: Account) -> bool:
         """A call has ended; whether it was the last."""
@@ -400,9 +446,13 @@ def _options(schedule: Schedule) -> PoolOptions:
         maximum=schedule.max_workers,
         max_tasks=schedule.left,
         retries=schedule.jobs[0].retries,
-        retryable=(Again,),
+        retryable=(Again,) if _retries(schedule) else (),
         idle_timeout=60.0 if schedule.linger is None else schedule.linger + 1e-3,
     )
+
+
+def _retries(schedule: Schedule) -> bool:
+    return any(task.act is Act.RETRIED for job in schedule.jobs for task in job.tasks)
 
 
 def for_pool(schedule: Schedule) -> Schedule:

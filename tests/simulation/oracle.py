@@ -9,7 +9,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING
 
 from simulation.schedule import Act, Job, Schedule
-from simulation.workers import Ref, Worker
+from simulation.workers import NO_OP, Ref, Worker
 
 if TYPE_CHECKING:
     from simulation.agents import Child
@@ -64,6 +64,8 @@ class Oracle:
 
     def begins(self, ref: Ref, worker: Worker) -> None:
         """``worker`` begins a task: the first time, or because an earlier run came to nothing."""
+        if ref == NO_OP:
+            return
         account = self.accounts[ref.job]
         runs = account.runs[ref.task]
         living = sum(earlier not in self._lost for earlier in runs)
@@ -79,7 +81,7 @@ class Oracle:
 
     def runs(self, ref: Ref) -> int:
         """How often a task was begun."""
-        return len(self.accounts[ref.job].runs[ref.task])
+        return 0 if ref == NO_OP else len(self.accounts[ref.job].runs[ref.task])
 
     def lost(self, worker: Worker) -> None:
         """The master knows, or believes, that a worker is gone."""

@@ -15,6 +15,11 @@ from simulation.workers import Ref
 
 if TYPE_CHECKING:
     from simulation.executor_master import ExecutorMaster
+    from simulation.staged import Actor
+
+
+HEARD = object()
+"""In place of an outcome that the oracle knows already."""
 
 
 class BrokenInput(Exception):
@@ -24,7 +29,13 @@ class BrokenInput(Exception):
 class Outcomes:
     """Where the executor puts the outcomes of one job, or of one call of it; a ``Future``."""
 
-    def __init__(self, master: ExecutorMaster, account: Account, call: int | None = None) -> None:
+    def __init__(
+        self,
+        master: ExecutorMaster,
+        account: Account,
+        call: int | None = None,
+        caller: Actor | None = None,
+    ) -> None:
         self.account = account
         self.call = call
         self.item: WorkItem | None = None
@@ -33,6 +44,8 @@ class Outcomes:
         self.consumed = 0
         self._master = master
         self._oracle = master.world.oracle
+        self._caller = caller
+        """Who waits for it."""
         self._ended = False
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
@@ -118,3 +131,24 @@ class Outcomes:
         if self._ended:
             raise Violation(f"job {self.account.number} ends twice")
         self._ended = True
+        if self._caller is not None:
+            self._caller.put(HEARD)
+
+    def get(self) -> object:
+        """The caller waits until the outcome is there, which the oracle is told."""
+        assert self._caller is not None
+        return self._caller.get()
+
+    def answered(self, outcome: Any) -> None:
+        """Its worker has told the caller itself."""
+        self._put(Ref(self.account.number, self.call or 0), outcome)
+        self._ended = True
+        if self._master.ended_call(self.account):
+            self._oracle.finished(self.account.number)
+
+    def interrupted(self) -> None:
+        """The caller does not wait for it any more."""
+        self._oracle.delivered(Ref(self.account.number, self.call or 0), "interrupted")
+        self._ended = True
+        if self._master.ended_call(self.account):
+            self._oracle.finished(self.account.number)

@@ -148,6 +148,12 @@ class PoolAudit:
         require(workers.size <= workers.maximum, f"the pool has {workers.size} workers")
         ready = {member.worker for member in workers.members if member.worker is not None}
         require(ready == self._ledger.workers, "the ledger knows other workers")
+        lent = sum(worker.lent for worker in self._ledger.workers)
+        require(lent == self._scheduler.lent, f"{lent} workers are lent")
+        unused = bool(self._executor._leases._idle)
+        needed = any(job.has_next for job in self._ledger.jobs) or bool(self._ledger._pins)
+        otherwise = "a task waits for a worker that is lent and not in use"
+        self._lasts("lent", unused and needed, lambda: PROMPTLY, otherwise)
 
     def _check_messages(self) -> None:
         held = self._ledger.batches.keys()
@@ -195,7 +201,8 @@ class PoolAudit:
             return False
         tasks = sum(job.fed - job.done for job in self._ledger.jobs)
         # A worker that still runs what was cancelled is not there for the others.
-        lost = sum(bool(it.queue) and it.queue[0].job is None for it in self._ledger.workers)
+        held_up = [it for it in self._ledger.workers if it.queue and not it.leaving]
+        lost = sum(worker.queue[0].job is None for worker in held_up)
         wanted = max(tasks and tasks + lost, 0 if self._scheduler.closing else workers.minimum)
         return workers.size < min(wanted, workers.maximum)
 
@@ -252,6 +259,8 @@ class PoolAudit:
             executor._sender._unsent,
             executor._jobs._streams,
             executor._called,
+            executor._exits,
+            executor._leases._lent,
         )
         require(not any(left), "the pool leaves something behind")
 

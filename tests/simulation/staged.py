@@ -10,8 +10,9 @@ from __future__ import annotations
 import random
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from unittest import mock
@@ -19,6 +20,7 @@ from unittest import mock
 from fiber._agent import service
 from fiber._backends.remote import RemoteChild
 from fiber._runtime import executor
+from fiber._wire.packet import Message
 from fiber.process import Process
 from simulation.agents import Child
 from simulation.remote_hosts import NoCapture, RemoteHost
@@ -50,9 +52,11 @@ class Stage:
         }
         self._stack = ExitStack()
         self._actors: list[Actor] = []
-        self._running: Actor | None = None
+        self.running: Actor | None = None
+        """The thread whose turn it is."""
         self.user_code_on_loop = False
         self.item = _item_of(self)
+        world.make_channel = partial(StagedChannel, self)
         self.bad_item = BadItem
 
     def enter(self) -> None:
@@ -84,9 +88,9 @@ class Stage:
         self, process: Any, observer: Any, *, tasks: bool, method: str
     ) -> Child | RemoteChild:
         """Start a worker on some agent."""
-        assert self._running is not None
+        assert self.running is not None
         # What comes of it comes after all that this thread has asked for.
-        self._running.sleep(self.loop.heard_in(self._running.name) + self.loop.moment())
+        self.running.sleep(self.loop.heard_in(self.running.name) + self.loop.moment())
         self._started += 1
         famine = self.world.famine()
         if self._started in self._refusals or famine is Famine.REFUSED:
@@ -104,17 +108,17 @@ class Stage:
 
     def pause(self) -> None:
         """Let others go on, if this is a thread that may be interrupted."""
-        if self._running is not None and self.rng.random() < 0.3:
-            self._running.sleep(self.loop.moment())
+        if self.running is not None and self.rng.random() < 0.3:
+            self.running.sleep(self.loop.moment())
 
     def run_actor(self, actor: Actor, run: Callable[[], None]) -> None:
         """Let ``actor`` run."""
-        before, self._running = self._running, actor
+        before, self.running = self.running, actor
         try:
             with self.loop.off_thread(actor.name):
                 run()
         finally:
-            self._running = before
+            self.running = before
 
 
 def _item_of(stage: Stage) -> type[tuple[int, int]]:
@@ -150,6 +154,7 @@ class Actor:
         self._back = threading.Semaphore(0)
         self._entries: deque[Any] = deque()
         self._waits = False
+        self._alarm: Any = None
         self._error: BaseException | None = None
         self._abandoned = False
         self._thread = threading.Thread(target=self._run, name=f"simulated {name}", daemon=True)
@@ -188,6 +193,21 @@ class Actor:
         """In the actor: let time pass."""
         self._stage.loop.call_later(seconds, self.resume)
         self._pause()
+
+    def wait(self, seconds: float) -> None:
+        """In the actor: let time pass until somebody wakes it."""
+        self._alarm = self._stage.loop.call_later(seconds, self._wake_up)
+        self._pause()
+
+    def wake(self) -> None:
+        """Let it go on, if it waits, when its thread gets its turn."""
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = self._stage.loop.call_later(self._stage.loop.moment(), self._wake_up)
+
+    def _wake_up(self) -> None:
+        self._alarm = None
+        self.resume()
 
     # As the queue that a thread waits at
 
@@ -256,3 +276,66 @@ class StagedThread:
         while (entry := actor.get()) is not None:
             action, args = entry
             action(*args)
+
+
+class Interrupted(BaseException):
+    """Ctrl-C."""
+
+
+class StagedChannel:
+    """The channel of a worker on this host in the hands of callers; a ``DirectChannel``."""
+
+    def __init__(self, stage: Stage, child: Child) -> None:
+        self._stage = stage
+        self._child = child
+        self._received: deque[Any] = deque()
+        self._reader: Actor | None = None
+        self._ended = False
+        stage.world.note("%s is lent", child.name)
+
+    def send(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> None:
+        """Send it a packet."""
+        self._stage.pause()
+        if self._child.gone:
+            raise BrokenPipeError
+        self._stage.world.note("%s is called directly", self._child.name)
+        self._child.deliver(seq, payload, buffers)
+        self._stage.pause()
+
+    def receive(self, timeout: float) -> Message | None:
+        """The next packet; sometimes Ctrl-C comes first."""
+        assert self._stage.running is not None
+        if not self._received and not self._ended:
+            self._reader = self._stage.running
+            self._reader.wait(timeout)
+            self._reader = None
+        if self._stage.rng.random() < 0.03:
+            self._stage.world.note("whoever called %s is interrupted", self._child.name)
+            raise Interrupted
+        if self._received:
+            message: Message = self._stage.world.language.message(self._received.popleft())
+            return message
+        if self._ended:
+            raise EOFError
+        return None
+
+    def close(self) -> None:
+        """Nobody uses it any more."""
+
+    def hear(self, message: Any) -> None:
+        """The worker sent it."""
+        self._received.append(message)
+        if self._reader is not None:
+            self._reader.wake()
+
+    def drain(self) -> list[Any]:
+        """What nobody has received."""
+        left = list(self._received)
+        self._received.clear()
+        return left
+
+    def end(self) -> None:
+        """The worker is gone."""
+        self._ended = True
+        if self._reader is not None:
+            self._reader.wake()

@@ -14,8 +14,10 @@ from fiber._engine.worker_set import Member, StartFailure
 from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.jobs import Jobs
+from fiber._runtime.leases import Lease, Leases
 from fiber._runtime.outcome import Pickled
 from fiber._runtime.sender import Sender
+from fiber._runtime.work_items import Call
 from fiber._runtime.worker_handle import WorkerHandle
 from simulation.explore import first_failure
 from simulation.suites import SUITES
@@ -214,6 +216,25 @@ def acts_later(patch: Patch) -> None:
     patch.setattr(Executor, "_take_calls", _take_calls)
 
 
+def lends_what_is_needed(patch: Patch) -> None:
+    patch.setattr(Scheduler, "needs_lent", lambda _: False)
+
+
+def forgets_calls_that_take_longer(patch: Patch) -> None:
+    def _adopt(self: Leases, lease: Lease, seq: int, call: Call) -> None:
+        self._return_idle(lease)
+
+    patch.setattr(Leases, "_adopt", _adopt)
+
+
+def forgets_who_died_while_lent(patch: Patch) -> None:
+    patch.setattr(Executor, "_back", lambda self, _: self._advance())
+
+
+def never_returns_leases_of_the_interrupted(patch: Patch) -> None:
+    patch.setattr(Leases, "_abandon", lambda *_: None)
+
+
 FAULTS: list[Fault] = [
     forgets_what_is_unsent,
     replaces_nobody,
@@ -243,6 +264,10 @@ FAULTS: list[Fault] = [
     never_resumes,
     holds_nothing_back,
     acts_later,
+    lends_what_is_needed,
+    forgets_calls_that_take_longer,
+    forgets_who_died_while_lent,
+    never_returns_leases_of_the_interrupted,
 ]
 
 

@@ -128,6 +128,30 @@ class NeverFinishes(Ledger):
         return False
 
 
+class LendsTheBusy(Ledger):
+    def lend(self, worker: Worker) -> bool:
+        worker.lent = True
+        return True
+
+
+class GivesToWhoIsLent(Ledger):
+    def lend(self, worker: Worker) -> bool:
+        if not super().lend(worker):
+            return False
+        self._load.idle[worker] = None
+        return True
+
+
+class ForgetsWhoIsBack(Ledger):
+    def return_idle(self, worker: Worker, now: float) -> None:
+        worker.lent = False
+
+
+class ForgetsWhatIsAdopted(Ledger):
+    def return_busy(self, worker: Worker, seq: int, *rest: Any) -> None:
+        super().return_busy(worker, self.next_seq(), *rest)
+
+
 BROKEN = [
     ForgetsLostBatches,
     KeepsLostBatches,
@@ -147,6 +171,10 @@ BROKEN = [
     IgnoresMaxTasks,
     PinsToAnyone,
     NeverFinishes,
+    LendsTheBusy,
+    GivesToWhoIsLent,
+    ForgetsWhoIsBack,
+    ForgetsWhatIsAdopted,
 ]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from fiber._wire import work
 from fiber._wire.packet import Message
 from simulation.schedule import Act
-from simulation.workers import Broken, Ready, Ref, Results, Unknown, Unreadable, Work, Worker
+from simulation.workers import NO_OP, Broken, Ready, Ref, Results, Unknown, Unreadable, Work, Worker
 
 
 class PlannedError(ValueError):
@@ -68,6 +68,8 @@ class Wire:
             return None
         if head.kind == work.CALLS:
             calls = [pickle.loads(call)[1] for call, _ in work.unpack_calls(body, head.size)]
+            if calls == [()]:
+                return Work(seq, [NO_OP], 1, 1, apart=True)
             if seq in self.pinned:
                 calls = [(calls[0][0], self.pinned[seq])]
             return Work(seq, [Ref(*call) for call in calls], 1, 1, apart=True)

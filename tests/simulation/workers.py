@@ -30,6 +30,10 @@ class Ref(NamedTuple):
     task: int
 
 
+NO_OP = Ref(-1, 0)
+"""A call that does nothing, and is nobody's."""
+
+
 class Work(NamedTuple):
     """A message with tasks."""
 

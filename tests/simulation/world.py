@@ -32,7 +32,7 @@ from simulation.schedule import (
     Task,
     Terminate,
 )
-from simulation.workers import Broken, Ref, Unknown, Work, Worker
+from simulation.workers import NO_OP, Broken, Ref, Unknown, Work, Worker
 
 PATIENCE = 300
 """Simulated seconds after which what did not happen over links never will."""
@@ -177,6 +177,8 @@ class World:
         self.schedule = plans
         self.loop = Loop(plans.seed)
         self.oracle = Oracle(plans)
+        self.make_channel: Callable[[Child], Any] = lambda child: None
+        """A child's channel for direct use, if there is such a thing."""
         self._trace = trace
         self.workers: list[Worker] = []
         self._calls = 0
@@ -254,6 +256,8 @@ class World:
 
     def task(self, ref: Ref) -> Task:
         """What a task does."""
+        if ref == NO_OP:
+            return Task(0.0)
         job = self.schedule.jobs[ref.job]
         return job.tasks[0 if job.everywhere else ref.task]
 
