@@ -10,10 +10,10 @@ import random
 import signal
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._agent.port import ChildObserver, ExitReport
-from fiber._transport.link import Keepalive
+from fiber._transport.link import Patience
 from fiber._transport.memory import SimulatedLoop
 from simulation import schedule
 from simulation.workers import Worker
@@ -21,7 +21,7 @@ from simulation.workers import Worker
 if TYPE_CHECKING:
     from simulation.world import World
 
-LOST_AFTER = Keepalive().lost_after
+LOST_AFTER = Patience().lost_after
 """Seconds of silence after which the master gives a host up."""
 
 SAME_HOST = schedule.Agent(1e-5, 5e-5)
@@ -108,7 +108,7 @@ class Agent:
         """The master knows that ``child`` is gone, or believes so."""
         if not self.lost:
             self._children.remove(child)
-        self.world.oracle.lost(child.worker, was_heard=child.was_heard, reported=not self.lost)
+        self.world.oracle.lost(child.worker)
 
     def _lose(self, cut_number: int) -> None:
         if not self.up.is_cut or cut_number != self._cut_number:
@@ -136,6 +136,19 @@ class Agent:
             child.worker.die(-signal.SIGKILL)
 
 
+class Channel(Protocol):
+    """A worker's channel, in direct use."""
+
+    def hear(self, message: Any) -> None:
+        """The worker sent it."""
+
+    def drain(self) -> list[Any]:
+        """What nobody has received."""
+
+    def end(self) -> None:
+        """The worker is gone."""
+
+
 class Child:
     """One worker, as the master holds it (a ``ChildPort``) and as its agent does."""
 
@@ -148,7 +161,7 @@ class Child:
         self.inbox: deque[tuple[int, Any, Sequence[memoryview]]] = deque()
         self.gone = False
         """The master knows, or believes."""
-        self.was_heard = False
+        self._channel: Channel | None = None
         self._observer = observer
         self._unread: dict[int, None] = {}
 
@@ -159,6 +172,18 @@ class Child:
         self._unread[seq] = None
         self.agent.down.send(self._put, seq, payload, buffers)
         return True
+
+    def lend(self) -> Channel | None:
+        """Its channel, for direct use."""
+        self._channel = self.agent.world.make_channel(self)
+        return self._channel
+
+    def reclaim(self) -> None:
+        """Hear what it says again."""
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            for message in channel.drain():
+                self.agent.world.loop.call_soon(self._said, message)
 
     def take_back(self) -> None:
         """Recall the packets that it has not read."""
@@ -215,10 +240,14 @@ class Child:
     def _said(self, message: Any) -> None:
         if self.gone:
             self.agent.world.heard_late(self, message)
+        elif self._channel is not None:
+            self._channel.hear(message)
         else:
-            self.was_heard = True
-            self.agent.world.note("%s says %s", self.name, message)
-            self._observer.said(self.agent.world.language.message(message))
+            self._tell(message)
+
+    def _tell(self, message: Any) -> None:
+        self.agent.world.note("%s says %s", self.name, message)
+        self._observer.said(self.agent.world.language.message(message))
 
     def _taken_back(self, seqs: list[int]) -> None:
         for seq in seqs:
@@ -233,6 +262,10 @@ class Child:
             self._end(ExitReport(exitcode, f"exit {exitcode}", unread, running, host=self.host))
 
     def _end(self, report: ExitReport) -> None:
+        if self._channel is not None:
+            for message in self._channel.drain():  # its last words
+                self._tell(message)
+            self._channel.end()
         self.gone = True
         world = self.agent.world
         world.note("%s is gone: unread %s, in %s", self.name, report.unread, report.running)

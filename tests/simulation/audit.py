@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._engine.chunks import LIMIT
 from fiber._engine.ledger import PATIENCE, Batch, Job, Ledger, Loss, Receipt, Worker
-from simulation.oracle import Account, Violation
+from simulation.oracle import Account, Violation, require
 from simulation.workers import Ref
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ class Audit:
         self._left: dict[Worker, int] = {}
         """Units that each may do, less those that it has done."""
         self._jobs: set[Job] = set()
+        self._lent: set[Worker] = set()
         watched = {
             "open": self._open,
             "add": self._add,
@@ -65,6 +66,9 @@ class Audit:
             "recall": self._recall,
             "put_back": self._put_back,
             "lose": self._lose,
+            "lend": self._lend,
+            "return_idle": self._return_idle,
+            "return_busy": self._return_busy,
         }
         self._real = SimpleNamespace(**{name: getattr(ledger, name) for name in watched})
         vars(ledger).update(watched)
@@ -88,6 +92,7 @@ class Audit:
             for worker in self._ledger._pins
             for job, span in worker.pinned
         }
+        reached = {job: job.reached for job in self._ledger.jobs if job.paused}
         batch: Batch | None = self._real.assign(now)
         if batch is not None:
             worker = batch.worker
@@ -100,13 +105,16 @@ class Audit:
                 batch.stop,
             )
             self._check_tasks(batch, batch.job)
-            _require(worker in self._ledger.workers, "a worker that is gone is given a batch")
-            _require(not worker.leaving, "a worker that leaves is given a batch")
-            _require(not worker.key.leaving, "a worker that was told to stop is given a batch")
-            _require(worker.queue[-1] is batch, "a batch is not the last one of its worker")
+            back = batch.start < reached.get(batch.job, batch.stop)
+            require(back or batch.pin, "a task is begun though nobody reads results")
+            require(worker in self._ledger.workers, "a worker that is gone is given a batch")
+            require(not worker.leaving, "a worker that leaves is given a batch")
+            require(not worker.lent, "a worker that is lent is given a batch")
+            require(not worker.key.leaving, "a worker that was told to stop is given a batch")
+            require(worker.queue[-1] is batch, "a batch is not the last one of its worker")
             pinned_to = pins.get((batch.job, batch.start))
-            _require(batch.pin is (pinned_to is not None), "a pinned task is not marked")
-            _require(pinned_to in (None, worker), "a task runs where it is not pinned to")
+            require(batch.pin is (pinned_to is not None), "a pinned task is not marked")
+            require(pinned_to in (None, worker), "a task runs where it is not pinned to")
             if not batch.pin:
                 self._check_turns(batch.job, worker)
         return batch
@@ -116,27 +124,27 @@ class Audit:
         workers = self._ledger.workers
         # Another one with a single batch is kept free for whoever needs an idle worker.
         passed = not any(len(worker.queue) == 1 for worker in workers if worker is not given)
-        waiting = [other for other in self._ledger.jobs if other.waiting and other is not job]
+        waiting = [other for other in self._ledger.jobs if other.has_next and other is not job]
         fair = PASSES * (len(self._ledger.jobs) + len(workers))
         self._patience = {other: self._patience.get(other, fair) - passed for other in waiting}
         least = min(self._patience.values(), default=0)
-        _require(least >= 0, "a job waits while others get all the workers")
+        require(least >= 0, "a job waits while others get all the workers")
 
     def _check_tasks(self, batch: Batch, job: Job) -> None:
-        _require(1 <= len(batch.items) <= LIMIT, f"a batch has {len(batch.items)} tasks")
+        require(1 <= len(batch.items) <= LIMIT, f"a batch has {len(batch.items)} tasks")
         if job.alone or batch.pin or not job.retries:
-            _require(len(batch.items) == 1, "tasks that travel alone share a batch")
-            _require(batch.alone, "a task that travels alone is not marked")
+            require(len(batch.items) == 1, "tasks that travel alone share a batch")
+            require(batch.alone, "a task that travels alone is not marked")
         account = self._names.account(job)
         if account is not None:
-            _require(not account.cancelled, "a cancelled job is given out")
-            _require(batch.pin is account.plan.everywhere, "a task is pinned, or not, by mistake")
+            require(not account.cancelled, "a cancelled job is given out")
+            require(batch.pin is account.plan.everywhere, "a task is pinned, or not, by mistake")
             for index, item in enumerate(batch.items, batch.start):
                 self._check_name(job, account, index, item)
 
     def _check_name(self, job: Job, account: Account, index: int, item: Any) -> None:
         ref = self._names.ref(job, index, item)
-        _require(ref == (account.number, index), f"{ref} is taken for task {index}")
+        require(ref == (account.number, index), f"{ref} is taken for task {index}")
 
     def _receive(self, seq: int, *args: Any, **options: Any) -> Receipt | None:
         batch = self._ledger.batches.get(seq)
@@ -159,7 +167,7 @@ class Audit:
     def _cancel(self, job: Job) -> list[Worker]:
         missing = job.fed - job.done
         unfinished = len(self._ledger.unfinished(job))
-        _require(unfinished == missing, f"{unfinished} tasks are unfinished, not {missing}")
+        require(unfinished == missing, f"{unfinished} tasks are unfinished, not {missing}")
         holders = {
             worker
             for worker in self._ledger.workers
@@ -167,17 +175,17 @@ class Audit:
         }
         told: list[Worker] = self._real.cancel(job)
         self._jobs.discard(job)
-        _require(set(told) == holders, "unread batches of a cancelled job are not recalled")
+        require(set(told) == holders, "unread batches of a cancelled job are not recalled")
         return told
 
     def _leave(self, worker: Worker) -> bool:
         busy = bool(worker.queue or worker.pinned)
         leaving = worker.leaving
         left: bool = self._real.leave(worker)
-        _require(
+        require(
             left is not busy, "a busy worker leaves" if left else "an idle worker may not leave"
         )
-        _require(worker.leaving is (left or leaving), "a refusal to leave changes the worker")
+        require(worker.leaving is (left or leaving), "a refusal to leave changes the worker")
         return left
 
     def _recall(self, now: float) -> list[Worker]:
@@ -211,12 +219,36 @@ class Audit:
             ref = self._names.ref(job, index, item)
             loss = given_up.get((job, index))
             now = loss.attempts if loss is not None else job.attempts.get(index, 0)
-            _require(attempts <= now <= attempts + 1, f"{ref} goes from {attempts} to {now}")
-            _require(loss is None or loss.item is item, "a loss names another task")
+            require(attempts <= now <= attempts + 1, f"{ref} goes from {attempts} to {now}")
+            require(loss is None or loss.item is item, "a loss names another task")
             self._check_charge(self._names.child(worker), seq, offset, ref, now > attempts)
             if loss is not None:
                 self._world.note("%s is given up", ref)
         return losses
+
+    def _lend(self, worker: Worker) -> bool:
+        idle = worker in self._ledger.idle()
+        lent: bool = self._real.lend(worker)
+        require(idle or not lent, "a worker is lent that is not idle")
+        if lent:
+            self._lent.add(worker)
+        return lent
+
+    def _return_idle(self, worker: Worker, now: float) -> None:
+        self._check_return(worker)
+        self._real.return_idle(worker, now)
+
+    def _return_busy(
+        self, worker: Worker, seq: int, job: Job | None, item: Any, now: float
+    ) -> None:
+        self._check_return(worker)
+        require(seq not in self._ledger.batches, "two batches have the same number")
+        self._real.return_busy(worker, seq, job, item, now)
+
+    def _check_return(self, worker: Worker) -> None:
+        require(worker in self._lent, "a worker is returned that was not lent")
+        require(worker in self._ledger.workers, "a worker is returned that is gone")
+        self._lent.discard(worker)
 
     def _check_charge(self, child: Child, seq: int, offset: int, ref: Ref, charged: bool) -> None:
         if charged:
@@ -230,7 +262,7 @@ class Audit:
         """Each task is in one place, each worker where it belongs, nobody idle without need."""
         self._check_workers()
         forgotten = {job for job in self._jobs - self._ledger.jobs if not job.finished}
-        _require(not forgotten, "the ledger has forgotten a job")
+        require(not forgotten, "the ledger has forgotten a job")
         places: dict[Job, list[tuple[str, int, int]]] = {
             job: [
                 ("waiting", stock.start + stock.position, len(stock))
@@ -262,27 +294,29 @@ class Audit:
         )
         demand = self._ledger.demand()
         fits = wanted <= demand <= wanted + unwanted
-        _require(fits, f"the demand is {demand} for {wanted} tasks and {unwanted} cancelled ones")
+        require(fits, f"the demand is {demand} for {wanted} tasks and {unwanted} cancelled ones")
 
     def _check_workers(self) -> None:
         held = 0
         for worker in self._ledger.workers:
             held += len(worker.queue)
             child = self._names.child(worker)
-            _require(not child.gone, f"{child.name} is gone, but not lost")
-            _require(len(worker.queue) <= 2, f"{child.name} has too many batches")
+            # Whoever uses it finds that out.
+            require(worker.lent or not child.gone, f"{child.name} is gone, but not lost")
+            require(not (worker.lent and worker.queue), f"{child.name} is lent and has a batch")
+            require(len(worker.queue) <= 2, f"{child.name} has too many batches")
             for batch in worker.queue:
-                _require(self._ledger.batches.get(batch.seq) is batch, "an unknown batch is held")
-                _require(batch.worker is worker, "a batch is held by another worker")
+                require(self._ledger.batches.get(batch.seq) is batch, "an unknown batch is held")
+                require(batch.worker is worker, "a batch is held by another worker")
             if worker in self._left:
                 left = self._left[worker] - sum(batch.units for batch in worker.queue)
-                _require(worker.left == left, f"{child.name} has {worker.left} left, not {left}")
+                require(worker.left == left, f"{child.name} has {worker.left} left, not {left}")
             if len(worker.queue) == 2:
-                _require(
+                require(
                     not any(batch.alone for batch in worker.queue),
                     "something queues behind or before a task that travels alone",
                 )
-        _require(held == len(self._ledger.batches), "a batch is with nobody")
+        require(held == len(self._ledger.batches), "a batch is with nobody")
 
     def _check_idle(self) -> None:
         idle = self._ledger.idle()
@@ -290,10 +324,10 @@ class Audit:
             self._watched.clear()
             return
         since = [worker.since for worker in idle]
-        _require(since == sorted(since), "the idle are not in the order in which they became so")
-        waiting = any(job.waiting for job in self._ledger.jobs)
-        _require(not waiting, "a task waits though a worker is idle")
-        _require(not any(worker.pinned for worker in idle), "a pinned task waits for nothing")
+        require(since == sorted(since), "the idle are not in the order in which they became so")
+        waiting = any(job.has_next for job in self._ledger.jobs)
+        require(not waiting, "a task waits though a worker is idle")
+        require(not any(worker.pinned for worker in idle), "a pinned task waits for nothing")
         now = self._world.loop.now()
         asked = 0
         late = []
@@ -316,17 +350,17 @@ class Audit:
     def check_end(self) -> None:
         """Nothing happens any more."""
         ledger = self._ledger
-        _require(not ledger.batches, f"batches {list(ledger.batches)} are left over")
-        _require(not ledger.demand(), f"{ledger.demand()} tasks are left over")
-        _require(not any(job.closed for job in ledger.jobs), "a finished job is left over")
-        _require(not any(worker.queue for worker in ledger.workers), "a worker is left busy")
-        _require(ledger.starting == 0, f"{ledger.starting} workers never started")
+        require(not ledger.batches, f"batches {list(ledger.batches)} are left over")
+        require(not ledger.demand(), f"{ledger.demand()} tasks are left over")
+        require(not any(job.closed for job in ledger.jobs), "a finished job is left over")
+        require(not any(worker.queue for worker in ledger.workers), "a worker is left busy")
+        require(ledger.starting == 0, f"{ledger.starting} workers never started")
 
 
 def _check_places(job: Job, account: Account, places: list[tuple[str, int, int]]) -> None:
     """Each task is waiting, or in a batch, or done, and nowhere else."""
     number = account.number
-    _require(not account.cancelled, f"job {number} was cancelled, but the ledger keeps {places}")
+    require(not account.cancelled, f"job {number} was cancelled, but the ledger keeps {places}")
     seen = account.delivered
     for place, start, size in places:
         tasks = (1 << size) - 1 << start
@@ -336,9 +370,4 @@ def _check_places(job: Job, account: Account, places: list[tuple[str, int, int]]
     if seen != account.everything:
         raise Violation(f"tasks {account.everything & ~seen:b} of job {number} are nowhere")
     done = account.delivered.bit_count()
-    _require(job.done == done, f"job {number} counts {job.done}, not {done}, as done")
-
-
-def _require(condition: bool, otherwise: str) -> None:
-    if not condition:
-        raise Violation(otherwise)
+    require(job.done == done, f"job {number} counts {job.done}, not {done}, as done")

@@ -1,10 +1,11 @@
-"""The least that a dispatcher does: what the ledger says, followed to the letter, and checked."""
+"""The least that an executor does: what the ledger says, followed to the letter, and checked."""
 
 from __future__ import annotations
 
 import random
 import signal
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from fiber._agent.port import ExitReport
@@ -14,9 +15,15 @@ from fiber._engine.ledger import Ledger
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation
-from simulation.schedule import Act
-from simulation.workers import Ready, Ref, Results, Unreadable, Work, Worker
+from simulation.schedule import Act, Famine, Schedule
+from simulation.workers import NO_OP, Ready, Ref, Results, Unreadable, Work, Worker
 from simulation.world import World
+
+
+def for_ledger(schedule: Schedule) -> Schedule:
+    """Whoever drives it starts workers without a pause, so that there must be some that can."""
+    faults = tuple(fault for fault in schedule.faults if not isinstance(fault, Famine))
+    return replace(schedule, faults=faults)
 
 
 class Plain:
@@ -70,9 +77,9 @@ class Member:
 class Names:
     """Tells the audit what the master's objects stand for."""
 
-    def account(self, job: engine.Job) -> Account:
-        """Whose job it is."""
-        account: Account = job.owner
+    def account(self, job: engine.Job) -> Account | None:
+        """Whose job it is; None if a caller sent it directly."""
+        account: Account | None = job.owner
         return account
 
     def ref(self, job: engine.Job, index: int, item: Any) -> Ref:
@@ -102,6 +109,9 @@ class LedgerMaster:
         self._pace = Pace()
         self._recall_at: float | None = None
         self._idle_since: dict[engine.Worker, float] = {}
+        self._direct: dict[engine.Worker, int] = {}
+        """What lent workers were sent by those who use them."""
+        self._adopted: list[engine.Job] = []
 
     def begin(self) -> None:
         """Plan the jobs, and start the first workers."""
@@ -194,7 +204,10 @@ class LedgerMaster:
             self.ledger.starting -= 1
             member.worker = self.ledger.add(member, self._now, self.world.schedule.left)
         elif isinstance(said, Results):
-            self._take(said)
+            if member.worker is not None and self._direct.get(member.worker) == said.seq:
+                del self._direct[member.worker]  # its caller hears it
+            else:
+                self._take(said)
         elif isinstance(said, Unreadable):
             self._split(said.seq)
         self._settle()
@@ -228,6 +241,8 @@ class LedgerMaster:
             self._deliver(receipt.job, receipt.item(receipt.start), "unreadable")
 
     def _deliver(self, job: engine.Job, ref: Ref, outcome: Act | str) -> None:
+        if ref == NO_OP:
+            return
         self.world.oracle.delivered(ref, outcome)
         self._look(job)
 
@@ -254,6 +269,8 @@ class LedgerMaster:
 
     def _lose(self, worker: engine.Worker, report: ExitReport) -> None:
         losses = self.ledger.lose(worker, report.unread, report.running)
+        self._direct.pop(worker, None)
+        losses = [loss for loss in losses if loss.item != NO_OP]
         for loss in losses:
             self.world.oracle.died(loss.item, loss.attempts)
         for job in {loss.job for loss in losses}:
@@ -272,7 +289,7 @@ class LedgerMaster:
     def drain(self) -> None:
         """Ask some worker to leave."""
         able = sorted(self._members.values(), key=lambda member: member.child.name)
-        able = [member for member in able if member.worker and not member.leaving]
+        able = [it for it in able if it.worker and not it.worker.lent and not it.leaving]
         if able:
             self._leave(self._rng.choice(able))
         self._settle()
@@ -291,6 +308,8 @@ class LedgerMaster:
         for worker in self.ledger.recall(self._now):
             worker.key.child.take_back()
         self._let_go()
+        if self._rng.random() < 0.05:
+            self._lend()
         self._scale()
         self._set_timer()
         self._audit.check()
@@ -299,14 +318,42 @@ class LedgerMaster:
         while (batch := self.ledger.assign(self._now)) is not None:
             member: Member = batch.worker.key
             assert batch.job is not None
-            account: Account = batch.job.owner
+            account: Account | None = batch.job.owner
             if any(self.world.task(ref).act is Act.UNSENDABLE for ref in batch.items):
                 self._split(batch.seq)
                 continue
-            work = Work(batch.seq, batch.items, batch.stride, account.plan.unit)
+            work = Work(batch.seq, batch.items, batch.stride, batch.unit)
             member.child.deliver(batch.seq, work)
-            if account.plan.timeout is not None:
+            if account is not None and account.plan.timeout is not None:
                 self._later(account.plan.timeout, self._expire, batch)
+
+    def _lend(self) -> None:
+        """Leave an idle worker to somebody who may call it directly, for a while."""
+        idle = self.ledger.idle()
+        if not idle or not self.ledger.lend(worker := self._rng.choice(idle)):
+            return
+        self.world.note("%s is lent", worker.key.child.name)
+        if self._rng.random() < 0.7:
+            seq = self._direct[worker] = self.ledger.next_seq()
+            worker.key.child.deliver(seq, Work(seq, [NO_OP], 1, 1, apart=True))
+        self._later(self._rng.choice((1e-5, 1e-3, 0.1)), self._return, worker)
+
+    def _return(self, worker: engine.Worker) -> None:
+        """Whoever used it leaves it, and perhaps the answer that is still to come."""
+        if worker not in self.ledger.workers:
+            return
+        self.world.note("%s is returned", worker.key.child.name)
+        seq = self._direct.pop(worker, None)
+        if seq is None:
+            self.ledger.return_idle(worker, self._now)
+            return
+        job = None
+        if self._rng.random() < 0.5:
+            job = self.ledger.open()
+            self._adopted.append(job)
+        self.ledger.return_busy(worker, seq, job, NO_OP, self._now)
+        if job is not None:
+            self.ledger.close(job)
 
     def _let_go(self) -> None:
         for worker in self.ledger.spent():
@@ -315,7 +362,7 @@ class LedgerMaster:
     def _scale(self) -> None:
         staying = sum(not member.leaving for member in self._members.values())
         schedule, wanted = self.world.schedule, self._wanted()
-        newcomers = len(self.ledger.homeless()) - self.ledger.starting
+        newcomers = self.ledger.newcomers_wanted() - self.ledger.starting
         if not self._terminated:
             missing = max(wanted - staying, min(newcomers, schedule.max_workers - staying))
             for _ in range(missing):
@@ -364,6 +411,8 @@ class LedgerMaster:
 
     def check_end(self) -> None:
         """Nothing may be left over."""
+        if not all(job.finished for job in self._adopted):
+            raise Violation("the answer to a direct call never comes")
         self._audit.check_end()
 
 

@@ -1,6 +1,6 @@
 """What must hold: compares what the user sees with what truly happened to each task.
 
-The oracle knows what no dispatcher can know: when each simulated worker began and ended each task.
+The oracle knows what no executor can know: when each simulated worker began and ended each task.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING
 
 from simulation.schedule import Act, Job, Schedule
-from simulation.workers import Ref, Worker
+from simulation.workers import NO_OP, Ref, Worker
 
 if TYPE_CHECKING:
     from simulation.agents import Child
@@ -17,6 +17,12 @@ if TYPE_CHECKING:
 
 class Violation(AssertionError):
     """A promise was broken."""
+
+
+def require(condition: bool, otherwise: str) -> None:
+    """Violation unless ``condition`` holds."""
+    if not condition:
+        raise Violation(otherwise)
 
 
 class Account:
@@ -53,12 +59,13 @@ class Oracle:
         self.accounts = [Account(number, plan) for number, plan in enumerate(schedule.jobs)]
         self._left = schedule.left
         self._lost: set[Worker] = set()
-        self.stillborn = 0
 
     # What truly happens
 
     def begins(self, ref: Ref, worker: Worker) -> None:
         """``worker`` begins a task: the first time, or because an earlier run came to nothing."""
+        if ref == NO_OP:
+            return
         account = self.accounts[ref.job]
         runs = account.runs[ref.task]
         living = sum(earlier not in self._lost for earlier in runs)
@@ -74,15 +81,11 @@ class Oracle:
 
     def runs(self, ref: Ref) -> int:
         """How often a task was begun."""
-        return len(self.accounts[ref.job].runs[ref.task])
+        return 0 if ref == NO_OP else len(self.accounts[ref.job].runs[ref.task])
 
-    def lost(self, worker: Worker, *, was_heard: bool, reported: bool) -> None:
-        """The master knows, or believes, that a worker is gone.
-
-        ``was_heard``: it was ready before.  ``reported``: its agent says so.
-        """
+    def lost(self, worker: Worker) -> None:
+        """The master knows, or believes, that a worker is gone."""
         self._lost.add(worker)
-        self.stillborn += reported and not was_heard
         if self._left is not None and worker.units > self._left:
             raise Violation(f"{worker.name} ran {worker.units} units, more than {self._left}")
 

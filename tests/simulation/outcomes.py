@@ -1,12 +1,11 @@
-"""What the user of the real dispatcher sees, told to the oracle."""
+"""What the user of the real executor sees, told to the oracle."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from fiber._runtime.requests import Request
-
-from fiber._runtime.outcome import Encoded, Failure
+from fiber._runtime.outcome import Failure, Pickled
+from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from fiber.errors import StartError, TimeoutError, WorkerDied
 from simulation.oracle import Account, Violation
@@ -15,7 +14,12 @@ from simulation.wire import value_of
 from simulation.workers import Ref
 
 if TYPE_CHECKING:
-    from simulation.dispatcher_master import DispatcherMaster
+    from simulation.executor_master import ExecutorMaster
+    from simulation.staged import Actor
+
+
+HEARD = object()
+"""In place of an outcome that the oracle knows already."""
 
 
 class BrokenInput(Exception):
@@ -23,28 +27,47 @@ class BrokenInput(Exception):
 
 
 class Outcomes:
-    """Where the dispatcher puts the outcomes of one job, or of one call of it; a ``Sink``."""
+    """Where the executor puts the outcomes of one job, or of one call of it; a ``Future``."""
 
-    def __init__(self, master: DispatcherMaster, account: Account, call: int | None = None) -> None:
+    def __init__(
+        self,
+        master: ExecutorMaster,
+        account: Account,
+        call: int | None = None,
+        caller: Actor | None = None,
+    ) -> None:
         self.account = account
         self.call = call
-        self.request: Request | None = None
+        self.item: WorkItem | None = None
+        self.limit: int | None = None
+        """Tasks that may be read and not consumed."""
+        self.consumed = 0
         self._master = master
         self._oracle = master.world.oracle
+        self._caller = caller
+        """Who waits for it."""
         self._ended = False
 
-    def put(self, start: int, outcomes: list[Any], mixed: bool = True) -> None:
-        """Outcomes of tasks from ``start`` on."""
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+        """Outcomes of tasks from ``start`` on; sometimes nobody reads them for a while."""
+        if not mixed and any(type(outcome) in (Failure, Pickled) for outcome in outcomes):
+            raise Violation(f"job {self.account.number} has results that are not plain")
         for index, outcome in enumerate(outcomes, start if self.call is None else self.call):
             self._put(Ref(self.account.number, index), outcome)
-        if self.request is not None and self.request.reader is not None:
-            # The user takes them a little later.
-            self._master.stage.soon(self.request.reader.consume, len(outcomes))
+        if self.limit is not None:
+            for _ in outcomes:
+                self._master.consume_soon(self)
+        return self.item is not None and self._master.holds_back(self.item)
+
+    def lift_bound(self) -> None:
+        """Whoever would read the results waits for the rest."""
+        self._master.waits_for_all(self.account)
 
     def _put(self, ref: Ref, outcome: Any) -> None:
         error = outcome.error if type(outcome) is Failure else None
         if isinstance(error, BrokenInput):
-            if self.request is None or ref.task != self.request.job.fed:
+            job = self.item.job if self.item is not None else None
+            if job is None or ref.task != job.fed:
                 raise Violation(f"the error of the input takes the place of {ref}")
         elif isinstance(error, WorkerDied):
             self._oracle.died(ref, error.attempts)
@@ -55,7 +78,7 @@ class Outcomes:
                 raise Violation(f"{ref} cannot be sent: {error}")
             self._master.world.note("%s cannot be sent", ref)
             self._oracle.delivered(ref, "unsendable")
-        elif type(outcome) is Encoded:
+        elif type(outcome) is Pickled:
             act = self._master.world.task(ref).act
             if act is Act.UNREADABLE:
                 self._oracle.delivered(ref, "unreadable")
@@ -68,22 +91,64 @@ class Outcomes:
         else:
             self._oracle.delivered(ref, Act.FINE)
 
-    def end(self) -> None:
+    def set_done(self) -> None:
         """That was all."""
-        if self._ended:
-            raise Violation(f"job {self.account.number} ends twice")
-        self._ended = True
+        self._end()
         if self.call is None or self._master.ended_call(self.account):
             self._master.world.note("job %d is finished", self.account.number)
             self._oracle.finished(self.account.number)
 
-    def abort(self, error: BaseException) -> None:
+    def set_exception(self, error: BaseException) -> None:
         """There will be no more."""
-        if isinstance(error, StartError) and self._oracle.stillborn < 3:
+        account, number = self.account, self.account.number
+        self._end()
+        if self.call is not None and not self._master.world.loop.on_thread():
+            self._refuse(Ref(number, self.call), error)
+            return
+        late = isinstance(error, ValueError) and str(error) == "Pool not running"
+        if late and not self._master.is_closing:
+            raise Violation(f"job {number} is refused, though the pool is not closed")
+        if isinstance(error, StartError) and not self._master.starved:
             raise Violation("the pool gives up though workers can start")
-        if isinstance(error, ValueError) and not self.account.broken:
-            raise Violation(f"job {self.account.number} is aborted without a reason")
-        if self.account.finished:
-            raise Violation(f"job {self.account.number} is aborted after it was finished")
-        self._master.world.note("job %d is aborted: %s", self.account.number, type(error).__name__)
-        self.account.cancelled = True
+        if isinstance(error, ValueError) and not (late or account.broken):
+            raise Violation(f"job {number} is aborted without a reason")
+        if account.finished:
+            raise Violation(f"job {number} is aborted after it was finished")
+        if late and self.call is not None and not account.cancelled:
+            self._master.world.note("call %d of job %d comes too late", self.call, number)
+            self._master.refused_call(account, self.call)
+        else:
+            self._master.world.note("job %d is aborted: %s", number, type(error).__name__)
+            account.cancelled = True
+
+    def _refuse(self, ref: Ref, error: BaseException) -> None:
+        """A call does not pickle, as its caller hears at once."""
+        self._put(ref, Failure(error))
+        if self._master.ended_call(self.account):
+            self._oracle.finished(self.account.number)
+
+    def _end(self) -> None:
+        if self._ended:
+            raise Violation(f"job {self.account.number} ends twice")
+        self._ended = True
+        if self._caller is not None:
+            self._caller.put(HEARD)
+
+    def get(self) -> object:
+        """The caller waits until the outcome is there, which the oracle is told."""
+        assert self._caller is not None
+        return self._caller.get()
+
+    def answered(self, outcome: Any) -> None:
+        """Its worker has told the caller itself."""
+        self._put(Ref(self.account.number, self.call or 0), outcome)
+        self._ended = True
+        if self._master.ended_call(self.account):
+            self._oracle.finished(self.account.number)
+
+    def interrupted(self) -> None:
+        """The caller does not wait for it any more."""
+        self._oracle.delivered(Ref(self.account.number, self.call or 0), "interrupted")
+        self._ended = True
+        if self._master.ended_call(self.account):
+            self._oracle.finished(self.account.number)

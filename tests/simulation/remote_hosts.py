@@ -131,7 +131,6 @@ class Seen:
         self.child: Child | None = None
         self.gone = False
         self._observer = observer
-        self._was_heard = False
 
     @property
     def worker(self) -> Worker:
@@ -145,7 +144,6 @@ class Seen:
 
     def said(self, message: Message) -> None:
         """It said something."""
-        self._was_heard = True
         self._observer.said(message)
 
     def taken_back(self, seqs: list[int]) -> None:
@@ -155,12 +153,10 @@ class Seen:
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
         self.gone = True
-        reported = not self.agent.lost
         world = self.agent.world
         world.note("the master hears that %s is gone: unread %s", self.name, report.unread)
         if self.child is not None:
-            was_heard = self._was_heard
-            world.oracle.lost(self.child.worker, was_heard=was_heard, reported=reported)
+            world.oracle.lost(self.child.worker)
         self._observer.exited(report)
 
 

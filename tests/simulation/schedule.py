@@ -6,7 +6,7 @@ import enum
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 FOREVER = float("inf")
 
@@ -130,6 +130,18 @@ class Refusal:
 
 
 @dataclass(frozen=True, slots=True)
+class Famine:
+    """For a while no worker gets as far as being ready."""
+
+    at: float
+    seconds: float
+    exitcode: int
+    """How they die; REFUSED: the system starts none."""
+
+    REFUSED: ClassVar[int] = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Drain:
     """Some worker is asked to leave."""
 
@@ -144,7 +156,7 @@ class Terminate:
 
 
 Fault: TypeAlias = (
-    Crash | Kill | StillBirth | Stop | Slow | Cut | Repeat | Refusal | Drain | Terminate
+    Crash | Kill | StillBirth | Stop | Slow | Cut | Repeat | Refusal | Famine | Drain | Terminate
 )
 
 
@@ -278,6 +290,12 @@ class _Draw:
                     yield Cut(rng.randint(1, remote), self.time(), seconds)
         if rng.random() < 0.05:
             yield Terminate(self.time())
+        if rng.random() < 0.06:
+            at = rng.choice((0.0, 5e-3, self.time()))
+            exitcode = rng.choice((1, -9, Famine.REFUSED))
+            yield Famine(at, rng.choice((0.3, 3.0, 15.0, 100.0)), exitcode)
+            if at:
+                yield Kill(rng.randrange(workers), at + self.time())
 
 
 def simpler(schedule: Schedule) -> Iterator[Schedule]:

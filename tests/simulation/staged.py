@@ -1,103 +1,124 @@
-"""What the real dispatcher finds in place of threads, processes and the runtime.
+"""What the real executor finds in place of threads, processes and the runtime.
 
-One thread runs everything, so that a seed decides the order.  What the dispatcher does on other
-threads (its pump, its caller sending a batch, a reader of input) happens at later moments that the
-seed chooses, as it may with threads.
+One thread runs at a time, so that a seed decides the order.  What the executor does on its
+background threads, and its callers on theirs, happens at moments that the seed chooses, and may be
+interrupted where it runs the user's code or starts a process.
 """
 
 from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from unittest import mock
 
-from fiber._runtime.dispatcher import Dispatcher, Terms
-
 from fiber._agent import service
 from fiber._backends.remote import RemoteChild
-from fiber._engine.ledger import Batch
-from fiber._runtime import dispatcher, exchange, workers
+from fiber._runtime import executor
+from fiber._wire.packet import Message
 from fiber.process import Process
 from simulation.agents import Child
 from simulation.remote_hosts import NoCapture, RemoteHost
-from simulation.schedule import Refusal
+from simulation.schedule import Famine, Refusal
+from simulation.wire import PlannedError
 from simulation.workers import Ref
 
 if TYPE_CHECKING:
     from simulation.world import World
 
-MOMENTS = 1e-5, 1e-4, 3e-3
-"""Seconds until another thread gets its turn, at most: on an idle machine, on a busy one."""
-
 
 class StagedProcess(Process):
-    """Makes the dispatcher's processes leave the start method of this program alone."""
+    """Makes the executor's processes leave the start method of this program alone."""
 
     _start_method = "fork"
 
 
 class Stage:
-    """Stands in for the runtime; a context manager while it does."""
+    """Stands in for the runtime, as an executor's host; a context manager for the rest."""
 
     def __init__(self, world: World) -> None:
         self.loop = world.loop
         self.config = SimpleNamespace(start_timeout=1.0)
         self.rng = random.Random(f"{world.schedule.seed} stage")
-        self._world = world
+        self.world = world
         self._started = 0
         self._refusals = {
             fault.start for fault in world.schedule.faults if isinstance(fault, Refusal)
         }
-        self._longest = self.rng.choice(MOMENTS)
         self._stack = ExitStack()
-        self.pickled_on_loop = False
+        self._actors: list[Actor] = []
+        self.running: Actor | None = None
+        """The thread whose turn it is."""
+        self.user_code_on_loop = False
         self.item = _item_of(self)
+        world.make_channel = partial(StagedChannel, self)
         self.bad_item = BadItem
 
     def enter(self) -> None:
-        """Take the places."""
-        enter = self._stack.enter_context
-        enter(mock.patch.object(exchange, "runtime", return_value=self))
-        enter(mock.patch.object(workers, "runtime", return_value=self))
-        enter(mock.patch.object(exchange, "monotonic", self.loop.now))
-        enter(mock.patch.object(dispatcher, "monotonic", self.loop.now))
-        enter(mock.patch.object(exchange, "Pump", partial(StagedPump, self)))
-        enter(mock.patch.object(service, "Capture", NoCapture))
+        """Take the places of what cannot be handed over."""
+        self._stack.enter_context(mock.patch.object(service, "Capture", NoCapture))
+        self._stack.enter_context(mock.patch.object(executor, "_say", self._say))
+        self._stack.enter_context(mock.patch.object(PlannedError, "unpickled", self.run_user_code))
 
     def leave(self) -> None:
-        """Give them back."""
+        """Give them back, and end all threads."""
+        for actor in self._actors:
+            actor.abandon()
         self._stack.close()
+
+    def _say(self, news: str) -> None:
+        self.world.note("the user is told: %s", news)
+
+    def thread(self, name: str) -> StagedThread:
+        """In place of a BackgroundThread."""
+        return StagedThread(self, name)
+
+    def act(self, name: str, body: Callable[[Actor], None]) -> Actor:
+        """A thread that does ``body``, once it is resumed."""
+        actor = Actor(self, name, body)
+        self._actors.append(actor)
+        return actor
 
     def start(
         self, process: Any, observer: Any, *, tasks: bool, method: str
     ) -> Child | RemoteChild:
         """Start a worker on some agent."""
+        assert self.running is not None
+        # What comes of it comes after all that this thread has asked for.
+        self.running.sleep(self.loop.heard_in(self.running.name) + self.loop.moment())
         self._started += 1
-        if self._started in self._refusals:
-            self._world.note("the start of a worker is refused")
-            self._world.oracle.stillborn += 1
+        famine = self.world.famine()
+        if self._started in self._refusals or famine is Famine.REFUSED:
+            self.world.note("the start of a worker is refused")
             raise OSError("too many open files")
-        agent = self.rng.choice([agent for agent in self._world.agents if not agent.lost])
+        agent = self.rng.choice([agent for agent in self.world.agents if not agent.lost])
         if isinstance(agent, RemoteHost):
             return agent.start_for_master(f"start {self._started}", observer)
-        return self._world.start(agent, observer)
+        return self.world.start(agent, observer)
 
-    def soon(self, callback: Callable[..., object], *args: Any) -> None:
-        """Call it when another thread gets its turn."""
-        self.loop.call_later(self.moment(), self._off_loop, callback, args)
+    def run_user_code(self) -> None:
+        """What every piece of the user's code does."""
+        self.user_code_on_loop |= self.loop.on_thread()
+        self.pause()
 
-    def moment(self) -> float:
-        """Seconds until another thread gets its turn."""
-        return self.rng.random() * self._longest
+    def pause(self) -> None:
+        """Let others go on, if this is a thread that may be interrupted."""
+        if self.running is not None and self.rng.random() < 0.3:
+            self.running.sleep(self.loop.moment())
 
-    def _off_loop(self, callback: Callable[..., object], args: tuple[Any, ...]) -> None:
-        with self.loop.off_thread():
-            callback(*args)
+    def run_actor(self, actor: Actor, run: Callable[[], None]) -> None:
+        """Let ``actor`` run."""
+        before, self.running = self.running, actor
+        try:
+            with self.loop.off_thread(actor.name):
+                run()
+        finally:
+            self.running = before
 
 
 def _item_of(stage: Stage) -> type[tuple[int, int]]:
@@ -107,7 +128,7 @@ def _item_of(stage: Stage) -> type[tuple[int, int]]:
         __slots__ = ()
 
         def __reduce__(self) -> tuple[Any, ...]:
-            stage.pickled_on_loop |= stage.loop.on_thread()
+            stage.run_user_code()
             return Ref, tuple(self)
 
     return Item
@@ -122,82 +143,26 @@ class BadItem(tuple[int, int]):
         raise TypeError("cannot pickle this")
 
 
-class StagedPump:
-    """A ``Pump`` without a thread."""
-
-    def __init__(self, stage: Stage, name: str) -> None:
-        self._stage = stage
-        self._todo: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
-        self.stopped = False
-
-    def post(self, action: Callable[..., object], *args: Any) -> bool:
-        """Have it done later, in order."""
-        if not self.stopped:
-            self._todo.append((action, args))
-            self._stage.soon(self._run)
-        return not self.stopped
-
-    def stop(self) -> None:
-        """Take nothing more."""
-        self.stopped = True
-
-    def _run(self) -> None:
-        action, args = self._todo.pop(0)
-        action(*args)
-
-
-class StagedDispatcher(Dispatcher):
-    """Sends what a caller's thread assigned a moment later: other threads may come first."""
-
-    def __init__(self, stage: Stage, terms: Terms) -> None:
-        super().__init__(terms)
-        self._stage = stage
-
-    def _send(self, batches: Iterable[Batch]) -> None:
-        self._send_later(super()._send, list(batches))
-
-    def _send_safely(self, batches: Iterable[Batch]) -> None:
-        if self._loop.on_thread():
-            super()._send_safely(batches)
-        else:
-            self._send_later(super()._send_safely, list(batches))
-
-    def _send_later(self, send: Callable[[list[Batch]], None], batches: list[Batch]) -> None:
-        if batches:
-            self._stage.soon(send, batches)
-
-
-class WatchedLock:
-    """The dispatcher's lock.  Whenever it is released, everything behind it must be in order."""
-
-    def __init__(self, check: Callable[[], None]) -> None:
-        self._check = check
-        self._held = False
-
-    def __enter__(self) -> None:
-        if self._held:
-            raise RuntimeError("the dispatcher waits for a lock that it holds itself")
-        self._held = True
-
-    def __exit__(self, kind: object, *rest: object) -> None:
-        self._held = False
-        if kind is None:
-            self._check()
-
-
 class Actor:
-    """A thread that runs only while the simulation waits for it: what it does happens at once."""
+    """A thread that runs only while the simulation waits for it, until it pauses."""
 
-    def __init__(self, stage: Stage, body: Callable[[Actor], None]) -> None:
+    def __init__(self, stage: Stage, name: str, body: Callable[[Actor], None]) -> None:
+        self.name = name
         self._stage = stage
         self._body = body
         self._turn = threading.Semaphore(0)
         self._back = threading.Semaphore(0)
-        self._open = False
+        self._entries: deque[Any] = deque()
         self._waits = False
+        self._alarm: Any = None
         self._error: BaseException | None = None
         self._abandoned = False
-        self._thread = threading.Thread(target=self._run, name="simulated reader")
+        self._thread = threading.Thread(target=self._run, name=f"simulated {name}", daemon=True)
+
+    @property
+    def starves(self) -> bool:
+        """Whether it waits for an entry, and none is there."""
+        return self._waits and not self._entries
 
     def start(self) -> None:
         """Let it go."""
@@ -208,43 +173,62 @@ class Actor:
         """Let it run until it waits or ends."""
         if not self._thread.is_alive():
             return
-        with self._stage.loop.off_thread():
-            self._turn.release()
-            self._back.acquire()
+        self._stage.run_actor(self, self._take_turn)
         if self._error is not None:
             error, self._error = self._error, None
             raise error
 
+    def _take_turn(self) -> None:
+        self._turn.release()
+        self._back.acquire()
+
     def abandon(self) -> None:
         """End it, whatever it waits for."""
-        self._abandoned = True
-        self._turn.release()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._abandoned = True
+            self._turn.release()
+            self._thread.join()
 
     def sleep(self, seconds: float) -> None:
         """In the actor: let time pass."""
         self._stage.loop.call_later(seconds, self.resume)
         self._pause()
 
-    # As the lock that a reader waits at
+    def wait(self, seconds: float) -> None:
+        """In the actor: let time pass until somebody wakes it."""
+        self._alarm = self._stage.loop.call_later(seconds, self._wake_up)
+        self._pause()
 
-    def acquire(self) -> None:
-        """In the actor: wait until somebody releases it."""
-        while not self._open:
+    def wake(self) -> None:
+        """Let it go on, if it waits, when its thread gets its turn."""
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = self._stage.loop.call_later(self._stage.loop.moment(), self._wake_up)
+
+    def _wake_up(self) -> None:
+        self._alarm = None
+        self.resume()
+
+    # As the queue that a thread waits at
+
+    def get(self) -> Any:
+        """In the actor: the next entry, once there is one."""
+        while not self._entries:
             self._waits = True
             self._pause()
-        self._open = False
+        return self._entries.popleft()
 
-    def release(self) -> None:
-        """Let it go on, when its thread gets its turn."""
-        self._open = True
+    def put(self, entry: Any) -> None:
+        """Let it have an entry, when its thread gets its turn."""
+        self._entries.append(entry)
         if self._waits:
             self._waits = False
-            self._stage.loop.call_later(self._stage.moment(), self.resume)
+            self._stage.loop.call_later(self._stage.loop.moment(), self.resume)
 
     def _pause(self) -> None:
-        self._back.release()
-        self._turn.acquire()
+        if not self._abandoned:
+            self._back.release()
+            self._turn.acquire()
         if self._abandoned:
             raise SystemExit
 
@@ -259,3 +243,99 @@ class Actor:
             self._error = error
         finally:
             self._back.release()
+
+
+class StagedThread:
+    """In place of a ``BackgroundThread``: the same, as an actor."""
+
+    def __init__(self, stage: Stage, name: str) -> None:
+        self._stage = stage
+        self._name = name
+        self._actor: Actor | None = None
+        self.stopped = False
+
+    def submit(self, action: Callable[..., object], *args: Any) -> bool:
+        """Have it done later, in order."""
+        if self.stopped:
+            return False
+        if self._actor is None:
+            self._actor = self._stage.act(self._name, self._run)
+            self._actor.put((action, args))
+            self._stage.loop.call_later(self._stage.loop.moment(), self._actor.start)
+        else:
+            self._actor.put((action, args))
+        return True
+
+    def stop(self) -> None:
+        """Take nothing more."""
+        self.stopped = True
+        if self._actor is not None:
+            self._actor.put(None)
+
+    def _run(self, actor: Actor) -> None:
+        while (entry := actor.get()) is not None:
+            action, args = entry
+            action(*args)
+
+
+class Interrupted(BaseException):
+    """Ctrl-C."""
+
+
+class StagedChannel:
+    """The channel of a worker on this host in the hands of callers; a ``DirectChannel``."""
+
+    def __init__(self, stage: Stage, child: Child) -> None:
+        self._stage = stage
+        self._child = child
+        self._received: deque[Any] = deque()
+        self._reader: Actor | None = None
+        self._ended = False
+        stage.world.note("%s is lent", child.name)
+
+    def send(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> None:
+        """Send it a packet."""
+        self._stage.pause()
+        if self._child.gone:
+            raise BrokenPipeError
+        self._stage.world.note("%s is called directly", self._child.name)
+        self._child.deliver(seq, payload, buffers)
+        self._stage.pause()
+
+    def receive(self, timeout: float) -> Message | None:
+        """The next packet; sometimes Ctrl-C comes first."""
+        assert self._stage.running is not None
+        if not self._received and not self._ended:
+            self._reader = self._stage.running
+            self._reader.wait(timeout)
+            self._reader = None
+        if self._stage.rng.random() < 0.03:
+            self._stage.world.note("whoever called %s is interrupted", self._child.name)
+            raise Interrupted
+        if self._received:
+            message: Message = self._stage.world.language.message(self._received.popleft())
+            return message
+        if self._ended:
+            raise EOFError
+        return None
+
+    def close(self) -> None:
+        """Nobody uses it any more."""
+
+    def hear(self, message: Any) -> None:
+        """The worker sent it."""
+        self._received.append(message)
+        if self._reader is not None:
+            self._reader.wake()
+
+    def drain(self) -> list[Any]:
+        """What nobody has received."""
+        left = list(self._received)
+        self._received.clear()
+        return left
+
+    def end(self) -> None:
+        """The worker is gone."""
+        self._ended = True
+        if self._reader is not None:
+            self._reader.wake()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 
 from fiber._engine.ledger import Ledger
-from simulation.dispatcher_master import DispatcherMaster, for_pool
+from simulation.executor_master import ExecutorMaster, for_pool
 from simulation.explore import Suite, examine
-from simulation.ledger_master import LedgerMaster
+from simulation.ledger_master import LedgerMaster, for_ledger
 from simulation.remote_hosts import RemoteHost
 from simulation.world import World
 
@@ -24,11 +24,11 @@ def with_ledger(world: World) -> LedgerMaster:
 
 
 SUITES = {
-    "ledger": Suite(with_ledger),
-    "dispatcher": Suite(DispatcherMaster, adapt=for_pool, share=0.6),
-    "remote": Suite(DispatcherMaster, adapt=for_pool, share=0.25, remote=RemoteHost),
+    "ledger": Suite(with_ledger, adapt=for_ledger),
+    "executor": Suite(ExecutorMaster, adapt=for_pool, share=0.6),
+    "remote": Suite(ExecutorMaster, adapt=for_pool, share=0.25, remote=RemoteHost),
 }
-"""``remote`` is the dispatcher again, with everything between it and the far workers real but the
+"""``remote`` is the executor again, with everything between it and the far workers real but the
 connection."""
 
 

@@ -8,14 +8,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from fiber._runtime.workers import Link
 
-from fiber._engine.ledger import Batch, Job, Ledger, Loss, Receipt, Worker
-from simulation.dispatcher_master import DispatcherMaster
+from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
 from simulation.explore import Failure, Suite, examine, first_failure, run
-from simulation.ledger_master import LedgerMaster
+from simulation.ledger_master import LedgerMaster, for_ledger
 from simulation.schedule import draw
-from simulation.staged import StagedDispatcher
 from simulation.suites import SUITES, again
 
 SEEDS = range(300)
@@ -131,55 +128,28 @@ class NeverFinishes(Ledger):
         return False
 
 
-class ForgetsWhatIsUnsent(StagedDispatcher):
-    """Takes what was assigned, but not sent, for something that its worker may have run."""
-
-    def _assign(self) -> list[Batch]:
-        batches = super()._assign()
-        self._unsent.clear()
-        return batches
+class LendsTheBusy(Ledger):
+    def lend(self, worker: Worker) -> bool:
+        worker.lent = True
+        return True
 
 
-class ReplacesNobody(StagedDispatcher):
-    def _order(self) -> None:
-        """Nothing."""
+class GivesToWhoIsLent(Ledger):
+    def lend(self, worker: Worker) -> bool:
+        if not super().lend(worker):
+            return False
+        self._load.idle[worker] = None
+        return True
 
 
-class HearsNothingBack(StagedDispatcher):
-    def recalled(self, link: Link, seqs: list[int]) -> None:
-        """Nothing."""
+class ForgetsWhoIsBack(Ledger):
+    def return_idle(self, worker: Worker, now: float) -> None:
+        worker.lent = False
 
 
-class ForgetsDeadlines(StagedDispatcher):
-    def _expired(self, seq: int) -> None:
-        """Nothing."""
-
-
-class TellsTwice(StagedDispatcher):
-    def _put(self, receipt: Receipt, *args: Any, **options: Any) -> None:
-        super()._put(receipt, *args, **options)
-        super()._put(receipt, *args, **options)
-
-
-class TellsOthers(StagedDispatcher):
-    def _put(self, receipt: Receipt, results: list[Any], *args: Any, **options: Any) -> None:
-        super()._put(receipt, results[::-1], *args, **options)
-
-
-class NeverLetsGo(StagedDispatcher):
-    def _nobody_needed(self) -> list[Link]:
-        return []
-
-
-class GrowsTooLate(StagedDispatcher):
-    def _missing(self) -> int:
-        return super()._missing() if self.crew.size < self.crew.minimum else 0
-
-
-class PicklesOnTheLoop(StagedDispatcher):
-    def _send_safely(self, batches: Iterable[Batch]) -> None:
-        for batch in batches:
-            self._send_safely(self._send_one(batch, plain=False))
+class ForgetsWhatIsAdopted(Ledger):
+    def return_busy(self, worker: Worker, seq: int, *rest: Any) -> None:
+        super().return_busy(worker, self.next_seq(), *rest)
 
 
 BROKEN = [
@@ -201,26 +171,19 @@ BROKEN = [
     IgnoresMaxTasks,
     PinsToAnyone,
     NeverFinishes,
-    ForgetsWhatIsUnsent,
-    ReplacesNobody,
-    HearsNothingBack,
-    ForgetsDeadlines,
-    TellsTwice,
-    TellsOthers,
-    NeverLetsGo,
-    GrowsTooLate,
-    PicklesOnTheLoop,
+    LendsTheBusy,
+    GivesToWhoIsLent,
+    ForgetsWhoIsBack,
+    ForgetsWhatIsAdopted,
 ]
 
 
-def with_broken(broken: type[Ledger | StagedDispatcher]) -> Suite:
-    if issubclass(broken, Ledger):
-        return Suite(lambda world: LedgerMaster(world, broken()))
-    return SUITES["dispatcher"]._replace(make=lambda world: DispatcherMaster(world, broken))
+def with_broken(broken: type[Ledger]) -> Suite:
+    return Suite(lambda world: LedgerMaster(world, broken()), adapt=for_ledger)
 
 
 @pytest.mark.parametrize("broken", BROKEN)
-def test_what_is_broken_is_found_out(broken: type[Ledger | StagedDispatcher]) -> None:
+def test_what_is_broken_is_found_out(broken: type[Ledger]) -> None:
     assert first_failure(SEEDS, with_broken(broken)) is not None
 
 
@@ -277,7 +240,7 @@ TELLING = {
         "leaves",
         "in None",
     ),
-    "dispatcher": (
+    "executor": (
         "a map",
         "a call",
         "a stream",

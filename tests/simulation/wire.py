@@ -1,18 +1,34 @@
-"""The dispatcher's own messages, as a worker reads and writes them."""
+"""The executor's own messages, as a worker reads and writes them."""
 
 from __future__ import annotations
 
 import pickle
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from fiber._wire import work
 from fiber._wire.packet import Message
 from simulation.schedule import Act
-from simulation.workers import Broken, Ready, Ref, Results, Unknown, Unreadable, Work, Worker
+from simulation.workers import NO_OP, Broken, Ready, Ref, Results, Unknown, Unreadable, Work, Worker
 
-ERROR = pickle.dumps(ValueError("as planned"))
+
+class PlannedError(ValueError):
+    """What tasks raise; unpickling it is the user's code."""
+
+    unpickled: Callable[[], None] = staticmethod(lambda: None)
+    """Called by that."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _planned_error, ()
+
+
+def _planned_error() -> PlannedError:
+    PlannedError.unpickled()
+    return PlannedError("as planned")
+
+
+ERROR = pickle.dumps(PlannedError())
 
 
 def perform(job: int, index: int) -> int:
@@ -35,7 +51,7 @@ def value_of(ref: Ref) -> int:
 
 
 class Wire:
-    """The dispatcher's own messages, from the worker's side."""
+    """The executor's own messages, from the worker's side."""
 
     def __init__(self, seed: int) -> None:
         self._rng = random.Random(f"{seed} wire")
@@ -52,6 +68,8 @@ class Wire:
             return None
         if head.kind == work.CALLS:
             calls = [pickle.loads(call)[1] for call, _ in work.unpack_calls(body, head.size)]
+            if calls == [()]:
+                return Work(seq, [NO_OP], 1, 1, apart=True)
             if seq in self.pinned:
                 calls = [(calls[0][0], self.pinned[seq])]
             return Work(seq, [Ref(*call) for call in calls], 1, 1, apart=True)

@@ -30,6 +30,10 @@ class Ref(NamedTuple):
     task: int
 
 
+NO_OP = Ref(-1, 0)
+"""A call that does nothing, and is nobody's."""
+
+
 class Work(NamedTuple):
     """A message with tasks."""
 
@@ -114,6 +118,8 @@ class Worker:
     def _initialize(self) -> None:
         if self._still_born:
             self.die(1)
+        elif exitcode := self._world.famine():
+            self.die(exitcode)
         elif self._reach("while it starts"):
             self._awake = True
             self._say(Ready())

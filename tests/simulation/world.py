@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import heapq
+import random
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Protocol
 
 from fiber._agent.port import ChildObserver
+from fiber._transport.loop import Timer
 from fiber._transport.memory import SimulatedLoop
 from simulation import schedule
 from simulation.agents import LOST_AFTER, Agent, Child
@@ -16,6 +21,7 @@ from simulation.schedule import (
     Crash,
     Cut,
     Drain,
+    Famine,
     Fault,
     Kill,
     Repeat,
@@ -26,7 +32,7 @@ from simulation.schedule import (
     Task,
     Terminate,
 )
-from simulation.workers import Broken, Ref, Unknown, Work, Worker
+from simulation.workers import NO_OP, Broken, Ref, Unknown, Work, Worker
 
 PATIENCE = 300
 """Simulated seconds after which what did not happen over links never will."""
@@ -34,32 +40,87 @@ PATIENCE = 300
 CALLS = 50_000
 """More calls than any schedule needs: it goes round in circles."""
 
+MOMENTS = 1e-5, 1e-4, 3e-3
+"""Seconds until another thread gets its turn, at most: on an idle machine, on a busy one."""
+
+INSTANT = 1e-9
+"""Seconds between two things one of which must come first."""
+
 END = 1e6
 """Simulated seconds after which nothing can be left to happen."""
 
 
 class Loop(SimulatedLoop):
-    """The simulated loop; what other threads do happens on its thread, but does not know it."""
+    """The simulated loop, and threads beside it.
 
-    def __init__(self) -> None:
+    What another thread does happens at once, but what it asks of the loop comes there later, by
+    what the seed chooses, and as each thread asked for it in turn: that thread may be interrupted
+    before it asks, and the loop may be busy.
+    """
+
+    def __init__(self, seed: int) -> None:
         super().__init__()
-        self._off = 0
+        self.after_turn: Callable[[], None] = lambda: None
+        """Called whenever something was done on the loop's thread."""
+        self._rng = random.Random(f"{seed} threads")
+        self._longest = self._rng.choice(MOMENTS)
+        self._thread: str | None = None
+        self._asked: dict[str, deque[Callable[[], object]]] = defaultdict(deque)
+        self._heard_at: dict[str, float] = {}
 
     def depend(self, dependent: object) -> None:
         """This one never fails."""
 
     def on_thread(self) -> bool:
         """Whether whoever asks may take this for the loop's thread."""
-        return not self._off
+        return self._thread is None
 
     @contextmanager
-    def off_thread(self) -> Iterator[None]:
-        """What happens within happens on another thread."""
-        self._off += 1
+    def off_thread(self, name: str) -> Iterator[None]:
+        """What happens within happens on the thread of this name."""
+        before, self._thread = self._thread, name
         try:
             yield
         finally:
-            self._off -= 1
+            self._thread = before
+
+    def moment(self) -> float:
+        """Seconds until another thread gets its turn."""
+        return self._rng.random() * self._longest
+
+    def heard_in(self, thread: str) -> float:
+        """Seconds until the loop has heard all that ``thread`` has asked for."""
+        return max(0.0, self._heard_at.get(thread, 0.0) - self._now)
+
+    def comes_after(self, thread: str, earlier: str) -> None:
+        """What ``thread`` asks for comes after all that ``earlier`` has asked for until now."""
+        heard_at = self._heard_at.get(earlier, 0.0), self._heard_at.get(thread, 0.0)
+        self._heard_at[thread] = max(heard_at) + INSTANT
+
+    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
+        """Call it in the next turn; if another thread asks, when the seed says."""
+        thread = self._thread
+        if thread is None:
+            super().call_soon(callback, *args)
+            return
+        self._asked[thread].append(partial(callback, *args))
+        due = max(self._now + self.moment(), self._heard_at.get(thread, 0.0))
+        self._heard_at[thread] = due
+        self.call_later(due - self._now, self._heed, thread)
+
+    def _heed(self, thread: str) -> None:
+        self._asked[thread].popleft()()
+
+    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Any:
+        """Call it once, ``seconds`` from now."""
+        timer: Any = Timer(self._now + seconds, partial(callback, *args))
+        heapq.heappush(self._timers, (timer.due, next(self._sequence), timer))
+        return timer
+
+    def _turn(self, end: float) -> bool:
+        turned = super()._turn(end)
+        self.after_turn()
+        return turned
 
 
 class Language(Protocol):
@@ -114,8 +175,10 @@ class World:
         make_remote: Callable[[World, int, schedule.Agent], Agent] = Agent,
     ) -> None:
         self.schedule = plans
-        self.loop = Loop()
+        self.loop = Loop(plans.seed)
         self.oracle = Oracle(plans)
+        self.make_channel: Callable[[Child], Any] = lambda child: None
+        """A child's channel for direct use, if there is such a thing."""
         self._trace = trace
         self.workers: list[Worker] = []
         self._calls = 0
@@ -183,8 +246,18 @@ class World:
         """What happens to a worker as it goes on."""
         return self._faults.get(worker, [])
 
+    def famine(self) -> int | None:
+        """How all workers die that start now, if they do."""
+        now = self.loop.now()
+        for fault in self.schedule.faults:
+            if isinstance(fault, Famine) and fault.at <= now < fault.at + fault.seconds:
+                return fault.exitcode
+        return None
+
     def task(self, ref: Ref) -> Task:
         """What a task does."""
+        if ref == NO_OP:
+            return Task(0.0)
         job = self.schedule.jobs[ref.job]
         return job.tasks[0 if job.everywhere else ref.task]
 

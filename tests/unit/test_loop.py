@@ -140,6 +140,29 @@ def test_a_reader_hears_data_and_the_end(loop: Loop, pipe: tuple[int, int]) -> N
     assert heard == [b"data", b""]
 
 
+def test_what_was_asked_for_before_something_happened_is_done_first(
+    loop: Loop, pipe: tuple[int, int]
+) -> None:
+    """Who notes what it expects with ``call_soon``, and makes it happen then, is heard in order."""
+    reading, writing = pipe
+    seen: list[str] = []
+    busy, go_on, heard = threading.Event(), threading.Event(), threading.Event()
+
+    def hear() -> None:
+        seen.append(os.read(reading, 100).decode())
+        heard.set()
+
+    loop.register(reading, hear)
+    loop.call_soon(lambda: (busy.set(), go_on.wait(PATIENCE)))
+    assert busy.wait(PATIENCE)
+    loop.call_soon(seen.append, "expected")
+    os.write(writing, b"happened")
+    go_on.set()
+    assert heard.wait(PATIENCE)
+    loop.unregister(reading)
+    assert seen == ["expected", "happened"]
+
+
 def test_a_writer_is_called_until_it_is_taken_back(loop: Loop, pipe: tuple[int, int]) -> None:
     calls: list[int] = []
     enough = threading.Event()

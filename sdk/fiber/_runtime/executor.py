@@ -30,6 +30,7 @@ from typing import Any, Protocol
 
 from fiber._agent.port import UNKNOWN, ExitReport
 from fiber._engine.chunks import FLOOR
+from fiber._engine.ledger import Batch
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import StartFailure
 from fiber._runtime.background import BackgroundThread
@@ -433,9 +434,21 @@ class Executor:
         if kind == work.UNREADABLE:
             self._sender.split(seq, error)
         elif batch is not None:
-            if batch.job is not None:
-                self._jobs.fail(batch.job, error.decode().error)
-            self._ledger.put_back(batch.worker, (seq,), self._loop.now())
+            self._sender.dropped(batch)
+            self._background.submit(self._unpickle_fault, batch, error)
+        self._advance()
+
+    def _unpickle_fault(self, batch: Batch, error: Pickled) -> None:
+        """On the background thread: whatever a worker found with a function is the user's."""
+        self._loop.call_soon(self._unusable, batch, error.decode().error)
+
+    def _unusable(self, batch: Batch, error: BaseException) -> None:
+        """The function of a batch cannot be unpickled by its worker, which has dropped the batch."""
+        if self._ledger.batches.get(batch.seq) is not batch:
+            return  # its worker is gone
+        if batch.job is not None:
+            self._jobs.fail(batch.job, error)
+        self._sender.take_back(batch)
         self._advance()
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:

@@ -45,7 +45,7 @@ class Sender:
         self._advance = advance
         self._on_timeout = on_timeout
         self._unsent: set[int] = set()
-        """Batches that are assigned and not sent: nobody can have run them."""
+        """Batches that their workers do not have: nobody can have run them."""
         self._deadlines: dict[int, Timer] = {}
 
     def send(self, batch: Batch) -> None:
@@ -81,8 +81,7 @@ class Sender:
         if self._ledger.batches.get(batch.seq) is not batch:
             return  # its worker is gone
         if batch.job is None:  # cancelled
-            self._unsent.discard(batch.seq)
-            self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
+            self.take_back(batch)
         elif encoded is not None:
             self._deliver(item, batch, encoded)
         elif error is not None:
@@ -117,6 +116,15 @@ class Sender:
         receipt = self._ledger.split(seq, self._loop.now())
         if receipt is not None:
             self._jobs.put(receipt, [failure])
+
+    def dropped(self, batch: Batch) -> None:
+        """Its worker has it no more, and has run nothing of it; ``take_back`` it soon."""
+        self._unsent.add(batch.seq)
+
+    def take_back(self, batch: Batch) -> None:
+        """Give it to whoever has time for it, if it is still wanted."""
+        self._unsent.discard(batch.seq)
+        self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
 
     def lost(self, worker: Worker) -> set[int]:
         """A worker is gone; those of its batches that were not sent."""

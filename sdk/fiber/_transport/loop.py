@@ -206,6 +206,7 @@ class Loop:
             return
         finally:
             self._asleep = False
+        self._run_ready()  # what was asked for before something happened is done before it is told
         self._dispatch(events)
         self._run_ready()
         self._run_timers()

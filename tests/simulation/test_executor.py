@@ -1,4 +1,4 @@
-"""The real dispatcher keeps the pool's promises, on hosts near and far."""
+"""The real executor keeps the pool's promises, on hosts near and far."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from simulation.suites import PARTS, examine_part
 
 
 @pytest.mark.parametrize("part", range(PARTS))
-def test_the_dispatcher_keeps_the_promises_of_a_pool(part: int) -> None:
-    examine_part("dispatcher", part)
+def test_the_executor_keeps_the_promises_of_a_pool(part: int) -> None:
+    examine_part("executor", part)
 
 
 @pytest.mark.parametrize("part", range(PARTS))

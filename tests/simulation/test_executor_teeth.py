@@ -1,0 +1,277 @@
+"""The simulation finds what is wrong with executors, too: what is named here breaks one promise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from fiber._engine import worker_set
+from fiber._engine.ledger import Batch, Job, Loss, Receipt, Worker
+from fiber._engine.scheduler import Decisions, Scheduler
+from fiber._engine.worker_set import Member, StartFailure
+from fiber._runtime.executor import Executor
+from fiber._runtime.input_stream import InputStream
+from fiber._runtime.jobs import Jobs
+from fiber._runtime.leases import Lease, Leases
+from fiber._runtime.outcome import Pickled
+from fiber._runtime.sender import Sender
+from fiber._runtime.work_items import Call
+from fiber._runtime.worker_handle import WorkerHandle
+from simulation.explore import first_failure
+from simulation.suites import SUITES
+
+SEEDS = range(400)
+"""Among these each fault must show."""
+
+Patch = pytest.MonkeyPatch
+Fault = Callable[[Patch], None]
+
+
+def forgets_what_is_unsent(patch: Patch) -> None:
+    """Takes what was assigned, but not sent, for something that its worker may have run."""
+
+    def lost(self: Sender, worker: Worker) -> set[int]:
+        real(self, worker)
+        return set()
+
+    real = Sender.lost
+    patch.setattr(Sender, "lost", lost)
+
+
+def decides(patch: Patch, change: Callable[[Scheduler, Decisions], Decisions]) -> None:
+    """The scheduler decides otherwise."""
+
+    def decide(self: Scheduler, now: float) -> Decisions:
+        return change(self, real(self, now))
+
+    real = Scheduler.decide
+    patch.setattr(Scheduler, "decide", decide)
+
+
+def replaces_nobody(patch: Patch) -> None:
+    decides(patch, lambda _, decisions: decisions._replace(start=0))
+
+
+def never_lets_go(patch: Patch) -> None:
+    patch.setattr(Scheduler, "_not_needed", lambda _: [])
+
+
+def grows_too_late(patch: Patch) -> None:
+    def demand(self: Scheduler) -> int:
+        return self.workers.minimum
+
+    patch.setattr(Scheduler, "_demand", demand)
+
+
+def grows_too_far(patch: Patch) -> None:
+    decides(patch, lambda _, decisions: decisions._replace(start=decisions.start + 1))
+
+
+def never_looks_again(patch: Patch) -> None:
+    """Who was idle for long stays, what could be recalled later is not, no pause ever ends."""
+    decides(patch, lambda _, decisions: decisions._replace(wake_at=float("inf")))
+
+
+def forgets_that_somebody_left(patch: Patch) -> None:
+    def let_go(self: worker_set.WorkerSet, member: Member) -> None:
+        member.leaving = True
+
+    patch.setattr(worker_set.WorkerSet, "let_go", let_go)
+
+
+def gives_up_at_once(patch: Patch) -> None:
+    """As if not the time decided, but the number."""
+    patch.setattr(worker_set, "RAISED_PATIENCE", 0.0)
+    patch.setattr(worker_set, "KILLED_PATIENCE", 0.0)
+
+
+def never_gives_up(patch: Patch) -> None:
+    def _failed(self: worker_set.WorkerSet, failure: StartFailure, now: float) -> None:
+        real(self, failure, now)
+        self.error = None
+
+    real = worker_set.WorkerSet._failed
+    patch.setattr(worker_set.WorkerSet, "_failed", _failed)
+
+
+def gives_up_with_workers_at_work(patch: Patch) -> None:
+    patch.setattr(worker_set.WorkerSet, "_at_work", lambda _: False)
+
+
+def tells_nobody_that_none_starts(patch: Patch) -> None:
+    patch.setattr(worker_set.WorkerSet, "news", lambda *_: "")
+
+
+def hears_nothing_back(patch: Patch) -> None:
+    patch.setattr(Executor, "on_recalled", lambda *_: None)
+
+
+def hears_of_no_end(patch: Patch) -> None:
+    """A handle that tells nobody when its worker is gone before it was ready."""
+
+    def exited(self: WorkerHandle, report: Any) -> None:
+        if self.worker is not None:
+            real(self, report)
+
+    real = WorkerHandle.exited
+    patch.setattr(WorkerHandle, "exited", exited)
+
+
+def dismisses_nobody(patch: Patch) -> None:
+    patch.setattr(WorkerHandle, "dismiss", lambda _: None)
+
+
+def forgets_deadlines(patch: Patch) -> None:
+    patch.setattr(Executor, "_timed_out", lambda *_: None)
+
+
+def keeps_deadlines(patch: Patch) -> None:
+    patch.setattr(Sender, "settled", lambda *_: None)
+
+
+def tells_twice(patch: Patch) -> None:
+    def _put(self: Jobs, receipt: Receipt, *rest: Any) -> None:
+        real(self, receipt, *rest)
+        real(self, receipt, *rest)
+
+    real = Jobs._put
+    patch.setattr(Jobs, "_put", _put)
+
+
+def tells_others(patch: Patch) -> None:
+    def _put(self: Jobs, receipt: Receipt, results: list[Any], mixed: bool) -> None:
+        real(self, receipt, results[::-1], mixed)
+
+    real = Jobs._put
+    patch.setattr(Jobs, "_put", _put)
+
+
+def tells_of_no_loss(patch: Patch) -> None:
+    def put_losses(self: Jobs, losses: list[Loss], *rest: Any) -> None:
+        real(self, losses[1:], *rest)
+
+    real = Jobs.put_losses
+    patch.setattr(Jobs, "put_losses", put_losses)
+
+
+def pickles_on_the_loop(patch: Patch) -> None:
+    def send(self: Sender, batch: Batch) -> None:
+        assert batch.job is not None
+        self._encode(batch.job.owner, batch)
+
+    patch.setattr(Sender, "send", send)
+
+
+def unpickles_on_the_loop(patch: Patch) -> None:
+    def _unreadable(self: Executor, kind: str, seq: int, error: Pickled) -> None:
+        error.decode()
+        real(self, kind, seq, error)
+
+    real = Executor._unreadable
+    patch.setattr(Executor, "_unreadable", _unreadable)
+
+
+def ignores_the_limit(patch: Patch) -> None:
+    patch.setattr(InputStream, "_room", lambda _, limit: 1000)
+
+
+def reads_everything(patch: Patch) -> None:
+    def grant(self: InputStream, waiting: int, workers: int, *rest: Any) -> None:
+        real(self, waiting, 1000 * workers, *rest)
+
+    real = InputStream.grant
+    patch.setattr(InputStream, "grant", grant)
+
+
+def forgets_who_waits_for_room(patch: Patch) -> None:
+    def consume(self: InputStream) -> None:
+        self._consumptions.append(None)
+
+    patch.setattr(InputStream, "consume", consume)
+
+
+def forgets_who_waits_for_input(patch: Patch) -> None:
+    patch.setattr(InputStream, "await_input", lambda _: None)
+
+
+def never_resumes(patch: Patch) -> None:
+    patch.setattr(Jobs, "resume", lambda *_: None)
+
+
+def holds_nothing_back(patch: Patch) -> None:
+    patch.setattr(Job, "has_next", property(lambda job: bool(job.waiting)))
+
+
+def acts_later(patch: Patch) -> None:
+    """Feeds calls, and leaves it to whatever happens next to give them out."""
+
+    def _take_calls(self: Executor) -> None:
+        self._acting = True
+        real(self)
+        self._acting = False
+
+    real = Executor._take_calls
+    patch.setattr(Executor, "_take_calls", _take_calls)
+
+
+def lends_what_is_needed(patch: Patch) -> None:
+    patch.setattr(Scheduler, "needs_lent", lambda _: False)
+
+
+def forgets_calls_that_take_longer(patch: Patch) -> None:
+    def _adopt(self: Leases, lease: Lease, seq: int, call: Call) -> None:
+        self._return_idle(lease)
+
+    patch.setattr(Leases, "_adopt", _adopt)
+
+
+def forgets_who_died_while_lent(patch: Patch) -> None:
+    patch.setattr(Executor, "_back", lambda self, _: self._advance())
+
+
+def never_returns_leases_of_the_interrupted(patch: Patch) -> None:
+    patch.setattr(Leases, "_abandon", lambda *_: None)
+
+
+FAULTS: list[Fault] = [
+    forgets_what_is_unsent,
+    replaces_nobody,
+    never_lets_go,
+    grows_too_late,
+    grows_too_far,
+    never_looks_again,
+    forgets_that_somebody_left,
+    gives_up_at_once,
+    never_gives_up,
+    gives_up_with_workers_at_work,
+    tells_nobody_that_none_starts,
+    hears_nothing_back,
+    hears_of_no_end,
+    dismisses_nobody,
+    forgets_deadlines,
+    keeps_deadlines,
+    tells_twice,
+    tells_others,
+    tells_of_no_loss,
+    pickles_on_the_loop,
+    unpickles_on_the_loop,
+    ignores_the_limit,
+    reads_everything,
+    forgets_who_waits_for_room,
+    forgets_who_waits_for_input,
+    never_resumes,
+    holds_nothing_back,
+    acts_later,
+    lends_what_is_needed,
+    forgets_calls_that_take_longer,
+    forgets_who_died_while_lent,
+    never_returns_leases_of_the_interrupted,
+]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_broken_is_found_out(fault: Fault, monkeypatch: Patch) -> None:
+    fault(monkeypatch)
+    assert first_failure(SEEDS, SUITES["executor"]) is not None
