@@ -35,7 +35,7 @@ class SimulatedLoop:
 
     def __init__(self) -> None:
         self._now = 0.0
-        self._ready: deque[Callable[[], None]] = deque()
+        self._ready: deque[Callable[[], object]] = deque()
         self._timers: list[tuple[float, int, SimulatedTimer]] = []
         self._sequence = itertools.count()
 
@@ -43,11 +43,9 @@ class SimulatedLoop:
         """Simulated seconds since the beginning."""
         return self._now
 
-    def call_soon(self, callback: Callable[..., None], *args: Any) -> None:
+    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
         """Call it in the next turn."""
         self._ready.append(lambda: callback(*args))
-
-    interrupt = call_soon
 
     def call_later(
         self, seconds: float, callback: Callable[..., None], *args: Any
