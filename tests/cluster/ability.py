@@ -41,7 +41,7 @@ def _obstacles() -> Iterator[str]:
         yield "it takes root, and this is an ordinary user"
     elif lacking := _capabilities_lacking():
         yield f"root lacks {' and '.join(lacking)} here, as in most containers"
-    if any(build.missing(folder) for folder in ("kubernetes", "helm")):
+    if any(build.missing(name) for name in ("kubernetes", "helm")):
         try:
             build.find_go()
         except ClusterError as error:

@@ -27,6 +27,6 @@ def prepare() -> None:
 
 def _prepare_cluster() -> None:
     packages.need(packages.TO_RUN, "run the test cluster")
-    build.build(["kubernetes", "etcd", "helm"])
+    build.build(["kubernetes", "helm"])
     pause_archive()
     images.build_images()

@@ -41,7 +41,7 @@ def install_go(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> 
     return calls
 
 
-@pytest.mark.parametrize("folder", places.MODULES)
+@pytest.mark.parametrize("folder", places.SOURCES)
 def test_versions_come_from_the_modules(folder: str) -> None:
     assert all(part.isdigit() for part in places.version(folder).split("."))
     assert f"{folder}-{places.version(folder)}" in places.cache().name
