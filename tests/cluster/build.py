@@ -69,14 +69,18 @@ def _build(name: str) -> None:
     say(f"built {name} in {time.monotonic() - began:.0f} s, into {places.programs()}")
 
 
+def minutes() -> int:
+    """About how long it takes to build it all where nothing else runs."""
+    return math.ceil(_CPU_MINUTES / len(os.sched_getaffinity(0)))
+
+
 def _advice(name: str) -> str:
     """What a person who waits for minutes wants to know."""
     if name != "kubernetes":
         return ""
-    processors = len(os.sched_getaffinity(0))
     return (
-        ", for a real cluster on this machine. It takes about "
-        f"{math.ceil(_CPU_MINUTES / processors)} minutes where nothing else runs, and a download. "
+        f", for a real cluster on this machine. It takes about {minutes()} minutes where nothing "
+        "else runs, and a download. "
         "To do without: set KUBECONFIG to a cluster that may be used, install kind and docker, or "
         "run what needs no cluster: make test-fast"
     )

@@ -33,6 +33,7 @@ from cluster import (
     lifecycle,
     places,
 )
+from cluster.ability import Choice
 from cluster.shell import ClusterError, output, wait_for
 
 NODES = 2
@@ -255,17 +256,14 @@ class Given(Cluster):
 
 def choose(environment: Mapping[str, str] = os.environ) -> Cluster:
     """The cluster to test on. Raises NoCluster where there is none."""
-    if given := environment.get("KUBECONFIG"):
-        return _given(Path(given), environment)
-    reasons = ["KUBECONFIG is not set"]
-    if lacking := ability.kind_lacks():
-        reasons.append(f"no kind: {lacking}")
-    else:
-        return Kind.make()
-    if obstacles := ability.obstacles():
-        reasons.append(f"no cluster of tests/cluster: {'; '.join(obstacles)}")
-    else:
-        return Own()
+    choice, reasons = ability.choose(environment)
+    match choice:
+        case Choice.GIVEN:
+            return _given(Path(environment["KUBECONFIG"]), environment)
+        case Choice.KIND:
+            return Kind.make()
+        case Choice.OWN:
+            return Own()
     raise NoCluster(
         f"there is no Kubernetes cluster to test on. {'. '.join(reasons)}. Set KUBECONFIG to a "
         "cluster that may be used, or run this where docker and kind are, or as root on Linux "
