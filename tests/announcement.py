@@ -1,6 +1,6 @@
 """What `make test` is about to run, how long that takes, and what it leaves out here and why.
 
-    python -m announcement [VERSION …]     the other versions of Python that were found
+python -m announcement [VERSION …]     the other versions of Python that were found
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ def announcement(others: Sequence[str], environment: Mapping[str, str]) -> str:
     lines += [f"  {minutes:2} min  {what}" for what, minutes in runs]
     if left_out := list(_left_out(others, environment)):
         lines += ["left out on this machine:", *(f"  {what}" for what in left_out)]
-    return "\n".join([*lines, "`make test-fast` is the first line alone, `make help` has the rest."])
+    return "\n".join(
+        [*lines, "`make test-fast` is the first line alone, `make help` has the rest."]
+    )
 
 
 def _parts(others: Sequence[str], environment: Mapping[str, str]) -> Iterator[tuple[str, int]]:

@@ -84,8 +84,10 @@ class Daemon:
         cannot be seen at every moment, a process that is about to execute a program has no words.
         """
         recorded = _Process.read(self._record)
-        found = recorded and _Process.of(recorded.pid)
-        alive = recorded and found and found.began == recorded.began and found.lives
+        if recorded is None:
+            return None
+        found = _Process.of(recorded.pid)
+        alive = found is not None and found.lives and found.began == recorded.began
         return recorded.pid if alive else None
 
     def kill(self) -> None:

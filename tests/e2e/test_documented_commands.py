@@ -1,4 +1,4 @@
-"""The commands of docs/fiberpools.md, as they are printed, on a cluster that has no operator yet."""
+"""The commands of docs/fiberpools.md, as they are printed, on a cluster without an operator."""
 
 from __future__ import annotations
 
