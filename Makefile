@@ -39,11 +39,10 @@ test-fast: $(VENV)/.with-dev
 
 ## make test-pythons  the essential tests on every other supported Python that is found here
 test-pythons: $(VENV)/.made
-	@for version in $(OTHER_PYTHONS); do \
-	    $(MAKE) --no-print-directory .venv-$$version/.with-test || exit; \
-	    echo "the essential tests on Python $$version"; \
-	    .venv-$$version/bin/python -m pytest $(SIDE_BY_SIDE) $(ESSENTIAL_TESTS) || exit; \
-	done
+	@$(foreach version,$(OTHER_PYTHONS),$(MAKE) --no-print-directory test-python-$(version) &&) true
+
+test-python-%: .venv-%/.with-test
+	.venv-$*/bin/python -m pytest $(SIDE_BY_SIDE) $(ESSENTIAL_TESTS)
 
 ## make e2e           all scenarios on a real cluster: KUBECONFIG, kind or our own
 e2e: $(VENV)/.with-dev
@@ -116,4 +115,4 @@ $(VENV)/.with-testsuite: $(VENV)/.made
 .venv-%/.with-test: .venv-%/.made pyproject.toml
 	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	touch $@
-.PRECIOUS: .venv-%/.made
+.PRECIOUS: .venv-%/.made .venv-%/.with-test
