@@ -15,7 +15,7 @@ from multiprocessing import process as mp_process
 from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
-from fiber._agent.board import Board
+from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import access
 from fiber._hub.access import Access
@@ -28,7 +28,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 _descriptors: list[int] = []
 _task_channel: UnixChannel | None = None
 _progress: memoryview | None = None
-elders: tuple[int, ...] = ()
+ancestors: tuple[int, ...] = ()
 """Pids of the processes that this one ends with: its parent first; none in a program that Fiber did
 not start.
 """
@@ -36,14 +36,14 @@ host = ""
 """The host that this process belongs to; empty in a program that Fiber did not start."""
 
 
-class Start(NamedTuple):
+class StartRequest(NamedTuple):
     """What a zygote is told of one child, and the child of itself; descriptors come beside it."""
 
     method: str
     preparation: bytes
     payload: bytes
     slot: int | None
-    """Its place on the progress board; a worker's first descriptor is its task channel."""
+    """Its place on the progress table; a worker's first descriptor is its task channel."""
     executable: str | None
     captured: bool
     """Whether its output goes to its agent, which wants it line by line."""
@@ -51,13 +51,13 @@ class Start(NamedTuple):
     """Its limits of descriptors, soft and hard: those of its agent's process."""
     hub: Access | None
     """Where it finds the hub of its host."""
-    elders: tuple[int, ...]
+    ancestors: tuple[int, ...]
     """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
 
 
 def lineage() -> tuple[int, ...]:
     """This process's pid and those of the processes that it ends with."""
-    return os.getpid(), *elders
+    return os.getpid(), *ancestors
 
 
 def task_channel() -> UnixChannel:
@@ -87,33 +87,33 @@ def take_descriptor(index: int) -> int:
     return fd
 
 
-def die_with(parent: int) -> None:
+def die_with_parent(parent: int) -> None:
     """Have the kernel kill this process when its zygote dies."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
 
-def adopt_orphans() -> None:
+def become_subreaper() -> None:
     """Have the kernel make this process the parent of what our children leave behind."""
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def run(start: Start, fds: list[int], board: Board, agent: int) -> int:
+def run(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> int:
     """Run what was asked for and return the exit code."""
     if start.method == "spawn":
-        _exec(start, fds, board, agent)
-    return _run(start, fds, board, agent)
+        _exec(start, fds, progress_table, agent)
+    return _run(start, fds, progress_table, agent)
 
 
-def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
-    global _task_channel, _progress, _descriptors, elders
-    elders = start.elders
+def _run(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> int:
+    global _task_channel, _progress, _descriptors, ancestors
+    ancestors = start.ancestors
     _adopt_stdio(fds, captured=start.captured)
     rest = fds[2:]
     if start.slot is not None:
         _task_channel = UnixChannel.from_fd(rest.pop(0))
-        _progress = board.slot(start.slot)
+        _progress = progress_table.slot(start.slot)
     _descriptors = rest
     try:
         process = _load(start)
@@ -127,7 +127,7 @@ def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
     return int(process._bootstrap(parent_sentinel=agent))
 
 
-def _load(start: Start) -> Any:
+def _load(start: StartRequest) -> Any:
     data: dict[str, Any] = pickle.loads(start.preparation)
     if start.hub is not None:
         access.install(start.hub)
@@ -213,13 +213,13 @@ def _report_birth_failure() -> None:
             _task_channel.send(pickle.dumps(("birth", traceback.format_exc())))
 
 
-def _exec(start: Start, fds: list[int], board: Board, agent: int) -> None:
+def _exec(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> None:
     """Replace this forked process by a fresh interpreter that goes on in ``spawned``."""
     again = os.memfd_create("fiber-start")
-    plan = (tuple(start._replace(method="fork")), fds, board.fd, agent)
+    plan = (tuple(start._replace(method="fork")), fds, progress_table.fd, agent)
     with os.fdopen(os.dup(again), "wb") as file:
         pickle.dump(plan, file)
-    for fd in (*fds, board.fd, agent, again):
+    for fd in (*fds, progress_table.fd, agent, again):
         os.set_inheritable(fd, True)
     executable = os.fsdecode(start.executable or sys.executable)
     statement = f"from fiber._agent.child import spawned; spawned({again})"
@@ -233,11 +233,11 @@ def spawned(plan_fd: int) -> None:
     """Entry point of a child in an interpreter of its own."""
     with os.fdopen(plan_fd, "rb") as file:
         file.seek(0)
-        fields, fds, board, agent = pickle.load(file)
-    for fd in (*fds, board, agent):
+        fields, fds, progress_table, agent = pickle.load(file)
+    for fd in (*fds, progress_table, agent):
         os.set_inheritable(fd, False)
     code = 1
     try:
-        code = _run(Start(*fields), fds, Board(board), agent)
+        code = _run(StartRequest(*fields), fds, ProgressTable(progress_table), agent)
     finally:
         os._exit(code)
