@@ -7,7 +7,7 @@ import signal
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._engine import ledger as engine
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Ledger
@@ -49,13 +49,13 @@ class Member:
     def started(self, pid: int) -> None:
         """It exists."""
 
-    def said(self, message: Any) -> None:
+    def received(self, message: Any) -> None:
         """It said something."""
         self._master.heard(self, message)
 
-    def taken_back(self, seqs: list[int]) -> None:
+    def recalled(self, seqs: list[int]) -> None:
         """It did not read these."""
-        self._master.taken_back(self, seqs)
+        self._master.recalled(self, seqs)
 
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
@@ -177,7 +177,7 @@ class LedgerMaster:
         job = self.jobs.get(account.number)
         if job is not None:
             for worker in self.ledger.cancel(job):
-                worker.key.child.take_back()
+                worker.key.child.recall()
 
     def terminate(self) -> None:
         """Cancel all jobs."""
@@ -237,7 +237,7 @@ class LedgerMaster:
         if job.finished and account.delivered == account.everything:
             self._finished(account)
 
-    def taken_back(self, member: Member, seqs: list[int]) -> None:
+    def recalled(self, member: Member, seqs: list[int]) -> None:
         """A worker did not read these."""
         if member.worker is not None:
             self.ledger.put_back(member.worker, seqs, self._now)
@@ -289,7 +289,7 @@ class LedgerMaster:
         self.world.count()
         self._assign()
         for worker in self.ledger.recall(self._now):
-            worker.key.child.take_back()
+            worker.key.child.recall()
         self._let_go()
         self._scale()
         self._set_timer()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-from fiber._agent.port import ChildObserver
+from fiber._agent.interface import ChildObserver
 from fiber._transport.memory import SimulatedLoop
 from simulation import schedule
 from simulation.agents import LOST_AFTER, Agent, Child

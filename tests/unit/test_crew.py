@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._runtime import crew as crew_module
 from fiber._runtime.crew import IDLE_PAUSE, LONGEST_PAUSE, TRIES, Crew
 from fiber._runtime.workers import Link

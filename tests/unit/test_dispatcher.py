@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._engine.ledger import PATIENCE
 from fiber._runtime import exchange, workers
 from fiber._runtime.dispatcher import Dispatcher
@@ -92,7 +92,7 @@ class Port:
             self.packets.append((seq, payload))
         return not self.gone
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         self.recalls += 1
 
     def signal(self, signum: int) -> None:
@@ -156,7 +156,7 @@ class Rig:
         return port
 
     def say(self, link: Link, *words: Any) -> None:
-        link.said(Message(memoryview(pickle.dumps(words)), [], []))
+        link.received(Message(memoryview(pickle.dumps(words)), [], []))
 
     def answer(self, link: Link, seq: int, values: list[Any], odd: Sequence[Any] = ()) -> None:
         self.say(link, seq, 0, None, 1e-3, values, list(odd))
@@ -203,7 +203,7 @@ def test_a_function_is_sent_once_to_each_worker(rig: Rig) -> None:
 def test_a_function_that_was_not_read_is_sent_again(rig: Rig) -> None:
     rig.map(range(4))
     link, port = rig.links[0], rig.ports[0]
-    link.taken_back([seq for seq, _ in port.packets])
+    link.recalled([seq for seq, _ in port.packets])
     assert rig.head(link, 2).size
 
 
@@ -258,7 +258,7 @@ def test_idle_workers_get_what_busy_ones_have_not_read(rig: Rig) -> None:
     rig.loop.pass_time(PATIENCE)
     assert rig.ports[1].recalls == 1
     unread = rig.ports[1].packets[1][0]
-    busy.taken_back([unread])
+    busy.recalled([unread])
     rig.answer(idle, rig.ports[0].packets[-1][0], [7])
     rig.answer(busy, unread, ["late"])
     rig.answer(busy, rig.ports[1].packets[0][0], [8])

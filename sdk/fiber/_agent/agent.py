@@ -3,7 +3,7 @@
 In a program with the local backend it lives in the program itself, on its loop; elsewhere it is a
 process of its own (``python -m fiber.agent``) whose ``ChildObserver`` is the link to the master.
 
-Who touches what: ``start``, ``deliver``, ``take_back`` and ``signal`` come from any thread and only
+Who touches what: ``start``, ``deliver``, ``recall`` and ``signal`` come from any thread and only
 append to outboxes or tables under ``_lock``; everything that arrives is handled on the loop's
 thread.
 """
@@ -17,8 +17,8 @@ import threading
 from typing import Any
 
 from fiber._agent import zygote
+from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
-from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink, close_all
 from fiber._hub import access
@@ -28,7 +28,7 @@ from fiber._transport.loop import Loop
 
 
 class Agent:
-    """Runs the children of this host; an ``AgentPort``."""
+    """Runs the children of this host; an ``AgentHandle``."""
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None = None) -> None:
         self.host = host

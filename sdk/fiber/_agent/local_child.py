@@ -1,6 +1,6 @@
 """One child of this host, as its agent holds it: its channel, its signals, its end.
 
-``deliver``, ``take_back`` and ``signal`` come from any thread and only append to outboxes; what
+``deliver``, ``recall`` and ``signal`` come from any thread and only append to outboxes; what
 arrives is handled on the loop's thread, or by whoever attends to it.
 """
 
@@ -17,7 +17,7 @@ from typing import Protocol
 
 from fiber._agent import zygote
 from fiber._agent.child import StartRequest, lineage
-from fiber._agent.port import ChildObserver, ChildSpec
+from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
 from fiber._hub.access import Access
@@ -45,7 +45,7 @@ class Owner(Protocol):
 
 
 class LocalChild:
-    """One child of this host; a ``ChildPort``."""
+    """One child of this host; a ``ChildHandle``."""
 
     def __init__(self, owner: Owner, id_: int, spec: ChildSpec, observer: ChildObserver) -> None:
         self.id = id_
@@ -145,9 +145,9 @@ class LocalChild:
         finally:
             self._hearing.release()
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         """Recall unread packets; answered on the loop."""
-        self._loop.call_soon(self._answer_take_back)
+        self._loop.call_soon(self._send_recalled)
 
     def signal(self, signum: int) -> None:
         """Signal the child through its zygote."""
@@ -156,7 +156,7 @@ class LocalChild:
         if signum == signal.SIGKILL and self.pid is None:
             self._loop.call_soon(self._owner.abandon, self)
 
-    def condemn(self, fault: Exception) -> None:
+    def abort(self, fault: Exception) -> None:
         """Something to or from it is lost for good: only its end can tell the master so."""
         self.fault = self.fault or fault
         self.signal(signal.SIGKILL)
@@ -176,9 +176,9 @@ class LocalChild:
             self._theirs.close()
         return tuple(unread)
 
-    def _answer_take_back(self) -> None:
+    def _send_recalled(self) -> None:
         if self._theirs is not None and self._theirs.fileno() >= 0:
-            self.observer.taken_back(self._recall())
+            self.observer.recalled(self._recall())
 
     def _receive(self) -> None:
         # Whoever attends to it already hears it, in order.
@@ -195,12 +195,12 @@ class LocalChild:
         except (BlockingIOError, EOFError):
             return False
         except TooManyOpenFiles as error:
-            self.condemn(error)
+            self.abort(error)
             return True
         try:
-            self.observer.said(message)
+            self.observer.received(message)
         except Exception as error:
-            self.condemn(error)
+            self.abort(error)
             raise
         return True
 
@@ -214,7 +214,7 @@ class LocalChild:
             except (BlockingIOError, EOFError):
                 break
             except TooManyOpenFiles as error:
-                self.condemn(error)
+                self.abort(error)
                 continue
             seqs.append(_SEQ.unpack_from(message.payload)[0])
             message.release()

@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
 from fiber._hub.hub import Hub
 from fiber._transport.link import Link
@@ -24,7 +24,7 @@ _REMEMBERED = 1024
 
 
 class RemoteAgent:
-    """An ``AgentPort``.
+    """An ``AgentHandle``.
 
     It takes work before its link is there; what it cannot do it reports as exits.
     """
@@ -139,7 +139,7 @@ class RemoteAgent:
 
 
 class RemoteChild:
-    """A ``ChildPort`` whose child is on another host."""
+    """A ``ChildHandle`` whose child is on another host."""
 
     def __init__(self, agent: RemoteAgent, number: int, name: str, observer: ChildObserver) -> None:
         self.number = number
@@ -167,7 +167,7 @@ class RemoteChild:
         """Its answer is never near."""
         return False
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         """Recall unread packets."""
         self._agent.send(messages.TakeBack(self.number))
 
@@ -179,12 +179,12 @@ class RemoteChild:
         """Something about this child."""
         if isinstance(message, messages.Said):
             buffers = [memoryview(buffer) for buffer in message.buffers]
-            self.observer.said(packet.Message(memoryview(message.payload), buffers, []))
+            self.observer.received(packet.Message(memoryview(message.payload), buffers, []))
         elif isinstance(message, messages.Started):
             self.pid = message.pid
             self.observer.started(message.pid)
         elif isinstance(message, messages.TakenBack):
-            self.observer.taken_back(list(message.seqs))
+            self.observer.recalled(list(message.seqs))
         elif isinstance(message, messages.Output):
             output.write(f"{self.name}@{self.host}", message.text)
         elif isinstance(message, messages.Exited):

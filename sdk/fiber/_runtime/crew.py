@@ -9,7 +9,7 @@ import threading
 from typing import Any
 
 from fiber._agent import worker
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._runtime.workers import Link, PoolProcess, Supervisor, dismiss
 from fiber.errors import FiberError, StartError
 

@@ -9,7 +9,7 @@ from time import monotonic
 from typing import Any
 
 from fiber import reduction
-from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
 from fiber._engine.chunks import FLOOR, Pace
 from fiber._runtime.exchange import Exchange
 from fiber._runtime.outcome import Failure
@@ -66,7 +66,7 @@ class Dispatcher(Exchange):
         timeout: float | None = None,
         *,
         until: Callable[[], bool] | None = None,
-    ) -> ChildPort | None:
+    ) -> ChildHandle | None:
         """One call of a function.
 
         With ``until`` this thread waits a little for what its worker says, if one has it already
@@ -91,10 +91,10 @@ class Dispatcher(Exchange):
             self._follow(plan)
             if until is None or len(plan.batches) != 1 or until():
                 return None
-            port: ChildPort | None = plan.batches[0].worker.key.port
+            port: ChildHandle | None = plan.batches[0].worker.key.port
             return port if port is not None and port.attend() else None
 
-    def attend(self, port: ChildPort) -> bool:
+    def attend(self, port: ChildHandle) -> bool:
         """Wait a little more for what a worker says; False if it is left to the loop."""
         with unbroken:
             return port.attend()
@@ -253,7 +253,7 @@ class Dispatcher(Exchange):
         with unbroken:
             with self._lock:
                 for worker in self._ledger.cancel(request.job):
-                    worker.key.port.take_back()
+                    worker.key.port.recall()
                 self._over(request)
                 plan = self._step()
             self._act(plan)

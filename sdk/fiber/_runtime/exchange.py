@@ -30,7 +30,7 @@ from time import monotonic
 from typing import Any
 
 from fiber import reduction
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._engine.ledger import Batch, Job, Loss, Receipt
 from fiber._runtime.crew import Crew
 from fiber._runtime.outcome import Encoded, Failure, outcomes
@@ -86,7 +86,7 @@ class Exchange(Staff):
     def _recall(self, now: float) -> None:
         """Ask busy workers for what they have not begun, if others are idle."""
         for worker in self._ledger.recall(now):
-            worker.key.port.take_back()
+            worker.key.port.recall()
         due = self._ledger.next_recall()
         if due is not None:
             self._later("recall", due - now, self._reconsider)

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 
-from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
 from fiber._runtime.state import runtime
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.packet import Message
@@ -29,7 +29,7 @@ class Popen:
         self.report: ExitReport | None = None
         self.pid: int | None = None
         self._closed = True
-        self._port: ChildPort | None = None
+        self._port: ChildHandle | None = None
         self._born = threading.Event()
         self._exited = threading.Event()
         self._lock = threading.Lock()
@@ -65,11 +65,11 @@ class Popen:
         self.pid = pid
         self._born.set()
 
-    def said(self, message: Message) -> None:
+    def received(self, message: Message) -> None:
         """Only pool workers talk."""
         message.release()
 
-    def taken_back(self, seqs: list[int]) -> None:
+    def recalled(self, seqs: list[int]) -> None:
         """Only pool workers are given work."""
 
     def exited(self, report: ExitReport) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from multiprocessing import process as mp_process
 from typing import Any, Protocol
 
-from fiber._agent.port import ChildPort, ExitReport
+from fiber._agent.interface import ChildHandle, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._runtime.methods import zygote_method
 from fiber._runtime.state import runtime
@@ -41,7 +41,7 @@ class Link:
     def __init__(self, supervisor: Supervisor) -> None:
         self.process: PoolProcess | None = None
         """Once it is started."""
-        self.port: ChildPort | None = None
+        self.port: ChildHandle | None = None
         self.worker: Worker | None = None
         """Its entry in the ledger, once it is ready."""
         self.known: dict[int, None] = {}
@@ -75,11 +75,11 @@ class Link:
         self._pid = pid
         self._born.set()
 
-    def said(self, message: Message) -> None:
+    def received(self, message: Message) -> None:
         """It sent a packet."""
         self._supervisor.heard(self, message)
 
-    def taken_back(self, seqs: list[int]) -> None:
+    def recalled(self, seqs: list[int]) -> None:
         """It will never see these."""
         self._supervisor.recalled(self, seqs)
 

@@ -1,7 +1,8 @@
 """The seam between whoever wants children and whoever runs them.
 
-The master asks through ``AgentPort`` and ``ChildPort`` and hears through ``ChildObserver``.  The
-agent in this process (``agent.py``) and the agent behind a link (``fiber._backends``) both are one.
+The master asks through ``AgentHandle`` and ``ChildHandle`` and hears through ``ChildObserver``.
+The agent in this process (``agent.py``) and the agent behind a link (``fiber._backends``) both are
+one.
 """
 
 from __future__ import annotations
@@ -58,17 +59,17 @@ class ChildObserver(Protocol):
     def started(self, pid: int) -> None:
         """It exists."""
 
-    def said(self, message: Message) -> None:
+    def received(self, message: Message) -> None:
         """It sent a packet on its task channel."""
 
-    def taken_back(self, seqs: list[int]) -> None:
-        """These packets it will never see: the answer to ``take_back``."""
+    def recalled(self, seqs: list[int]) -> None:
+        """These packets it will never see: the answer to ``recall``."""
 
     def exited(self, report: ExitReport) -> None:
         """It is gone, or never came to be.  Exactly once, and last."""
 
 
-class ChildPort(Protocol):
+class ChildHandle(Protocol):
     """What the master holds of one child.  Any thread; nothing blocks."""
 
     name: str
@@ -88,19 +89,19 @@ class ChildPort(Protocol):
         this saves waking the loop, and the loop waking the caller.
         """
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         """Recall the packets that it has not read; the observer hears which."""
 
     def signal(self, signum: int) -> None:
         """Send it a signal; nothing if it is gone."""
 
 
-class AgentPort(Protocol):
+class AgentHandle(Protocol):
     """One agent: starts children on one host."""
 
     host: str
 
-    def start(self, spec: ChildSpec, observer: ChildObserver) -> ChildPort:
+    def start(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
         """Start a child; what goes wrong is told to the observer."""
 
     def close(self) -> None:
