@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from benchmarks import latency, overhead, pipes, startup, throughput
-from benchmarks.model import BASELINE, Run
+from benchmarks import agents, coldstart, latency, overhead, pipes, startup, throughput, workers
+from benchmarks.model import BASELINE, Metric, Run
 from benchmarks.samples import in_words, ratio, summary, times
 
 
@@ -14,8 +14,8 @@ from benchmarks.samples import in_words, ratio, summary, times
 class Budget:
     """A bound on a metric of `contender`: on its ratio to `against`, or on its value in `unit`.
 
-    With a unit it is the value that counts. The bound is the greatest value allowed; with
-    `at_least`, the least.
+    With a unit it is the value that counts. With `to_case` the ratio is to the contender's own
+    value in that case. The bound is the greatest value allowed; with `at_least`, the least.
     """
 
     what: str
@@ -26,7 +26,13 @@ class Budget:
     at_least: bool = False
     contender: str = "fiber"
     against: str = BASELINE
+    to_case: str = ""
     unit: str = ""
+
+    @property
+    def divisor(self) -> tuple[str, str]:
+        """The case and the contender whose value a ratio is to."""
+        return (self.to_case, self.contender) if self.to_case else (self.case, self.against)
 
     def in_words(self) -> str:
         """The bound with its unit."""
@@ -66,12 +72,18 @@ def verdicts(runs: Mapping[str, Run]) -> list[Verdict]:
     return [judge(budget, runs) for budget in BUDGETS]
 
 
+def of(measure: str, case: str, metric: str, contender: str) -> list[Budget]:
+    """The budgets on one value of a contender."""
+    keys = (measure, case, metric, contender)
+    return [b for b in BUDGETS if (b.measure, b.case, b.metric, b.contender) == keys]
+
+
 def _value(budget: Budget, run: Run) -> float | None:
     values = run.series(budget.case, budget.contender, budget.metric)
     if budget.unit:
         found = summary(values)
     else:
-        found = ratio(values, run.series(budget.case, budget.against, budget.metric))
+        found = ratio(values, run.series(*budget.divisor, budget.metric))
     return found.median if found else None
 
 
@@ -89,21 +101,27 @@ def _missed(value: float, budget: Budget) -> str:
 
 
 def _pool() -> Iterator[Budget]:
-    case, rate = "map, chunksize 1", throughput.RATE.name
-    yield Budget("no-op tasks, chunksize 1", "throughput", case, rate, 20, at_least=True)
-    case = "map, default chunks"
-    yield Budget("no-op tasks, default chunks", "throughput", case, rate, 1, at_least=True)
+    rate = throughput.RATE.name
+    for case, bound in (("map, chunksize 1", 50), ("map, default chunks", 1.1)):
+        what = f"no-op tasks, {case.removeprefix('map, ')}"
+        yield Budget(what, "throughput", case, rate, bound, at_least=True)
     for metric in (latency.P50, latency.P95):
-        yield Budget(
-            f"latency of one apply, {metric.label}", "latency", latency.NAME, metric.name, 0.7
-        )
+        what = f"latency of one apply, {metric.label}"
+        yield Budget(what, "latency", latency.NAME, metric.name, 0.5)
+    yield from _overhead()
+    for case in throughput.ARRAY_KINDS:
+        yield Budget(case, "throughput", case, throughput.TIME.name, 0.25)
+    case, what = throughput.LONG_NAME, "one 1 s task among 10,000 no-ops"
+    yield Budget(what, "throughput", case, throughput.TIME.name, 1.03, unit="s")
+
+
+def _overhead() -> Iterator[Budget]:
+    metric = overhead.TIME.name
     for chunks in overhead.CHUNKS:
         for duration in overhead.DURATIONS:
             case = overhead.case_name(duration, chunks)
-            bound = (
-                {0.001: 0.98, 0.0001: 0.8}.get(duration, 1.01) if chunks == "chunksize 1" else 1.01
-            )
-            yield Budget(f"overhead: {case}", "overhead", case, overhead.TIME.name, bound)
+            tight = {0.001: 0.95, 0.0001: 0.8} if chunks == "chunksize 1" else {}
+            yield Budget(f"overhead: {case}", "overhead", case, metric, tight.get(duration, 1.01))
     case = overhead.case_name(0.001, "chunksize 1")
     for peer, label, bound in (("ipyparallel", "ipyparallel", 8), ("spark", "Spark", 14)):
         what = f"overhead: {case}, {label}'s time against Fiber's"
@@ -111,44 +129,91 @@ def _pool() -> Iterator[Budget]:
             what,
             "overhead",
             case,
-            overhead.TIME.name,
+            metric,
             bound,
             at_least=True,
             contender=peer,
             against="fiber",
         )
-    case = throughput.LONG_NAME
-    yield Budget(
-        "one 1 s task among 10,000 no-ops", "throughput", case, throughput.TIME.name, 1.03, unit="s"
-    )
 
 
-def _data() -> Iterator[Budget]:
-    for case in throughput.ARRAY_KINDS:
-        yield Budget(case, "throughput", case, throughput.TIME.name, 0.3)
-    for (name, _, _), bound in zip(pipes.MESSAGES, (0.95, 0.9, 1.0, 0.4, 0.25), strict=True):
-        yield Budget(f"Pipe round trip, {name}", "pipes", name, pipes.ROUND_TRIP.name, bound)
+def _pipes() -> Iterator[Budget]:
+    for (name, _, _), bound in zip(pipes.MESSAGES, (0.95, 0.9, 1.0, 0.3, 0.2), strict=True):
+        for case in (name, *(pipes.placed(name, place) for place in pipes.PLACES)):
+            yield Budget(f"Pipe round trip, {case}", "pipes", case, pipes.ROUND_TRIP.name, bound)
     for count in (8, 32):
         case = pipes.environments(count)
-        yield Budget(f"vector step, {case}", "pipes", case, pipes.STEP.name, 1.0)
-
-
-def _loopback() -> Iterator[Budget]:
-    for chunks in overhead.CHUNKS:
-        case = overhead.case_name(0.001, chunks)
-        what = f"loopback: {case}"
-        yield Budget(what, "overhead", case, overhead.TIME.name, 1.02, contender="fiber-loopback")
-    case, what = "map, chunksize 1", "loopback: no-op tasks, chunksize 1"
-    yield Budget(
-        what, "throughput", case, throughput.RATE.name, 5, at_least=True, contender="fiber-loopback"
-    )
+        yield Budget(f"vector step, {case}", "pipes", case, pipes.STEP.name, 0.8)
 
 
 def _start() -> Iterator[Budget]:
+    for count, metric, what in (
+        (1, coldstart.READY, "first worker ready"),
+        (5, coldstart.READY, "five workers ready"),
+        (5, coldstart.MAP, "first map of five workers"),
+    ):
+        yield Budget(
+            f"from a fresh interpreter: {what}",
+            "coldstart",
+            coldstart.case_name(count),
+            metric.name,
+            1.0,
+            against="forkserver",
+        )
+    yield Budget("import fiber", "startup", startup.IMPORT_NAME, startup.IMPORT.name, 0.5)
     case = startup.workers(1024)
-    yield Budget("1,024 local workers, started", "startup", case, startup.START.name, 10, unit="s")
-    yield Budget("1,024 local workers, memory", "startup", case, startup.MEMORY.name, 6e9, unit="B")
-    yield Budget("import fiber", "startup", startup.IMPORT_NAME, startup.IMPORT.name, 1.3)
+    for metric, bound in ((startup.START, 4), (startup.MEMORY, 3.5e9)):
+        label = f"1,024 local workers, {metric.label}"
+        yield Budget(label, "startup", case, metric.name, bound, unit=metric.unit)
 
 
-BUDGETS = (*_pool(), *_data(), *_loopback(), *_start())
+def _remote() -> Iterator[Budget]:
+    def budget(
+        what: str,
+        measure: str,
+        case: str,
+        metric: Metric,
+        bound: float,
+        *,
+        at_least: bool = False,
+        against: str = BASELINE,
+    ) -> Budget:
+        return Budget(
+            f"loopback: {what}",
+            measure,
+            case,
+            metric.name,
+            bound,
+            at_least=at_least,
+            contender="fiber-loopback",
+            against=against,
+        )
+
+    what = "latency of one apply, p50"
+    yield budget(what, "latency", latency.NAME, latency.P50, 2)
+    yield budget(f"{what}, to Ray's", "latency", latency.NAME, latency.P50, 0.25, against="ray")
+    rate = throughput.RATE
+    yield budget("apply_async no-ops", "throughput", "apply_async", rate, 1, at_least=True)
+    what = "no-op tasks, chunksize 1"
+    yield budget(what, "throughput", "map, chunksize 1", rate, 20, at_least=True)
+    for case in throughput.ARRAY_KINDS:
+        yield budget(case, "throughput", case, throughput.TIME, 0.6)
+    for chunks in overhead.CHUNKS:
+        case = overhead.case_name(0.001, chunks)
+        yield budget(case, "overhead", case, overhead.TIME, 1.02)
+
+
+def _many() -> Iterator[Budget]:
+    case = agents.agents(1024)
+    what = "1,024 remote agents"
+    for metric, bound in ((agents.JOINED, 3), (agents.MEMORY, 100e3)):
+        label = f"{what}, {metric.label}"
+        yield Budget(label, "agents", case, metric.name, bound, unit=metric.unit)
+    label = f"{what}, a map of 100,000 no-ops"
+    yield Budget(label, "agents", case, agents.DEFAULT.name, 5, at_least=True)
+    label = "the master's processor time to start a worker, in a pool of 5,000"
+    few, case = workers.workers(10), workers.workers(5000)
+    yield Budget(label, "workers", case, workers.COST.name, 1.1, to_case=few)
+
+
+BUDGETS = (*_pool(), *_pipes(), *_start(), *_remote(), *_many())

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
-_PROCESSES = frozenset({"pipes", "start"})
+_PROCESSES = frozenset({"pipes", "start", "cold start"})
+_AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,18 @@ class Contender:
 
     def missing(self) -> str:
         """What must be installed before it can take part; empty if nothing."""
-        wanting = [name for name in self.modules if not importlib.util.find_spec(name)]
+        wanting = [name for name in self.modules if not _found(name)]
         if self.program and not shutil.which(self.program):
             wanting.append(self.program)
         return ", ".join(wanting)
+
+
+def _found(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        # It would be part of a package that is not there.
+        return False
 
 
 # Colours: Okabe and Ito's set, told apart by colour-blind readers, and Tol's wine.
@@ -43,7 +52,7 @@ ALL = (
         "fiber",
         "Fiber",
         ("fiber",),
-        _POOL | _PROCESSES | {"import"},
+        _POOL | _PROCESSES | _AGAINST_BASELINE | {"fake workers"},
         "#0072B2",
         "o",
         environment={"FIBER_BACKEND": "local"},
@@ -61,12 +70,17 @@ ALL = (
         "multiprocessing",
         "multiprocessing, fork",
         (),
-        _POOL | _PROCESSES | {"import"},
+        _POOL | _PROCESSES | _AGAINST_BASELINE,
         "#000000",
         "D",
     ),
     Contender(
-        "forkserver", "multiprocessing, forkserver", (), frozenset({"start"}), "#666666", "d"
+        "forkserver",
+        "multiprocessing, forkserver",
+        (),
+        frozenset({"start", "cold start"}),
+        "#666666",
+        "d",
     ),
     Contender(
         "concurrent.futures",

@@ -10,7 +10,7 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-from benchmarks import latency, overhead, pipes, startup, throughput
+from benchmarks import agents, coldstart, latency, overhead, pipes, startup, throughput, workers
 from benchmarks.contenders import BY_NAME
 from benchmarks.model import Metric, Run
 from benchmarks.samples import Summary, in_words, summary
@@ -77,20 +77,36 @@ def _latency(run: Run, path: Path) -> None:
 
 
 def _pipes(run: Run, path: Path) -> None:
-    figure, panels = plt.subplots(1, 2, figsize=(12, 5), width_ratios=(3, 2))
-    cases = pipes.cases(run.about["size"])
-    trips, steps = (
-        [case.name for case in cases if case.group == group] for group in (pipes.TRIPS, pipes.STEPS)
+    figure, panels = plt.subplots(2, 2, figsize=(12, 9))
+    messages = [name for name, _, _ in pipes.MESSAGES]
+    _pipe_panel(panels[0, 0], run, messages, messages, "where the kernel puts both")
+    for panel, place in zip((panels[0, 1], panels[1, 0]), pipes.PLACES, strict=True):
+        cases = [pipes.placed(name, place) for name in messages]
+        _pipe_panel(panel, run, messages, cases, f"on {place}")
+    steps = [case.name for case in pipes.cases(run.about["size"]) if case.group == pipes.STEPS]
+    _lines(panels[1, 1], run, list(enumerate(steps)), pipes.STEP, log_x=False)
+    panels[1, 1].set(
+        title="One step of Gymnasium's AsyncVectorEnv",
+        ylabel="time",
+        xticks=range(len(steps)),
+        xticklabels=steps,
+        xlim=(-0.5, len(steps) - 0.5),
     )
-    for panel, names, metric in (
-        (panels[0], trips, pipes.ROUND_TRIP),
-        (panels[1], steps, pipes.STEP),
-    ):
-        _lines(panel, run, list(enumerate(names)), metric, log_x=False)
-        panel.set(xticks=range(len(names)), xticklabels=names, xlim=(-0.5, len(names) - 0.5))
-    panels[0].set(title="Round trip through a Pipe", xlabel="message", ylabel="time")
-    panels[1].set(title="One step of Gymnasium's AsyncVectorEnv", ylabel="time")
     _finish(figure, path)
+
+
+def _pipe_panel(
+    panel: Any, run: Run, messages: Sequence[str], cases: Sequence[str], where: str
+) -> None:
+    _lines(panel, run, list(enumerate(cases)), pipes.ROUND_TRIP, log_x=False)
+    panel.set(
+        title=f"Round trip through a Pipe, {where}",
+        xlabel="message",
+        ylabel="time",
+        xticks=range(len(messages)),
+        xticklabels=messages,
+        xlim=(-0.5, len(messages) - 0.5),
+    )
 
 
 def _startup(run: Run, path: Path) -> None:
@@ -103,8 +119,46 @@ def _startup(run: Run, path: Path) -> None:
     ):
         _lines(panel, run, points, metric)
         panel.set(title=title, xlabel="workers", xticks=startup.WORKERS, xlim=(0.7, 1500))
-        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        panel.xaxis.set_minor_formatter(NullFormatter())
+        _counts(panel.xaxis)
+    _finish(figure, path)
+
+
+def _coldstart(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 2, figsize=(12, 4), sharey=True)
+    names = [case.name for case in coldstart.cases(run.about["size"])]
+    for panel, metric, title in (
+        (panels[0], coldstart.READY, "Until all workers are ready"),
+        (panels[1], coldstart.MAP, "Until the first map has returned"),
+    ):
+        _rows(panel, run, names, metric)
+        panel.set(title=title, xlabel="time since the interpreter was started")
+    _finish(figure, path)
+
+
+def _workers(run: Run, path: Path) -> None:
+    figure, panel = plt.subplots(figsize=(9, 4))
+    points = [(float(count), workers.workers(count)) for count in workers.WORKERS]
+    _lines(panel, run, points, workers.COST)
+    panel.set(
+        title="The master's processor time to start a worker",
+        xlabel="workers of the pool",
+        xticks=workers.WORKERS,
+    )
+    _counts(panel.xaxis)
+    _finish(figure, path)
+
+
+def _agents(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 3, figsize=(14, 5))
+    points = [(float(count), agents.agents(count)) for count in agents.AGENTS]
+    for panel, metric, title in (
+        (panels[0], agents.JOINED, "Until all have joined"),
+        (panels[1], agents.MEMORY, "Memory of the master for a link"),
+        (panels[2], agents.DEFAULT, "No-op tasks a second, default chunks"),
+    ):
+        _lines(panel, run, points, metric)
+        panel.set(title=title, xlabel="agents", xticks=agents.AGENTS)
+        _counts(panel.xaxis)
     _finish(figure, path)
 
 
@@ -114,6 +168,9 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "latency": _latency,
     "pipes": _pipes,
     "startup": _startup,
+    "coldstart": _coldstart,
+    "workers": _workers,
+    "agents": _agents,
 }
 
 
@@ -144,6 +201,8 @@ def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool 
                     fontsize=12,
                     horizontalalignment="center",
                 )
+    if not panel.lines:
+        return  # nobody took part, and an axis without values has no logarithms
     panel.margins(y=0.12)
     if log_x:
         panel.set_xscale("log")
@@ -200,6 +259,11 @@ def _unit(axis: Any, unit: str, ticks: Sequence[float] | None = None) -> None:
         # A decade or two alone would leave one or no number on the axis.
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value, unit)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _counts(axis: Any) -> None:
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     axis.set_minor_formatter(NullFormatter())
 
 

@@ -12,6 +12,8 @@ from typing import Any
 
 WORKERS = 5
 BASELINE = "multiprocessing"
+MANY = 1000
+MANY_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -23,13 +25,18 @@ class Metric:
     unit: str
 
 
+def rounds_with(workers: int) -> int | None:
+    """At most so many rounds with so many workers; None if there is no such bound."""
+    return MANY_ROUNDS if workers >= MANY else None
+
+
 @dataclass(frozen=True)
 class Case:
     """One thing that every able contender does once in every round.
 
     `limit`: seconds after which it counts as not finished and is not tried again.
     `fresh`: needs a contender process that has done nothing before.
-    `rounds`: at most so many, for cases that take long.
+    `rounds`: at most so many, however long they take.
     """
 
     measure: str
@@ -50,13 +57,15 @@ Series = list[float | None]
 class Run:
     """What one run of one measure gave.
 
-    For each case, contender and metric one value a round, None where there is none.
+    For each case, contender and metric one value a round, None where there is none. `in_use`: the
+    share of the processors' time that others used in a moment before each round.
     """
 
     about: dict[str, Any]
     values: dict[str, dict[str, dict[str, Series]]] = field(default_factory=dict)
     failures: dict[str, dict[str, str]] = field(default_factory=dict)
     unfinished: dict[str, dict[str, float]] = field(default_factory=dict)
+    in_use: list[float] = field(default_factory=list)
 
     def add(self, case: str, contender: str, turn: int, sample: Mapping[str, float]) -> None:
         """Note the sample of round `turn`, counted from 0."""

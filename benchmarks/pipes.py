@@ -21,8 +21,8 @@ Round trip: this process sends, a process at the other end of a `Pipe()` receive
 back, this process receives and touches every page of what came. From 28 KB (an Atari
 observation) up the message is a NumPy array. The value of a round is the median of its round
 trips. Where the kernel puts the two processes decides much of it, so it is measured too with both
-held on one processor, and on two. Vector step: one `step` of Gymnasium's AsyncVectorEnv with
-`shared_memory=False` over environments that do nothing; Fiber runs it by
+held on one processor, and with one on each of two. Vector step: one `step` of Gymnasium's
+AsyncVectorEnv with `shared_memory=False` over environments that do nothing; Fiber runs it by
 `fiber.adopt("gymnasium.vector.async_vector_env")`."""
 
 ROUND_TRIP = Metric("round trip", "round trip", "s")
@@ -39,8 +39,7 @@ MESSAGES = (
     ("1 MB", 1 << 20, 300),
     ("16 MB", 1 << 24, 20),
 )
-_PLACED = ("100 B", "28 KB")
-_PROCESSORS = {"one processor": 1, "two processors": 2}
+PLACES = {"one processor": 1, "two processors": 2}
 _ENVIRONMENTS = {8: 800, 32: 200}
 _PAGE = 4096
 _MODULE = "gymnasium.vector.async_vector_env"
@@ -51,16 +50,20 @@ def environments(count: int) -> str:
     return f"{count} environments"
 
 
+def placed(message: str, place: str) -> str:
+    """The name of the case with this message and the processes held in this place."""
+    return f"{message}, {place}"
+
+
 def cases(size: float) -> list[Case]:
     """The full measure at size 1; below, fewer round trips."""
     trips = [
         (TRIPS, name, ROUND_TRIP, {"nbytes": nbytes}, count) for name, nbytes, count in MESSAGES
     ]
-    placed = [
-        (PLACED, f"{name}, {place}", ROUND_TRIP, {"nbytes": nbytes, "processors": number}, count)
+    in_places = [
+        (PLACED, placed(name, place), ROUND_TRIP, {"nbytes": nbytes, "processors": number}, count)
         for name, nbytes, count in MESSAGES
-        if name in _PLACED
-        for place, number in _PROCESSORS.items()
+        for place, number in PLACES.items()
         if number <= len(os.sched_getaffinity(0))
     ]
     steps = [
@@ -72,12 +75,12 @@ def cases(size: float) -> list[Case]:
             measure="pipes",
             name=name,
             group=group,
-            needs="pipes",
+            needs="placed pipes" if group == PLACED else "pipes",
             params={**params, "count": max(5, round(count * size)), "seconds": 2.0 * size},
             metrics=(metric,),
             fresh=True,
         )
-        for group, name, metric, params, count in [*trips, *placed, *steps]
+        for group, name, metric, params, count in [*trips, *in_places, *steps]
     ]
 
 

@@ -39,7 +39,7 @@ def descendants(pid: int) -> list[int]:
 
 def memory(pid: int) -> int:
     """Bytes held by `pid` and all below it: PSS, where a page shared by n counts 1/n for each."""
-    return sum(_pss(each) for each in (pid, *descendants(pid)))
+    return sum(pss(each) for each in (pid, *descendants(pid)))
 
 
 def name_of(pid: int) -> str:
@@ -48,7 +48,8 @@ def name_of(pid: int) -> str:
     return (words or _read(f"/proc/{pid}/comm").strip() or "gone")[:80]
 
 
-def _pss(pid: int) -> int:
+def pss(pid: int) -> int:
+    """Bytes held by `pid` alone, as `memory` counts; 0 if it is gone."""
     for line in _read(f"/proc/{pid}/smaps_rollup").splitlines():
         if line.startswith("Pss:"):
             return int(line.split()[1]) * 1024

@@ -9,9 +9,9 @@ from typing import Any
 
 from benchmarks import budgets, figures
 from benchmarks.contenders import BY_NAME
-from benchmarks.model import BASELINE, Case, Metric, Run
+from benchmarks.model import BASELINE, MANY, MANY_ROUNDS, Case, Metric, Run
 from benchmarks.rounds import LONG, SERVER_ROUNDS
-from benchmarks.samples import Summary, in_words, ratio, summary, times
+from benchmarks.samples import Summary, in_words, is_idle, ratio, summary, times
 from benchmarks.suite import MEASURES
 
 RESULTS = "results.json"
@@ -98,7 +98,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _against(budget: budgets.Budget) -> str:
-    return "—" if budget.unit else BY_NAME[budget.against].label
+    if budget.unit:
+        return "—"
+    return budget.to_case or BY_NAME[budget.against].label
 
 
 def _group_table(run: Run, cases: Sequence[Case]) -> str:
@@ -157,32 +159,46 @@ def _ratio(found: Summary | None) -> str:
 
 
 def _verdict(run: Run, case: Case, metric: Metric, contender: str) -> tuple[str, str]:
-    keys = (case.measure, case.name, metric.name, contender)
-    for budget in budgets.BUDGETS:
-        if (budget.measure, budget.case, budget.metric, budget.contender) == keys:
-            against = (
-                ""
-                if budget.unit or budget.against == BASELINE
-                else f" {BY_NAME[budget.against].label}"
-            )
-            return f"{budget.in_words()}{against}", budgets.judge(
-                budget, {case.measure: run}
-            ).verdict
-    return "", ""
+    """Bounds and verdicts of the row, of which most have one or none."""
+    found = [
+        (f"{budget.in_words()}{_to_whom(budget)}", budgets.judge(budget, {case.measure: run}))
+        for budget in budgets.of(case.measure, case.name, metric.name, contender)
+    ]
+    return "; ".join(bound for bound, _ in found), "; ".join(v.verdict for _, v in found)
+
+
+def _to_whom(budget: budgets.Budget) -> str:
+    """Whose value the bound is a multiple of, where it is not the baseline's."""
+    if budget.unit or (budget.against == BASELINE and not budget.to_case):
+        return ""
+    return f" {_against(budget)}"
 
 
 def _reading(run: Run) -> str:
     rounds = run.about["rounds"]
     text = (
         f"Median of {rounds} round{'s' if rounds > 1 else ''}; contenders with servers of their "
-        f"own take part in at most {SERVER_ROUNDS}, and what takes more than {LONG:g} s is "
-        "measured once. The ratio is to multiprocessing in the same round: its median, least and "
+        f"own take part in at most {SERVER_ROUNDS}, cases with {MANY:,} workers and more are "
+        f"measured in at most {MANY_ROUNDS}, and what else takes more than {LONG:g} s is measured "
+        "once. The ratio is to multiprocessing in the same round: its median, least and "
         "greatest."
     )
+    if run.in_use:
+        text += f"\n\n{_company(run.in_use)}"
     if run.about["size"] < 1:
         size = f"{run.about['size']:g}"
         text += f"\n\n**Run at {size} of the full size: it shows that everything works, no more.**"
     return text
+
+
+def _company(in_use: Sequence[float]) -> str:
+    shares = ", ".join(f"{100 * share:.0f} %" for share in in_use)
+    verdict = (
+        "the machine was idle."
+        if is_idle(in_use)
+        else "**the machine was not idle**, which shows in short times above all."
+    )
+    return f"Of the processors' time others used {shares} in a moment before each round: {verdict}"
 
 
 def _failures(run: Run) -> str:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from benchmarks import machine
 from benchmarks.contenders import Contender
 from benchmarks.model import Case, Run
 from benchmarks.session import Failed, Session, sweep
@@ -40,10 +41,17 @@ class Rounds:
     cases, and is stopped.
     """
 
-    def __init__(self, scratch: Path, runs: dict[str, Run], say: Say = say) -> None:
+    def __init__(
+        self,
+        scratch: Path,
+        runs: dict[str, Run],
+        say: Say = say,
+        in_use: Callable[[], float] = machine.in_use,
+    ) -> None:
         self._scratch = scratch
         self._runs = runs
         self._say = say
+        self._in_use = in_use
         self._sessions: dict[str, Session] = {}
         self._finished: set[tuple[str, str, str]] = set()
 
@@ -54,6 +62,8 @@ class Rounds:
         for turn in range(rounds):
             label = f"round {turn + 1}/{rounds}"
             for index, case in enumerate(cases):
+                if not index or cases[index - 1].measure != case.measure:
+                    self._runs[case.measure].in_use.append(self._in_use())
                 for contender in in_turn(light, turn + index):
                     self._visit(case, contender, turn, label)
             for contender in in_turn(heavy, turn) if turn < SERVER_ROUNDS else []:
@@ -89,7 +99,7 @@ class Rounds:
             run.fail(case.name, contender.name, str(failure), failure.after)
             self._say(f"{where}  failed: {failure}")
             return
-        if time.monotonic() - begin > LONG:
+        if case.rounds is None and time.monotonic() - begin > LONG:
             self._finished.add(key)
         run.add(case.name, contender.name, turn, sample)
         self._say(f"{where}  " + "  ".join(f"{name} {value:.6g}" for name, value in sample.items()))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from benchmarks.model import Series
 
+IDLE = 0.05
 _TIMES = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 _SIZES = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 
@@ -44,6 +45,11 @@ def percentile(values: Sequence[float], percent: float) -> float:
     """The value below which `percent` of the values lie, without interpolation; needs a value."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(len(ordered) * percent / 100))]
+
+
+def is_idle(in_use: Sequence[float]) -> bool:
+    """Whether others never used more than 5 % of the processors' time."""
+    return max(in_use) <= IDLE
 
 
 def in_words(value: float, unit: str) -> str:

@@ -16,7 +16,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from benchmarks import processes
-from benchmarks.model import Case, Metric
+from benchmarks.model import Case, Metric, rounds_with
 from benchmarks.tasks import announce, no_op
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ STOP = Metric("stop", "stopped", "s")
 IMPORT = Metric("import", "import", "s")
 WORKERS = (1, 5, 64, 1024)
 IMPORT_NAME = "import"
-_MANY = 1000
 _MOST = 3200
 _IMPORT_OF = {"fiber": "fiber", "multiprocessing": "multiprocessing.pool"}
 _PATIENCE = 40.0
@@ -61,7 +60,7 @@ def cases(size: float) -> list[Case]:
             metrics=(START, MEMORY, STOP),
             fresh=True,
             limit=_PATIENCE,
-            rounds=3 if n >= _MANY else None,
+            rounds=rounds_with(n),
         )
         for n in counts
     ]
@@ -79,7 +78,7 @@ def run(bench: Bench, workers: int = 0, interpreters: int = 0) -> dict[str, floa
         }
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    with _meeting_point() as (path, fd):
+    with meeting_point() as (path, fd):
         begin = time.perf_counter()
         pool = bench.processes.Pool(workers, initializer=announce, initargs=(path,))
         try:
@@ -96,7 +95,7 @@ def run(bench: Bench, workers: int = 0, interpreters: int = 0) -> dict[str, floa
 
 
 @contextlib.contextmanager
-def _meeting_point() -> Iterator[tuple[str, int]]:
+def meeting_point() -> Iterator[tuple[str, int]]:
     """A named pipe into which every worker writes one byte."""
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder, "workers"))

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from benchmarks import latency, overhead, pipes, startup, throughput
+from benchmarks import (
+    agents,
+    coldstart,
+    latency,
+    overhead,
+    pipes,
+    startup,
+    throughput,
+    workers,
+)
 
 MEASURES: dict[str, ModuleType] = {
     "overhead": overhead,
@@ -12,4 +21,7 @@ MEASURES: dict[str, ModuleType] = {
     "latency": latency,
     "pipes": pipes,
     "startup": startup,
+    "coldstart": coldstart,
+    "workers": workers,
+    "agents": agents,
 }

@@ -94,8 +94,12 @@ def _no_ops(bench: Bench, method: str, tasks: int, chunksize: int | None) -> dic
         return pool.submit(no_op, items)
 
     sum(batch(range(WORKERS)))
-    took = _time(lambda: sum(batch(range(tasks))), sum(range(tasks)))
-    return {RATE.name: tasks / took}
+    return {RATE.name: rate(lambda count: batch(range(count)), tasks)}
+
+
+def rate(batch: Callable[[int], Iterable[Any]], tasks: int) -> float:
+    """Tasks a second, for a batch that gives the numbers below its argument back."""
+    return tasks / _time(lambda: sum(batch(tasks)), sum(range(tasks)))
 
 
 def _arrays(bench: Bench, kind: str, tasks: int) -> dict[str, float]:

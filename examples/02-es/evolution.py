@@ -92,5 +92,6 @@ class Adam:
         self._square += (1 - self._decay_square) * (gradient**2 - self._square)
         mean = self._mean / (1 - self._decay_mean**self._steps)
         square = self._square / (1 - self._decay_square**self._steps)
-        step: Vector = self._rate * mean / (np.sqrt(square) + np.float32(1e-8))
+        root: Vector = np.sqrt(square)
+        step: Vector = self._rate * mean / (root + np.float32(1e-8))
         return step

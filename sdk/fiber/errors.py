@@ -266,8 +266,8 @@ def _advice(exitcode: int | None) -> str:
     if exitcode < 0:
         return "find out who sends this signal to the program's processes."
     return (
-        "the task ended its process itself: by os._exit(), by native code, or with a "
-        "KeyboardInterrupt. Let it return, or raise another exception, instead."
+        "the task ended its process itself: by os._exit(), or by native code. "
+        "Let it return, or raise an exception, instead."
     )
 
 

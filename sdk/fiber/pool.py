@@ -32,7 +32,7 @@ from fiber._runtime.state import runtime
 from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from fiber.errors import FiberError
-from fiber.process import process_type
+from fiber.process import PoolProcess, process_type
 from fiber.results import (
     ApplyResult,
     AsyncResult,
@@ -105,10 +105,10 @@ class Pool:
         self._maxtasksperchild = options.max_tasks(maxtasksperchild)
         self._task_timeout = options.seconds("task_timeout", task_timeout)
         self._owner = os.getpid()
-        process = process_type(methods.settle()) if context is None else context.Process
+        like = process_type(methods.settle()) if context is None else context.Process
         self._executor = Executor(
             PoolOptions(
-                process_type=process,
+                new_process=partial(PoolProcess, like=like),
                 initializer=initializer,
                 initargs=tuple(initargs),
                 minimum=minimum,

@@ -7,6 +7,10 @@ The class is multiprocessing's own BaseProcess underneath, so that ``current_pro
 from __future__ import annotations
 
 import os
+import weakref
+from collections import deque
+from collections.abc import Callable
+from functools import partial
 from multiprocessing import process as _mp
 from multiprocessing.process import (
     BaseProcess,
@@ -14,7 +18,10 @@ from multiprocessing.process import (
     current_process,
     parent_process,
 )
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fiber._runtime.worker_handle import WorkerHandle
 
 __all__ = [
     "BaseProcess",
@@ -26,6 +33,12 @@ __all__ = [
     "current_process",
     "parent_process",
 ]
+
+_ended: deque[weakref.ref[BaseProcess]] = deque()
+"""Processes that ended, to be dropped from ``_children`` at the next start.
+
+Fiber's own thread only appends: a process that is dropped may run the user's finalizers.
+"""
 
 
 class Process(BaseProcess):
@@ -41,7 +54,11 @@ class Process(BaseProcess):
         from fiber._runtime.methods import zygote_method
         from fiber._runtime.popen import Popen
 
-        return Popen(self, zygote_method(self._start_method))
+        return Popen(self, zygote_method(self._start_method), self._on_exit())
+
+    def _on_exit(self) -> Callable[[], None]:
+        """What its ``Popen`` calls once ``returncode`` is set."""
+        return partial(_ended.append, weakref.ref(self))
 
     def start(self) -> None:
         """Start it; returns when it has a pid."""
@@ -52,12 +69,24 @@ class Process(BaseProcess):
         )
         if getattr(current_process(), "_inheriting", False):
             raise RuntimeError(UNGUARDED_MAIN)
-        _mp._cleanup()  # type: ignore[attr-defined]
+        _drop_ended()
         self._popen: Any = self._Popen()
         self._sentinel = self._popen.sentinel
         # The child has them now; here they would keep the target's arguments alive.
         del self._target, self._args, self._kwargs  # type: ignore[attr-defined]
         _mp._children.add(self)  # type: ignore[attr-defined]
+        if self._popen.returncode is not None:  # its end came first, and found nothing to drop
+            _mp._children.discard(self)  # type: ignore[attr-defined]
+
+
+def _drop_ended() -> None:
+    """What multiprocessing's ``_cleanup`` does by asking every child, whatever became of it."""
+    while _ended:
+        try:
+            process = _ended.popleft()()
+        except IndexError:  # another thread was faster
+            return
+        _mp._children.discard(process)  # type: ignore[attr-defined]
 
 
 class ForkProcess(Process):
@@ -76,6 +105,38 @@ class SpawnProcess(Process):
     """A process in a new interpreter."""
 
     _start_method = "spawn"
+
+
+class PoolProcess(Process):
+    """The Process object of a pool worker, which ``handle`` starts and watches.
+
+    Its name and start method are those of ``like``, the class of the start method.
+    """
+
+    def __init__(self, handle: WorkerHandle, like: type[BaseProcess], **options: Any) -> None:
+        super().__init__(**options)
+        self._start_method = getattr(like, "_start_method", None)
+        role = like.__name__.replace("Process", "PoolWorker")
+        self.name = self.name.replace(type(self).__name__, role)
+        self.daemon = True
+        self._handle: WorkerHandle | None = handle
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_handle": None}
+
+    def _Popen(self) -> WorkerHandle:
+        from fiber._runtime.methods import zygote_method
+
+        assert self._handle is not None
+        self._handle.launch(self, zygote_method(self._start_method))
+        return self._handle
+
+    @property
+    def sentinel(self) -> int:
+        """As in multiprocessing."""
+        self._check_closed()  # type: ignore[attr-defined]
+        assert self._handle is not None
+        return self._handle.exit_descriptor()
 
 
 def process_type(method: str) -> type[Process]:

@@ -7,15 +7,17 @@ pickle there, travel by value.
 
 from __future__ import annotations
 
+import copyreg
 import io
 import os
 import pickle
 import sys
 from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from itertools import islice
 from multiprocessing import context as mp_context
+from multiprocessing import process as mp_process
 from multiprocessing import reduction as mp_reduction
 from multiprocessing.reduction import (
     DupFd,
@@ -262,11 +264,25 @@ def dump(obj: Any, file: Any, protocol: int | None = None) -> None:
 
 
 def main_is_out_of_reach() -> bool:
-    """Whether those who read our pickles cannot import our ``__main__`` from a file or by name."""
-    if _readers_are_remote:
+    """Whether those who read our pickles cannot import our ``__main__``, or must not: it goes by
+    value.
+    """
+    if _readers_are_remote or "ps1" in vars(sys):  # what an interactive session adds has no file
         return True
-    main = sys.modules.get("__main__")
-    return getattr(main, "__file__", None) is None and getattr(main, "__spec__", None) is None
+    main = vars(sys.modules["__main__"])
+    spec = main.get("__spec__")
+    return not _importable(spec and spec.name, main.get("__file__"))
+
+
+@lru_cache(maxsize=1)
+def _importable(name: str | None, file: str | None) -> bool:
+    """Whether a main module can be imported as ``__mp_main__``: by name if it has one."""
+    if name is not None:
+        # To import the one of a package, folder or archive is to run it: few have a guard.
+        return name.rpartition(".")[2] != "__main__"
+    # A program that came by standard input calls its file <stdin>.
+    started_in: str = mp_process.ORIGINAL_DIR or ""  # type: ignore[attr-defined]
+    return file is not None and os.path.isfile(os.path.join(started_in, file))
 
 
 def readers_are_remote(remote: bool) -> None:
@@ -283,7 +299,7 @@ class _Forking(ForkingPickler):
 
     def __init__(self, file: Any, protocol: int | None, **options: Any) -> None:
         pickle.Pickler.__init__(self, file, protocol, **options)
-        self.dispatch_table = self._copyreg_dispatch.new_child(self._extra_reducers)  # type: ignore[attr-defined]
+        self.dispatch_table = copyreg.dispatch_table | self._extra_reducers  # type: ignore[attr-defined]
 
 
 def _by_value_pickler() -> Any:

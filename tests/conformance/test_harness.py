@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import pytest
 
 from conformance.run import select
-from conformance.runner import Outcome, Report, Target, list_cases, run_group
+from conformance.runner import TESTS, Outcome, Report, Target, list_cases, run_group
 from conformance.verdict import Verdict
 
 FAULTY = "TestSimpleQueue.test_close"
@@ -45,6 +48,16 @@ def test_a_process_left_behind_fails_the_group_and_is_killed() -> None:
 def test_a_module_that_cannot_be_loaded_is_said_at_once() -> None:
     target = Target("no_such_module", "spawn", frozenset({"core"}), 60)
     with pytest.raises(RuntimeError, match="No module named 'no_such_module'"):
+        list_cases(target)
+
+
+def test_a_python_without_its_tests_is_told(tmp_path: Path) -> None:
+    # As distributions leave it that have them in a package of their own.
+    (tmp_path / "test").mkdir()
+    (tmp_path / "test" / "__init__.py").touch()
+    path = ("PYTHONPATH", os.pathsep.join([str(tmp_path), str(TESTS)]))
+    target = Target("multiprocessing", "spawn", frozenset({"core"}), 60, (path,))
+    with pytest.raises(RuntimeError, match=r"has no test\._test_multiprocessing: install"):
         list_cases(target)
 
 

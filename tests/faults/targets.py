@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import os
+import select
 import signal
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any, NoReturn
 
 import fiber
@@ -87,6 +89,13 @@ def exit_on_sigterm(connection: Any) -> NoReturn:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(42))
     connection.send("ready")
     block()
+
+
+def outlive(pid: int, path: str) -> None:
+    """Make the file, then wait until that process is gone."""
+    fd = os.pidfd_open(pid)
+    Path(path).touch()
+    select.select([fd], [], [])
 
 
 def spin() -> NoReturn:

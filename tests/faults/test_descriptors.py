@@ -307,8 +307,11 @@ AGENT_WITHOUT = (
             print(pool.apply_async(len, (bytes(1 << 20),)).get())
         except fiber.WorkerDied as error:
             print("too many open files" in str(error).lower())
-        for worker in pool._pool:
+        workers = pool._pool
+        for worker in workers:
             worker.kill()
+        for worker in workers:
+            worker.join()
         try:
             pool.apply(abs, (-1,))
         except (fiber.WorkerDied, fiber.StartError) as error:

@@ -166,6 +166,26 @@ def test_killed_together_with_its_zygotes_it_leaves_no_process(
         shutil.rmtree(directory)
 
 
+STARTING_WORKER = """
+    import fiber, os, time
+    from faults import targets
+    if __name__ == "__main__":
+        pool = fiber.Pool(1, initializer=targets.outlive, initargs=(os.getpid(), "initializing"))
+        while not os.path.exists("initializing"):
+            time.sleep(0.001)
+        os._exit(0)
+"""
+
+
+def test_a_worker_that_is_ready_when_nobody_is_there_says_nothing(
+    launch: Callable[..., Program],
+) -> None:
+    program = launch(STARTING_WORKER)
+    assert program.wait() == 0
+    assert program.left() == []
+    assert program.stderr == ""
+
+
 ENDS = """
     import fiber, os, sys
     from faults import targets

@@ -9,8 +9,11 @@ import pytest
 from faults.program import LOOPBACK, Program
 
 FORKS = """
-    import fiber, os, sys
+    import fiber, os, sys, warnings
     from faults import targets
+
+    # From Python 3.12 on os.fork() warns of any thread, and the loop is one.
+    warnings.simplefilter("ignore", DeprecationWarning)
 
     def use(name):
         ours, theirs = fiber.Pipe()

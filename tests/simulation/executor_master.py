@@ -18,13 +18,14 @@ from fiber._runtime.outcome import Pickled
 from fiber._runtime.work_items import Call, Function, WorkItem
 from fiber._wire import work
 from fiber.errors import StartError
+from fiber.process import ForkProcess, PoolProcess
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation, require
 from simulation.outcomes import HEARD, BrokenInput, Outcomes
 from simulation.pool_audit import PoolAudit, Reading
 from simulation.schedule import Act, Job, Schedule, Task
-from simulation.staged import Actor, Interrupted, Stage, StagedProcess
+from simulation.staged import Actor, Interrupted, Stage
 from simulation.wire import ERROR, PlannedError, Wire, perform, perform_nowhere, perform_other
 from simulation.workers import Ref
 from simulation.world import World
@@ -441,7 +442,7 @@ def _user(account: Account) -> str:
 
 def _options(schedule: Schedule) -> PoolOptions:
     return PoolOptions(
-        process_type=StagedProcess,
+        new_process=partial(PoolProcess, like=ForkProcess),
         minimum=schedule.min_workers,
         maximum=schedule.max_workers,
         max_tasks=schedule.left,

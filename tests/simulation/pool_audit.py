@@ -88,11 +88,13 @@ class PoolAudit:
         return decisions
 
     def _ready(self, member: Member, now: float) -> None:
-        require(member in self._workers.members, "an unknown worker is ready")
-        if not member.leaving:
+        before = member.worker
+        self._real.ready(member, now)
+        if member.worker is not before:
+            require(before is None, "a worker is ready twice")
+            require(member in self._workers.members, "an unknown worker is ready")
             self._failures.clear()
             self._told = self.starved = False
-        self._real.ready(member, now)
 
     def _gone(
         self, member: Member, now: float, *, failure: StartFailure | None = None, **rest: Any

@@ -142,8 +142,6 @@ def runs(path: Path) -> int:
 def die(how: str) -> NoReturn:
     if how == "exit":
         os._exit(3)
-    if how == "interrupt":
-        raise KeyboardInterrupt
     if how == "segfault":
         # No core file, which would take long to write.
         import resource
@@ -170,6 +168,16 @@ def die_at_first(path: Path) -> str:
 def die_when_counted(path: Path, _: object = None) -> NoReturn:
     count(path)
     os._exit(3)
+
+
+def raise_it(error: BaseException) -> NoReturn:
+    raise error
+
+
+def announce_and_wait_for_interrupt(path: Path) -> NoReturn:
+    announce(path)
+    while True:
+        time.sleep(600)
 
 
 def fail_until(path: Path, times: int) -> str:

@@ -87,8 +87,13 @@ def specification(target: Callable[..., Any], *args: Any, **options: Any) -> Chi
 
 
 def begin(agent: Agent, target: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    """A child, once its agent has looked at it."""
     observer = Recorder()
-    return agent.start(specification(target, *args, **options), observer), observer
+    child = agent.start(specification(target, *args, **options), observer)
+    settled(agent.loop)
+    if child.start_error is not None:
+        raise child.start_error
+    return child, observer
 
 
 def end(child: LocalChild, observer: Recorder) -> None:

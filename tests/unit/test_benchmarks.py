@@ -112,7 +112,7 @@ def budget_for(case: str) -> budgets.Budget:
 
 @pytest.mark.parametrize(
     ("fiber", "kept", "verdict"),
-    [(0.9, True, "met"), (0.98, True, "met"), (1.078, False, "missed by 10.0 %")],
+    [(0.9, True, "met"), (0.95, True, "met"), (1.045, False, "missed by 10.0 %")],
 )
 def test_budget_on_a_ratio(fiber: float, kept: bool, verdict: str) -> None:
     budget = budget_for(overhead.case_name(0.001, "chunksize 1"))
@@ -125,10 +125,10 @@ def test_budget_that_asks_for_at_least() -> None:
         each for each in budgets.BUDGETS if each.at_least and each.measure == "throughput"
     )
     run = Run(dict(ABOUT))
-    run.add(budget.case, budget.contender, 0, {budget.metric: 30.0})
+    run.add(budget.case, budget.contender, 0, {budget.metric: 75.0})
     run.add(budget.case, "multiprocessing", 0, {budget.metric: 2.0})
     found = budgets.judge(budget, {"throughput": run})
-    assert (found.kept, found.measured, found.verdict) == (False, "15.0x", "missed by 25.0 %")
+    assert (found.kept, found.measured, found.verdict) == (False, "37.5x", "missed by 25.0 %")
 
 
 def test_budget_of_what_was_not_measured() -> None:
@@ -150,7 +150,9 @@ def test_a_rival_that_was_too_slow_to_finish_keeps_a_budget_on_its_slowness() ->
     assert budgets.judge(budget, {"overhead": run}).kept is None
 
 
-def test_every_budget_is_on_a_case_that_is_measured() -> None:
+def test_every_budget_is_on_a_case_that_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    # With one processor alone nothing can be held on two.
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     measured = {
         (case.measure, case.name, metric.name, contender.name)
         for measure in MEASURES.values()
@@ -162,7 +164,8 @@ def test_every_budget_is_on_a_case_that_is_measured() -> None:
     for each in budgets.BUDGETS:
         assert (each.measure, each.case, each.metric, each.contender) in measured, each.what
         if not each.unit:
-            assert (each.measure, each.case, each.metric, each.against) in measured, each.what
+            case, contender = each.divisor
+            assert (each.measure, case, each.metric, contender) in measured, each.what
 
 
 def test_case_names_are_unique_in_a_measure() -> None:
@@ -175,7 +178,7 @@ def test_page_shows_ratio_budget_failures_and_who_was_skipped() -> None:
     run = overhead_run(0.5, 1.0)
     run.fail(overhead.case_name(0.0001, "chunksize 1"), "spark", "not finished after 20 s")
     page = report.page("overhead", run)
-    assert "| Fiber | 500 ms | 500 ms to 500 ms | 0.50x (0.50x to 0.50x) | ≤ 0.98x | met |" in page
+    assert "| Fiber | 500 ms | 500 ms to 500 ms | 0.50x (0.50x to 0.50x) | ≤ 0.95x | met |" in page
     assert "| 100 µs tasks, chunksize 1 | PySpark | not finished after 20 s |" in page
     assert "| all | Ray's Pool | skipped, not installed: ray |" in page
     assert "2 cores (a processor), 8.00 GB of memory" in page
@@ -192,7 +195,7 @@ def test_measuring_one_thing_again_keeps_the_other_pages(tmp_path: Path) -> None
     index = (tmp_path / "README.md").read_text(encoding="utf-8")
     assert "(overhead.md)" in index
     assert "(latency.md)" in index
-    assert "≤ 0.98x | 0.50x | met" in index
+    assert "≤ 0.95x | 0.50x | met" in index
 
 
 def test_an_absent_peer_names_what_is_missing() -> None:
@@ -259,10 +262,13 @@ def test_a_tiny_run_of_everything(tmp_path: Path) -> None:
     assert not list((tmp_path / "scratch").iterdir())
     runs = report.load(tmp_path)
     assert set(runs) == set(MEASURES)
+    offers = contenders.BY_NAME["multiprocessing"].offers
     for name, measure in MEASURES.items():
-        assert set(runs[name].values) == {case.name for case in measure.cases(0.002)}
+        cases = {case.name for case in measure.cases(0.002) if case.needs in offers}
+        assert set(runs[name].values) == cases
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
-        assert "multiprocessing, fork" in (tmp_path / f"{name}.md").read_text(encoding="utf-8")
+        page = (tmp_path / f"{name}.md").read_text(encoding="utf-8")
+        assert bool(cases) == ("multiprocessing, fork" in page)
 
 
 def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:

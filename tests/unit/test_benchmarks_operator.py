@@ -181,12 +181,25 @@ def test_a_ratio_is_taken_within_a_round() -> None:
 )
 def test_budgets(seconds: float, memory: float, verdicts: list[str]) -> None:
     found = report.budgets({"1000": result((seconds, 10.0), memory=memory)})
-    assert [line.verdict for line in found] == verdicts
+    of_1000 = [line for line in found if "1,000 pods" in line.what]
+    assert [line.verdict for line in of_1000] == verdicts
+    assert {line.verdict for line in found if line not in of_1000} == {"not measured"}
+
+
+def test_each_case_has_its_budget() -> None:
+    seconds = {"1000": 11.0, "100x10": 24.0, "5000": 13.2}
+    found = report.budgets({name: result((value, 10.0)) for name, value in seconds.items()})
+    assert {line.what.partition(" settled")[0]: line.verdict for line in found[:3]} == {
+        "1,000 pods": "met",
+        "100 times 10 pods": "missed by 100.0 %",
+        "5,000 pods": "missed by 10.0 %",
+    }
 
 
 def test_budgets_of_what_was_not_measured() -> None:
     found = report.budgets({"5000": result((1.0, 1.0))})
-    assert [line.verdict for line in found] == ["not measured"] * 2
+    of_1000 = [line for line in found if "1,000 pods" in line.what]
+    assert [line.verdict for line in of_1000] == ["not measured"] * 2
 
 
 def test_the_page_has_ratio_memory_requests_and_origin() -> None:

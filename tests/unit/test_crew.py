@@ -7,11 +7,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fiber._runtime.crew import IDLE_PAUSE, LONGEST_PAUSE, TRIES, Crew
+from fiber._runtime.workers import Link
 
 from fiber._agent.port import ExitReport
 from fiber._runtime import crew as crew_module
-from fiber._runtime.crew import IDLE_PAUSE, LONGEST_PAUSE, TRIES, Crew
-from fiber._runtime.workers import Link
 from fiber.errors import StartError
 
 

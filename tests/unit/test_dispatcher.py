@@ -10,14 +10,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fiber._runtime.dispatcher import Dispatcher
+from fiber._runtime.staff import Terms
+from fiber._runtime.workers import Link
 
 from fiber._agent.port import ExitReport
 from fiber._engine.ledger import PATIENCE
 from fiber._runtime import exchange, workers
-from fiber._runtime.dispatcher import Dispatcher
 from fiber._runtime.outcome import Encoded, Failure
-from fiber._runtime.staff import Terms
-from fiber._runtime.workers import Link
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import WorkerDied

@@ -236,7 +236,7 @@ def remote_agent(
 
 
 FORKER = """
-import os, sys, threading
+import os, sys, threading, warnings
 from fiber._transport import dialer
 from fiber._transport.credentials import make_credentials
 from fiber._transport.listener import MasterListener
@@ -248,6 +248,8 @@ credentials = make_credentials("test")
 listener = MasterListener(
     loop, "127.0.0.1:0", credentials, on_agent=print, on_refused=print
 )
+# From Python 3.12 on os.fork() warns of any thread, and the loop is one.
+warnings.simplefilter("ignore", DeprecationWarning)
 child = os.fork()
 if child == 0:
     del listener, loop

@@ -70,9 +70,42 @@ def test_sys_exit_ends_the_worker_and_is_not_tried_again(
         time.sleep(0.001)
 
 
-def test_a_keyboard_interrupt_in_a_task_is_named_in_the_advice(pool: Pool) -> None:
-    with pytest.raises(WorkerDied, match="KeyboardInterrupt"):
-        pool.apply(tasks.die, ("interrupt",))
+@pytest.mark.parametrize("chunksize", [None, 1, 2])
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, GeneratorExit])
+def test_what_is_no_exception_is_still_the_tasks_error(
+    pool: Pool, kind: type[BaseException], chunksize: int | None
+) -> None:
+    before = {process.pid for process in pool._pool}
+    with pytest.raises(kind) as caught:
+        pool.map(tasks.raise_it, [kind("on purpose")] * 4, chunksize)
+    assert caught.value.args == ("on purpose",)
+    assert "in raise_it" in str(caught.value.__cause__), "the remote traceback"
+    with pytest.raises(kind):
+        pool.apply(tasks.raise_it, (kind(),))
+    assert {process.pid for process in pool._pool} == before
+
+
+def test_sigint_ends_the_task_that_runs_and_not_its_worker(pool: Pool, tmp_path: Path) -> None:
+    result = pool.apply_async(tasks.announce_and_wait_for_interrupt, (tmp_path / "runs",))
+    (worker,) = tasks.wait_until_announced(tmp_path / "runs")
+    os.kill(worker, signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        result.get(PATIENCE)
+    assert len(tasks.announced(tmp_path / "runs")) == 1, "it was not tried again"
+    assert worker in {process.pid for process in pool._pool}
+
+
+def test_sigint_does_nothing_to_an_idle_worker(pool: Pool) -> None:
+    workers = {pool.apply(tasks.pid)}
+    for process in pool._pool:
+        os.kill(process.pid, signal.SIGINT)
+    assert set(pool.broadcast(tasks.pid)) == {process.pid for process in pool._pool} >= workers
+
+
+def test_a_handler_of_the_initializers_own_stays(tmp_path: Path) -> None:
+    ignore = (signal.SIGINT, signal.SIG_IGN)
+    with fiber.Pool(1, initializer=signal.signal, initargs=ignore) as pool:
+        assert pool.apply(signal.getsignal, (signal.SIGINT,)) is signal.SIG_IGN
 
 
 def test_a_task_runs_again_when_its_worker_died(pool: Pool, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing.process
 import os
 import signal
 import threading
@@ -163,6 +164,48 @@ def test_a_process_that_is_dropped_gives_its_sentinel_back() -> None:
     assert census.wait_until(lambda: open_files() <= before, PATIENCE)
 
 
+def test_a_start_asks_no_other_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    fiber.active_children()
+    first, second = fiber.Process(target=run_forever), fiber.Process(target=os.getpid)
+    first.start()
+    monkeypatch.setattr(first._popen, "poll", lambda: asked.append("first"))
+    second.start()
+    assert asked == []
+    first.kill()
+    first._popen.wait()
+    second.join()
+
+
+def test_a_start_drops_the_children_that_ended() -> None:
+    ended = fiber.Process(target=os.getpid)
+    ended.start()
+    ended._popen.wait(PATIENCE)
+    assert ended in multiprocessing.process._children
+    reference = weakref.ref(ended)
+    del ended
+    another = fiber.Process(target=os.getpid)
+    another.start()
+    assert reference() is None
+    another.join()
+
+
+def test_a_child_that_ends_before_its_start_returns_is_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wait_for_birth = popen.Popen._wait_for_birth
+
+    def wait_for_end(self: popen.Popen, host: str) -> None:
+        wait_for_birth(self, host)
+        self.wait(PATIENCE)
+        process._drop_ended()
+
+    monkeypatch.setattr(popen.Popen, "_wait_for_birth", wait_for_end)
+    child = fiber.Process(target=os.getpid)
+    child.start()
+    assert child not in multiprocessing.process._children
+
+
 @pytest.mark.parametrize("round_", range(5))
 def test_a_signal_right_after_the_start_is_not_lost(round_: int) -> None:
     child = fiber.Process(target=run_forever)
@@ -200,7 +243,7 @@ def test_the_start_during_the_import_of_main_is_refused(monkeypatch: pytest.Monk
 
 
 class Port:
-    name, host, pid = "p", "elsewhere", None
+    name, host, pid, start_error = "p", "elsewhere", None, None
 
     def __init__(self) -> None:
         self.signals: list[int] = []
@@ -256,7 +299,5 @@ def test_a_start_that_the_system_refuses_says_why(
 
 
 def test_the_class_is_multiprocessings_underneath() -> None:
-    import multiprocessing.process
-
     assert issubclass(process.Process, multiprocessing.process.BaseProcess)
     assert fiber.current_process() is multiprocessing.process.current_process()

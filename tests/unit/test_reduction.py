@@ -56,6 +56,17 @@ def test_what_cannot_goes_by_value(make: Any) -> None:
     assert (thing() if type(thing) is not type else thing.f) == 42
 
 
+def test_what_plain_pickle_can_do_needs_no_cloudpickle(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise AssertionError("cloudpickle was asked")
+
+    monkeypatch.setattr(reduction, "_by_value_pickler", refuse)
+    assert pickle.loads(reduction.dumps(Point.origin)).__self__ is Point  # a reducer of its own
+    process = Process(target=os.getpid)
+    payload, _ = reduction.dump_process(process, same_host=True)
+    assert pickle.loads(payload).name == process.name
+
+
 def test_the_error_is_about_the_object_not_about_the_second_try() -> None:
     with pytest.raises(TypeError, match=r"cannot pickle '_thread\.lock' object"):
         reduction.dumps([threading.Lock()])

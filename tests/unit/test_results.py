@@ -6,11 +6,11 @@ import threading
 from typing import Any
 
 import pytest
+from fiber._runtime.reader import Reader
 
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Ledger
 from fiber._runtime.outcome import Encoded
-from fiber._runtime.reader import Reader
 from fiber._wire import work
 from fiber.results import ApplyResult, IMapIterator
 

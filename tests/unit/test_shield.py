@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-
 from fiber._runtime.shield import Shield
+
 from unit import pool_tasks as tasks
 from unit.test_dispatcher import Rig, Sink
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import pickle
+import random
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -289,6 +291,82 @@ def test_other_exceptions_are_the_tasks_own(rig: Rig) -> None:
     assert isinstance(error, tasks.Exotic)
 
 
+@MODES
+def test_an_interrupt_is_the_error_of_the_task_that_runs(rig: Rig, mode: dict[str, int]) -> None:
+    found = rig.channel.results(rig.give(interrupt_at_three, range(10), **mode))
+    assert [type(value) for value in found] == [int] * 3 + [tuple] + [int] * 6
+    assert isinstance(found[3][1], KeyboardInterrupt)
+
+
+@MODES
+@pytest.mark.parametrize("seed", range(5))
+def test_sigint_at_any_moment_costs_no_result(rig: Rig, mode: dict[str, int], seed: int) -> None:
+    items, moments = range(2000), random.Random(seed)
+    previous = signal.signal(signal.SIGINT, rig.worker.interrupt)
+    striker = threading.Thread(target=strike_main_thread, args=(stop := threading.Event(), moments))
+    striker.start()
+    try:
+        for _ in range(5):
+            found = rig.channel.results(rig.give(count_a_little, items, **mode))
+            assert len(found) == len(items)
+            assert all(
+                value == item or isinstance(value[1], KeyboardInterrupt)
+                for item, value in zip(items, found, strict=True)
+            )
+    finally:
+        stop.set()
+        striker.join()
+        signal.signal(signal.SIGINT, previous)
+
+
+def strike_main_thread(stop: threading.Event, moments: random.Random) -> None:
+    while not stop.wait(moments.uniform(0, 1e-3)):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+
+def count_a_little(x: int) -> int:
+    for _ in range(3):
+        pass
+    return x
+
+
+def test_sigint_between_tasks_is_nothing(rig: Rig) -> None:
+    rig.give(abs, range(3))
+    rig.worker.interrupt(signal.SIGINT, None)
+
+
+def interrupt_at_three(x: int) -> int:
+    if x == 3:
+        raise KeyboardInterrupt
+    return x
+
+
+class Rude:
+    """Raises what is no Exception, however it travels."""
+
+    def __init__(self, when: str) -> None:
+        self.when = when
+
+    def __reduce__(self) -> Any:
+        if self.when == "pickled":
+            raise KeyboardInterrupt
+        return interrupt_at_three, (3,)
+
+
+@MODES
+def test_an_interrupt_raised_in_pickling_a_result_is_an_error(
+    rig: Rig, mode: dict[str, int]
+) -> None:
+    ((_, error),) = rig.channel.results(rig.give(Rude, ["pickled"], **mode))
+    assert "KeyboardInterrupt" in str(error)
+
+
+def test_an_interrupt_raised_in_unpickling_is_an_error(rig: Rig) -> None:
+    rig.give(abs, [Rude("unpickled")])
+    rig.give(abs, [1], identity=2)
+    assert [words[0] for words in rig.channel.said] == [work.UNREADABLE, 2]
+
+
 def test_errors_worth_a_retry_are_marked() -> None:
     rig = Rig((LookupError,))
     found = rig.channel.results(rig.give(raise_either, range(2), stride=1, unit=2))
@@ -354,3 +432,12 @@ def test_a_short_batch_is_answered_once(rig: Rig) -> None:
     for _ in range(20):
         rig.give(tasks.square, range(50))
     assert [words[0] for words in rig.channel.said] == list(range(1, 21))
+
+
+# The form of messages
+
+
+def test_a_function_and_calls_may_be_larger_than_4_gib() -> None:
+    head = work.Head(work.MAP, 0, 1, 1, 5 << 30, 0)
+    assert work.Head._make(work.HEAD.unpack(work.HEAD.pack(*head))) == head
+    assert work.CALL.unpack(work.CALL.pack(5 << 30, 3)) == (5 << 30, 3)

@@ -3,9 +3,9 @@
 In a program with the local backend it lives in the program itself, on its loop; elsewhere it is a
 process of its own (``python -m fiber.agent``) whose ``ChildObserver`` is the link to the master.
 
-Who touches what: ``start``, ``deliver``, ``take_back`` and ``signal`` come from any thread and only
-append to outboxes or tables under ``_lock``; everything that arrives is handled on the loop's
-thread.
+Everything happens on the loop's thread.  ``start``, and a child's ``take_back`` and ``signal``,
+come from anywhere and only put into the loop's queue; so no lock is needed that a finalizer or a
+signal handler could meet.
 """
 
 from __future__ import annotations
@@ -26,6 +26,11 @@ from fiber._hub.access import Access
 from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
 
+_ENDING = "this process is ending: no process can be started any more"
+
+_CLOSE_TIMEOUT = 10.0
+"""Seconds that the loop may take to come to the end of what it was asked before."""
+
 
 class Agent:
     """Runs the children of this host; an ``AgentPort``."""
@@ -35,7 +40,6 @@ class Agent:
         self.loop = loop
         self.board = Board()
         self._hub = hub
-        self._lock = threading.Lock()
         self._ids = itertools.count(1)
         self._children: dict[int, LocalChild] = {}
         self._forsaken: dict[int, int | None] = {}
@@ -43,29 +47,46 @@ class Agent:
         self._closed = False
 
     def start(self, spec: ChildSpec, observer: ChildObserver) -> LocalChild:
-        """Start a child; it has its pid when ``observer.started`` is called."""
-        with self._lock:
-            if self._closed:
-                close_all(spec.fds)
-                raise RuntimeError("this process is ending: no process can be started any more")
-            child = LocalChild(self, next(self._ids), spec, observer)
-            self._children[child.id] = child
-            try:
-                child.start(self._zygote(), self._access())
-            except BaseException:
-                del self._children[child.id]
-                self.loop.call_soon(self._bury, child)
-                raise
+        """Start a child; it has its pid when ``observer.started`` is called.
+
+        What keeps it from starting is its ``exited``, but for what can be seen here and now.
+        """
+        if self._closed:
+            close_all(spec.fds)
+            raise RuntimeError(_ENDING)
+        child = LocalChild(self, next(self._ids), spec, observer)
+        self.loop.call_soon(self._start, child)
         return child
+
+    def _start(self, child: LocalChild) -> None:
+        self._children[child.id] = child
+        try:
+            child.open()
+            if self._closed:
+                raise RuntimeError(_ENDING)
+            child.start(self._zygote(), self._access())
+        except Exception as error:
+            child.start_error = error
+            self._gone(child, 1, f"could not be started: {error}")
 
     def close(self) -> None:
         """Kill every child and end the zygotes.  Not on the loop's thread."""
-        with self._lock:
-            self._closed = True
-            zygotes, self._zygotes = self._zygotes, []
+        zygotes: list[ZygoteLink] = []
+        taken = threading.Event()
+        if self.loop.running:
+            self.loop.call_soon(self._close, zygotes, taken)
+            taken.wait(_CLOSE_TIMEOUT)
+        else:
+            self._close(zygotes, taken)
         for link in zygotes:
             link.quit()
         self.loop.call_soon(self.board.close)
+
+    def _close(self, zygotes: list[ZygoteLink], taken: threading.Event) -> None:
+        self._closed = True
+        zygotes += self._zygotes
+        self._zygotes.clear()
+        taken.set()
 
     def _access(self) -> Access | None:
         """What our children are told of this host's hub."""
@@ -111,10 +132,9 @@ class Agent:
 
     def zygote_gone(self, link: ZygoteLink) -> None:
         """A zygote died, and its children with it."""
-        with self._lock:
-            if link in self._zygotes:
-                self._zygotes.remove(link)
-            bereft = [child for child in self._children.values() if child.zygote is link]
+        if link in self._zygotes:
+            self._zygotes.remove(link)
+        bereft = [child for child in self._children.values() if child.zygote is link]
         for child in bereft:
             self._gone(child, -signal.SIGKILL, "killed by SIGKILL, together with its zygote")
 
@@ -123,22 +143,20 @@ class Agent:
 
         What the old one runs already lives on there.
         """
+        if self._closed:
+            return  # and the end of its zygote is its own
+        old = child.zygote
         try:
-            with self._lock:
-                if self._closed:
-                    return  # and the end of its zygote is its own
-                old = child.zygote
-                child.start(self._zygote(preload=self._zygotes[-1] is not old), self._access())
-                deserted = all(other.zygote is not old for other in self._children.values())
+            child.start(self._zygote(preload=self._zygotes[-1] is not old), self._access())
         except Exception as error:
             self._gone(child, 1, f"could not be started: {error}")
             return
+        deserted = all(other.zygote is not old for other in self._children.values())
         if deserted and old is not None:
             old.send(zygote.QUIT)
 
     def _gone(self, child: LocalChild, exitcode: int, reason: str) -> None:
-        with self._lock:
-            del self._children[child.id]
+        del self._children[child.id]
         unread, running = self._bury(child)
         if child.fault is not None:
             reason = f"killed by its agent: {child.fault}"

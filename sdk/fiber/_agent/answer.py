@@ -109,10 +109,10 @@ class Answer:
             data, buffers = packet.dumps(value)
             if len(buffers) > work.BUFFERS:
                 data, buffers = pickle.dumps(value, 5), []
-        except Exception as error:
+        except BaseException as error:
             try:
                 data, buffers = _pickle_unusual(value)
-            except Exception:
+            except BaseException:
                 self._odd.append((position, work.ERROR, encode_error(unsendable(error, value)), 0))
                 return
         self._buffers += buffers
@@ -163,7 +163,7 @@ def _pickle_unusual(value: Any) -> tuple[bytes, list[memoryview]]:
     try:
         # Sockets and the like need multiprocessing's reducers, which only its pickler knows.
         return bytes(ForkingPickler.dumps(value)), []
-    except Exception:
+    except BaseException:
         data, buffers = packet.dumps(value, by_name.dumps)
         return (data, buffers) if len(buffers) <= work.BUFFERS else (by_name.dumps(value), [])
 
@@ -179,7 +179,7 @@ def encode_error(error: BaseException) -> bytes:
             data = dumps(wrapped)
             pickle.loads(data)
             return data
-        except Exception as reason:
+        except BaseException as reason:
             refusals.append(reason)
     # An error that cannot be sent still has to say what happened, and where.
     substitute = ExceptionWithTraceback(unsendable(refusals[0], error), None)
@@ -204,5 +204,5 @@ class _Words:
     def __repr__(self) -> str:
         try:
             return repr(self._value)
-        except Exception:  # whatever it is, an error message must not fail for it
+        except BaseException:  # whatever it is, an error message must not fail for it
             return object.__repr__(self._value)

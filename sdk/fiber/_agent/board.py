@@ -5,6 +5,7 @@ When a worker dies, its agent reads here which task to blame.  Saying so is one 
 
 from __future__ import annotations
 
+import itertools
 import mmap
 import os
 
@@ -27,15 +28,18 @@ class Board:
             raise
         self._words = memoryview(self._memory).cast("Q")
         self._free: list[int] = []
-        self._next = 0
+        self._next = itertools.count()
 
     def claim(self) -> int:
         """A slot for a new child, cleared."""
-        slot = self._free.pop() if self._free else self._next
-        if slot == self._next:
-            if slot == _SLOTS:
-                raise RuntimeError(f"one agent runs at most {_SLOTS} pool workers at a time")
-            self._next += 1
+        try:
+            slot = self._free.pop()  # in one step: several threads may be here
+        except IndexError:
+            slot = next(self._next)
+            if slot >= _SLOTS:
+                raise RuntimeError(
+                    f"one agent runs at most {_SLOTS} pool workers at a time"
+                ) from None
         view = self.slot(slot)
         view[0] = view[1] = 0
         return slot

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import io
@@ -104,6 +105,9 @@ def run(start: Start, fds: list[int], board: Board, agent: int) -> int:
     """Run what was asked for and return the exit code."""
     if start.method == "spawn":
         _exec(start, fds, board, agent)
+    # What the zygote's imports registered, say to remove a folder, is not for each child to do.
+    atexit._clear()
+    atexit.register(util._exit_function)  # type: ignore[attr-defined]
     return _run(start, fds, board, agent)
 
 
@@ -117,11 +121,19 @@ def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
         _progress = board.slot(start.slot)
     _descriptors = rest
     try:
+        return _load_and_run(start, agent)
+    finally:
+        # Up to Python 3.12 ``_bootstrap`` runs multiprocessing's own, which know that they ran.
+        atexit._run_exitfuncs()
+        util._flush_std_streams()  # type: ignore[attr-defined]
+
+
+def _load_and_run(start: Start, agent: int) -> int:
+    try:
         process = _load(start)
     except BaseException:
         traceback.print_exc()
         _report_birth_failure()
-        util._flush_std_streams()  # type: ignore[attr-defined]
         return 1
     return int(process._bootstrap(parent_sentinel=agent))
 

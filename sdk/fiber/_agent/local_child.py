@@ -1,7 +1,7 @@
 """One child of this host, as its agent holds it: its channel, its signals, its end.
 
-``deliver``, ``take_back`` and ``signal`` come from any thread and only append to outboxes; what
-arrives is handled on the loop's thread, or by whoever uses its channel directly.
+``take_back`` and ``signal`` come from anywhere and only put into the loop's queue; all else is done
+on the loop's thread, but for what whoever uses its channel directly does.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ class LocalChild:
         self.host = owner.host
         self.pid: int | None = None
         self.slot: int | None = None
+        self.start_error: Exception | None = None
         self.fault: Exception | None = None
         self.zygote: ZygoteLink | None = None
         self.observer = observer
@@ -64,12 +65,12 @@ class LocalChild:
         self._lent = False
         try:
             if spec.tasks:
-                self._open_channel()
+                self._make_channel()
         except BaseException:
             self.release_descriptors()
             raise
 
-    def _open_channel(self) -> None:
+    def _make_channel(self) -> None:
         slot = self._owner.board.claim()
         try:
             ours, theirs = socketpair("starting a pool worker")
@@ -81,8 +82,12 @@ class LocalChild:
         # We keep the child's end too: what it has not read when it dies, or when another worker is
         # idle, is read from there.  The kernel gives each packet to exactly one reader.
         self._ours, self._theirs = ours, theirs
-        self._outbox = Outbox(self._loop, ours)
-        self._loop.register(ours.fileno(), self._receive)
+
+    def open(self) -> None:
+        """Be ready to hear it."""
+        if self._ours is not None:
+            self._outbox = Outbox(self._loop, self._ours)
+            self._loop.register(self._ours.fileno(), self._receive)
 
     def start(self, zygote: ZygoteLink, hub: Access | None) -> None:
         """Have ``zygote`` start it; ``hub`` is what it is told of its host's hub."""
@@ -152,10 +157,16 @@ class LocalChild:
 
     def signal(self, signum: int) -> None:
         """Signal the child through its zygote."""
+        if self._loop.broken:
+            self._signal(signum)  # nobody else will
+        else:
+            self._loop.call_soon(self._signal, signum)
+
+    def _signal(self, signum: int) -> None:
         if self.zygote is not None:
             self.zygote.send(zygote.SIGNAL, self.id, signum)
         if signum == signal.SIGKILL and self.pid is None:
-            self._loop.call_soon(self._owner.forsake, self)
+            self._owner.forsake(self)
 
     def condemn(self, fault: Exception) -> None:
         """Something to or from it is lost for good: only its end can tell the master so."""
@@ -165,7 +176,11 @@ class LocalChild:
     def hang_up(self) -> tuple[int, ...]:
         """It is gone: hear its last words, recall what it never read.  On the loop."""
         self.release_descriptors()
-        if self._ours is None or self._theirs is None or self._outbox is None:
+        if self._ours is None or self._theirs is None:
+            return ()
+        if self._outbox is None:  # nobody ever heard it
+            self._ours.close()
+            self._theirs.close()
             return ()
         while self._hear():
             pass

@@ -90,6 +90,8 @@ class ChildPort(Protocol):
     name: str
     host: str
     pid: int | None
+    start_error: Exception | None
+    """What kept it from being started, where that is not only told by its report."""
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to its task channel, ``seq`` (eight bytes) in front.

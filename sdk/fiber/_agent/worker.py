@@ -7,7 +7,9 @@ is, so that its death names the task.
 
 from __future__ import annotations
 
+import contextlib
 import pickle
+import signal
 import time
 import traceback
 from collections import OrderedDict
@@ -43,17 +45,21 @@ def run(
     if initializer is not None:
         try:
             initializer(*initargs)
-        except Exception:
-            channel.send(pickle.dumps((work.BIRTH, traceback.format_exc())))
+        except SystemExit:
+            raise
+        except BaseException:
+            with contextlib.suppress(OSError):  # the agent is gone
+                channel.send(pickle.dumps((work.BIRTH, traceback.format_exc())))
             raise SystemExit(1) from None
-    channel.send(pickle.dumps((work.READY,)))
     worker = Worker(channel, child.progress(), retryable)
-    more = True
-    while more:
-        try:
-            more = worker.handle(channel.recv())
-        except (EOFError, ConnectionError):  # the agent is gone
-            more = False
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, worker.interrupt)
+    try:
+        channel.send(pickle.dumps((work.READY,)))
+        while worker.handle(channel.recv()):
+            pass
+    except (EOFError, ConnectionError):  # the agent is gone
+        pass
     worker.close()
 
 
@@ -68,10 +74,19 @@ class Worker:
         self._retryable = retryable
         self._functions: OrderedDict[int, _Function] = OrderedDict()
         self._watch = Watch()
+        self._interruptible = False
 
     def close(self) -> None:
         """End its second thread, if it has one."""
         self._watch.stop()
+
+    def interrupt(self, signum: int, frame: object) -> None:
+        """The handler of SIGINT: KeyboardInterrupt in the task that runs, and nowhere else.
+
+        Between tasks it would lose a batch, or half of an answer.
+        """
+        if self._interruptible:
+            raise KeyboardInterrupt
 
     def handle(self, message: Message) -> bool:
         """Run and answer one message; False if it says to stop."""
@@ -101,7 +116,7 @@ class Worker:
                 return
             try:
                 items = pickle.loads(body[head.size :], buffers=buffers[head.buffers :])
-            except Exception as error:
+            except BaseException as error:
                 self._say(work.UNREADABLE, seq, encode_error(error))
                 return
         answer = self._start(seq, items, started, exact=not head.stride)
@@ -115,11 +130,12 @@ class Worker:
         """A single call: the way of every ``apply``, and the shortest."""
         self._note(seq)
         try:
+            self._interruptible = True
             function, args, kwargs = pickle.loads(body[work.CALL.size :], buffers=buffers)
             value = function(*args, **kwargs)
-        except KeyboardInterrupt:
-            raise
+            self._interruptible = False
         except BaseException as error:
+            self._interruptible = False
             answer = self._start(seq, (), started, exact=True)
             answer.fail(error)
             answer.flush()
@@ -159,7 +175,7 @@ class Worker:
         if head.size:
             try:
                 function = pickle.loads(body[: head.size], buffers=buffers[: head.buffers])
-            except Exception as error:
+            except BaseException as error:
                 self._say(work.BROKEN, seq, encode_error(error))
                 return _ANSWERED
             functions[head.function] = function
@@ -196,8 +212,11 @@ class Worker:
         for index, item in enumerate(answer.rest):
             board[1] = index
             try:
+                self._interruptible = True
                 value = function(item)
+                self._interruptible = False
             except BaseException as error:
+                self._interruptible = False
                 self._failed(answer, error)
                 continue
             if type(value) in plain:
@@ -213,9 +232,14 @@ class Worker:
         for index, item in enumerate(answer.rest):
             board[1] = index
             try:
-                values.append(function(item))
+                self._interruptible = True
+                value = function(item)
+                self._interruptible = False
             except BaseException as error:
+                self._interruptible = False
                 self._failed(answer, error)
+            else:
+                values.append(value)
             if time.perf_counter() - started > LONG_PATIENCE and not len(values) % head.unit:
                 answer.settle()
                 answer.give_back()
@@ -246,9 +270,13 @@ class Worker:
         stop = len(values) + size
         while True:
             try:
+                self._interruptible = True
                 values.extend(results)
+                self._interruptible = False
             except BaseException as error:
-                self._failed(answer, error)
+                self._interruptible = False
+                if answer.begun() > len(values):  # or else SIGINT came after the last of them
+                    self._failed(answer, error)
                 continue
             if len(values) == stop:
                 return True
@@ -258,19 +286,14 @@ class Worker:
             answer.fail(StopIteration())
 
     def _failed(self, answer: Answer, error: BaseException) -> None:
-        if not isinstance(error, KeyboardInterrupt):
-            answer.fail(error)
-            if not isinstance(error, SystemExit):
-                return
-        # It ends this process, as in multiprocessing; what was done before it counts.
-        self._watch.end()
-        if not answer.exact:
-            answer.settle()
+        answer.fail(error)
         if isinstance(error, SystemExit):
+            # It ends this process, as in multiprocessing; what was done before it counts.
+            self._watch.end()
+            if not answer.exact:
+                answer.settle()
             answer.give_back()
-        else:
-            answer.flush()
-        raise error
+            raise error
 
 
 def _spread(function: _Function) -> _Function:

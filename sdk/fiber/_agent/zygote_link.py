@@ -68,13 +68,15 @@ class ZygoteLink:
         self._outbox.send(pickle.dumps((zygote.START, child, tuple(request)), protocol=5), fds=fds)
 
     def send(self, *request: Any) -> None:
-        """Ask for something else."""
+        """Ask for something else.  On the loop's thread, as ``start``."""
         self._outbox.send(pickle.dumps(request))
 
     def quit(self) -> None:
         """End it and its children, and wait for that; on any thread but the loop's."""
         if self._answered:
-            self.send(zygote.QUIT)
+            self._loop.call_soon(self.send, zygote.QUIT)
+            if not self._loop.running:
+                self.send(zygote.QUIT)
         else:
             # It has no child yet and may be importing the program's main module for ever.
             self._process.kill()

@@ -146,6 +146,7 @@ class RemoteChild:
         self.name = name
         self.host = agent.host
         self.pid: int | None = None
+        self.start_error: Exception | None = None
         self.observer = observer
         self._agent = agent
         self._lock = threading.Lock()

@@ -20,41 +20,35 @@ thread, values whose unpickling could stay ``Pickled``.
 
 from __future__ import annotations
 
-import itertools
 import math
 import pickle
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from fiber import reduction
-from fiber._agent import worker
 from fiber._agent.port import UNKNOWN, ExitReport
 from fiber._engine.chunks import FLOOR
 from fiber._engine.ledger import Batch
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import StartFailure
 from fiber._runtime.background import BackgroundThread
+from fiber._runtime.functions import Function, FunctionCache
 from fiber._runtime.host import Host, Loop, Timer
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.latch import Latch
+from fiber._runtime.launcher import Launcher
 from fiber._runtime.leases import ADOPTED, UNAVAILABLE, Leases
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.outcome import Failure, Pickled, decode, outcomes
 from fiber._runtime.sender import Sender
-from fiber._runtime.work_items import Call, Function, Future, WorkItem, name_of, pickle_call
-from fiber._runtime.worker_handle import PoolProcess, WorkerHandle
+from fiber._runtime.work_items import Call, Future, WorkItem, pickle_call
+from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import FiberError
-
-FUNCTIONS = 128
-"""Functions that are recognized when they come again."""
-
-FUNCTION_SIZE = 1 << 16
-"""Bytes of a pickled function up to which it is."""
 
 KILL_AFTER = 2.0
 """Seconds between SIGTERM and SIGKILL for workers that are to end at once."""
@@ -104,14 +98,20 @@ class Executor:
             advance=self._advance,
             on_timeout=self._timed_out,
         )
+        self._launcher = Launcher(
+            options,
+            self._loop,
+            self._background,
+            on_failed=self._never_started,
+            on_late=self._ready,
+        )
         self._leases = Leases(
             self._scheduler, self._loop, on_adopted=self._adopt, on_back=self._back
         )
         self._lends = options.max_tasks is None and not options.retryable
         self._exits: dict[WorkerHandle, ExitReport] = {}
         """Ends of workers that callers are using."""
-        self._functions: dict[bytes, Function] = {}
-        self._function_ids = itertools.count(1)
+        self._functions = FunctionCache()
         self._calls = WorkItem(work.CALLS, exact=True)
         self._jobs.open(self._calls)
         self._called: deque[Call] = deque()
@@ -130,13 +130,9 @@ class Executor:
         self._loop.depend(self)
         handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
         self._loop.call_soon(self._begin, handles)
-        started = 0
         try:
-            for handle in handles:
-                self._launch(handle)
-                started += 1
+            self._launcher.launch_now(handles, self._host.config.start_timeout)
         except BaseException as error:
-            self._loop.call_soon(self._never_started, handles[started:])
             self.terminate(error)
             raise
 
@@ -199,20 +195,7 @@ class Executor:
 
     def function(self, function: Callable[..., Any]) -> Function:
         """``function``, pickled; one that pickles as an earlier one did is the same."""
-        try:
-            data, buffers, grants = reduction.encode_reusable(function)
-        except reduction.REFUSALS as error:
-            what = f"the function {name_of(function)}"
-            raise reduction.blame({what: function}, error) from error
-        known = self._functions.get(data)
-        if known is not None:
-            return known
-        made = Function(next(self._function_ids), name_of(function), data, buffers, grants)
-        if not buffers and grants is None and len(data) <= FUNCTION_SIZE:
-            if len(self._functions) >= FUNCTIONS:
-                self._functions.clear()  # one step: several threads may be here
-            self._functions[data] = made
-        return made
+        return self._functions.get(function)
 
     def submit(self, item: WorkItem, tasks: Sequence[Any]) -> None:
         """Run all of ``tasks``, which must not change until they are done."""
@@ -265,7 +248,7 @@ class Executor:
         """Whether this is the loop's thread, which must not wait."""
         return self._loop.on_thread()
 
-    def processes(self) -> list[PoolProcess]:
+    def processes(self) -> list[BaseProcess]:
         """The processes of the workers that are there."""
         handles: list[Any] = list(self._scheduler.workers.members)
         return [handle.process for handle in handles if handle.process is not None]
@@ -437,7 +420,8 @@ class Executor:
         self._sender.settled(seq)
         if receipt is not None:
             item: WorkItem = receipt.job.owner
-            if self._lends and item.future is None and receipt.item(receipt.start).blocking:
+            waited = item.future is None and receipt.size and receipt.item(receipt.start).blocking
+            if waited and self._lends:
                 # First: who waited for it may call again at once.
                 self._leases.offer(receipt.batch.worker.key)
             self._jobs.put(receipt, results, mixed=bool(odd))
@@ -514,46 +498,17 @@ class Executor:
 
     # Workers come and go
 
+    def _start_workers(self, count: int) -> None:
+        handles = [WorkerHandle(self, self._host) for _ in range(count)]
+        self._begin(handles)
+        self._launcher.launch_soon(handles)
+
     def _begin(self, handles: list[WorkerHandle]) -> None:
         for handle in handles:
             self._scheduler.starting(handle)
 
-    def _start_workers(self, count: int) -> None:
-        handles = [WorkerHandle(self, self._host) for _ in range(count)]
-        self._begin(handles)
-        for handle in handles:
-            # Not on the loop's thread: the user's arguments are pickled, and agents may need it.
-            self._background.submit(self._launch_safely, handle)
-
-    def _launch(self, handle: WorkerHandle) -> None:
-        options = self.options
-        process = PoolProcess(
-            handle,
-            options.process_type,
-            target=worker.run,
-            args=(options.initializer, options.initargs, options.retryable),
-        )
-        process.start()
-        handle.process = process
-        if handle.leaving:  # it was told to before it could be reached
-            self._loop.call_soon(handle.dismiss)
-            if self._scheduler.terminated:
-                handle.kill()
-
-    def _launch_safely(self, handle: WorkerHandle) -> None:
-        """On the background thread."""
-        error = None
-        if not handle.leaving:
-            try:
-                self._launch(handle)
-                return
-            except Exception as raised:  # want of descriptors or memory, mostly
-                error = raised
-        self._loop.call_soon(self._never_started, (handle,), error)
-
-    def _never_started(
-        self, handles: Iterable[WorkerHandle], error: Exception | None = None
-    ) -> None:
+    def _never_started(self, handles: Iterable[WorkerHandle], error: Exception | None) -> None:
+        """Workers whose processes there never were; ``error``: not for want of trying."""
         failure = None
         if error is not None:
             failure = StartFailure("a pool worker", str(error), killed=True, cause=error)
@@ -563,8 +518,8 @@ class Executor:
 
     def _ready(self, handle: WorkerHandle) -> None:
         """A worker is initialized."""
-        if handle.port is None:  # whoever started it is still about to note how to reach it
-            self._loop.call_soon(self._ready, handle)
+        handle.is_ready = True
+        if handle.port is None:  # whoever started it is about to note how to reach it, and calls
             return
         self._scheduler.ready(handle, self._loop.now())
         self._advance()
@@ -579,7 +534,8 @@ class Executor:
         if not report.reason.startswith("agent "):  # a lost host says nothing of the worker
             text = handle.complaint or "\n".join(report.log)
             reason = "it raised an error" if handle.complaint else report.reason
-            killed = not handle.complaint and report.exitcode < 0
+            refused = report.reason.startswith("could not be started")
+            killed = refused or (not handle.complaint and report.exitcode < 0)
             failure = StartFailure(f"pool worker {handle.name!r}", reason, text, killed)
         self._lost(handle, failure, report)
         self._advance()

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
+from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
 from fiber import config, cpu
-from fiber.process import Process
 
 LARGEST_CHUNK = 2**32 - 1
 """What a message can say; more than anybody has."""
@@ -17,8 +17,8 @@ LARGEST_CHUNK = 2**32 - 1
 class PoolOptions(NamedTuple):
     """What a pool promises its workers and callers; ``fiber.pool.Pool`` says what each means."""
 
-    process_type: type[Process] = Process
-    """The class of processes of the start method."""
+    new_process: Callable[..., BaseProcess]
+    """Makes the Process object for a WorkerHandle."""
     initializer: Callable[..., object] | None = None
     initargs: tuple[Any, ...] = ()
     minimum: int = 1

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import threading
+from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 
 from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._runtime.latch import Latch
 from fiber._runtime.state import runtime
+from fiber._transport.loop import Wakeup
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.packet import Message
 from fiber.errors import FiberError, StartError
@@ -21,39 +22,42 @@ class Popen:
     Attributes and methods as multiprocessing's Process expects them.
     """
 
-    def __init__(self, process: BaseProcess, method: str) -> None:
+    def __init__(self, process: BaseProcess, method: str, on_exit: Callable[[], None]) -> None:
         self._name = process.name
+        self._on_exit = on_exit
         self.returncode: int | None = None
         self.report: ExitReport | None = None
         self.pid: int | None = None
-        self._closed = True
         self._port: ChildPort | None = None
-        self._born = threading.Event()
-        self._exited = threading.Event()
-        self._lock = threading.Lock()
+        self._born = Latch()
+        self._exited = Latch()
         with naming_the_limit("starting a process"):
-            self.sentinel = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._closed = False
+            # Held by whoever writes to it meanwhile, so that it is closed, but never another's.
+            self._at_exit: Wakeup | None = Wakeup()
+        self.sentinel = self._at_exit.fd
         try:
             runtime().loop.depend(self)
             port = runtime().start(process, self, method=method)
             if self.returncode is None:
                 self._port = port
-            self._wait_for_birth(port.host)
+            self._wait_for_birth(port)
         except BaseException:
             # Whoever asked does not know of it: it must not go on.
             self.kill()
             self.close()
             raise
 
-    def _wait_for_birth(self, host: str) -> None:
+    def _wait_for_birth(self, port: ChildPort) -> None:
         timeout = runtime().config.start_timeout
-        if not self._born.wait(min(timeout, threading.TIMEOUT_MAX)):
+        if not self._born.wait(timeout):
             raise StartError(
                 f"process {self._name!r}",
-                f"its agent on host {host!r} did not start it within {timeout:g} s (start_timeout)",
+                f"its agent on host {port.host!r} did not start it within {timeout:g} s "
+                "(start_timeout)",
             )
         if self.pid is None and self.report is not None:
+            if port.start_error is not None:
+                raise port.start_error
             raise StartError(f"process {self._name!r}", self.report.reason)
 
     # What the agent says, on the loop's thread
@@ -73,11 +77,12 @@ class Popen:
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
         self.report = report
-        with self._lock:
-            if not self._closed:
-                os.eventfd_write(self.sentinel, 1)
+        at_exit = self._at_exit
+        if at_exit is not None:
+            at_exit.set()
         # From here on its Process may be closed.
         self.returncode = report.exitcode
+        self._on_exit()
         self._exited.set()
         self._born.set()
         # Each held the other; the sentinel's descriptor goes when the last user of this lets go.
@@ -99,7 +104,7 @@ class Popen:
 
     def wait(self, timeout: float | None = None) -> int | None:
         """Wait for the exit code."""
-        self._exited.wait(None if timeout is None else min(timeout, threading.TIMEOUT_MAX))
+        self._exited.wait(timeout)
         return self.returncode
 
     def terminate(self) -> None:
@@ -117,10 +122,4 @@ class Popen:
 
     def close(self) -> None:
         """Give the sentinel's descriptor back."""
-        with self._lock:
-            if not self._closed:
-                self._closed = True
-                os.close(self.sentinel)
-
-    def __del__(self) -> None:
-        self.close()
+        self._at_exit = None

@@ -94,6 +94,8 @@ class Runtime:
         return agent.start(spec, observer)
 
     def _preparation(self, process: Any, agent: AgentPort, same_host: bool) -> bytes:
+        # pdb leaves its program a main module without one, which multiprocessing does not expect.
+        vars(sys.modules["__main__"]).setdefault("__spec__", None)
         try:
             data = spawn.get_preparation_data(process.name)
         except FileNotFoundError as error:
@@ -113,6 +115,7 @@ class Runtime:
             data["preload"] = [*methods.preload, *_modules_of(process)]
         else:
             data["preload"] = ["cloudpickle"]
+        if reduction.main_is_out_of_reach():
             data.pop("init_main_from_name", None)
             data.pop("init_main_from_path", None)
         return pickle.dumps(data)
@@ -162,20 +165,28 @@ def _modules_of(process: Any) -> list[str]:
 _OURS = ("fiber.connection", "fiber.queues", "fiber.synchronize", "fiber._agent.worker")
 
 
-_lock = threading.Lock()
+_lock = threading.RLock()  # a finalizer may come back here while one is made
 _runtime: Runtime | None = None
 
 
 def runtime() -> Runtime:
     """The runtime of this process; made at the first call."""
-    global _runtime
     if _runtime is None:
         with _lock:
             if _runtime is None:
                 with naming_the_limit("starting Fiber"):
-                    _runtime = Runtime()
-                util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
+                    _adopt(Runtime())
+    assert _runtime is not None
     return _runtime
+
+
+def _adopt(made: Runtime) -> None:
+    global _runtime
+    if _runtime is not None:  # a finalizer was faster
+        made.close()
+        return
+    _runtime = made
+    util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
 
 
 def shutdown() -> None:
@@ -190,7 +201,7 @@ def shutdown() -> None:
 def _forget() -> None:
     """In a process forked by someone else: the loop's thread did not come along."""
     global _runtime, _lock
-    _runtime, _lock = None, threading.Lock()
+    _runtime, _lock = None, threading.RLock()
 
 
 os.register_at_fork(after_in_child=_forget)

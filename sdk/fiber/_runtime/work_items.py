@@ -12,9 +12,9 @@ from itertools import chain
 from typing import Any, Protocol
 
 from fiber import reduction
-from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Batch, Job
 from fiber._hub.grants import GrantSet
+from fiber._runtime.functions import Function, name_of
 from fiber._runtime.input_stream import InputStream
 from fiber._wire import work
 
@@ -37,28 +37,6 @@ class Future(Protocol):
 
     def set_exception(self, error: BaseException) -> None:
         """There will be no more, because of ``error``."""
-
-
-class Function:
-    """A function that workers are asked to apply, pickled once."""
-
-    __slots__ = ("buffers", "data", "grants", "id", "name", "pace")
-
-    def __init__(
-        self,
-        id_: int,
-        name: str,
-        data: bytes,
-        buffers: Sequence[memoryview],
-        grants: GrantSet | None,
-        pace: Pace | None = None,
-    ) -> None:
-        self.grants = grants
-        self.id = id_
-        self.name = name
-        self.data = data
-        self.buffers = buffers
-        self.pace = pace
 
 
 class Call:
@@ -140,11 +118,6 @@ class WorkItem:
             return f"the call of {item.name}()"
         assert self.function is not None
         return f"task {task} of {self.function.name}()"
-
-
-def name_of(function: Any) -> str:
-    """What a person calls a function."""
-    return getattr(function, "__qualname__", None) or repr(function)
 
 
 def pickle_call(

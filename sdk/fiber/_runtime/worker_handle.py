@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 from multiprocessing import process as mp_process
+from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from fiber._agent.port import ChildPort, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._runtime.latch import Latch
-from fiber._runtime.methods import zygote_method
+from fiber._transport.loop import Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
-from fiber.process import Process
 
 
 class Supervisor(Protocol):
@@ -37,10 +36,10 @@ class WorkerHandle:
     """
 
     sentinel = -1
-    """What a Process asks for when it starts; ``PoolProcess`` has a real one, if wanted."""
+    """What a Process asks for when it starts; a real one is made if it is wanted."""
 
     def __init__(self, supervisor: Supervisor, host: Any) -> None:
-        self.process: PoolProcess | None = None
+        self.process: BaseProcess | None = None
         """Once it is started."""
         self.port: ChildPort | None = None
         self.worker: Worker | None = None
@@ -51,21 +50,27 @@ class WorkerHandle:
         """What its initializer, or its birth, failed with."""
         self.leaving = False
         """It was told to go, or will be at once."""
+        self.is_ready = False
+        """It said so."""
+        self.unwanted = False
+        """It was told to end at once, whatever it does."""
         self.returncode: int | None = None
         self._supervisor = supervisor
         self._host = host
         self._pid: int | None = None
         self._born = Latch()
         self._exited = Latch()
-        self._exit: int | None = None
+        self._at_exit: Wakeup | None = None
+        self._launched: BaseProcess | None = None
 
     @property
     def name(self) -> str:
         """The worker's name."""
         return self.port.name if self.port is not None else "?"
 
-    def launch(self, process: PoolProcess, method: str) -> None:
+    def launch(self, process: BaseProcess, method: str) -> None:
         """Start the process; returns before it exists."""
+        self._launched = process
         self.port = self._host.start(process, self, tasks=True, method=method)
 
     # What the agent says, on the loop's thread
@@ -88,9 +93,11 @@ class WorkerHandle:
         self.returncode = report.exitcode
         self._exited.set()
         self._born.set()
-        if self._exit is not None:
-            os.eventfd_write(self._exit, 1)
-        mp_process._children.discard(self.process)  # type: ignore[attr-defined]
+        at_exit = self._at_exit
+        if at_exit is not None:
+            at_exit.set()
+        # Its caller adds it, and looks at ``returncode`` afterwards.
+        mp_process._children.discard(self._launched)  # type: ignore[attr-defined]
         self._supervisor.on_exit(self, report)
 
     # What its Process object asks
@@ -104,11 +111,11 @@ class WorkerHandle:
 
     def exit_descriptor(self) -> int:
         """A descriptor that becomes readable when it is gone; made when first asked for."""
-        if self._exit is None:
-            self._exit = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        if self._at_exit is None:
+            self._at_exit = Wakeup()
             if self.returncode is not None:
-                os.eventfd_write(self._exit, 1)
-        return self._exit
+                self._at_exit.set()
+        return self._at_exit.fd
 
     def poll(self) -> int | None:
         """The exit code, None while it runs."""
@@ -133,6 +140,7 @@ class WorkerHandle:
 
     def terminate(self) -> None:
         """SIGTERM."""
+        self.unwanted = True
         self.signal(signal.SIGTERM)
 
     def kill(self) -> None:
@@ -141,38 +149,4 @@ class WorkerHandle:
 
     def close(self) -> None:
         """Give the descriptor back."""
-        descriptor, self._exit = self._exit, None
-        if descriptor is not None:
-            os.close(descriptor)
-
-    def __del__(self) -> None:
-        self.close()
-
-
-class PoolProcess(Process):
-    """The Process object of a pool worker."""
-
-    def __init__(
-        self, handle: WorkerHandle | None, process_type: type[Any], **options: Any
-    ) -> None:
-        super().__init__(**options)
-        self._start_method = getattr(process_type, "_start_method", None)
-        role = process_type.__name__.replace("Process", "PoolWorker")
-        self.name = self.name.replace(type(self).__name__, role)
-        self.daemon = True
-        self._handle = handle
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_handle": None}
-
-    def _Popen(self) -> WorkerHandle:
-        assert self._handle is not None
-        self._handle.launch(self, zygote_method(self._start_method))
-        return self._handle
-
-    @property
-    def sentinel(self) -> int:
-        """As in multiprocessing."""
-        self._check_closed()  # type: ignore[attr-defined]
-        assert self._handle is not None
-        return self._handle.exit_descriptor()
+        self._at_exit = None

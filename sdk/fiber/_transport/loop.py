@@ -53,14 +53,22 @@ class Timer:
         self.callback = None
 
 
-class _Wakeup:
+class Wakeup:
     """An eventfd that lives for as long as somebody could write to it."""
 
+    __slots__ = ("fd",)
+
     def __init__(self) -> None:
+        self.fd = -1
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
+    def set(self) -> None:
+        """Make it readable."""
+        os.eventfd_write(self.fd, 1)
+
     def __del__(self) -> None:
-        os.close(self.fd)
+        if self.fd >= 0:
+            os.close(self.fd)
 
 
 class Loop:
@@ -73,8 +81,8 @@ class Loop:
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        wakeup = _Wakeup()
-        self._wakeup: _Wakeup | None = wakeup
+        wakeup = Wakeup()
+        self._wakeup: Wakeup | None = wakeup
         self._epoll.register(wakeup.fd, select.EPOLLIN)
         self._asleep = False
         self._readers: dict[int, Callback] = {wakeup.fd: partial(os.eventfd_read, wakeup.fd)}
@@ -98,6 +106,11 @@ class Loop:
     def on_thread(self) -> bool:
         """Whether the caller is the loop's own thread."""
         return threading.get_ident() == self._ident
+
+    @property
+    def broken(self) -> bool:
+        """Whether it has failed, and calls nobody back any more."""
+        return self._failure is not None
 
     @property
     def running(self) -> bool:
@@ -126,7 +139,7 @@ class Loop:
         # back: whoever is interrupted here, by a signal that raises, has changed nothing.
         wakeup = self._wakeup  # held until this is over, so that it is nobody else's meanwhile
         if self._asleep and wakeup is not None:
-            os.eventfd_write(wakeup.fd, 1)
+            wakeup.set()
 
     def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
         """Call it once, ``seconds`` from now, on the loop's thread."""

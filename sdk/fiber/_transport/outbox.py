@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -19,12 +18,14 @@ _Waiting = tuple[BytesLike, Sequence[memoryview], tuple[int, ...]]
 
 
 class Outbox:
-    """The sending side of a non-blocking socket that the loop already reads.  Any thread."""
+    """The sending side of a non-blocking socket that the loop already reads.
+
+    On the loop's thread only.
+    """
 
     def __init__(self, loop: Loop, sock: socket.socket) -> None:
         self._loop = loop
         self._sock = sock
-        self._lock = threading.Lock()
         self._waiting: deque[_Waiting] = deque()
         self._closed = False
         self._stalled = False
@@ -36,34 +37,31 @@ class Outbox:
 
         Takes over ``fds``.  A peer that is gone swallows it.
         """
-        with self._lock:
-            if self._closed:
-                _close_all(fds)
-                return False
-            try:
-                packet.check_buffers(buffers)
-                if not self._waiting and self._try(payload, buffers, fds):
-                    return True
-            except BaseException:
-                _close_all(fds)
-                raise
-            self._waiting.append((payload, buffers, tuple(fds)))
-            if len(self._waiting) == 1:
-                self._loop.call_soon(self._watch, self._flush)
-            return True
+        if self._closed:
+            _close_all(fds)
+            return False
+        try:
+            packet.check_buffers(buffers)
+            if not self._waiting and self._try(payload, buffers, fds):
+                return True
+        except BaseException:
+            _close_all(fds)
+            raise
+        self._waiting.append((payload, buffers, tuple(fds)))
+        if len(self._waiting) == 1:
+            self._watch(self._flush)
+        return True
 
     def recall(self) -> list[BytesLike]:
         """Take back the payloads that never left."""
-        with self._lock:
-            payloads = [payload for payload, _, _ in self._waiting]
-            self._drop()
-            return payloads
+        payloads = [payload for payload, _, _ in self._waiting]
+        self._drop()
+        return payloads
 
     def close(self) -> None:
         """Send nothing more.  On the loop's thread, before the socket is closed."""
-        with self._lock:
-            self._closed = True
-            self._drop()
+        self._closed = True
+        self._drop()
 
     def _drop(self) -> None:
         for _, _, fds in self._waiting:
@@ -82,22 +80,21 @@ class Outbox:
         return True
 
     def _flush(self) -> None:
-        with self._lock:
-            while self._waiting:
-                try:
-                    if not self._try(*self._waiting[0]):
-                        return
-                except OSError:
-                    # No descriptor or no memory.  Its sender cannot be told any more, and others'
-                    # ends give back what is missing.
-                    self._watch(None)
-                    self._loop.call_later(_PAUSE, self._watch, self._flush)
-                    if self._stalled:
-                        return
-                    self._stalled = True
-                    raise
-                self._stalled = False
-                self._waiting.popleft()
+        while self._waiting:
+            try:
+                if not self._try(*self._waiting[0]):
+                    return
+            except OSError:
+                # No descriptor or no memory.  Its sender cannot be told any more, and others'
+                # ends give back what is missing.
+                self._watch(None)
+                self._loop.call_later(_PAUSE, self._watch, self._flush)
+                if self._stalled:
+                    return
+                self._stalled = True
+                raise
+            self._stalled = False
+            self._waiting.popleft()
         self._watch(None)
 
     def _watch(self, callback: Callable[[], None] | None) -> None:

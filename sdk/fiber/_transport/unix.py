@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
 import select
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 from fiber._transport.loop import LONGEST_POLL
 from fiber._wire import packet
@@ -16,17 +16,23 @@ from fiber._wire.packet import BytesLike, Message
 from fiber.errors import TooManyOpenFiles
 
 
-@contextlib.contextmanager
-def naming_the_limit(doing: str) -> Iterator[None]:
-    """Turn "no more descriptors" into the error that says the limit and what to set."""
-    try:
-        yield
-    except TooManyOpenFiles:
-        raise
-    except OSError as error:
+class naming_the_limit:
+    """In the block, "no more descriptors" becomes the error that says the limit and what to set."""
+
+    # Not a generator: contextlib leaves frames that translate errors in a cycle, and with them
+    # whatever descriptors the program had on its stack, until some garbage collection.
+
+    def __init__(self, doing: str) -> None:
+        self._doing = doing
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _kind: Any, error: BaseException | None, _trace: Any) -> None:
+        if not isinstance(error, OSError) or isinstance(error, TooManyOpenFiles):
+            return
         if error.errno in (errno.EMFILE, errno.ENFILE):
-            raise TooManyOpenFiles(doing) from error
-        raise
+            raise TooManyOpenFiles(self._doing) from error
 
 
 def socketpair(doing: str) -> tuple[socket.socket, socket.socket]:

@@ -3,7 +3,7 @@
 To a worker (behind the sequence number that its agent put in front)::
 
     MAP, STAR   head, pickled function (once for each worker), pickled items
-    CALLS       head, (size:u32, buffers:u32) * count, a pickled (function, args, kwargs) each
+    CALLS       head, (size:u64, buffers:u32) * count, a pickled (function, args, kwargs) each
     STOP        head
 
 From a worker, pickled tuples of plain values, so that reading one never runs the user's code::
@@ -34,8 +34,8 @@ UNREADABLE, UNKNOWN, BROKEN, READY, BIRTH = "unreadable", "unknown", "broken", "
 VALUE, ERROR, AGAIN = range(3)
 
 SEQ = struct.Struct("<Q")
-HEAD = struct.Struct("<BHIQII")
-CALL = struct.Struct("<II")
+HEAD = struct.Struct("<BHIQQI")
+CALL = struct.Struct("<QI")
 
 PLAIN = frozenset({int, float, complex, str, bytes, bool, type(None)})
 """Immutable, and pickled and unpickled without running anyone's code."""

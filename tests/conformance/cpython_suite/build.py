@@ -15,6 +15,8 @@ import sys
 import types
 import unittest
 from collections.abc import Callable
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec
 from typing import Any, NamedTuple
 
 from .redirect import Missing, Redirection
@@ -51,20 +53,32 @@ class Case(NamedTuple):
 
 def load_source(redirection: Redirection) -> types.ModuleType:
     """CPython's test module, executed with the redirection as its ``__import__``."""
-    for name in _SUPPORT:
-        importlib.import_module(name)
-    spec = importlib.util.find_spec(SOURCE)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"this Python has no {SOURCE}: install its test package")
+    spec, loader = _find_source()
     module = importlib.util.module_from_spec(spec)
     vars(module)["__builtins__"] = dict(vars(builtins), __import__=redirection.import_)
     sys.modules[SOURCE] = module
     redirection.loading = True
     try:
-        spec.loader.exec_module(module)
+        loader.exec_module(module)
     finally:
         redirection.loading = False
     return module
+
+
+def _find_source() -> tuple[ModuleSpec, Loader]:
+    try:
+        for name in _SUPPORT:
+            importlib.import_module(name)
+        spec = importlib.util.find_spec(SOURCE)
+    except ModuleNotFoundError:
+        spec = None
+    if spec is None or spec.loader is None:
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        raise ImportError(
+            f"{sys.executable} has no {SOURCE}: install CPython's own tests for it "
+            f"(Debian, Ubuntu: libpython{version}-testsuite), or use a Python that has them"
+        )
+    return spec, spec.loader
 
 
 class Builder:

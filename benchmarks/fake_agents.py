@@ -1,0 +1,147 @@
+"""Agents and workers that are not processes, for what only their number shows.
+
+A `FakeAgent` is an `AgentPort` whose children live in the process of the agent itself: what the
+master does for them, and what travels to and from them, is as ever, but they cost next to nothing.
+They run their tasks, by the code of a real worker, one after the other on the loop's thread.
+This is the one module that knows Fiber's inner parts, with `agent_host` and `fake_cluster`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+from collections.abc import Callable, Sequence
+
+from fiber._agent.port import AgentPort, ChildObserver, ChildSpec, ExitReport
+from fiber._agent.worker import Worker
+from fiber._transport.loop import Loop
+from fiber._wire import work
+from fiber._wire.packet import BytesLike, Message
+
+_READY = pickle.dumps((work.READY,))
+_BOARD = 16
+_BIRTH = 0.01
+"""Seconds until a child is there, about those of a real one: no process is ready before the call
+that starts it has returned, and the master need not be quick about one that is."""
+
+
+class FakeBackend:
+    """A `Backend` of one fake agent in this process."""
+
+    name = "fake"
+    same_host = True
+
+    def __init__(self, agent: FakeAgent) -> None:
+        self._agent = agent
+
+    def place(self) -> AgentPort:
+        """The one agent."""
+        return self._agent
+
+    def close(self) -> None:
+        """Nothing is left behind by objects."""
+
+
+class FakeAgent:
+    """An `AgentPort` whose children are objects. `on_ready` is called for each that is ready."""
+
+    def __init__(
+        self,
+        loop: Loop,
+        host: str,
+        runner: TaskRunner,
+        on_ready: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.loop = loop
+        self.host = host
+        self.runner = runner
+        self.on_ready = on_ready
+        self._numbers = itertools.count(1)
+
+    def start(self, spec: ChildSpec, observer: ChildObserver) -> FakeChild:
+        """Start a child, which is ready soon."""
+        child = FakeChild(self, spec.name, next(self._numbers), observer)
+        self.loop.call_later(_BIRTH, child.begin)
+        return child
+
+    def close(self) -> None:
+        """Nothing is left behind by objects."""
+
+
+class FakeChild:
+    """A `ChildPort` of a pool worker."""
+
+    def __init__(self, agent: FakeAgent, name: str, number: int, observer: ChildObserver) -> None:
+        self.name = name
+        self.host = agent.host
+        self.pid: int | None = None
+        self._number = number
+        self._agent = agent
+        self._observer = observer
+        self._gone = False
+
+    def begin(self) -> None:
+        """It is there, and ready, if it lives. On the loop's thread, as all that follows of it."""
+        if self._gone:
+            return
+        self.pid = self._number
+        self._observer.started(self._number)
+        self.send(_READY)
+        self._agent.on_ready()
+
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Run the batch at the loop's next turn, or end."""
+        self._agent.loop.call_soon(self._run, work.SEQ.pack(seq) + bytes(payload), list(buffers))
+        return True
+
+    def attend(self) -> bool:
+        """Its answer is the loop's to bring."""
+        return False
+
+    def take_back(self) -> None:
+        """What was delivered it has run by now, or is just about to."""
+        self._agent.loop.call_soon(self._observer.taken_back, [])
+
+    def signal(self, signum: int) -> None:
+        """Die of it."""
+        self._agent.loop.call_soon(self._end, ExitReport(-signum, "killed"))
+
+    def condemn(self, error: OSError) -> None:
+        """What its agent does with a child that cannot be written to; this one always can."""
+        raise error
+
+    def send(self, payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
+        """What its worker says goes to its observer: a worker's `Sender`."""
+        self._observer.said(Message(memoryview(payload), list(buffers), []))
+
+    def _run(self, payload: bytes, buffers: list[memoryview]) -> None:
+        if not self._gone and not self._agent.runner.run(
+            self, Message(memoryview(payload), buffers, [])
+        ):
+            self._end(ExitReport(0, "exit status 0"))
+
+    def _end(self, report: ExitReport) -> None:
+        if not self._gone:
+            self._gone = True
+            self._observer.exited(report._replace(host=self.host))
+
+
+class TaskRunner:
+    """One real worker that runs what all fake children of a process have to run, each in turn.
+
+    One for all, as a worker may start a thread that watches over long batches.
+    """
+
+    def __init__(self) -> None:
+        self._child: FakeChild | None = None
+        self._worker = Worker(self, memoryview(bytearray(_BOARD)).cast("Q"))
+
+    def run(self, child: FakeChild, message: Message) -> bool:
+        """Run and answer for this child; False if it was told to stop."""
+        self._child = child
+        return self._worker.handle(message)
+
+    def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """The worker's answer is that of the child whose turn it is."""
+        assert self._child is not None
+        self._child.send(bytes(payload), buffers)

@@ -1,0 +1,163 @@
+"""The master's side of many fake agents: a backend whose agents have real links."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
+from typing import TypeAlias
+
+from benchmarks import processes
+from benchmarks.agent_host import Order
+
+from fiber._backends.output import Output
+from fiber._backends.remote import RemoteAgent
+from fiber._runtime.state import Runtime
+from fiber._transport.credentials import make_credentials
+from fiber._transport.link import Link
+from fiber._transport.listener import MasterListener
+
+HOSTS = 4
+"""Processes among which the agents are shared out."""
+
+_PATIENCE = 60.0
+_END = 10.0
+_LOOK = 0.1
+
+Host: TypeAlias = subprocess.Popen[str]
+
+
+class FakeCluster:
+    """A `Backend` whose agents live in `hosts`; its children go to each of them in turn.
+
+    `joined` are the seconds that it took all agents to join, from the order to dial, and `joining`
+    those of a processor that this process used meanwhile; `master_memory` and `agent_memory` the
+    bytes that a link costs either side, as PSS.
+    """
+
+    name = "fake"
+    same_host = False
+
+    def __init__(self, runtime: Runtime, hosts: Sequence[Host], agents: int) -> None:
+        assert runtime.hub is not None
+        self._hosts = hosts
+        self._output = Output()
+        self._agents = {
+            name: RemoteAgent(name, runtime.hub, self._output, on_lost=self._lost)
+            for name in (f"fake-{number}" for number in range(agents))
+        }
+        self._turns = itertools.cycle(self._agents.values())
+        self._missing = agents
+        self._all_joined = threading.Event()
+        self._problem = ""
+        credentials = make_credentials("fake")
+        self._credentials = asdict(credentials.agent_half())
+        self._listener = MasterListener(
+            runtime.loop,
+            "127.0.0.1:0",
+            credentials,
+            on_agent=self._link,
+            on_refused=self._fail,
+        )
+        self.joined = self.joining = self.master_memory = self.agent_memory = 0.0
+
+    def join(self) -> None:
+        """Have all agents dial, and wait until the last of them has its link."""
+        names = list(self._agents)
+        before = self._memory()
+        begin, used = time.perf_counter(), time.process_time()
+        for number, host in enumerate(self._hosts):
+            share = names[number :: len(self._hosts)]
+            order = Order(self._listener.address, self._credentials, share, _PATIENCE)
+            assert host.stdin is not None
+            host.stdin.write(order.to_line())
+            host.stdin.flush()
+        self._wait_for_all(begin + _PATIENCE)
+        self.joined = time.perf_counter() - begin
+        self.joining = time.process_time() - used
+        self.master_memory, self.agent_memory = (
+            (after - was) / len(names) for was, after in zip(before, self._memory(), strict=True)
+        )
+
+    def _wait_for_all(self, end: float) -> None:
+        while not self._all_joined.wait(_LOOK):
+            for host in self._hosts:
+                if host.poll() is not None:
+                    raise RuntimeError(f"{self._missing} agents did not join: {_last_words(host)}")
+            if time.perf_counter() > end:
+                raise TimeoutError(f"{self._missing} agents did not join in {_PATIENCE:g} s")
+        if self._problem:
+            raise RuntimeError(self._problem)
+
+    def place(self) -> RemoteAgent:
+        """The agent whose turn it is."""
+        return next(self._turns)
+
+    def close(self) -> None:
+        """End the agents, and with them their hosts; those that never began do not matter."""
+        for agent in self._agents.values():
+            agent.close()
+        for host in self._hosts:
+            with suppress(subprocess.TimeoutExpired):
+                host.wait(_END if not self._missing else 0)
+        done = threading.Event()
+        self._listener.close("the master ended", then=done.set)
+        done.wait(_END)
+        self._output.close()
+
+    def _memory(self) -> tuple[int, int]:
+        """Of this process, and of the hosts together."""
+        return processes.pss(os.getpid()), sum(processes.pss(host.pid) for host in self._hosts)
+
+    # On the loop's thread
+
+    def _link(self, link: Link) -> None:
+        self._agents[link.peer.name].join(link)
+        self._missing -= 1
+        if not self._missing:
+            self._all_joined.set()
+
+    def _lost(self, agent: RemoteAgent, reason: str) -> None:
+        if self._missing:
+            self._fail(f"{agent.host} was lost: {reason}")
+
+    def _fail(self, reason: str) -> None:
+        self._problem = reason
+        self._all_joined.set()
+
+
+@contextmanager
+def agent_hosts(count: int = HOSTS) -> Iterator[list[Host]]:
+    """Processes that have imported all that they need and wait for their orders."""
+    with ExitStack() as stack:
+        hosts = [stack.enter_context(_host()) for _ in range(count)]
+        for host in hosts:
+            assert host.stdout is not None
+            if not host.stdout.readline():
+                raise RuntimeError(f"a host of agents ended with exit status {host.wait()}")
+        yield hosts
+
+
+@contextmanager
+def _host() -> Iterator[Host]:
+    with subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.agent_host"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as host:
+        try:
+            yield host
+        finally:
+            host.kill()
+
+
+def _last_words(host: Host) -> str:
+    assert host.stdout is not None
+    return host.stdout.read().strip() or f"a host ended with exit status {host.returncode}"

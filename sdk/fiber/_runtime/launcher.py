@@ -1,0 +1,90 @@
+"""Starting the processes of a pool's workers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from fiber._agent import worker
+from fiber._runtime.background import BackgroundThread
+from fiber._runtime.host import Loop
+from fiber._runtime.latch import Latch
+from fiber._runtime.options import PoolOptions
+from fiber._runtime.worker_handle import WorkerHandle
+
+
+class Launcher:
+    """Starts workers of one pool.
+
+    Not on the loop's thread: the user's initializer and its arguments are pickled for each, and
+    agents may need the loop.  ``on_failed`` is called, on the loop's thread, with workers whose
+    processes there will never be, and why, if that was tried; ``on_late`` with a worker that was
+    ready before it could be reached.
+    """
+
+    def __init__(
+        self,
+        options: PoolOptions,
+        loop: Loop,
+        background: BackgroundThread,
+        *,
+        on_failed: Callable[[Sequence[WorkerHandle], Exception | None], None],
+        on_late: Callable[[WorkerHandle], None],
+    ) -> None:
+        self._options = options
+        self._loop = loop
+        self._background = background
+        self._on_failed = on_failed
+        self._on_late = on_late
+
+    def launch_now(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
+        """Start some on the calling thread; raises what stands in the way of one."""
+        started = 0
+        try:
+            for handle in handles:
+                self._start(handle)
+                started += 1
+        except BaseException:
+            self._loop.call_soon(self._on_failed, handles[started:], None)
+            raise
+        self._raise_start_error(handles, timeout)
+
+    def _raise_start_error(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
+        """Wait until their agent has looked at them: the system may have no room for them."""
+        looked_at = Latch()
+        self._loop.call_soon(looked_at.set)
+        if not self._loop.on_thread():
+            looked_at.wait(timeout)
+        for handle in handles:
+            if handle.port is not None and handle.port.start_error is not None:
+                raise handle.port.start_error
+
+    def _start(self, handle: WorkerHandle) -> None:
+        options = self._options
+        process = options.new_process(
+            handle,
+            target=worker.run,
+            args=(options.initializer, options.initargs, options.retryable),
+        )
+        process.start()
+        handle.process = process
+        if handle.is_ready:
+            self._loop.call_soon(self._on_late, handle)
+        if handle.leaving:  # it was told to before it could be reached
+            self._loop.call_soon(handle.dismiss)
+            if handle.unwanted:
+                handle.kill()
+
+    def launch_soon(self, handles: Sequence[WorkerHandle]) -> None:
+        """Start some on the background thread; called on the loop's."""
+        for handle in handles:
+            self._background.submit(self._launch, handle)
+
+    def _launch(self, handle: WorkerHandle) -> None:
+        error = None
+        if not handle.leaving:
+            try:
+                self._start(handle)
+                return
+            except Exception as raised:  # want of descriptors or memory, mostly
+                error = raised
+        self._loop.call_soon(self._on_failed, (handle,), error)

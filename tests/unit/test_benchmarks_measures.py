@@ -1,0 +1,276 @@
+"""The measures of many agents, many workers and cold starts; what else the machine did."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks import (  # noqa: E402
+    agents,
+    budgets,
+    coldstart,
+    contenders,
+    latency,
+    machine,
+    processes,
+    report,
+    rounds,
+    samples,
+    workers,
+)
+from benchmarks.agent_host import Order  # noqa: E402
+from benchmarks.fake_agents import FakeAgent, TaskRunner  # noqa: E402
+from benchmarks.model import Case, Run  # noqa: E402
+from benchmarks.session import Session  # noqa: E402
+from benchmarks.tasks import no_op  # noqa: E402
+
+from fiber._agent.port import ChildSpec, ExitReport  # noqa: E402
+from fiber._wire import work  # noqa: E402
+from fiber._wire.packet import Message  # noqa: E402
+
+ABOUT = {
+    "date": "2026-01-01 00:00 UTC",
+    "command": "python benchmarks/run.py",
+    "rounds": 2,
+    "size": 1.0,
+    "cores": 2,
+    "processor": "a processor",
+    "memory": "8.00 GB",
+    "load": 0.0,
+    "system": "Linux 6",
+    "python": "3.11.0",
+    "versions": {},
+    "skipped": {},
+}
+
+
+# What else the machine did
+
+
+@pytest.mark.parametrize(
+    ("after", "share"),
+    [
+        ("cpu  10 5 5 180 0 0 0 0 0 0", 0.1),
+        ("cpu  0 0 0 100 100 0 0 0 0 0", 0.0),  # a disk at work is not a processor at work
+        ("cpu  0 0 0 150 0 0 0 50 0 0", 0.25),  # the machine's other guests
+        ("cpu  50 0 0 150 0 0 0 0 50 0", 0.25),  # a guest's time is in the first number too
+        ("cpu  0 0 0 0 0 0 0 0 0 0", 0.0),
+    ],
+)
+def test_the_share_in_use_is_what_was_not_idle(after: str, share: float) -> None:
+    before = "cpu  0 0 0 0 0 0 0 0 0 0\ncpu0 1 2 3"
+    assert machine.share_in_use(before, after) == pytest.approx(share)
+
+
+def test_the_share_in_use_now_is_a_share() -> None:
+    assert 0 <= machine.in_use() <= 1
+
+
+def test_idle_is_a_machine_that_never_did_much() -> None:
+    assert samples.is_idle([0.0, 0.05])
+    assert not samples.is_idle([0.0, 0.06, 0.0])
+
+
+def test_each_measure_looks_at_the_machine_before_each_of_its_rounds(tmp_path: Path) -> None:
+    shares = iter([0.1, 0.2, 0.3, 0.4])
+    runs = {name: Run(dict(ABOUT)) for name in ("overhead", "latency")}
+    names = ("overhead", "overhead", "latency")
+    cases = [Case(name, str(n), "", "", {}, ()) for n, name in enumerate(names)]
+    rounds.Rounds(tmp_path, runs, in_use=lambda: next(shares)).play(cases, [], 2)
+    assert (runs["overhead"].in_use, runs["latency"].in_use) == ([0.1, 0.3], [0.2, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("in_use", "words"),
+    [
+        ([0.004, 0.02], "others used 0 %, 2 % in a moment before each round: the machine was idle"),
+        ([0.0, 0.31], "others used 0 %, 31 % in a moment before each round: **the machine was not"),
+    ],
+)
+def test_the_page_says_whether_the_machine_was_idle(in_use: list[float], words: str) -> None:
+    assert words in report.page("latency", Run(dict(ABOUT), in_use=in_use))
+
+
+def test_a_case_with_rounds_of_its_own_has_them_however_long_they_take(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rounds, "LONG", 0.0)
+    runs = {"latency": Run(dict(ABOUT))}
+    params = {"calls": 20, "seconds": 1.0}
+    metrics = latency.cases(0.01)[0].metrics
+    short = Case("latency", "once", "", "apply", params, metrics)
+    many = Case("latency", "twice", "", "apply", params, metrics, rounds=2)
+    contender = contenders.BY_NAME["multiprocessing"]
+    rounds.Rounds(tmp_path, runs, in_use=lambda: 0.0).play([short, many], [contender], 3)
+    assert len(runs["latency"].series("once", contender.name, "p50")) == 1
+    assert len(runs["latency"].series("twice", contender.name, "p50")) == 2
+
+
+def test_a_run_from_before_that_was_looked_at_can_be_read() -> None:
+    assert "others used" not in report.page("latency", Run.from_json({"about": dict(ABOUT)}))
+
+
+def test_a_part_of_a_peer_that_is_absent_is_missing_like_the_peer() -> None:
+    modules = ("no_such_package", "no_such_package.part")
+    peer = contenders.Contender("x", "X", modules, frozenset(), "#000000", "o")
+    assert peer.missing() == "no_such_package, no_such_package.part"
+
+
+# Budgets
+
+
+def test_a_value_with_two_budgets_shows_both() -> None:
+    run = Run(dict(ABOUT))
+    for contender, p50 in (("fiber-loopback", 3e-4), ("multiprocessing", 1e-4), ("ray", 2e-3)):
+        run.add(latency.NAME, contender, 0, {"p50": p50, "p95": p50})
+    row = next(line for line in report.page("latency", run).splitlines() if "| 300 µs |" in line)
+    assert row.endswith("| ≤ 2x; ≤ 0.25x Ray's Pool | missed by 50.0 %; met |")
+
+
+def test_a_budget_on_the_same_value_in_another_case() -> None:
+    budget = next(each for each in budgets.BUDGETS if each.measure == "workers")
+    run = Run(dict(ABOUT))
+    run.add(workers.workers(10), "fiber", 0, {workers.COST.name: 2e-4})
+    run.add(workers.workers(5000), "fiber", 0, {workers.COST.name: 4.4e-4})
+    found = budgets.judge(budget, {"workers": run})
+    assert (found.kept, found.measured, found.verdict) == (False, "2.20x", "missed by 100 %")
+    row = report.page("workers", run).splitlines()
+    assert any(line.endswith("| ≤ 1.1x a pool of 10 | missed by 100 % |") for line in row)
+
+
+def test_a_page_with_a_budget_for_each_message_in_each_place() -> None:
+    on_pipes = [each.case for each in budgets.BUDGETS if each.measure == "pipes"]
+    assert on_pipes[:3] == ["int", "int, one processor", "int, two processors"]
+    assert len(on_pipes) == len(set(on_pipes)) == 5 * 3 + 2
+
+
+# Cold start
+
+
+def test_times_of_a_cold_start_are_those_of_its_last_worker_and_its_map() -> None:
+    second = 10**9
+    stamps = [("worker", 5 * second), ("map", 4 * second), ("worker", 3 * second)]
+    assert coldstart.times_from(2 * second, stamps) == {"ready": 3.0, "map": 2.0}
+
+
+# Fake agents
+
+
+class Turns:
+    """A loop whose turns the test takes."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+
+    def call_soon(self, callback: Callable[..., Any], *args: Any) -> None:
+        self.calls.append((callback, args))
+
+    def call_later(self, seconds: float, callback: Callable[..., Any], *args: Any) -> None:
+        self.call_soon(callback, *args)
+
+    def run(self) -> None:
+        while self.calls:
+            callback, args = self.calls.pop(0)
+            callback(*args)
+
+
+class Heard:
+    """An observer that writes down what it hears."""
+
+    def __init__(self) -> None:
+        self.words: list[Any] = []
+
+    def started(self, pid: int) -> None:
+        self.words.append("started")
+
+    def said(self, message: Message) -> None:
+        self.words.append(pickle.loads(message.payload))
+
+    def taken_back(self, seqs: list[int]) -> None:
+        self.words.append(seqs)
+
+    def exited(self, report: ExitReport) -> None:
+        self.words.append((report.exitcode, report.host))
+
+
+SPEC = ChildSpec("worker-1", "fork", b"", b"", tasks=True)
+
+
+def fake_child() -> tuple[Turns, Heard, Any]:
+    loop, heard = Turns(), Heard()
+    agent = FakeAgent(loop, "host-1", TaskRunner())  # type: ignore[arg-type]  # all that it uses
+    child = agent.start(SPEC, heard)
+    loop.run()
+    return loop, heard, child
+
+
+def test_a_fake_child_is_ready_at_once_and_runs_its_tasks() -> None:
+    loop, heard, child = fake_child()
+    assert heard.words == ["started", (work.READY,)]
+    call = pickle.dumps((no_op, (42,), {}))
+    assert child.deliver(7, work.pack_calls([(call, ())]))
+    loop.run()
+    seq, offset, kept, _, values, odd = heard.words[2]
+    assert (seq, offset, kept, values, odd) == (7, 0, None, [42], ())
+
+
+def test_a_fake_child_ends_once_when_told_to_or_killed() -> None:
+    loop, heard, child = fake_child()
+    child.deliver(8, work.STOP_MESSAGE)
+    child.signal(signal.SIGKILL)
+    loop.run()
+    assert heard.words[2:] == [(0, "host-1")]
+    loop, heard, child = fake_child()
+    child.signal(signal.SIGKILL)
+    child.deliver(8, work.STOP_MESSAGE)
+    loop.run()
+    assert heard.words[2:] == [(-signal.SIGKILL, "host-1")]
+
+
+def test_a_fake_child_that_was_killed_before_it_was_there_never_is() -> None:
+    loop, heard = Turns(), Heard()
+    agent = FakeAgent(loop, "host-1", TaskRunner())  # type: ignore[arg-type]  # all that it uses
+    child = agent.start(SPEC, heard)
+    child.signal(signal.SIGKILL)
+    loop.calls.reverse()
+    loop.run()
+    assert heard.words == [(-signal.SIGKILL, "host-1")]
+
+
+def test_what_was_taken_back_was_run_before() -> None:
+    loop, heard, child = fake_child()
+    child.deliver(9, work.pack_calls([(pickle.dumps((no_op, (1,), {})), ())]))
+    child.take_back()
+    loop.run()
+    assert (heard.words[2][0], heard.words[3]) == (9, [])
+
+
+def test_an_order_survives_its_line() -> None:
+    order = Order("127.0.0.1:1", {"key": "secret"}, ["a", "b"], 3.0)
+    assert Order.from_line(order.to_line()) == order
+
+
+@pytest.mark.timeout(60)  # starts processes with the engine; the processors may be busy
+@pytest.mark.parametrize("measure", [agents, workers])
+def test_what_knows_the_engine_from_inside_works_with_it_as_it_is(
+    measure: Any, tmp_path: Path
+) -> None:
+    case = measure.cases(0.002)[0]
+    session = Session(contenders.BY_NAME["fiber"], tmp_path)
+    try:
+        sample = session.run(case)
+        left = processes.descendants(session.pid)
+    finally:
+        session.stop()
+    assert set(sample) == {metric.name for metric in case.metrics}
+    assert all(value > 0 for value in sample.values())
+    assert not left
