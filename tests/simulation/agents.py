@@ -174,8 +174,10 @@ class Child:
         self.agent.down.send(self._put, seq, payload, buffers)
         return True
 
-    def lend(self) -> Channel | None:
+    def lend(self) -> Any:
         """Its channel, for direct use."""
+        if self.gone:
+            return None
         self._channel = self.agent.world.make_channel(self)
         return self._channel
 

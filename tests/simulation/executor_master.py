@@ -12,10 +12,11 @@ from typing import Any
 from fiber._backends.remote import RemoteChild
 from fiber._engine import ledger as engine
 from fiber._runtime.executor import Executor
+from fiber._runtime.functions import Function
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.outcome import Pickled
-from fiber._runtime.work_items import Call, Function, WorkItem
+from fiber._runtime.work_items import Call, WorkItem
 from fiber._wire import work
 from fiber.errors import StartError
 from fiber.process import ForkProcess, PoolProcess
@@ -80,7 +81,8 @@ class ExecutorMaster:
         self._stage = Stage(world)
         self._stage.enter()
         self._rng = random.Random(f"{world.schedule.seed} user")
-        self._executor = make(_options(world.schedule), self._stage, thread=self._stage.thread)
+        thread: Any = self._stage.thread
+        self._executor = make(_options(world.schedule), self._stage, thread=thread)
         self._ledger = self._executor._ledger
         self.language = Wire(world.schedule.seed)
         self._audit = Audit(world, self._ledger, Names())

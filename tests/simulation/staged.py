@@ -78,9 +78,7 @@ class Stage:
         self._actors.append(actor)
         return actor
 
-    def start(
-        self, process: Any, observer: Any, *, tasks: bool, method: str
-    ) -> ChildPort:
+    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildPort:
         """Start a worker on some agent."""
         assert self.running is not None
         # What comes of it comes after all that this thread has asked for.
