@@ -11,8 +11,9 @@ from __future__ import annotations
 import itertools
 import pickle
 from collections.abc import Callable, Sequence
+from typing import Any
 
-from fiber._agent.port import AgentPort, ChildObserver, ChildSpec, ExitReport
+from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.worker import Worker
 from fiber._transport.loop import Loop
 from fiber._wire import work
@@ -34,8 +35,8 @@ class FakeBackend:
     def __init__(self, agent: FakeAgent) -> None:
         self._agent = agent
 
-    def place(self) -> AgentPort:
-        """The one agent."""
+    def place(self) -> Any:
+        """The one agent, an ``AgentPort``."""
         return self._agent
 
     def close(self) -> None:
@@ -75,6 +76,7 @@ class FakeChild:
         self.name = name
         self.host = agent.host
         self.pid: int | None = None
+        self.start_error: Exception | None = None
         self._number = number
         self._agent = agent
         self._observer = observer
@@ -94,9 +96,11 @@ class FakeChild:
         self._agent.loop.call_soon(self._run, work.SEQ.pack(seq) + bytes(payload), list(buffers))
         return True
 
-    def attend(self) -> bool:
-        """Its answer is the loop's to bring."""
-        return False
+    def lend(self) -> None:
+        """Its answers are the loop's to bring."""
+
+    def reclaim(self) -> None:
+        """It is never lent."""
 
     def take_back(self) -> None:
         """What was delivered it has run by now, or is just about to."""

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from fiber._hub import access, grants
+from fiber._hub import client, handles
 from fiber._hub.hub import Hub
 from fiber._hub.tunnel import Frame, Tunnels
 from fiber._transport.loop import Loop
@@ -76,23 +76,23 @@ class Hosts:
     @contextlib.contextmanager
     def at(self, name: str) -> Iterator[Hub]:
         """In the block, this process is on that host, and the hub's own."""
-        before = access._hub, access._access
-        access._hub, access._access = self[name], None
+        before = client._local_hub, client._address
+        client._local_hub, client._address = self[name], None
         try:
             yield self[name]
         finally:
-            access._hub, access._access = before
+            client._local_hub, client._address = before
 
     @contextlib.contextmanager
     def child_at(self, name: str) -> Iterator[Hub]:
-        """In the block, this process is a child on that host, which reaches the hub by its door."""
-        before = access._hub, access._access
-        access._hub, access._access = None, self[name].access
+        """In the block, this process is a child there, which reaches the hub by its socket."""
+        before = client._local_hub, client._address
+        client._local_hub, client._address = None, self[name].address
         try:
             yield self[name]
         finally:
-            access._hub, access._access = before
-            grants._single_use._forget()
+            client._local_hub, client._address = before
+            handles._single_use.reset()
 
     def close(self) -> None:
         """End all."""

@@ -3,7 +3,9 @@
 It takes everything from its environment, nothing from its command line (but ``--help``):
 
 ``FIBER_AGENT_ADDRESS``      ``host:port`` of the master
-``FIBER_AGENT_CREDENTIALS``  the agent's half of the credentials, or the directory that holds it
+``FIBER_AGENT_CREDENTIALS``  the directory that holds the agent's half of the credentials, or
+                           ``fd:N`` for an inherited descriptor that brings it.  The environment
+                           of a process is open to those that it starts: no secret is in it
 ``FIBER_AGENT_NAME``         what the master calls it
 ``FIBER_AGENT_PARENT``       optional: the pid of a process on this host to end with
 ``FIBER_AGENT_INHERITS``     optional: a directory of that process, to be removed if it is killed
@@ -40,6 +42,7 @@ from fiber.errors import AuthenticationError, ConfigError, FiberError, LinkError
 
 _ADDRESS = "FIBER_AGENT_ADDRESS"
 _CREDENTIALS = "FIBER_AGENT_CREDENTIALS"
+_DESCRIPTOR = "fd:"
 _NAME = "FIBER_AGENT_NAME"
 _PARENT = "FIBER_AGENT_PARENT"
 _INHERITS = "FIBER_AGENT_INHERITS"
@@ -58,6 +61,7 @@ class Main:
 
     def __init__(self) -> None:
         self._environment = dict(os.environ)
+        self._credentials = _read(_required(_CREDENTIALS))  # before anything is started
         self._name = os.environ.get(_NAME) or f"agent-{os.getpid()}"
         self._lost_grace = _seconds(_LOST_GRACE)
         self._waits_until = _seconds(_WAITS_UNTIL)
@@ -83,21 +87,28 @@ class Main:
         self._hub.close()
         if self._again:
             # Nothing of what the last master did or left may reach the next one.
+            self._hand_on_credentials()
             os.execve(sys.executable, sys.orig_argv, self._environment)
         return self._status
+
+    def _hand_on_credentials(self) -> None:
+        if _descriptor_in(self._environment[_CREDENTIALS]) is not None:
+            descriptor = self._credentials.to_descriptor()
+            os.set_inheritable(descriptor, True)
+            self._environment[_CREDENTIALS] = f"{_DESCRIPTOR}{descriptor}"
 
     def _dial(self) -> AgentDialer:
         return AgentDialer(
             self._loop,
             _required(_ADDRESS),
-            _read(_required(_CREDENTIALS)),
+            self._credentials,
             Identity.of_this_process(self._name, pid=str(os.getpid())),
             on_link=self._joined,
             on_failed=self._failed,
-            timeout=self._patience(),
+            timeout=self._timeout(),
         )
 
-    def _patience(self) -> float | None:
+    def _timeout(self) -> float | None:
         if self._lost_grace is None:
             return config.current().start_timeout
         if self._waits_until is None:
@@ -116,7 +127,7 @@ class Main:
         self._complain(error)
         if self._lost_grace is None or not isinstance(error, LinkError):
             self._status = 1
-        elif self._waits_until is None or self._patience():
+        elif self._waits_until is None or self._timeout():
             # It was there and refused us: it is ending, or took our name for another's.
             self._again = True
             self._loop.call_later(_REFUSED_PAUSE, self._loop.stop)
@@ -166,9 +177,21 @@ class Main:
 
 
 def _read(credentials: str) -> Credentials:
+    descriptor = _descriptor_in(credentials)
+    if descriptor is not None:
+        return Credentials.from_descriptor(descriptor)
     if os.path.isabs(credentials):
         return Credentials.from_directory(credentials)
-    return Credentials.from_environment(credentials)
+    raise ConfigError(  # and does not repeat what may be a secret in the wrong place
+        f"{_CREDENTIALS} ({len(credentials)} characters) is neither an absolute path nor fd:N. It "
+        "says where the credentials are, a mounted directory for instance, and does not hold them."
+    )
+
+
+def _descriptor_in(credentials: str) -> int | None:
+    number = credentials.removeprefix(_DESCRIPTOR)
+    is_one = number != credentials and number.isascii() and number.isdigit() and len(number) < 10
+    return int(number) if is_one else None
 
 
 def _seconds(variable: str) -> float | None:

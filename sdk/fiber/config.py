@@ -14,12 +14,14 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import pickle
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
+from fiber import inherited
 from fiber.errors import ConfigError
 
 __all__ = ["Config", "current", "guard", "init", "install", "load", "use"]
@@ -151,12 +153,13 @@ _used = False  # something that is no part of the runtime was built on it, such 
 
 
 def current() -> Config:
-    """The configuration in force; read from its sources at the first call."""
+    """The configuration in force: at the first call read from its sources, or a parent's."""
     global _current
     if _current is None:
         with _lock:
             if _current is None:
-                _current = load()
+                pickled = inherited.configuration()
+                _current = pickle.loads(pickled) if pickled is not None else load()
     return _current
 
 
@@ -185,7 +188,7 @@ def init(**settings: object) -> Config:
 
 
 def install(config: Config) -> None:
-    """Put a configuration in force as it is: how a child gets its parent's."""
+    """Put a configuration in force as it is."""
     global _current, _used
     with _lock:
         _current, _used = config, False

@@ -78,7 +78,13 @@ class Connection:
 
     def recv(self) -> Any:
         """The next object."""
-        return packet.loads(self._receive())
+        channel = self._channel
+        if channel is None or not self._readable:
+            raise self._misuse("write-only")
+        try:
+            return channel.recv_object()
+        except ConnectionClosed as error:
+            raise self._explained(error) from None
 
     def recv_bytes(self, maxlength: int | None = None) -> bytes:
         """The next message as bytes; OSError, and the connection closed, if it is longer."""
@@ -119,20 +125,20 @@ class Connection:
             raise self._misuse("write-only")
         try:
             return channel.recv()
-        except EOFError as error:
-            if isinstance(error, ConnectionClosed) and error.reason:
-                raise  # it knows better
-            raise self._closed_by() from None
+        except ConnectionClosed as error:
+            raise self._explained(error) from None
 
-    def _closed_by(self) -> ConnectionClosed:
+    def _explained(self, error: ConnectionClosed) -> ConnectionClosed:
         """The end of the connection, with how the process that held the other end ended."""
+        if error.reason:
+            return error
         for reference in reversed(self._other_given_to):
             process = reference()
             popen = getattr(process, "_popen", None)
             # The kernel closes what a process held moments before its parent hears of its death.
             if popen is not None and popen.wait(_LAST_MOMENT) is not None:
                 return ConnectionClosed(process.name, popen.report.reason)
-        return ConnectionClosed()
+        return error
 
     # The end itself
 
@@ -185,7 +191,7 @@ class Connection:
         process = getattr(spawning, "process", None)
         if process is not None:
             self._given_to.append(weakref.ref(process))
-        return _rebuild, (handles.lend(self._channel), self._readable, self._writable)
+        return _rebuild, (handles.handle_for(self._channel), self._readable, self._writable)
 
     def _misuse(self, wrong_way: str = "") -> OSError:
         if self._channel is None:

@@ -21,8 +21,8 @@ from multiprocessing.context import (
 from typing import TYPE_CHECKING, Any
 
 from fiber import config, cpu
-from fiber._hub.absent import absent
-from fiber._runtime import methods
+from fiber._hub.unsupported import unsupported
+from fiber._runtime import early, methods
 from fiber.process import ForkProcess, ForkServerProcess, Process, SpawnProcess
 
 if TYPE_CHECKING:
@@ -58,15 +58,15 @@ class BaseContext:
     Process: type[Process] = Process
 
     # What multiprocessing has and Fiber has not yet: each says what to use instead.
-    Lock = staticmethod(absent("Lock"))
-    RLock = staticmethod(absent("RLock"))
-    Condition = staticmethod(absent("Condition"))
-    Barrier = staticmethod(absent("Barrier"))
-    Value = staticmethod(absent("Value"))
-    Array = staticmethod(absent("Array"))
-    RawValue = staticmethod(absent("RawValue"))
-    RawArray = staticmethod(absent("RawArray"))
-    Manager = staticmethod(absent("Manager"))
+    Lock = staticmethod(unsupported("Lock"))
+    RLock = staticmethod(unsupported("RLock"))
+    Condition = staticmethod(unsupported("Condition"))
+    Barrier = staticmethod(unsupported("Barrier"))
+    Value = staticmethod(unsupported("Value"))
+    Array = staticmethod(unsupported("Array"))
+    RawValue = staticmethod(unsupported("RawValue"))
+    RawArray = staticmethod(unsupported("RawArray"))
+    Manager = staticmethod(unsupported("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)
@@ -150,6 +150,7 @@ class BaseContext:
         idle_timeout: float | None = 60.0,
     ) -> Pool:
         """A pool of workers; ``fiber.pool.Pool`` says what the options mean."""
+        early.start_zygote()
         from fiber.pool import Pool
 
         return Pool(

@@ -19,7 +19,7 @@ from multiprocessing.managers import (
 )
 from typing import Any
 
-from fiber._hub.absent import absent, refuse
+from fiber._hub.unsupported import refuse, unsupported
 
 __all__ = [
     "AcquirerProxy",
@@ -45,7 +45,7 @@ __all__ = [
     "ValueProxy",
 ]
 
-Manager = absent("Manager")
+Manager = unsupported("Manager")
 
 _untyped: Any = mp_managers  # typeshed has part of it
 AcquirerProxy = _untyped.AcquirerProxy

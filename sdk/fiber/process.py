@@ -51,6 +51,9 @@ class Process(BaseProcess):
     _start_method: str | None = None
 
     def _Popen(self) -> Any:
+        from fiber._runtime.early import start_zygote
+
+        start_zygote()
         from fiber._runtime.methods import zygote_method
         from fiber._runtime.popen import Popen
 

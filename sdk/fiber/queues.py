@@ -3,7 +3,7 @@
 ::
 
     put ── a slot ── pickle ─┬─ room in the channel ─────────► channel ──► get ── the slot is free
-                             └─ no room: backlog ─► feeder ──►
+                             └─ no room: feeder ────────────►
 
 There is no lock between processes: an item is one message, which the kernel gives to exactly one
 reader.  A process that dies while it waits takes nothing; one that dies later takes its own item.
@@ -20,9 +20,9 @@ from queue import Empty, Full
 from typing import Any
 
 from fiber import reduction
-from fiber._hub.backlog import Backlog, Slots, Tally
-from fiber._hub.handles import SharedCounter
+from fiber._hub.feeder import Feeder, ItemCount, Slots
 from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._transport.base import SharedCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
 from fiber.connection import Connection
@@ -35,7 +35,7 @@ class Queue:
     """A first-in first-out queue for any number of processes and threads."""
 
     def __init__(self, maxsize: int = 0, *, ctx: Any = None) -> None:
-        self._slots: Slots | Tally = Slots(maxsize) if maxsize > 0 else Tally()
+        self._slots: Slots | ItemCount = Slots(maxsize) if maxsize > 0 else ItemCount()
         self._inbox, self._outbox = LocalChannel.pair()
         self._open()
 
@@ -52,12 +52,12 @@ class Queue:
         self._reader = Connection(self._inbox, writable=False)
         self._writer = Connection(self._outbox, readable=False)
         self._closed = False
-        self._new_backlog()
-        util.register_after_fork(self, Queue._new_backlog)
+        self._new_feeder()
+        util.register_after_fork(self, Queue._new_feeder)
 
-    def _new_backlog(self) -> None:
+    def _new_feeder(self) -> None:
         # What the parent of a fork has not sent yet, the parent sends.
-        self._backlog = Backlog(
+        self._feeder = Feeder(
             self,
             self._outbox,
             self._slots,
@@ -86,7 +86,7 @@ class Queue:
             self._send(payload, buffers)
 
     def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
-        self._backlog.put(payload, buffers)
+        self._feeder.put(payload, buffers)
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """The next item; Empty if there is none, nor within ``timeout`` seconds."""
@@ -119,7 +119,7 @@ class Queue:
 
         Of a queue without a maximum, those that wait in another process for room are not counted.
         """
-        return self._slots.used(self._backlog.waiting)
+        return self._slots.used(self._feeder.waiting)
 
     def empty(self) -> bool:
         """Whether ``get`` would wait."""
@@ -133,16 +133,16 @@ class Queue:
         """This process puts and gets no more.  What it has put still gets sent."""
         self._closed = True
         self._reader.close()
-        self._backlog.close()
+        self._feeder.close()
 
     def join_thread(self) -> None:
         """After ``close``: wait until everything that this process put is sent."""
         assert self._closed, f"Queue {self!r} not closed"
-        self._backlog.join()
+        self._feeder.join()
 
     def cancel_join_thread(self) -> None:
         """Let this process end even if not all that it put is sent."""
-        self._backlog.cancel_join()
+        self._feeder.cancel_join()
 
     @staticmethod
     def _on_queue_feeder_error(e: Exception, obj: Any) -> None:

@@ -32,7 +32,7 @@ from types import FunctionType, ModuleType
 from typing import Any, ClassVar, cast
 
 from fiber._agent import child
-from fiber._hub import grants
+from fiber._hub import handles
 from fiber._wire import packet
 from fiber.errors import UnpicklableError
 
@@ -154,13 +154,14 @@ def _name_culprit(parts: Mapping[str, Any], whole: str, reason: Exception) -> Un
 
 def _refusal(obj: Any) -> str | None:
     """Why ``obj`` does not pickle; None if it does."""
-    grants.begin_attempt()
+    outer = handles.begin_pickling()
     try:
         dumps(obj)
     except Exception as error:
         return str(error)  # the error itself would keep what our callers hold, in a cycle
     finally:
-        grants.undo_attempt()
+        handles.undo_pickling()
+        handles.end_pickling(outer)
     return None
 
 
@@ -226,9 +227,22 @@ def dumps(
     return _dump(_by_value_pickler(), obj, protocol, buffer_callback)
 
 
-def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
-    """Pickle ``obj`` for a packet: the pickle, and large buffers beside it."""
-    grants.begin_attempt()
+def encode(obj: Any, grants: handles.GrantSet | None = None) -> tuple[bytes, list[memoryview]]:
+    """Pickle ``obj`` for a packet: the pickle, and large buffers beside it.
+
+    Connections and queues in it can be unpickled once; with ``grants`` until those are released.
+    """
+    outer = handles.begin_pickling(grants)
+    try:
+        return _encode(obj)
+    except BaseException:
+        handles.undo_pickling()
+        raise
+    finally:
+        handles.end_pickling(outer)
+
+
+def _encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     try:
         encoded = packet.dumps(obj)
         if not (main_is_out_of_reach() and b"__main__" in encoded[0]):
@@ -236,26 +250,18 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     except Exception:
         # Whether or not cloudpickle can do it, its error says as much.
         pass
-    grants.undo_attempt()
-    try:
-        return packet.dumps(obj, partial(_dump, _by_value_pickler()))
-    except BaseException:
-        grants.undo_attempt()
-        raise
+    handles.undo_pickling()
+    return packet.dumps(obj, partial(_dump, _by_value_pickler()))
 
 
-def encode_reusable(obj: Any) -> tuple[bytes, list[memoryview], grants.GrantSet | None]:
+def encode_reusable(obj: Any) -> tuple[bytes, list[memoryview], handles.GrantSet | None]:
     """As ``encode``, for what may be unpickled several times, as a task that runs again.
 
     Connections and queues in it can be unpickled for as long as the third value is kept.
     """
-    payload, buffers = encode(obj)
-    if not grants.granted():
-        return payload, buffers, None
-    grants.undo_attempt()
-    with grants.collecting_grants() as kept:
-        payload, buffers = encode(obj)
-    return payload, buffers, kept
+    grants = handles.GrantSet()
+    payload, buffers = encode(obj, grants)
+    return payload, buffers, grants or None
 
 
 def dump(obj: Any, file: Any, protocol: int | None = None) -> None:

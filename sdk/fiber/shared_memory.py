@@ -1,13 +1,13 @@
 """multiprocessing's classes of named shared memory, for annotations; Fiber makes none yet."""
 
-from fiber._hub.absent import Absent
+from fiber._hub.unsupported import Unsupported
 
 __all__ = ["ShareableList", "SharedMemory"]
 
 
-class SharedMemory(Absent):
+class SharedMemory(Unsupported):
     pass
 
 
-class ShareableList(Absent):
+class ShareableList(Unsupported):
     pass

@@ -10,7 +10,7 @@ from multiprocessing.sharedctypes import (
     SynchronizedString,
 )
 
-from fiber._hub.absent import absent
+from fiber._hub.unsupported import unsupported
 
 __all__ = [
     "Array",
@@ -25,9 +25,9 @@ __all__ = [
     "synchronized",
 ]
 
-Value = absent("Value")
-Array = absent("Array")
-RawValue = absent("RawValue")
-RawArray = absent("RawArray")
-copy = absent("copy")
-synchronized = absent("synchronized")
+Value = unsupported("Value")
+Array = unsupported("Array")
+RawValue = unsupported("RawValue")
+RawArray = unsupported("RawArray")
+copy = unsupported("copy")
+synchronized = unsupported("synchronized")

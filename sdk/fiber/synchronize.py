@@ -9,13 +9,13 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from fiber._hub.absent import Absent
 from fiber._hub.local import LocalCounter
+from fiber._hub.unsupported import Unsupported
 
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from fiber._hub.handles import SharedCounter
+    from fiber._transport.base import SharedCounter
 
 __all__ = [
     "Barrier",
@@ -33,19 +33,19 @@ RECHECK = 1.0
 """Seconds after which whoever waits for a bell looks for itself: its ringer may have died."""
 
 
-class Lock(Absent):
+class Lock(Unsupported):
     pass
 
 
-class RLock(Absent):
+class RLock(Unsupported):
     pass
 
 
-class Condition(Absent):
+class Condition(Unsupported):
     pass
 
 
-class Barrier(Absent):
+class Barrier(Unsupported):
     pass
 
 

@@ -32,7 +32,9 @@ def backend() -> Iterator[LoopbackBackend]:
 def pid_of(backend: LoopbackBackend, host: str) -> int:
     for process in backend._processes:
         if process.agent.host == host:
-            return process._process.pid
+            pid = process.process.pid
+            assert pid is not None
+            return pid
     raise AssertionError(f"{host} is gone")
 
 
@@ -180,7 +182,7 @@ def test_after_good_work_agents_end_with_status_0(launch: Callable[..., Program]
                 pool.map(abs, range(10))
             child = fiber.Process(target=print)
             child.start()
-            agents = [process._process for process in state.runtime().backend._processes]
+            agents = [process.process._process for process in state.runtime().backend._processes]
             child.join()
             state.shutdown()
             print({agent.returncode for agent in agents})

@@ -51,12 +51,13 @@ def master(
     credentials = make_credentials("test")
     path = tmp_path / "credentials"
     path.write_bytes(pickle.dumps(credentials))
+    credentials.agent_half().to_directory(tmp_path / "agent")
 
     def agent(before: str = "", **env: str) -> tuple[Program, Program]:
         listening = launch(MASTER, str(path))
         told = {
             "FIBER_AGENT_ADDRESS": listening.line(),
-            "FIBER_AGENT_CREDENTIALS": credentials.agent_half().to_environment(),
+            "FIBER_AGENT_CREDENTIALS": str(tmp_path / "agent"),
             "FIBER_AGENT_NAME": "newcomer",
             "FIBER_AGENT_PARENT": str(os.getpid()),
             "FIBER_START_TIMEOUT": "10",
@@ -73,10 +74,10 @@ def test_an_agent_that_fits_is_taken(master: Callable[..., tuple[Program, Progra
     agent.kill()
 
 
-def test_wrong_credentials(master: Callable[..., tuple[Program, Program]]) -> None:
-    other = make_credentials("test").agent_half().to_environment()
+def test_wrong_credentials(master: Callable[..., tuple[Program, Program]], tmp_path: Path) -> None:
+    make_credentials("test").agent_half().to_directory(tmp_path / "other")
     before = time.monotonic()
-    _, agent = master(FIBER_AGENT_CREDENTIALS=other)
+    _, agent = master(FIBER_AGENT_CREDENTIALS=str(tmp_path / "other"))
     assert agent.wait() == 1
     assert time.monotonic() - before < 8, "it does not try for the whole timeout"
     assert "do not trust each other" in agent.stderr
@@ -118,7 +119,12 @@ def test_wrong_version_of(
     [
         ({"FIBER_AGENT_ADDRESS": ""}, "FIBER_AGENT_ADDRESS is not set"),
         ({"FIBER_AGENT_CREDENTIALS": ""}, "FIBER_AGENT_CREDENTIALS is not set"),
-        ({"FIBER_AGENT_CREDENTIALS": "garbage"}, "credentials in the environment"),
+        (
+            {"FIBER_AGENT_CREDENTIALS": "garbage"},
+            "(7 characters) is neither an absolute path nor fd:N",
+        ),
+        ({"FIBER_AGENT_CREDENTIALS": "fd:"}, "is neither an absolute path nor fd:N"),
+        ({"FIBER_AGENT_CREDENTIALS": "fd:77"}, "the credentials on descriptor 77 cannot be read"),
         ({"FIBER_AGENT_CREDENTIALS": "/no/such/folder"}, "/no/such/folder"),
         ({"FIBER_AGENT_ADDRESS": "nonsense"}, "nonsense"),
         ({"FIBER_AGENT_PARENT": "abc"}, "FIBER_AGENT_PARENT='abc' is not the id of a process"),

@@ -179,26 +179,6 @@ def test_a_connection_sent_through_a_connection_outlives_its_sender(
     outer.close()
 
 
-@pytest.mark.xfail(
-    reason="nobody tells the hub that the kernel threw a message away together with its pipe: the "
-    "handle in it is kept until somebody takes it, or the program ends"
-)
-def test_a_handle_that_nobody_took_is_no_holder(start: Callable[..., Any]) -> None:
-    outer, outer_theirs = fiber.Pipe()
-    ours, theirs = fiber.Pipe()
-    child = start(targets.hold, outer_theirs)
-    assert outer.recv() == "held"
-    outer.send(theirs)  # never received
-    theirs.close()
-    child.kill()
-    child.join(PATIENCE)
-    outer_theirs.close()
-    outer.close()
-    there_is_an_end = ours.poll(1)
-    ours.close()
-    assert there_is_an_end
-
-
 def test_a_stopped_reader_holds_up_its_own_pipe_only(start: Callable[..., Any]) -> None:
     stopped, stopped_theirs = fiber.Pipe()
     lively, lively_theirs = fiber.Pipe()

@@ -135,7 +135,7 @@ def test_a_stranger_stops_every_later_start(backend: str) -> None:
     else:
         hub = state.runtime().hub
         assert hub is not None
-        door, family, kind = hub.access.address, socket.AF_UNIX, socket.SOCK_SEQPACKET
+        door, family, kind = hub.address.path, socket.AF_UNIX, socket.SOCK_SEQPACKET
     strangers = [socket.socket(family, kind) for _ in range(3)]
     for stranger in strangers:
         stranger.connect(door)

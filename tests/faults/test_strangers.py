@@ -7,19 +7,21 @@ import os
 import pickle
 import socket
 import ssl
-from collections.abc import Iterator
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import pynng
 import pytest
 
 import fiber
 from faults import targets
-from faults.program import PATIENCE, wait_for
+from faults.program import LOOPBACK, PATIENCE, Program, wait_for
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
-from fiber._transport.credentials import Credentials, make_credentials
+from fiber._transport import tls
+from fiber._transport.credentials import make_credentials
+from unit.link_site import say
 
 GARBAGE = [
     b"",
@@ -78,11 +80,47 @@ def test_garbage_on_the_masters_port(backend: LoopbackBackend, data: bytes) -> N
 def test_strangers_that_say_nothing_and_stay_hold_nobody_up(backend: LoopbackBackend) -> None:
     strangers = [socket.create_connection(address(backend), PATIENCE) for _ in range(50)]
     works()
-    backend._processes[0].kill()
+    backend._processes[0].process.kill()
     wait_for(lambda: backend._processes[0].agent.host != "loopback-0")
     works()  # by an agent that had to come in past them
     for stranger in strangers:
         stranger.close()
+
+
+CROWDED = """
+    import resource, fiber
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, 256))
+    from fiber._runtime import state
+
+    if __name__ == "__main__":
+        with fiber.Pool(1) as pool:
+            assert pool.map(abs, range(3)) == [0, 1, 2]
+            print(state.runtime().backend._listener.address, flush=True)
+            while input() == "go on":
+                assert pool.apply(abs, (-1,)) == 1
+                with open("/dev/null"), fiber.Pool(1) as another:  # there are descriptors left
+                    print(another.apply(abs, (-2,)), flush=True)
+"""
+
+
+def test_a_crowd_of_strangers_does_not_take_the_masters_descriptors(
+    launch: Callable[..., Program],
+) -> None:
+    program = launch(CROWDED, env=LOOPBACK, stdin=subprocess.PIPE)
+    host, _, port = program.line().rpartition(":")
+    with contextlib.ExitStack() as crowd:
+        for _ in range(300):
+            crowd.enter_context(socket.create_connection((host, int(port)), PATIENCE))
+        assert program.process.stdin is not None
+        program.process.stdin.write(b"go on\n")
+        program.process.stdin.flush()
+        assert program.line() == "2"
+        descriptors = len(os.listdir(f"/proc/{program.pid}/fd"))
+        assert descriptors < 150
+    program.process.stdin.write(b"end\n")
+    program.process.stdin.close()
+    program.finish()
+    assert program.stderr.count("too many come at the same time") <= 1
 
 
 def test_tls_without_a_certificate_gets_no_word(backend: LoopbackBackend) -> None:
@@ -101,30 +139,24 @@ def test_tls_without_a_certificate_gets_no_word(backend: LoopbackBackend) -> Non
     works()
 
 
-def tls_of(credentials: Credentials, *, certificate: bool = True) -> pynng.TLSConfig:
-    own = {"own_key_string": credentials.key, "own_cert_string": credentials.certificate}
-    return pynng.TLSConfig(
-        pynng.TLSConfig.MODE_CLIENT,
-        server_name=credentials.server_name,
-        ca_string=credentials.authority,
-        auth_mode=pynng.TLSConfig.AUTH_MODE_NONE,
-        **(own if certificate else {}),
-    )
-
-
 @pytest.mark.parametrize("certificate", [True, False], ids=["another run's", "none"])
-def test_nng_with_a_foreign_certificate_can_push_nothing(
+def test_who_has_a_foreign_certificate_can_push_nothing(
     backend: LoopbackBackend, certificate: bool, tmp_path: Path
 ) -> None:
     trace = tmp_path / "unpickled"
     foreign = make_credentials("loopback").agent_half()
-    with pynng.Pair1(polyamorous=True, send_timeout=300, recv_timeout=300) as stranger:
-        stranger.tls_config = tls_of(foreign, certificate=certificate)
-        with contextlib.suppress(pynng.NNGException):
-            stranger.dial(f"tls+tcp://{backend._listener.address}", block=True)
-            stranger.send(pickle.dumps(Bomb(trace)))
-        with pytest.raises(pynng.NNGException):
-            stranger.recv()
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    if certificate:
+        context = tls.context_of(foreign, listens=False)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    with socket.create_connection(address(backend), PATIENCE) as plain:
+        stranger = context.wrap_socket(plain)  # the master's part of TLS 1.3 is over before ours
+        with contextlib.suppress(OSError):
+            stranger.sendall(pickle.dumps(Bomb(trace)))
+        with pytest.raises((ssl.SSLError, ConnectionError)):
+            assert stranger.recv(100)
+        stranger.close()
     works()
     assert not trace.exists()
 
@@ -133,12 +165,9 @@ def test_who_has_the_credentials_and_speaks_nonsense_is_refused_not_unpickled(
     backend: LoopbackBackend, tmp_path: Path
 ) -> None:
     trace = tmp_path / "unpickled"
-    ours = Credentials.from_environment(backend._credentials)
-    with pynng.Pair1(polyamorous=True, send_timeout=2000, recv_timeout=5000) as odd:
-        odd.tls_config = tls_of(ours)
-        odd.dial(f"tls+tcp://{backend._listener.address}", block=True)
-        odd.send(pickle.dumps(Bomb(trace)))
-        assert b"no agent of Fiber" in odd.recv()
+    ours = backend._launcher._credentials
+    answer = say(backend._listener.address, ours, pickle.dumps(Bomb(trace)))
+    assert b"no agent of Fiber" in answer
     works()
     assert not trace.exists()
 
@@ -152,7 +181,7 @@ def door() -> Iterator[str]:
         queue = fiber.Queue()
         queue.put(1)
         assert runtime.hub is not None
-        yield runtime.hub.access.address
+        yield runtime.hub.address.path
 
 
 def test_the_door_is_in_a_directory_that_only_this_user_can_enter(door: str) -> None:

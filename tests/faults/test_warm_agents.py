@@ -23,7 +23,7 @@ AGENT = """
 
 MASTER = """
     import pickle, signal, sys
-    from fiber._transport.link import Patience
+    from fiber._transport.link import Keepalive
     from fiber._transport.listener import MasterListener
     from fiber._transport.loop import Loop
     from fiber._wire.messages import Shutdown, TakeBack
@@ -61,7 +61,7 @@ MASTER = """
     listener = MasterListener(
         loop, sys.argv[2], pickle.load(open(sys.argv[1], "rb")),
         on_agent=joined, on_refused=lambda reason: None,
-        patience=Patience(0.2, 0.5, 1.0), lost_grace=float(sys.argv[3]) if sys.argv[3:] else None,
+        keepalive=Keepalive(0.2, 0.5, 1.0), lost_grace=float(sys.argv[3]) if sys.argv[3:] else None,
     )
     print("listens", flush=True)
     loop.run()
@@ -75,21 +75,23 @@ class Pool:
         self.credentials: MasterCredentials = make_credentials("warm")
         self._path = folder / "credentials"
         self._path.write_bytes(pickle.dumps(self.credentials))
+        self._folder = folder / "agent"
+        self.credentials.agent_half().to_directory(self._folder)
         self._launch = launch
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{free.getsockname()[1]}"
 
-    def agent(self, grace: float, **env: str) -> Program:
+    def agent(self, grace: float, pass_fds: tuple[int, ...] = (), **env: str) -> Program:
         told = {
             "FIBER_AGENT_ADDRESS": self.address,
-            "FIBER_AGENT_CREDENTIALS": self.credentials.agent_half().to_environment(),
+            "FIBER_AGENT_CREDENTIALS": str(self._folder),
             "FIBER_AGENT_NAME": "warm-0",
             "FIBER_AGENT_PARENT": str(os.getpid()),
             "FIBER_AGENT_LOST_GRACE": str(grace),
             "FIBER_START_TIMEOUT": "0.2",
         }
-        return self._launch(AGENT, env={**told, **env})
+        return self._launch(AGENT, env={**told, **env}, pass_fds=pass_fds)
 
     def master(self, *grace: str) -> Program:
         master = self._launch(MASTER, str(self._path), self.address, *grace)
@@ -124,6 +126,17 @@ def test_it_serves_one_master_after_the_other_and_keeps_nothing_of_them(pool: Po
         f"fiber agent warm-0: the master at {pool.address} refused this agent: "
         "this master is ending"
     }
+
+
+def test_credentials_from_a_descriptor_serve_for_all_its_masters(pool: Pool) -> None:
+    descriptor = pool.credentials.agent_half().to_descriptor()
+    told = {"FIBER_AGENT_CREDENTIALS": f"fd:{descriptor}"}
+    pool.agent(30, pass_fds=(descriptor,), **told)
+    os.close(descriptor)
+    for _ in range(3):
+        master = pool.master()
+        assert master.line() == "joined warm-0"
+        master.kill()
 
 
 def test_it_finds_the_next_master_when_the_last_was_killed(pool: Pool) -> None:

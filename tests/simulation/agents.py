@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._agent.port import ChildObserver, ExitReport
-from fiber._transport.link import Patience
+from fiber._transport.link import Keepalive
 from fiber._transport.memory import SimulatedLoop
 from simulation import schedule
 from simulation.workers import Worker
@@ -21,7 +21,7 @@ from simulation.workers import Worker
 if TYPE_CHECKING:
     from simulation.world import World
 
-LOST_AFTER = Patience().lost_after
+LOST_AFTER = Keepalive().lost_after
 """Seconds of silence after which the master gives a host up."""
 
 SAME_HOST = schedule.Agent(1e-5, 5e-5)

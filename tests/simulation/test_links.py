@@ -7,23 +7,23 @@ from collections.abc import Callable
 
 import pytest
 
-from fiber._transport.link import Patience
+from fiber._transport.link import Keepalive
 from fiber._transport.memory import Cable, SimulatedLoop
-from fiber._transport.session import Frame
-from fiber._transport.session_link import SessionLink
+from fiber._transport.resumable_link import ResumableLink
+from fiber._transport.stream import Frame
 
-PATIENCE = Patience()
+KEEPALIVE = Keepalive()
 SEEDS = 200
 PARTS = 4
 INSTANT = 1e-6
-TICK = PATIENCE.heartbeat / 3 + 0.05
+TICK = KEEPALIVE.heartbeat / 3 + 0.05
 """Seconds after which silence that is too long has been noticed."""
 
 
 class Judge:
     """Hears what one end of a link tells, and knows when that end truly heard of the other."""
 
-    def __init__(self, loop: SimulatedLoop, link: SessionLink) -> None:
+    def __init__(self, loop: SimulatedLoop, link: ResumableLink) -> None:
         self.frames: list[bytes] = []
         self.suspect = False
         self.lost: str | None = None
@@ -55,7 +55,7 @@ class Judge:
     def on_suspect(self) -> None:
         assert self.lost is None
         assert not self.suspect
-        assert 0 <= self.silence - PATIENCE.suspect_after + INSTANT <= TICK
+        assert 0 <= self.silence - KEEPALIVE.suspect_after + INSTANT <= TICK
         self.suspect = True
 
     def on_trusted(self) -> None:
@@ -70,7 +70,7 @@ class Judge:
         self.longest = max(self.longest, self.silence)
         if "nothing was heard" in reason:
             assert self.suspect
-            assert 0 <= self.silence - PATIENCE.lost_after + INSTANT <= TICK
+            assert 0 <= self.silence - KEEPALIVE.lost_after + INSTANT <= TICK
 
 
 def run(seed: int) -> tuple[list[Judge], list[list[bytes]]]:
@@ -111,7 +111,7 @@ def check(seed: int) -> None:
     lost = [judge.lost is not None for judge in judges]
     if any(lost):
         assert all(lost), "one end waits for an other that has given up"
-        assert max(judge.longest for judge in judges) + TICK >= PATIENCE.lost_after
+        assert max(judge.longest for judge in judges) + TICK >= KEEPALIVE.lost_after
     else:
         assert [judge.frames for judge in judges] == sent
         assert not any(judge.suspect for judge in judges)

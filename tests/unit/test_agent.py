@@ -16,7 +16,7 @@ import pytest
 
 import census
 from fiber import reduction
-from fiber._agent import zygote_link
+from fiber._agent import zygote_process
 from fiber._agent.agent import Agent
 from fiber._agent.local_child import LocalChild
 from fiber._agent.port import ChildSpec
@@ -294,7 +294,7 @@ def test_a_zygote_that_cannot_be_launched_is_an_error_of_the_start(
 
     before = len(os.listdir("/proc/self/fd"))
     with monkeypatch.context() as broken:
-        broken.setattr(zygote_link, "_launch", refuse)
+        broken.setattr(zygote_process, "launch", refuse)
         with pytest.raises(FileNotFoundError, match="no interpreter"):
             begin(own, os._exit, 0, tasks=True, fds=(os.dup(1),))
     settled(own.loop)

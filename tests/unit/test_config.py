@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fiber import agent, config
+from fiber import agent, config, inherited
 from fiber.config import Config, load
 from fiber.errors import ConfigError, FiberError
 
@@ -310,6 +310,13 @@ class TestCurrent:
         parents = pickle.loads(pickle.dumps(Config(backend="loopback", agents=4)))
         config.install(parents)
         assert config.current() == Config(backend="loopback", agents=4)
+
+    def test_a_child_has_its_parents_once_it_asks(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(inherited, "_configuration", None)
+        inherited.keep(pickle.dumps(Config(agents=7)))
+        assert config.current() == Config(agents=7)
+        config.init(agents=8)
+        assert config.current().agents == 8
 
 
 class TestInit:

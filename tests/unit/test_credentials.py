@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import datetime
 import json
 import os
@@ -60,9 +59,12 @@ def test_only_the_master_bears_the_servers_name(credentials: MasterCredentials) 
 
 def test_the_agents_half_holds_nothing_of_the_masters(credentials: MasterCredentials) -> None:
     agent = credentials.agent_half()
-    everything = agent.to_environment() + repr(vars(agent))
-    assert credentials.key not in base64.b64decode(agent.to_environment()).decode()
-    assert credentials.key not in everything
+    descriptor = agent.to_descriptor()
+    with open(descriptor) as file:
+        handed_over = file.read()
+    assert json.dumps(agent.key)[1:-1] in handed_over
+    assert json.dumps(credentials.key)[1:-1] not in handed_over
+    assert credentials.key not in repr(vars(agent))
     assert type(agent) is Credentials
 
 
@@ -102,24 +104,36 @@ def test_a_directory_without_credentials_is_named(tmp_path: Path) -> None:
         Credentials.from_directory(tmp_path)
 
 
-def test_one_value_for_the_environment(credentials: MasterCredentials) -> None:
+def test_a_descriptor_brings_them_once(credentials: MasterCredentials) -> None:
     agent = credentials.agent_half()
-    value = agent.to_environment()
-    assert value.isascii()
-    assert "\n" not in value
-    assert Credentials.from_environment(value) == agent
+    descriptor = agent.to_descriptor()
+    assert not os.get_inheritable(descriptor)
+    again = os.dup(descriptor)
+    assert Credentials.from_descriptor(descriptor) == agent
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(descriptor)
+    with pytest.raises(ConfigError, match="what is cut short"):
+        Credentials.from_descriptor(again)
 
 
-def not_credentials() -> list[str]:
-    texts = [b"secret", b"\xff", b"[]", b"1", json.dumps({"key": "secret"}).encode()]
-    return ["", "secret", "sécret", *(base64.b64encode(text).decode() for text in texts)]
+def not_credentials() -> list[bytes]:
+    return [b"", b"secret", b"s\xff", b"[]", b"1", json.dumps({"key": "secret"}).encode()]
 
 
 @pytest.mark.parametrize("value", not_credentials())
-def test_another_value_is_refused_and_not_repeated(value: str) -> None:
-    with pytest.raises(ConfigError, match=rf"\({len(value)} characters\) cannot be read") as caught:
-        Credentials.from_environment(value)
-    assert not value or value not in str(caught.value)
+def test_what_else_a_descriptor_brings_is_refused_and_not_repeated(value: bytes) -> None:
+    reader, writer = os.pipe()
+    os.write(writer, value)
+    os.close(writer)
+    with pytest.raises(ConfigError, match=rf"on descriptor {reader} cannot be read") as caught:
+        Credentials.from_descriptor(reader)
+    assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("descriptor", [-1, 10**6, 10**12])
+def test_a_descriptor_that_is_none_is_named(descriptor: int) -> None:
+    with pytest.raises(ConfigError, match=f"descriptor {descriptor} cannot be read"):
+        Credentials.from_descriptor(descriptor)
 
 
 def test_no_secret_in_a_repr(credentials: MasterCredentials) -> None:

@@ -16,11 +16,10 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._hub import access, grants, protocol
-from fiber._hub.access import Access, NoHub
-from fiber._hub.client import Line, Unreachable
+from fiber._hub import client, handles, protocol
+from fiber._hub.client import HubStream, NoHub, Unreachable
 from fiber._hub.handles import collecting_grants
-from fiber._hub.protocol import TWO, Op
+from fiber._hub.protocol import TWO, HubAddress, Op
 from fiber._wire import packet
 from fiber.connection import Connection
 from hosts import Hosts
@@ -114,11 +113,12 @@ def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:
     with hosts.at("a") as hub:
         one, other = fiber.Pipe()
         kept = pickle.dumps(one)
-        grants.begin_attempt()
+        outer = handles.begin_pickling()
         with pytest.raises(Exception, match="pickle"):
             pickle.dumps([other, threading.Lock()])
         assert len(hub.registry) == 2
-        grants.undo_attempt()
+        handles.undo_pickling()
+        handles.end_pickling(outer)
         assert len(hub.registry) == 1
         pickle.loads(kept)
 
@@ -126,7 +126,7 @@ def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:
 def test_one_object_takes_one_descriptor_however_often_it_is_shared(hosts: Hosts) -> None:
     with hosts.at("a") as hub, collecting_grants() as collected:
         queue = fiber.Queue()
-        assert hub.access  # the door takes one of its own
+        assert hub.address  # its socket takes one
         before = len(os.listdir("/proc/self/fd"))
         for _ in range(50):
             pickle.dumps(queue)
@@ -168,30 +168,30 @@ def test_everything_shared_travels(hosts: Hosts) -> None:
 
 
 def test_without_a_hub_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("_hub", "_access", "_starter"):
-        monkeypatch.setattr(access, name, None)
+    for name in ("_local_hub", "_address", "_starter"):
+        monkeypatch.setattr(client, name, None)
     _, end = fiber.Pipe()
     with pytest.raises(NoHub, match="Start a process or pool first"):
         pickle.dumps(end)
 
 
 def test_a_program_without_a_hub_makes_one(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(access, "_hub", None)
-    monkeypatch.setattr(access, "_access", None)
-    monkeypatch.setattr(access, "_starter", lambda: access.serve(hosts["a"]))
+    monkeypatch.setattr(client, "_local_hub", None)
+    monkeypatch.setattr(client, "_address", None)
+    monkeypatch.setattr(client, "_starter", lambda: client.set_local_hub(hosts["a"]))
     _, end = fiber.Pipe()
     pickle.loads(pickle.dumps(end))
 
 
-# The door
+# The socket
 
 
-def test_the_door_is_private_and_goes_with_the_hub(hosts: Hosts) -> None:
+def test_the_socket_is_private_and_goes_with_the_hub(hosts: Hosts) -> None:
     hub = hosts["a"]
     assert hub.directory is None
-    address = hub.access.address
+    address = hub.address.path
     assert hub.directory is not None
-    assert hub.access == hub.access
+    assert hub.address == hub.address
     assert stat.S_IMODE(os.stat(hub.directory).st_mode) == 0o700
     assert address.startswith(hub.directory)
     hosts.on_loop(hub.close)
@@ -206,13 +206,13 @@ def test_a_path_that_is_too_long_says_what_to_set(tmp_path: Path, hosts: Hosts) 
     deep.mkdir()
     hub = Hub(hosts.loop, "a", str(deep))
     with pytest.raises(OSError, match="FIBER_RUNTIME_DIRECTORY"):
-        _ = hub.access
+        _ = hub.address
     assert list(deep.iterdir()) == []
     hosts.on_loop(hub.close)
 
 
 def test_the_key_is_not_shown(hosts: Hosts) -> None:
-    own = hosts["a"].access
+    own = hosts["a"].address
     assert own.key.hex() not in repr(own)
     assert repr(own.key) not in repr(own)
 
@@ -244,7 +244,7 @@ def test_a_stranger_is_shown_out(hosts: Hosts, greeting: bytes) -> None:
         pickle.dumps(end)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
         stranger.settimeout(PATIENCE)
-        stranger.connect(hub.access.address)
+        stranger.connect(hub.address.path)
         stranger.send(greeting)
         try:
             packet.send(stranger, TWO.pack(Op.FETCH, 1, 1, 2))
@@ -264,25 +264,25 @@ def test_nothing_of_a_stranger_is_unpickled(hosts: Hosts, tmp_path: Path) -> Non
     hub = hosts["a"]
     mark = tmp_path / "unpickled"
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
-        stranger.connect(hub.access.address)
+        stranger.connect(hub.address.path)
         packet.send(stranger, pickle.dumps(Bomb(mark)))
         assert stranger.recv(4096)[1] == protocol.Status.GONE
     assert not mark.exists()
 
 
 def test_a_wrong_key_is_refused_with_a_reason(hosts: Hosts) -> None:
-    own = hosts["a"].access
+    own = hosts["a"].address
     with hosts.child_at("a"):
-        line = Line(Access("a", own.address, bytes(32)))
+        stream = HubStream(HubAddress("a", own.path, bytes(32)))
         with pytest.raises(Unreachable, match="another program"):
-            line.ask(Op.FETCH, 1, 2, form=TWO)
-        line.close()
+            stream.ask(Op.FETCH, 1, 2, form=TWO)
+        stream.close()
 
 
 def test_another_version_is_refused_by_name(hosts: Hosts) -> None:
-    own = hosts["a"].access
+    own = hosts["a"].address
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
-        other.connect(own.address)
+        other.connect(own.path)
         packet.send(other, protocol.HELLO.pack(Op.HELLO, 0, protocol.VERSION + 1, own.key))
         assert b"install the same fiberpool" in other.recv(4096)
 
@@ -303,8 +303,8 @@ def test_a_hub_without_descriptors_lets_callers_wait(
     hosts: Hosts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hub = hosts["a"]
-    own = hub.access
-    real, refusals = hub._door, []
+    own = hub.address
+    real, refusals = hub._listener, []
 
     class Exhausted:
         def accept(self) -> Any:
@@ -322,20 +322,20 @@ def test_a_hub_without_descriptors_lets_callers_wait(
             assert real is not None
             real.close()
 
-    monkeypatch.setattr(hub, "_door", Exhausted())
+    monkeypatch.setattr(hub, "_listener", Exhausted())
     with hosts.child_at("a"):
         _, end = fiber.Pipe()
         pickle.loads(pickle.dumps(end))
     assert len(refusals) >= 3
-    assert own == hub.access
+    assert own == hub.address
 
 
 # Children
 
 
-def in_a_child(own: Access, commands: Connection) -> None:
-    """Lends and borrows as told, in a process that reaches the hub by its door."""
-    access.install(own)
+def in_a_child(own: HubAddress, commands: Connection) -> None:
+    """Lends and borrows as told, in a process that reaches the hub by its socket."""
+    client.set_hub_address(own)
     for command in iter(commands.recv, None):
         if command == "lend":
             here, there = fiber.Pipe()
@@ -353,7 +353,7 @@ def in_a_child(own: Access, commands: Connection) -> None:
 @pytest.fixture
 def child(hosts: Hosts) -> Iterator[Connection]:
     ours, theirs = fiber.Pipe()
-    process = start(in_a_child, hosts["a"].access, theirs)
+    process = start(in_a_child, hosts["a"].address, theirs)
     theirs.close()
     yield ours
     ours.close()
@@ -395,8 +395,8 @@ def test_children_lend_to_each_other_without_the_hubs_process_in_between(
         assert borrowed.recv() == "from the child"
 
 
-def collect_and_die(own: Access, results: Connection) -> None:
-    access.install(own)
+def collect_and_die(own: HubAddress, results: Connection) -> None:
+    client.set_hub_address(own)
     _, there = fiber.Pipe()
     with collecting_grants() as collected:
         results.send_bytes(pickle.dumps(there))
@@ -408,7 +408,7 @@ def collect_and_die(own: Access, results: Connection) -> None:
 def test_what_a_dead_process_had_collected_is_released(hosts: Hosts) -> None:
     hub = hosts["a"]
     ours, theirs = fiber.Pipe()
-    process = start(collect_and_die, hub.access, theirs)
+    process = start(collect_and_die, hub.address, theirs)
     theirs.close()
     data = ours.recv_bytes()
     with hosts.at("a"):
@@ -435,8 +435,9 @@ def test_a_child_takes_back_what_it_collected(hosts: Hosts) -> None:
 def test_a_child_takes_back_what_it_could_not_pickle(hosts: Hosts) -> None:
     with hosts.child_at("a") as hub:
         _, end = fiber.Pipe()
-        grants.begin_attempt()
+        outer = handles.begin_pickling()
         with pytest.raises(Exception, match="pickle"):
             pickle.dumps([end, threading.Lock()])
-        grants.undo_attempt()
+        handles.undo_pickling()
+        handles.end_pickling(outer)
         assert wait_until(lambda: len(hub.registry) == 0, PATIENCE)

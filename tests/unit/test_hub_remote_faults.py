@@ -17,18 +17,18 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._hub import access
-from fiber._hub.access import Access
+from fiber._hub import client
 from fiber._hub.client import Unreachable
 from fiber._hub.local import LocalCounter
+from fiber._hub.protocol import HubAddress
 from fiber.connection import Connection
 from hosts import PATIENCE, Far, Hosts, Wire, background
 
 # Processes that die, links that break
 
 
-def receive_from_afar(own: Access, data: bytes, report: Connection, times: int) -> None:
-    access.install(own)
+def receive_from_afar(own: HubAddress, data: bytes, report: Connection, times: int) -> None:
+    client.set_hub_address(own)
     remote = pickle.loads(data)
     remote.poll(0)
     report.send("ready")
@@ -46,7 +46,7 @@ def lost_soul(hosts: Hosts, far: Far) -> Iterator[Callable[..., Any]]:
         with hosts.at("a"):
             data = pickle.dumps(end)
         ours, theirs = fiber.Pipe()
-        arguments = (hosts["b"].access, data, theirs, times)
+        arguments = (hosts["b"].address, data, theirs, times)
         process = fiber.Process(target=receive_from_afar, args=arguments, daemon=True)
         process.start()
         theirs.close()
@@ -117,7 +117,7 @@ def test_a_lost_link_ends_every_wait_with_its_reason(hosts: Hosts, far: Far) -> 
         background(fails, far_counter.take, None),
         background(fails, far_counter.take, PATIENCE),
     ]
-    assert wait_until(lambda: len(hosts["a"]._sessions) >= 4, PATIENCE)
+    assert wait_until(lambda: len(hosts["a"]._handlers) >= 4, PATIENCE)
     hosts.on_loop(hosts["b"].unlink, "a", "agent a was lost: no heartbeat")
     hosts.on_loop(hosts["a"].unlink, "b", "agent b was lost: no heartbeat")
     for thread in waiting:
@@ -168,7 +168,7 @@ def test_an_interrupted_receive_loses_nothing(
 ) -> None:
     here, there = pipe
     there.poll(0)
-    asked = lambda: any(session.waiting for session in hosts["a"]._sessions)  # noqa: E731
+    asked = lambda: any(session.waiting for session in hosts["a"]._handlers)  # noqa: E731
     interrupter = background(interrupt_main_thread, asked)
     with pytest.raises(Interrupted):
         there.recv()

@@ -16,7 +16,7 @@ import fiber
 from census import wait_until
 from fiber._hub.client import Unreachable
 from fiber._hub.remote import RemoteChannel
-from fiber._hub.streams import Deaf
+from fiber._hub.streams import NullHandler
 from fiber._hub.tunnel import PIECE, WINDOW, Frame, Tunnels, TunnelStream
 from fiber._wire import messages
 from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
@@ -239,7 +239,7 @@ def test_frames_for_a_tunnel_that_ended_are_ignored() -> None:
     pair.master.on_frame(TunnelClose(99))
     assert pair.down == []
     pair.master.on_frame(TunnelOpen(99, "there"))
-    assert isinstance(pair.arrived[-1][1].handler, Deaf)
+    assert isinstance(pair.arrived[-1][1].handler, NullHandler)
 
 
 # Across three hosts

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import pickle
 import signal
 import socket
+import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,10 +20,10 @@ import census
 import fiber
 from fiber import config
 from fiber._agent.port import ChildSpec
-from fiber._backends import loopback
+from fiber._backends import agent_process, loopback
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
-from fiber._hub.access import Access
+from fiber._hub.protocol import HubAddress
 from fiber._runtime import state
 from fiber._wire import messages
 from fiber.errors import LinkError, StartError
@@ -86,7 +89,7 @@ def test_nothing_secret_is_on_a_command_line_or_in_the_environment_of_children(
     shared: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
     child = start()
-    agents = [process._process.pid for process in shared._processes]
+    agents = [process.process.pid for process in shared._processes]
     for found in census.everything():
         if found.pid in agents or found.parent in agents or found.pid == child.pid:
             assert shared._listener.address not in found.command
@@ -97,6 +100,42 @@ def test_nothing_secret_is_on_a_command_line_or_in_the_environment_of_children(
         with open(f"/proc/{pid}/environ", "rb") as file:
             assert b"FIBER_AGENT_CREDENTIALS" not in file.read()
     stop(child)
+
+
+def credentials_in_reach() -> list[str]:
+    """Where this process, which runs anybody's code, finds a private key of Fiber's."""
+    found = []
+    family = [os.getpid()]
+    ancestor = census.read(os.getpid())
+    while ancestor is not None and ancestor.parent > 1:
+        family.append(ancestor.parent)
+        ancestor = census.read(ancestor.parent)
+    for pid in family:
+        for name in ("environ", "cmdline"):
+            with contextlib.suppress(OSError), open(f"/proc/{pid}/{name}", "rb") as file:
+                if b"PRIVATE KEY" in (data := file.read()) or b"FIBER_AGENT_CREDENTIALS=ey" in data:
+                    found.append(f"{name} of {pid}")
+    for fd in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            if os.readlink(f"/proc/self/fd/{fd}").startswith(("pipe:", "/memfd:credentials")):
+                os.set_blocking(int(fd), False)
+                if b"PRIVATE" in os.read(int(fd), 1 << 16):
+                    found.append(f"descriptor {fd}")
+    return found
+
+
+def tell_credentials(channel: Any) -> None:
+    channel.send(credentials_in_reach())
+
+
+def test_no_child_finds_the_credentials_of_its_agent(shared: Any) -> None:
+    ours, theirs = fiber.Pipe()
+    child = fiber.Process(target=tell_credentials, args=(theirs,))
+    child.start()
+    theirs.close()
+    assert ours.recv() == []
+    ours.close()
+    child.join(PATIENCE)
 
 
 def print_both() -> None:
@@ -127,7 +166,7 @@ def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() ->
         child = start()
         pid = child.pid
         process = backend._processes[0]
-        os.kill(process._process.pid, signal.SIGKILL)
+        os.kill(process.process.pid, signal.SIGKILL)
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL
         assert "agent loopback-0 lost" in child._popen.report.reason
@@ -141,7 +180,7 @@ def test_agents_that_die_before_they_join_are_not_started_for_ever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     dies = [sys.executable, "-c", "raise SystemExit(3)"]
-    monkeypatch.setattr(loopback, "interpreter_arguments", lambda *_: dies)
+    monkeypatch.setattr(agent_process, "interpreter_arguments", lambda *_: dies)
     with running(start_timeout=PATIENCE) as backend:
         with pytest.raises(StartError, match="its process ended with status 3"):
             start()
@@ -149,6 +188,86 @@ def test_agents_that_die_before_they_join_are_not_started_for_ever(
         with pytest.raises(StartError, match="none joined") as caught:
             start()
     assert "loopback-2: its process ended with status 3" in str(caught.value)
+
+
+class Reluctant:
+    """In place of subprocess.Popen: the system refuses so many processes."""
+
+    def __init__(self, times: int, error: int) -> None:
+        self.left = times
+        self._error = OSError(error, os.strerror(error))
+        self._popen = subprocess.Popen
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        if self.left:
+            self.left -= 1
+            raise self._error
+        return self._popen(*args, **options)
+
+
+def test_an_agent_that_cannot_be_replaced_at_once_is_replaced_later_and_that_is_said(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with running() as backend:
+        child = start()
+        reluctant = Reluctant(2, errno.EAGAIN)
+        monkeypatch.setattr(agent_process.subprocess, "Popen", reluctant)
+        os.kill(backend._processes[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        child.join(PATIENCE)
+        assert child.exitcode == -signal.SIGKILL, "its end is reported whatever comes after"
+        another = start()
+        assert reluctant.left == 0
+        stop(another)
+    said = capfd.readouterr().err
+    assert "agent loopback-1 has to wait, its process cannot be started: [Errno 11]" in said
+    assert "next attempt in 0.1 s" in said
+    assert "next attempt in 0.2 s" in said
+
+
+def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    with running() as backend:
+        stop(start())
+        goes_on, popen = threading.Event(), subprocess.Popen
+
+        def slow(*args: Any, **options: Any) -> Any:
+            assert goes_on.wait(PATIENCE)
+            return popen(*args, **options)
+
+        monkeypatch.setattr(agent_process.subprocess, "Popen", slow)
+        os.kill(backend._processes[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        assert census.wait_until(lambda: backend._processes[0].agent.host != "loopback-0", PATIENCE)
+        turned = threading.Event()
+        backend._loop.call_soon(turned.set)
+        assert turned.wait(PATIENCE)
+        goes_on.set()
+        stop(start())
+
+
+def test_an_agent_that_can_never_be_started_is_an_error_with_the_cause(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(agent_process.subprocess, "Popen", Reluctant(99, errno.ENOEXEC))
+    with running() as backend:
+        assert census.wait_until(lambda: len(backend._failures) == 3, PATIENCE)
+        with pytest.raises(StartError, match="none joined") as caught:
+            start()
+    assert "loopback-2: its process cannot be started: [Errno 8]" in str(caught.value)
+
+
+def test_while_another_agent_is_there_no_place_is_given_up(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with running(agents=2) as backend:
+        for process in backend._processes:
+            assert census.wait_until(lambda process=process: process.agent.joined, PATIENCE)
+        monkeypatch.setattr(agent_process.subprocess, "Popen", Reluctant(4, errno.ENOEXEC))
+        os.kill(backend._processes[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        assert census.wait_until(lambda: len(backend._failures) >= 3, PATIENCE)
+        child = start()  # on the other one
+        assert child._popen._port.host == "loopback-1"
+        assert census.wait_until(lambda: backend._processes[0].agent.joined, PATIENCE)
+        stop(child)
+    assert "The others go on; the next attempt is in 0.1 s" in capfd.readouterr().err
 
 
 def test_a_port_in_use_is_named_and_leaves_nothing() -> None:
@@ -188,7 +307,7 @@ class Silent:
 
     def __init__(self) -> None:
         self.sent: list[Any] = []
-        self.access = Access("local", "nowhere", b"")
+        self.access = HubAddress("local", "nowhere", b"")
 
     def link(self, *_: Any, **__: Any) -> Silent:
         return self

@@ -6,16 +6,16 @@ import random
 
 import pytest
 
-from fiber._transport.link import Patience
+from fiber._transport.link import Keepalive
 from fiber._transport.memory import Cable, SimulatedLoop
-from fiber._transport.session import Frame
-from fiber._transport.session_link import SessionLink
+from fiber._transport.resumable_link import ResumableLink
+from fiber._transport.stream import Frame
 
 
 class Notes:
     """An observer that writes down what it hears."""
 
-    def __init__(self, link: SessionLink) -> None:
+    def __init__(self, link: ResumableLink) -> None:
         self.frames: list[bytes] = []
         self.events: list[str] = []
         link.attach(self)
@@ -52,7 +52,7 @@ def run_schedule(seed: int) -> None:
     loop, rng = SimulatedLoop(), random.Random(seed)
     cable = Cable(loop, seed=seed, drop=rng.choice((0, 0.2)), delay=(0, rng.choice((0.001, 0.3))))
     notes = {link: Notes(link) for link in (cable.agent, cable.master)}
-    sent: dict[SessionLink, list[bytes]] = {cable.agent: [], cable.master: []}
+    sent: dict[ResumableLink, list[bytes]] = {cable.agent: [], cable.master: []}
     faults = [cable.break_off, cable.cut, cable.mend]
     for number in range(60):
         link = rng.choice((cable.agent, cable.master))
@@ -250,8 +250,8 @@ def test_what_is_sent_after_the_end_is_not_kept(loop: SimulatedLoop) -> None:
     assert not cable.master._outbox
 
 
-def test_patience_is_configurable(loop: SimulatedLoop) -> None:
-    cable = Cable(loop, patience=Patience(0.5, 2, 4))
+def test_keepalive_is_configurable(loop: SimulatedLoop) -> None:
+    cable = Cable(loop, keepalive=Keepalive(0.5, 2, 4))
     notes = Notes(cable.master)
     loop.run_for(20)
     assert notes.events == []

@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from multiprocessing import spawn
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ import pytest
 
 import census
 from fiber import reduction
-from fiber._agent import child, zygote, zygote_link
+from fiber._agent import child, zygote, zygote_process
 from fiber._agent.board import Board
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
@@ -35,10 +35,10 @@ class Master:
     """The agent's end of a zygote, spoken by hand."""
 
     def __init__(self, board: Board, *, preload: bool = False, heirloom: str | None = None) -> None:
-        self.sock, theirs = socketpair("a test")
+        self.process, self.sock = zygote_process.launch()
         self.sock.settimeout(PATIENCE)
-        self.process = zygote_link._launch(theirs.fileno(), board.fd, heirloom, preload=preload)
-        theirs.close()
+        setup = (zygote.SETUP, (os.getpid(),), preload, heirloom)
+        packet.send(self.sock, pickle.dumps(setup), fds=[board.fd])
 
     def start(self, number: int, **options: Any) -> None:
         """Ask for a child that runs for ever, unless ``options`` say otherwise."""
@@ -222,11 +222,11 @@ def test_a_child_whose_zygote_died_first_does_not_live_on(parent: str) -> None:
     assert _run(script, expect=0 if alive else 1) == ("alive\n" if alive else "")
 
 
-def _run(script: str, expect: int) -> str:
+def _run(script: str, expect: int, env: Mapping[str, str] = os.environ) -> str:
     path = os.pathsep.join(filter(None, sys.path))
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(script)],
-        env={**os.environ, "PYTHONPATH": path},
+        env={**env, "PYTHONPATH": path},
         stdout=subprocess.PIPE,
         text=True,
         timeout=PATIENCE,
@@ -362,3 +362,86 @@ def test_descriptors_that_nobody_took_are_closed_in_the_child(
     child._load(start)
     assert os.read(reader, 1) == b""
     os.close(reader)
+
+
+# Started before anything needs it
+
+
+def test_one_that_was_started_early_is_the_next_one(board: Board) -> None:
+    zygote_process.start_early()
+    early = zygote_process._early
+    assert early is not None
+    zygote_process.start_early()
+    assert zygote_process._early is early, "one is enough"
+    master = Master(board)
+    assert master.process is early.process
+    master.started(1)
+    master.close()
+
+
+def test_one_that_nobody_came_for_is_ended() -> None:
+    zygote_process.start_early()
+    assert zygote_process._early is not None
+    pid = zygote_process._early.process.pid
+    zygote_process.discard_early()
+    assert census.read(pid) is None
+
+
+def test_one_that_was_started_early_ends_with_the_program() -> None:
+    script = """
+        import os
+        from fiber._agent import zygote_process
+        zygote_process.start_early()
+        print(zygote_process._early.process.pid, flush=True)
+        os._exit(0)
+    """
+    pid = int(_run(script, expect=0))
+    assert census.wait_until(lambda: gone(pid), PATIENCE)
+
+
+def test_a_forked_process_leaves_it_to_its_parent() -> None:
+    script = """
+        import os
+        from fiber._agent import zygote_process
+        zygote_process.start_early()
+        forked = os.fork()
+        if forked:
+            assert os.waitpid(forked, 0)[1] == 0
+            process, sock = zygote_process.launch()
+            assert process.poll() is None, "it goes on"
+            sock.close()
+            process.wait()
+        else:
+            assert zygote_process._early is None
+    """
+    assert _run(script, expect=0) == ""
+
+
+@pytest.mark.parametrize(("backend", "zygotes"), [("local", 1), ("loopback", 0)])
+def test_the_first_pool_starts_it_before_it_imports_the_rest(backend: str, zygotes: int) -> None:
+    script = """
+        import fiber, sys
+        from fiber._agent import zygote_process
+        class Stop(BaseException): pass
+        class Importer:
+            def find_spec(self, name, path, target=None):
+                if name == "fiber.pool":
+                    raise Stop
+        sys.meta_path.insert(0, Importer())
+        try:
+            fiber.Pool(1)
+        except Stop:
+            print(int(zygote_process._early is not None))
+    """
+    environ = {**os.environ, "FIBER_BACKEND": backend}
+    assert int(_run(script, expect=0, env=environ)) == zygotes
+
+
+def test_a_worker_imports_nothing_that_it_does_not_need() -> None:
+    script = """
+        import fiber
+        heavy = {"cloudpickle", "dataclasses", "fiber.config", "fiber._runtime.state", "traceback"}
+        with fiber.Pool(1) as pool:
+            print(pool.apply(eval, (f"{heavy} & __import__('sys').modules.keys()",)))
+    """
+    assert _run(script, expect=0) == "set()\n"

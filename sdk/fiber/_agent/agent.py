@@ -11,7 +11,6 @@ signal handler could meet.
 from __future__ import annotations
 
 import itertools
-import os
 import signal
 import threading
 from typing import Any
@@ -21,9 +20,9 @@ from fiber._agent.board import Board
 from fiber._agent.local_child import LocalChild
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.zygote_link import ZygoteLink, close_all
-from fiber._hub import access
-from fiber._hub.access import Access
+from fiber._hub import client as hub_client
 from fiber._hub.hub import Hub
+from fiber._hub.protocol import HubAddress
 from fiber._transport.loop import Loop
 
 _ENDING = "this process is ending: no process can be started any more"
@@ -88,13 +87,16 @@ class Agent:
         self._zygotes.clear()
         taken.set()
 
-    def _access(self) -> Access | None:
+    def _access(self) -> HubAddress | None:
         """What our children are told of this host's hub."""
-        return self._hub.access if self._hub is not None else access.told()
+        if self._hub is None:
+            return hub_client.inherited_address()
+        return self._hub.address_or_problem
 
     def _zygote(self, *, preload: bool = True) -> ZygoteLink:
         if not self._zygotes or not preload:
-            directory = None if self._hub is None else os.path.dirname(self._hub.access.address)
+            self._access()  # makes the hub's directory, if there is to be one
+            directory = None if self._hub is None else self._hub.directory
             self._zygotes.append(
                 ZygoteLink(self, self.loop, self.board.fd, directory, preload=preload)
             )

@@ -10,17 +10,16 @@ import multiprocessing.spawn
 import os
 import pickle
 import signal
-import subprocess
 import sys
-import traceback
 from collections.abc import Iterator
 from multiprocessing import process as mp_process
 from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
 from fiber._agent.board import Board
-from fiber._hub import access
-from fiber._hub.access import Access
+from fiber._agent.zygote_process import interpreter_arguments
+from fiber._hub import client as hub_client
+from fiber._hub.protocol import HubAddress
 from fiber._transport.unix import UnixChannel
 
 _PR_SET_PDEATHSIG = 1
@@ -51,7 +50,7 @@ class Start(NamedTuple):
     """Whether its output goes to its agent, which wants it line by line."""
     open_files: tuple[int, int]
     """Its limits of descriptors, soft and hard: those of its agent's process."""
-    hub: Access | None
+    hub: HubAddress | None
     """Where it finds the hub of its host."""
     elders: tuple[int, ...]
     """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
@@ -132,6 +131,8 @@ def _load_and_run(start: Start, agent: int) -> int:
     try:
         process = _load(start)
     except BaseException:
+        import traceback  # rarely needed, and long to import
+
         traceback.print_exc()
         _report_birth_failure()
         return 1
@@ -141,7 +142,7 @@ def _load_and_run(start: Start, agent: int) -> int:
 def _load(start: Start) -> Any:
     data: dict[str, Any] = pickle.loads(start.preparation)
     if start.hub is not None:
-        access.install(start.hub)
+        hub_client.set_hub_address(start.hub)
     prepare_paths(data)
     _prepare_environment(data)
     with inheriting():
@@ -218,6 +219,8 @@ def _adopt_stdio(fds: list[int], *, captured: bool) -> None:
 
 def _report_birth_failure() -> None:
     if _task_channel is not None:
+        import traceback
+
         with contextlib.suppress(OSError):
             _task_channel.send(pickle.dumps(("birth", traceback.format_exc())))
 
@@ -236,14 +239,6 @@ def _exec(start: Start, fds: list[int], board: Board, agent: int) -> None:
         os.execv(executable, interpreter_arguments(executable, statement))
     except OSError as error:
         raise OSError(error.errno, error.strerror, executable) from None
-
-
-def interpreter_arguments(executable: str, statement: str) -> list[str]:
-    """The command line of a fresh interpreter with our flags that can import this package."""
-    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    code = f"import sys; sys.path.insert(0, {root!r}); {statement}"
-    interpreter_flags: list[str] = cast("Any", subprocess)._args_from_interpreter_flags()
-    return [executable, *interpreter_flags, "-c", code]
 
 
 def spawned(plan_fd: int) -> None:

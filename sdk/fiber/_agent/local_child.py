@@ -20,7 +20,7 @@ from fiber._agent.board import Board
 from fiber._agent.child import Start, lineage
 from fiber._agent.port import ChildObserver, ChildSpec
 from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
-from fiber._hub.access import Access
+from fiber._hub.protocol import HubAddress
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
 from fiber._transport.unix import naming_the_limit, socketpair
@@ -89,7 +89,7 @@ class LocalChild:
             self._outbox = Outbox(self._loop, self._ours)
             self._loop.register(self._ours.fileno(), self._receive)
 
-    def start(self, zygote: ZygoteLink, hub: Access | None) -> None:
+    def start(self, zygote: ZygoteLink, hub: HubAddress | None) -> None:
         """Have ``zygote`` start it; ``hub`` is what it is told of its host's hub."""
         self.zygote = zygote
         spec = self._spec

@@ -85,7 +85,9 @@ class DirectChannel(Protocol):
 
 
 class ChildPort(Protocol):
-    """What the master holds of one child.  Any thread; nothing blocks."""
+    """What the master holds of one child.  Nothing blocks; ``signal`` and ``take_back`` come from
+    anywhere, the rest from the loop's thread.
+    """
 
     name: str
     host: str

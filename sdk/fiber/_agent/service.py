@@ -14,7 +14,7 @@ from fiber._agent.port import ChildSpec, ExitReport
 from fiber._hub.hub import Hub
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
-from fiber._transport.session import Frame
+from fiber._transport.stream import Frame
 from fiber._wire import messages, packet
 
 _BACKLOG = 4 << 20

@@ -11,7 +11,6 @@ import contextlib
 import pickle
 import signal
 import time
-import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice, starmap
@@ -48,6 +47,8 @@ def run(
         except SystemExit:
             raise
         except BaseException:
+            import traceback  # rarely needed, and long to import
+
             with contextlib.suppress(OSError):  # the agent is gone
                 channel.send(pickle.dumps((work.BIRTH, traceback.format_exc())))
             raise SystemExit(1) from None

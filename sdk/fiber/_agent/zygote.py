@@ -5,7 +5,8 @@ imports once what its children need, so that forking is cheap.  As their parent 
 sends them signals (a pid that only we can reap cannot be someone else's).  It ends, and they with
 it, when its agent's process does.
 
-Packets from the agent: ``(START, child, start, descriptor count)``, ``(SIGNAL, child, signum)``,
+Packets from the agent: ``(SETUP, elders, preload, heirloom)``, first and once, with the descriptor
+of the progress board; ``(START, child, start, descriptor count)``, ``(SIGNAL, child, signum)``,
 ``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
 ``(UNFIT, child, reason)``: this zygote's imports made forking unsafe, start that child elsewhere.
@@ -20,12 +21,10 @@ import os
 import pickle
 import resource
 import select
-import shutil
 import signal
 import socket
 import threading
 import time
-import traceback
 import warnings
 from typing import Any, NoReturn
 
@@ -34,7 +33,7 @@ from fiber._agent.board import Board
 from fiber._agent.child import Start
 from fiber._wire import packet
 
-START, SIGNAL, DESCRIPTORS, QUIT = range(4)
+SETUP, START, SIGNAL, DESCRIPTORS, QUIT = range(5)
 STARTED, FAILED, EXITED, UNFIT = range(4)
 
 _HELD = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -169,6 +168,8 @@ class Zygote:
             code = child_module.run(start, fds, self._board, self._elders[0])
         except BaseException:
             # The user's own errors do not come here: these are of the system, or Fiber's.
+            import traceback  # rarely needed, and long to import
+
             traceback.print_exc()
         finally:
             os._exit(code)
@@ -237,28 +238,46 @@ def _close_all(fds: list[int]) -> None:
         os.close(fd)
 
 
-def main(
-    control: int, board: int, elders: tuple[int, ...], preload: bool, heirloom: str | None
-) -> None:
-    """Entry point of the zygote's process.
-
-    ``elders``: pids, the agent's first.  ``heirloom``: a directory to remove should they die before
-    they can do so themselves.
-    """
+def main(control: int, agent: int) -> None:
+    """Entry point of the zygote's process; ``agent`` is the pid of the one that started it."""
     # Native threads of libraries such as OpenBLAS, which handle forks, are what this warns of.
     warnings.filterwarnings("ignore", message=".*multi-threaded.*fork", category=DeprecationWarning)
-    for fd in (control, board):
-        os.set_inheritable(fd, False)
+    os.set_inheritable(control, False)
     # A program that raised its limit after it started us may send more than ours.
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    if elders[0] == 1:
+    if agent == 1:
         # In a container nobody else would reap them: the agent waits for what it started only.
         child_module.adopt_orphans()
-    watched = _watch(elders)
+    # What every child needs, while the program that started us early is busy with its own imports.
+    import fiber._agent.worker  # noqa: F401
+
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control)
+    try:
+        message = packet.receive(sock, descriptors=True)
+    except (EOFError, ConnectionError):
+        return  # nothing was ever asked of it
+    (board,), message.fds = message.fds, []
+    _, elders, preload, heirloom = packet.loads(message)
+    _serve(sock, board, elders, heirloom, preload=preload)
+
+
+def _serve(
+    sock: socket.socket,
+    board: int,
+    elders: tuple[int, ...],
+    heirloom: str | None,
+    *,
+    preload: bool,
+) -> None:
+    """``elders``: pids, the agent's first.  ``heirloom``: a directory to remove should they die
+    before they can do so themselves.
+    """
+    watched = _watch(elders)
     told_to = bool(watched) and Zygote(sock, Board(board), watched, preload=preload).run()
     if heirloom is not None and not told_to:
+        import shutil  # rarely needed: whoever waits for the first child waits for our imports
+
         shutil.rmtree(heirloom, ignore_errors=True)
 
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import pickle
 import subprocess
-import sys
 import threading
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from fiber._agent import zygote
-from fiber._agent.child import Start, interpreter_arguments, lineage
+from fiber._agent import zygote, zygote_process
+from fiber._agent.child import Start, lineage
+from fiber._agent.zygote_process import is_standard_stream
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
-from fiber._transport.unix import naming_the_limit, socketpair
+from fiber._transport.unix import naming_the_limit
 from fiber._wire import packet
 
 _QUIT_TIMEOUT = 10.0
@@ -47,17 +46,17 @@ class ZygoteLink:
         self._loop = loop
         self._gone = threading.Event()
         self._answered = False
-        self._sock, theirs = socketpair("starting the zygote")
-        try:
-            with naming_the_limit("starting the zygote"):
-                self._process = _launch(theirs.fileno(), board, heirloom, preload=preload)
-        except BaseException:
-            self._sock.close()
-            raise
-        finally:
-            theirs.close()
+        with naming_the_limit("starting the zygote"):
+            own_board = os.dup(board)  # what is sent is closed
+            try:
+                self._process, self._sock = zygote_process.launch()
+            except BaseException:
+                os.close(own_board)
+                raise
         self._sock.setblocking(False)
         self._outbox = Outbox(loop, self._sock)
+        setup = (zygote.SETUP, lineage(), preload, heirloom)
+        self._outbox.send(pickle.dumps(setup), fds=[own_board])
         loop.register(self._sock.fileno(), self._receive)
 
     def start(self, child: int, request: Start, fds: list[int]) -> None:
@@ -106,46 +105,8 @@ class ZygoteLink:
         self._observer.heard(self, answer)
 
 
-def _launch(
-    control: int, board: int, heirloom: str | None, *, preload: bool
-) -> subprocess.Popen[bytes]:
-    # A program that closed its standard streams may have their numbers under ours; the zygote and
-    # its children must not.
-    fds = [fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 3) for fd in (control, board)]
-    arguments = f"{fds[0]}, {fds[1]}, {lineage()}, {preload}, {heirloom!r}"
-    try:
-        return subprocess.Popen(
-            interpreter_arguments(
-                sys.executable, f"from fiber._agent.zygote import main; main({arguments})"
-            ),
-            pass_fds=fds,
-            stdin=subprocess.DEVNULL,
-            stdout=_null_if_closed(1),
-            stderr=_null_if_closed(2),
-            # Ctrl-C in the terminal is for the program's own group.  A session of its own would
-            # make the kernel's scheduler share the processors between program and children by half
-            # (sched_autogroup), however many children there are.
-            process_group=0,
-        )
-    finally:
-        close_all(fds)
-
-
-def _null_if_closed(fd: int) -> int | None:
-    return None if _is_standard_stream(fd) else subprocess.DEVNULL
-
-
 def dup_or_null(fd: int) -> int:
-    return os.dup(fd) if _is_standard_stream(fd) else os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
-
-
-def _is_standard_stream(fd: int) -> bool:
-    # Python makes no descriptor inheritable by itself: one that is not has taken the number of a
-    # stream that the program closed.
-    try:
-        return os.get_inheritable(fd)
-    except OSError:
-        return False
+    return os.dup(fd) if is_standard_stream(fd) else os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
 
 
 def close_all(fds: Sequence[int]) -> None:

@@ -1,35 +1,39 @@
-"""Agents as processes of their own on this machine, which dial in over nng exactly as pods do.
+"""Agents as processes of their own on this machine, which dial in exactly as pods do.
 
 The whole remote path, encryption and authentication included, without a cluster.
 """
 
 from __future__ import annotations
 
-import contextlib
+import itertools
 import os
-import subprocess
-import sys
 import threading
 
-from fiber._agent.child import interpreter_arguments
+from fiber._backends.agent_process import AgentProcess, Launcher
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._hub.hub import Hub
 from fiber._transport.credentials import make_credentials
-from fiber._transport.link import Link, Patience
+from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import StartError
 
 _ATTEMPTS = 3
-"""Agents in a row that may fail to join before nothing more is started."""
+"""Agents in a row that may fail to join, and none be there, before nothing more is started."""
+
+_PAUSE_MIN, _PAUSE_MAX = 0.1, 30.0
+"""Seconds before another one is started after those, if there are others to work with."""
 
 _QUIT_TIMEOUT = 5.0
 
 
 class LoopbackBackend:
-    """Starts its agents at once and replaces each at the moment it is lost."""
+    """Starts its agents at once and replaces each at the moment it is lost.
+
+    Only the loop's thread changes what it holds; others read it, without a lock.
+    """
 
     name = "loopback"
     same_host = False
@@ -39,66 +43,74 @@ class LoopbackBackend:
         self._hub = hub
         self._config = config
         self._output = Output()
-        self._lock = threading.Lock()
-        self._failures: list[str] = []
+        self._failures: tuple[str, ...] = ()
         self._closing = False
+        self._numbers = itertools.count()
         credentials = make_credentials("loopback")
-        self._credentials = credentials.agent_half().to_environment()
         self._listener = MasterListener(
             loop,
             f"{config.listen_host}:{config.listen_port}",
             credentials,
             on_agent=self._joined,
-            on_refused=self._refused,
-            patience=Patience(config.heartbeat_interval, config.suspect_after, config.lost_after),
+            on_refused=lambda reason: self._output.write("fiber", f"refused an agent: {reason}"),
+            keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
         )
-        self._launched = 0
-        self._processes = [self._launch() for _ in range(config.agents)]
+        self._launcher = Launcher(
+            credentials.agent_half(),
+            config.start_timeout,
+            lambda trouble: self._output.write("fiber", trouble),
+        )
+        self._processes = tuple(self._launch() for _ in range(config.agents))
 
     def place(self) -> RemoteAgent:
         """The agent with the fewest children; StartError if none can take one more."""
+        there = [process for process in self._processes if not process.agent.lost]
+        if not there:
+            reasons = "\n".join(self._failures)
+            raise StartError("the loopback agents", "none joined", reasons, _ATTEMPTS)
         limit = self._config.processes_per_agent
-        with self._lock:
-            if len(self._failures) >= _ATTEMPTS:
-                reasons = "\n".join(self._failures)
-                raise StartError("the loopback agents", "none joined", reasons, _ATTEMPTS)
-            agents = [process.agent for process in self._processes]
-        free = [agent for agent in agents if not limit or agent.children < limit]
+        free = [process for process in there if not limit or process.agent.children < limit]
         if not free:
             raise StartError(
                 "one more process",
-                f"all {len(agents)} agents run {limit} processes already (processes_per_agent); "
+                f"all {len(there)} agents run {limit} processes already (processes_per_agent); "
                 "raise FIBER_AGENTS or FIBER_PROCESSES_PER_AGENT",
             )
-        return min(free, key=lambda agent: (agent.suspect, agent.children))
+        return min(free, key=_Placed.preference).agent
 
     def close(self) -> None:
         """End the agents and wait for them."""
         self._closing = True
+        self._launcher.close()
         for process in self._processes:
             process.agent.close()
         for process in self._processes:
-            process.wait(_QUIT_TIMEOUT)
+            process.process.wait(_QUIT_TIMEOUT)
         done = threading.Event()
         self._listener.close("the master ended", then=done.set)
         done.wait(_QUIT_TIMEOUT)
         self._output.close()
 
-    def _launch(self) -> _AgentProcess:
+    def _launch(self, pause: float = 0.0) -> _Placed:
         # A name is never used again: what comes late from its last holder is not for the next.
-        name = f"loopback-{self._launched}"
-        self._launched += 1
+        name = f"loopback-{next(self._numbers)}"
         agent = RemoteAgent(name, self._hub, self._output, on_lost=self._lost)
-        return _AgentProcess(self._loop, agent, self._environment(name))
+        process = AgentProcess(self._loop, agent.lose)
+        launch = self._launcher.launch, process, name, self._environment(name)
+        if pause:
+            process.delayed = True
+            self._loop.call_later(pause, *launch)
+        else:
+            launch[0](*launch[1:])
+        return _Placed(agent, process)
 
     def _environment(self, name: str) -> dict[str, str]:
         return {
             **os.environ,
             "FIBER_AGENT_ADDRESS": self._listener.address,
-            "FIBER_AGENT_CREDENTIALS": self._credentials,
             "FIBER_AGENT_NAME": name,
             "FIBER_AGENT_PARENT": str(os.getpid()),
-            "FIBER_AGENT_INHERITS": os.path.dirname(self._hub.access.address),
+            "FIBER_AGENT_INHERITS": os.path.dirname(self._hub.address_or_problem.path),
             "FIBER_START_TIMEOUT": str(self._config.start_timeout),
         }
 
@@ -107,61 +119,46 @@ class LoopbackBackend:
     def _joined(self, link: Link) -> None:
         for process in self._processes:
             if process.agent.host == link.peer.name and not process.agent.joined:
-                self._failures.clear()
+                self._failures = ()
                 process.agent.join(link)
+                self._replace_lost()  # those that were given up: it can be done after all
                 return
         link.close(f"the master expects no agent named {link.peer.name}")
 
-    def _refused(self, reason: str) -> None:
-        self._output.write("fiber", f"refused an agent: {reason}")
-
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
-        """Replace it before its children's ends make anybody ask for new ones."""
+        """Have a place for new children before the ends of its own make anybody ask for one."""
         if self._closing:
             return
-        with self._lock:
-            if not agent.joined:
-                self._failures.append(f"{agent.host}: {reason}")
-            for index, process in enumerate(self._processes):
-                if process.agent is agent:
-                    process.kill()
-                    if len(self._failures) < _ATTEMPTS:
-                        self._processes[index] = self._launch()
+        for process in self._processes:
+            if process.agent is agent:
+                process.process.kill()
+        if not agent.joined:
+            self._failures += (f"{agent.host}: {reason}",)
+        in_a_row = len(self._failures)
+        if in_a_row < _ATTEMPTS:
+            self._replace_lost()
+        elif any(process.agent.joined and not process.agent.lost for process in self._processes):
+            pause = min(_PAUSE_MIN * 2 ** (in_a_row - _ATTEMPTS), _PAUSE_MAX)
+            self._output.write(
+                "fiber",
+                f"agent {agent.host} was lost before it joined, as {in_a_row - 1} before it: "
+                f"{reason}. The others go on; the next attempt is in {pause:g} s",
+            )
+            self._replace_lost(pause)
 
-
-class _AgentProcess:
-    """The process of one agent."""
-
-    def __init__(self, loop: Loop, agent: RemoteAgent, environment: dict[str, str]) -> None:
-        self.agent = agent
-        self._loop = loop
-        statement = "import runpy; runpy.run_module('fiber.agent', run_name='__main__')"
-        self._process = subprocess.Popen(
-            interpreter_arguments(sys.executable, statement),
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            process_group=0,
+    def _replace_lost(self, pause: float = 0.0) -> None:
+        self._processes = tuple(
+            self._launch(pause) if process.agent.lost else process for process in self._processes
         )
-        self._watched = os.pidfd_open(self._process.pid)
-        loop.register(self._watched, self._ended)
 
-    def kill(self) -> None:
-        """It is out of reach, though it may run: nothing of it is wanted any more."""
-        with contextlib.suppress(ProcessLookupError):
-            self._process.kill()
 
-    def wait(self, timeout: float) -> None:
-        """Wait for its end, by force after ``timeout`` seconds."""
-        try:
-            self._process.wait(timeout)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+class _Placed:
+    """An agent, and the process that it is."""
 
-    def _ended(self) -> None:
-        status = self._process.poll()
-        if status is None:
-            return
-        self._loop.unregister(self._watched)
-        os.close(self._watched)
-        self.agent.lose(f"its process ended with status {status}")
+    def __init__(self, agent: RemoteAgent, process: AgentProcess) -> None:
+        self.agent = agent
+        self.process = process
+
+    def preference(self) -> tuple[bool, bool, int]:
+        """Lower is better for one more child."""
+        return self.agent.suspect, self.process.delayed, self.agent.children

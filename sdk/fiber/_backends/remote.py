@@ -13,7 +13,7 @@ from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
 from fiber._hub.hub import Hub
 from fiber._transport.link import Link
-from fiber._transport.session import Frame
+from fiber._transport.stream import Frame
 from fiber._wire import messages, packet
 from fiber._wire.packet import BytesLike
 
@@ -37,12 +37,17 @@ class RemoteAgent:
         self._tunnels = hub.link(host, self.send, dialer=False)
         self._output = output
         self._on_lost = on_lost
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a finalizer may send, wherever the collector runs
         self._ids = itertools.count(1)
         self._children: dict[int, RemoteChild] = {}
         self._link: Link | None = None
         self._early: list[Frame] = []
         self._lost: str | None = None
+
+    @property
+    def lost(self) -> bool:
+        """Whether it is gone for good."""
+        return self._lost is not None
 
     @property
     def children(self) -> int:
@@ -97,11 +102,14 @@ class RemoteAgent:
             self._lost = reason
             children, self._children = self._children, {}
         self._hub.unlink(self.host, reason)
-        self._on_lost(self, reason)
-        for child in children.values():
-            child.end(
-                ExitReport(-signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host)
+        try:
+            self._on_lost(self, reason)
+        finally:  # whatever becomes of it, nobody must wait for these
+            report = ExitReport(
+                -signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host
             )
+            for child in children.values():
+                child.end(report)
 
     # What comes over the link, on the loop's thread
 
@@ -149,20 +157,18 @@ class RemoteChild:
         self.start_error: Exception | None = None
         self.observer = observer
         self._agent = agent
-        self._lock = threading.Lock()
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._gone = False
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to its task channel; False if its end is known."""
-        with self._lock:
-            if self._gone:
-                return False
-            self._delivered += 1
-            self._latest.append(seq)
-            self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
-            return True
+        if self._gone:
+            return False
+        self._delivered += 1
+        self._latest.append(seq)
+        self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
+        return True
 
     def lend(self) -> None:
         """Its channel is elsewhere."""
@@ -195,7 +201,6 @@ class RemoteChild:
 
     def end(self, report: ExitReport, crossed: int = 0) -> None:
         """It is gone; the last ``crossed`` packets met the news of that on their way."""
-        with self._lock:
-            self._gone = True
-            missed = list(self._latest)[len(self._latest) - crossed :]
+        self._gone = True
+        missed = list(self._latest)[len(self._latest) - crossed :]
         self.observer.exited(report._replace(unread=(*report.unread, *missed)))

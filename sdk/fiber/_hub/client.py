@@ -1,4 +1,8 @@
-"""A process's side of its streams to hubs: blocking, and for one thread at a time."""
+"""This process and its hub: which one that is, and streams to it and through it to others.
+
+The hub lives in the agent of its host.  The processes that the agent starts are told its address
+and key when they are born.  A stream blocks, and is for one thread at a time.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +10,23 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol
 
-from fiber._hub import access, protocol
-from fiber._hub.access import Access
-from fiber._hub.local import QuietSocket, blocking
-from fiber._hub.protocol import HEAD, ONE, TWO, Op, Status
+from fiber._hub import protocol
+from fiber._hub.local import QuietSocket, without_timeout
+from fiber._hub.protocol import HEAD, ONE, TWO, HubAddress, Op, Status
+from fiber._hub.registry import Registry
 from fiber._transport.unix import naming_the_limit, wait_readable
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
-from fiber.errors import ConnectionClosed
+from fiber.errors import ConnectionClosed, FiberError
 
 _FORMS = {form.size: form for form in (HEAD, ONE, TWO)}
+
+
+class NoHub(FiberError, OSError):
+    """A handle has to leave this process and no hub is there to keep what it stands for."""
 
 
 class Unreachable(ConnectionClosed):
@@ -27,6 +36,111 @@ class Unreachable(ConnectionClosed):
         EOFError.__init__(self, f"what is kept on host {host!r} cannot be used: {reason}")
         self.peer = f"host {host!r}"
         self.reason = reason
+
+
+# The hub of this process
+
+
+class LocalHub(Protocol):
+    """A hub that lives in this process."""
+
+    host: str
+    key: bytes
+    registry: Registry
+
+    @property
+    def address(self) -> HubAddress:
+        """Where other processes of this host find it; NoHub if they cannot."""
+
+    @property
+    def known_address(self) -> HubAddress | None:
+        """The same, if anybody was told yet."""
+
+    def dial(self) -> socket.socket:
+        """A stream to it."""
+
+    def on_loop(self) -> bool:
+        """Whether the caller is the thread that serves it."""
+
+
+def set_hub_address(address: HubAddress) -> None:
+    """This process's hub is elsewhere on its host."""
+    global _address, _local_hub
+    _address, _local_hub = address, None
+
+
+def set_local_hub(hub: LocalHub | None) -> None:
+    """This process is the hub's own; None: it is no longer."""
+    global _local_hub
+    _local_hub = hub
+
+
+def set_hub_starter(starter: Callable[[], object]) -> None:
+    """How a program that needs a hub, and was told of none, makes the runtime that has one."""
+    global _starter
+    _starter = starter
+
+
+def local_hub() -> LocalHub | None:
+    """The hub, if it lives in this process; made now if this process is to have one."""
+    if _local_hub is None and _address is None:
+        if _starter is None:
+            raise NoHub(
+                "a pipe, queue or event cannot leave this process: nothing of Fiber runs here that "
+                "could keep it for the other side. Start a process or pool first."
+            )
+        _starter()
+    return _local_hub
+
+
+def hub_address() -> HubAddress:
+    """How other processes of this host reach its hub; NoHub if they cannot."""
+    hub = local_hub()
+    if hub is not None:
+        return hub.address
+    assert _address is not None
+    if _address.problem:
+        raise NoHub(_address.problem)
+    return _address
+
+
+def host() -> str:
+    """The name of this host."""
+    hub = local_hub()
+    if hub is not None:
+        return hub.host
+    assert _address is not None
+    return _address.host
+
+
+def inherited_address() -> HubAddress | None:
+    """The hub's address, if this process was told it when it was born."""
+    return _address
+
+
+def _refuse_on_loop() -> None:
+    """RuntimeError on the thread that would have to carry the answer."""
+    if _local_hub is not None and _local_hub.on_loop():
+        raise RuntimeError(
+            "an object of another host is used in a callback on Fiber's own thread, which would "
+            "wait for itself for ever: use it on a thread of the program"
+        )
+
+
+def _after_fork() -> None:
+    """In a process forked by someone else: the hub did not come along, but can be reached."""
+    global _local_hub, _address
+    if _local_hub is not None:
+        _address, _local_hub = _local_hub.known_address, None
+
+
+_address: HubAddress | None = None
+_local_hub: LocalHub | None = None
+_starter: Callable[[], object] | None = None
+os.register_at_fork(after_in_child=_after_fork)
+
+
+# Streams
 
 
 class Reply:
@@ -47,10 +161,10 @@ class Reply:
             os.close(fd)
 
 
-class Line:
+class HubStream:
     """A stream to the hub that has ``home``'s objects.  Opening one waits for nothing."""
 
-    def __init__(self, home: Access, greeting: Iterable[bytes] = ()) -> None:
+    def __init__(self, home: HubAddress, greeting: Iterable[bytes] = ()) -> None:
         self._host = home.host
         self._number = 0
         self._unsettled: Op | None = None
@@ -75,7 +189,7 @@ class Line:
         fds: Sequence[int] = (),
     ) -> Reply:
         """Make a request and wait for its answer; NO once ``timeout`` seconds are over."""
-        access.refuse_on_loop()
+        _refuse_on_loop()
         self._unsettled = operation
         number = self._next()
         try:
@@ -160,24 +274,24 @@ class Line:
                 self.receive()
 
 
-def _dial(home: Access) -> tuple[socket.socket, Sequence[bytes]]:
+def _dial(home: HubAddress) -> tuple[socket.socket, Sequence[bytes]]:
     """A socket towards ``home``, and what to say before greeting it."""
-    if home.host == access.host():
+    if home.host == host():
         return _connect(home), []
-    hub = access.own_hub()
+    hub = local_hub()
     if hub is not None:
         return hub.dial(), [protocol.hello(hub.key), protocol.connect(home.host)]
-    own = access.current()
+    own = hub_address()
     return _connect(own), [protocol.hello(own.key), protocol.connect(home.host)]
 
 
-def _connect(to: Access) -> socket.socket:
+def _connect(to: HubAddress) -> socket.socket:
     with naming_the_limit("reaching the hub"):
-        sock = blocking(QuietSocket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+        sock = without_timeout(QuietSocket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
     try:
-        sock.connect(to.address)
+        sock.connect(to.path)
     except OSError as error:
         sock.close()
-        reason = f"nobody serves {to.address}, so its program has ended"
+        reason = f"nobody serves {to.path}, so its program has ended"
         raise Unreachable(to.host, reason) from error
     return sock

@@ -5,48 +5,30 @@
   unpickles it on the same host is handed a descriptor, on another host it gets an object of which
   every operation is a request.
 
-A handle of the second kind works once, for whoever unpickles it first; within ``collecting_grants``
-it works as often as wanted until its grants are released.
+The hub keeps the object as long as a grant for it is out, which the handle carries.  A handle works
+once, for whoever unpickles it first; one whose grant is in a ``GrantSet`` works until the set is
+released.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copyreg
-from collections.abc import Sequence
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
 from multiprocessing import context as mp_context
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from fiber._hub import access, grants
-from fiber._hub.access import Access
-from fiber._hub.client import Line, Unreachable
+from fiber._hub import client
+from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.local import LocalChannel, LocalCounter
-from fiber._hub.protocol import TWO, Kind, Op
-from fiber._hub.registry import NoSuchObject
+from fiber._hub.protocol import ONE, TWO, GrantFlags, HubAddress, ObjectKind, Op
+from fiber._hub.registry import NoSuchObject, Registry
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
-from fiber._transport.base import Channel, Counter
+from fiber._transport.base import SharedChannel, SharedCounter
 from fiber._transport.unix import UnixChannel, UnixCounter
-from fiber._wire.packet import BytesLike
-
-
-class SharedChannel(Channel, Protocol):
-    """A channel that a queue can use: it never has to wait."""
-
-    @property
-    def prompt(self) -> bool:
-        """Whether ``try_send`` is worth a try."""
-
-    def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message, waiting for room but not until it is read."""
-
-    def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
-        """Send one message if there is room for it now."""
-
-
-class SharedCounter(Counter, Protocol):
-    """A counter whose every change can be waited for."""
-
-    def changed(self, since: int, timeout: float | None) -> bool:
-        """Wait until the count is not ``since``; False when ``timeout`` is over."""
 
 
 class InheritedDescriptor(Protocol):
@@ -59,34 +41,35 @@ class InheritedDescriptor(Protocol):
 class HubHandle(NamedTuple):
     """Stands for an object that a hub keeps."""
 
-    home: Access
+    home: HubAddress
     number: int
     grant: int
 
     def here(self) -> bool:
         """Whether the hub is on this host."""
-        return self.home.host == access.host()
+        return self.home.host == client.host()
 
     def fetch(self) -> int:
         """On the hub's host: a descriptor."""
-        hub = access.own_hub()
+        hub = client.local_hub()
         if hub is not None and hub.key == self.home.key:
             try:
                 return hub.registry.fetch(self.number, self.grant)
             except NoSuchObject as error:
                 raise Unreachable(hub.host, str(error)) from None
-        line = Line(self.home)
+        stream = HubStream(self.home)
         try:
-            reply = line.ask(Op.FETCH, self.number, self.grant, form=TWO)
+            reply = stream.ask(Op.FETCH, self.number, self.grant, form=TWO)
             (fd,) = reply.fds
             return fd
         finally:
-            line.close()
+            stream.close()
 
-
-collecting_grants = grants.collecting_grants
 
 Handle: TypeAlias = InheritedDescriptor | HubHandle
+
+
+# Unpickling
 
 
 def channel(handle: Handle) -> SharedChannel:
@@ -107,29 +90,219 @@ def counter(handle: Handle) -> SharedCounter:
     return RemoteCounter(*handle)
 
 
-def lend(end: Any) -> Handle:
+# Pickling
+
+
+def handle_for(end: Any) -> Handle:
     """What to pickle in place of a channel or counter."""
+    grants = _single_use if _pickling.grants is None else _pickling.grants
     if isinstance(end, RemoteObject):
-        return HubHandle(*grants.current().for_remote(end))
+        return grants.for_remote(end)
     spawning: Any = mp_context.get_spawning_popen()
     if spawning is not None and not getattr(spawning, "other_host", False):
         handle: InheritedDescriptor = spawning.DupFd(spawning.duplicate_for_child(end.fileno()))
         return handle
-    kind = Kind.CHANNEL if isinstance(end, UnixChannel) else Kind.COUNTER
-    return HubHandle(*grants.current().for_local(kind, end.fileno()))
+    kind = ObjectKind.CHANNEL if isinstance(end, UnixChannel) else ObjectKind.COUNTER
+    return grants.for_local(kind, end.fileno())
+
+
+class GrantSet:
+    """Grants that last until they are released, the set is forgotten or this process ends.
+
+    ``reusable``: for what may be unpickled any number of times, as a task that may run again.
+    Otherwise each also ends with its first use, as what is given to a new process.
+    """
+
+    __slots__ = ("_direct", "_reusable", "_streams")
+
+    def __init__(self, *, reusable: bool = True) -> None:
+        self._reusable = reusable
+        self._direct: list[tuple[Registry, int]] = []
+        self._streams: dict[HubAddress, HubStream] = {}
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to release."""
+        return bool(self._direct or self._streams)
+
+    def for_local(self, kind: ObjectKind, fd: int) -> HubHandle:
+        """A handle for an object of this host."""
+        home = client.hub_address()
+        hub = client.local_hub()
+        if hub is not None:
+            number, grant = hub.registry.register(kind, fd, reusable=self._reusable)
+            self._direct.append((hub.registry, grant))
+            return HubHandle(home, number, grant)
+        return _register(self._stream(home), home, kind, fd, self._flags())
+
+    def for_remote(self, end: RemoteObject) -> HubHandle:
+        """A handle for an object of another host."""
+        stream = self._stream(end.home)
+        reply = stream.ask(Op.GRANT, end.number, self._flags(), form=TWO)
+        return HubHandle(end.home, *reply.values)
+
+    def release(self) -> None:
+        """Nobody unpickles the handles any more."""
+        direct, self._direct = self._direct, []
+        streams, self._streams = self._streams, {}
+        for registry, grant in direct:
+            registry.release(grant)
+        for stream in streams.values():
+            stream.close()  # a hub takes back what was granted on a stream when it ends
+
+    def __del__(self) -> None:
+        # Whoever lets go of it, or the collector, may be in the middle of anything.
+        for registry, grant in self._direct:
+            registry.release_soon(grant)
+        for stream in self._streams.values():
+            stream.close()
+
+    def _flags(self) -> GrantFlags:
+        flags = GrantFlags.ENDS_WITH_STREAM
+        return flags | GrantFlags.REUSABLE if self._reusable else flags
+
+    def _stream(self, home: HubAddress) -> HubStream:
+        if home not in self._streams:
+            self._streams[home] = HubStream(home)
+        return self._streams[home]
+
+
+class _SingleUse:
+    """Grants for whoever unpickles a handle first; they outlive this process."""
+
+    def __init__(self) -> None:
+        self.reset()
+        os.register_at_fork(after_in_child=self.reset)
+
+    def reset(self) -> None:
+        """Open new streams from here on."""
+        # Each is for whoever takes it out, which a finalizer in the middle of that may be, too.
+        self._streams: deque[tuple[HubAddress, HubStream]] = deque()
+
+    def for_local(self, kind: ObjectKind, fd: int) -> HubHandle:
+        """A handle for an object of this host."""
+        home = client.hub_address()
+        hub = client.local_hub()
+        if hub is None:
+            with self._stream(home) as stream:
+                handle = _register(stream, home, kind, fd, GrantFlags(0))
+            _pickling.undo_by(lambda: self._release(handle))
+            return handle
+        registry = hub.registry
+        number, grant = registry.register(kind, fd, reusable=False)
+        _pickling.undo_by(lambda: registry.release(grant))
+        return HubHandle(home, number, grant)
+
+    def for_remote(self, end: RemoteObject) -> HubHandle:
+        """A handle for an object of another host."""
+        with end.stream() as stream:
+            reply = stream.ask(Op.GRANT, end.number, GrantFlags(0), form=TWO)
+        handle = HubHandle(end.home, *reply.values)
+        _pickling.undo_by(lambda: _release_remote(end, handle.grant))
+        return handle
+
+    @contextlib.contextmanager
+    def _stream(self, home: HubAddress) -> Iterator[HubStream]:
+        try:
+            to, stream = self._streams.pop()
+        except IndexError:
+            to, stream = home, HubStream(home)
+        if to != home:
+            stream.close()
+            stream = HubStream(home)
+        try:
+            yield stream
+        except BaseException:
+            # Whatever it was, Ctrl-C or the hub's refusal, the next one begins anew.
+            stream.close()
+            raise
+        self._streams.append((home, stream))
+
+    def _release(self, handle: HubHandle) -> None:
+        with self._stream(handle.home) as stream:
+            stream.say(Op.RELEASE, handle.grant, form=ONE)
+
+
+def _register(
+    stream: HubStream, home: HubAddress, kind: ObjectKind, fd: int, flags: GrantFlags
+) -> HubHandle:
+    reply = stream.ask(Op.REGISTER, kind, flags, form=TWO, fds=[fd])
+    return HubHandle(home, *reply.values)
+
+
+def _release_remote(end: RemoteObject, grant: int) -> None:
+    with end.stream() as stream:
+        stream.say(Op.RELEASE, grant, form=ONE)
+
+
+class _Pickling(threading.local):
+    """What this thread is pickling: where its handles get their grants, and how to undo those."""
+
+    def __init__(self) -> None:
+        self.grants: GrantSet | None = None
+        self.undo: list[Callable[[], None]] | None = None
+
+    def undo_by(self, step: Callable[[], None]) -> None:
+        """Remember how a grant is taken back, if anybody is to ask."""
+        if self.undo is not None:
+            self.undo.append(step)
+
+
+_pickling = _Pickling()
+_single_use = _SingleUse()
+
+Outer: TypeAlias = tuple[GrantSet | None, list[Callable[[], None]] | None]
+
+
+def begin_pickling(grants: GrantSet | None = None) -> Outer:
+    """Handles pickled on this thread get their grants from ``grants``, or work once.
+
+    The result is for ``end_pickling``: this may be a signal's handler that runs in the middle of
+    another pickling.
+    """
+    outer = _pickling.grants, _pickling.undo
+    _pickling.grants, _pickling.undo = grants, []
+    return outer
+
+
+def undo_pickling() -> None:
+    """It did not work out: what was granted meanwhile for one use, nobody will ever use."""
+    undo, _pickling.undo = _pickling.undo or [], []
+    for step in undo:
+        with contextlib.suppress(OSError, Unreachable):  # the hub is gone, and all with it
+            step()
+
+
+def end_pickling(outer: Outer) -> None:
+    """Go on with what ``begin_pickling`` interrupted."""
+    _pickling.grants, _pickling.undo = outer
+
+
+@contextlib.contextmanager
+def collecting_grants(*, reusable: bool = True) -> Iterator[GrantSet]:
+    """Handles pickled on this thread within the block work until the yielded set is released.
+
+    If the block raises, it is released.  Not ``reusable``: each works once.
+    """
+    grants = GrantSet(reusable=reusable)
+    outer = begin_pickling(grants)
+    try:
+        yield grants
+    except BaseException:
+        grants.release()
+        raise
+    finally:
+        end_pickling(outer)
 
 
 def _reduce_channel(end: Any) -> tuple[Any, ...]:
-    return channel, (lend(end),)
+    return channel, (handle_for(end),)
 
 
 def _reduce_counter(end: Any) -> tuple[Any, ...]:
-    return counter, (lend(end),)
+    return counter, (handle_for(end),)
 
 
-copyreg.pickle(UnixChannel, _reduce_channel)
-copyreg.pickle(LocalChannel, _reduce_channel)
-copyreg.pickle(RemoteChannel, _reduce_channel)
-copyreg.pickle(UnixCounter, _reduce_counter)
-copyreg.pickle(LocalCounter, _reduce_counter)
-copyreg.pickle(RemoteCounter, _reduce_counter)
+for _channel in (UnixChannel, LocalChannel, RemoteChannel):
+    copyreg.pickle(_channel, _reduce_channel)
+for _counter in (UnixCounter, LocalCounter, RemoteCounter):
+    copyreg.pickle(_counter, _reduce_counter)

@@ -12,11 +12,11 @@ from typing import Protocol, TypeAlias
 
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.poller import EDGE, IN, OUT, Poller
-from fiber._hub.protocol import Kind, Status
+from fiber._hub.protocol import ObjectKind, Status
 from fiber._wire.packet import INLINE_LIMIT, Message
 
 
-class Asker(Protocol):
+class Waiter(Protocol):
     """A request that waits."""
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
@@ -33,41 +33,41 @@ class Watcher(Protocol):
 class HostedChannel:
     """One end of a channel."""
 
-    kind = Kind.CHANNEL
+    kind = ObjectKind.CHANNEL
 
     def __init__(self, poller: Poller, fd: int) -> None:
         self._poller = poller
         self._channel = LocalChannel.from_fd(fd)
-        self._senders: deque[tuple[Asker, Sequence[memoryview]]] = deque()
-        self._receivers: deque[Asker] = deque()
-        self._pollers: deque[Asker] = deque()
+        self._senders: deque[tuple[Waiter, Sequence[memoryview]]] = deque()
+        self._receivers: deque[Waiter] = deque()
+        self._pollers: deque[Waiter] = deque()
         self._watchers: set[Watcher] = set()
 
     def fileno(self) -> int:
         """Its descriptor."""
         return self._channel.fileno()
 
-    def send(self, asker: Asker, parts: Sequence[memoryview]) -> None:
+    def send(self, waiter: Waiter, parts: Sequence[memoryview]) -> None:
         """Send payload and buffers, in the order of asking."""
-        self._senders.append((asker, parts))
+        self._senders.append((waiter, parts))
         self._serve_senders()
         self._watch()
 
-    def receive(self, asker: Asker, *, wait: bool) -> None:
+    def receive(self, waiter: Waiter, *, wait: bool) -> None:
         """Answer with the next message."""
-        self._receivers.append(asker)
+        self._receivers.append(waiter)
         self._serve_receivers()
-        if not wait and asker in self._receivers:
-            self._receivers.remove(asker)
-            asker.answer(Status.NO)
+        if not wait and waiter in self._receivers:
+            self._receivers.remove(waiter)
+            waiter.answer(Status.NO)
         self._watch()
 
-    def poll(self, asker: Asker) -> None:
+    def poll(self, waiter: Waiter) -> None:
         """Answer when it is readable."""
         if self.readable():
-            asker.answer(Status.OK)
+            waiter.answer(Status.OK)
         else:
-            self._pollers.append(asker)
+            self._pollers.append(waiter)
             self._watch()
 
     def readable(self) -> bool:
@@ -82,15 +82,15 @@ class HostedChannel:
             self._watchers.add(watcher)
             self._watch()
 
-    def withdraw(self, asker: Asker) -> bool:
+    def withdraw(self, waiter: Waiter) -> bool:
         """It waits no more; False if it did not."""
         for queue in (self._receivers, self._pollers):
-            if asker in queue:
-                queue.remove(asker)
+            if waiter in queue:
+                queue.remove(waiter)
                 self._watch()
                 return True
         for entry in self._senders:
-            if entry[0] is asker:
+            if entry[0] is waiter:
                 self._senders.remove(entry)
                 self._watch()
                 return True
@@ -121,7 +121,7 @@ class HostedChannel:
 
     def _serve_senders(self) -> None:
         while self._senders:
-            asker, parts = self._senders[0]
+            waiter, parts = self._senders[0]
             try:
                 if not self._channel.try_send(parts[0], parts[1:]):
                     return
@@ -130,7 +130,7 @@ class HostedChannel:
             else:
                 status = Status.OK
             self._senders.popleft()
-            asker.answer(status)
+            waiter.answer(status)
 
     def _serve_receivers(self) -> None:
         while self._receivers:
@@ -144,12 +144,12 @@ class HostedChannel:
                 return
             self._hand_over(self._receivers.popleft(), message)
 
-    def _hand_over(self, asker: Asker, message: Message) -> None:
+    def _hand_over(self, waiter: Waiter, message: Message) -> None:
         payload, buffers = message.payload, message.buffers
         if len(payload) <= INLINE_LIMIT:
             # It may be borrowed, and the answer may have to wait.
             payload = memoryview(message.tobytes())
-        asker.answer(Status.OK, self.readable(), [payload, *buffers])
+        waiter.answer(Status.OK, self.readable(), [payload, *buffers])
 
     def _tell(self) -> None:
         if (self._pollers or self._watchers) and self.readable():
@@ -163,14 +163,14 @@ class HostedChannel:
 class HostedCounter:
     """A counter."""
 
-    kind = Kind.COUNTER
+    kind = ObjectKind.COUNTER
 
     def __init__(self, poller: Poller, fd: int) -> None:
         self._poller = poller
         self._counter = LocalCounter(fd)
-        self._takers: deque[Asker] = deque()
-        self._waiters: deque[Asker] = deque()
-        self._changes: dict[Asker, int] = {}
+        self._takers: deque[Waiter] = deque()
+        self._waiters: deque[Waiter] = deque()
+        self._changes: dict[Waiter, int] = {}
 
     def fileno(self) -> int:
         """Its descriptor."""
@@ -188,27 +188,27 @@ class HostedCounter:
         """The count."""
         return self._counter.value()
 
-    def take(self, asker: Asker) -> None:
+    def take(self, waiter: Waiter) -> None:
         """Answer when the count was lowered for it."""
-        self._takers.append(asker)
+        self._takers.append(waiter)
         self._event(IN)
 
-    def wait(self, asker: Asker) -> None:
+    def wait(self, waiter: Waiter) -> None:
         """Answer when the count is above zero."""
-        self._waiters.append(asker)
+        self._waiters.append(waiter)
         self._event(IN)
 
-    def changed(self, asker: Asker, since: int) -> None:
+    def changed(self, waiter: Waiter, since: int) -> None:
         """Answer when the count is not ``since``."""
-        self._changes[asker] = since
+        self._changes[waiter] = since
         self._event(IN)
 
-    def withdraw(self, asker: Asker) -> bool:
+    def withdraw(self, waiter: Waiter) -> bool:
         """It waits no more; False if it did not."""
-        found = self._changes.pop(asker, None) is not None
+        found = self._changes.pop(waiter, None) is not None
         for queue in (self._takers, self._waiters):
-            if asker in queue:
-                queue.remove(asker)
+            if waiter in queue:
+                queue.remove(waiter)
                 found = True
         self._watch()
         return found
@@ -231,9 +231,9 @@ class HostedCounter:
                 self._waiters.popleft().answer(Status.OK)
         if self._changes:
             value = self._counter.value()
-            for asker in [asker for asker, since in self._changes.items() if since != value]:
-                del self._changes[asker]
-                asker.answer(Status.OK)
+            for waiter in [waiter for waiter, since in self._changes.items() if since != value]:
+                del self._changes[waiter]
+                waiter.answer(Status.OK)
         while self._takers and self._counter.take(0):
             self._takers.popleft().answer(Status.OK)
         self._watch()

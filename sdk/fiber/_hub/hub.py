@@ -19,21 +19,22 @@ import threading
 import weakref
 
 from fiber._hub import protocol
-from fiber._hub.access import Access
+from fiber._hub.client import NoHub
+from fiber._hub.client_handler import ClientHandler
 from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter
-from fiber._hub.local import QuietSocket, blocking
+from fiber._hub.local import QuietSocket, without_timeout
 from fiber._hub.poller import Poller
-from fiber._hub.protocol import Kind
+from fiber._hub.protocol import HubAddress, ObjectKind
 from fiber._hub.registry import Registry
-from fiber._hub.session import Session
 from fiber._hub.streams import SocketStream, Stream
-from fiber._hub.tunnel import Send, Switch, Tunnels
+from fiber._hub.tunnel import Router, Send, Tunnels
 from fiber._transport.loop import Loop
 from fiber._transport.unix import naming_the_limit, socketpair
+from fiber.errors import TooManyOpenFiles
 
 _PEER = struct.Struct("iII")  # pid, uid, gid
 
-_RETRY = 0.1
+_ACCEPT_AGAIN = 0.1
 """Seconds until the next try when no descriptor is free to accept a stream with."""
 
 
@@ -47,27 +48,45 @@ class Hub:
         self._parent = directory
         self._poller = Poller(loop)
         self.registry = Registry(self._host_object, self._discard, loop.call_soon)
-        self._switch = Switch(host, self._accept)
-        self._sessions: set[Session] = set()
+        self._router = Router(host, self._accept)
+        self._handlers: set[ClientHandler] = set()
         self._streams: weakref.WeakSet[SocketStream] = weakref.WeakSet()
-        self._lock = threading.Lock()
-        self._door: socket.socket | None = None
-        self._access: Access | None = None
-        self.directory: str | None = None
+        # A finalizer that shares something may come while this thread holds it.
+        self._lock = threading.RLock()
+        self._listener: socket.socket | None = None
+        self._address: HubAddress | None = None
         self._closed = False
 
     @property
-    def access(self) -> Access:
-        """What other processes of this host have to be told; opens the door."""
-        with self._lock:
-            if self._access is None:
-                self._access = self._open_door()
-            return self._access
+    def address(self) -> HubAddress:
+        """Where other processes of this host find the hub; NoHub if there can be no socket."""
+        address = self.address_or_problem
+        if address.problem:
+            raise NoHub(address.problem)
+        return address
 
     @property
-    def access_if_open(self) -> Access | None:
+    def address_or_problem(self) -> HubAddress:
+        """What the processes of this host are told at birth.  The first call opens the socket.
+
+        If that fails it is not tried again: those who clean up after us know the directory, or that
+        there is none, from the first child on.
+        """
+        with self._lock:
+            if self._address is None:
+                self._open_socket()
+            assert self._address is not None
+            return self._address
+
+    @property
+    def known_address(self) -> HubAddress | None:
         """The same, if anybody was told yet."""
-        return self._access
+        return self._address
+
+    @property
+    def directory(self) -> str | None:
+        """The socket's directory, once it is there."""
+        return os.path.dirname(self._address.path) or None if self._address else None
 
     def on_loop(self) -> bool:
         """Whether the caller is the thread that serves this hub."""
@@ -77,78 +96,75 @@ class Hub:
         """A stream to this hub for its own process.  Any thread."""
         ours, theirs = socketpair("using a pipe or queue of another host")
         self._loop.call_soon(self._admit, theirs)
-        return blocking(QuietSocket(fileno=ours.detach()))
+        return without_timeout(QuietSocket(fileno=ours.detach()))
 
     def link(self, host: str | None, send: Send, *, dialer: bool) -> Tunnels:
         """The hub of ``host`` can be reached by tunnels whose frames go out by ``send``.
 
         None stands for every host that has no link of its own, as an agent's link to the master.
         """
-        return self._switch.link(host, send, dialer=dialer)
+        return self._router.link(host, send, dialer=dialer)
 
     def unlink(self, host: str | None, reason: str) -> None:
         """That link is over; whoever used it is told ``reason``."""
-        self._switch.unlink(host, reason)
+        self._router.unlink(host, reason)
 
     def connect(self, host: str, stream: Stream) -> None:
         """Lead ``stream`` to the hub of ``host``."""
-        self._switch.connect(host, stream)
+        self._router.connect(host, stream)
 
-    def ended(self, session: Session) -> None:
-        """A session is over."""
-        self._sessions.discard(session)
+    def ended(self, handler: ClientHandler) -> None:
+        """A handler is over."""
+        self._handlers.discard(handler)
 
     def close(self) -> None:
         """End all streams, let go of all objects, leave no file.  On the loop, or after its end."""
         if self._closed:
             return
         self._closed = True
-        for session in list(self._sessions):
-            session.close("the program that keeps it has ended")
+        for handler in list(self._handlers):
+            handler.close("the program that keeps it has ended")
         for stream in list(self._streams):
             stream.finish("the program has ended")
         self.registry.close()
         with self._lock:
-            if self._door is not None:
-                self._loop.unregister(self._door.fileno())
-                self._door.close()
+            if self._listener is not None:
+                self._loop.unregister(self._listener.fileno())
+                self._listener.close()
         self._poller.close()
         if self.directory is not None:
             remove_directory(self.directory)
 
-    # The door
+    # The socket
 
-    def _open_door(self) -> Access:
-        self.directory = tempfile.mkdtemp(prefix="fiber-", dir=self._parent)
-        address = os.path.join(self.directory, "hub")
+    def _open_socket(self) -> None:
         try:
-            with naming_the_limit("opening the hub"):
-                door = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-            with contextlib.ExitStack() as undo:
-                undo.callback(door.close)
-                _bind(door, address)
-                door.listen(4096)
-                undo.pop_all()
-        except BaseException:
-            remove_directory(self.directory)
-            self.directory = None
+            sock, path = _listen(self._parent)
+        except TooManyOpenFiles:
             raise
-        self._door = door
-        self._loop.register(door.fileno(), self._knocked)
-        return Access(self.host, address, self.key)
+        except OSError as error:
+            self._address = HubAddress(self.host, "", self.key, _problem(error))
+            return
+        address = HubAddress(self.host, path, self.key)
+        if self._address is not None:  # a finalizer that came meanwhile has opened one
+            sock.close()
+            remove_directory(os.path.dirname(path))
+            return
+        self._listener, self._address = sock, address
+        self._loop.register(sock.fileno(), self._accept_socket)
 
-    def _knocked(self) -> None:
-        assert self._door is not None
+    def _accept_socket(self) -> None:
+        assert self._listener is not None
         try:
-            sock, _ = self._door.accept()
+            sock, _ = self._listener.accept()
         except BlockingIOError:
             return
         except OSError as error:
             if error.errno not in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
                 raise
             # Who knocked waits; without this pause the loop would do nothing else.
-            self._loop.unregister(self._door.fileno())
-            self._loop.call_later(_RETRY, self._listen_again)
+            self._loop.unregister(self._listener.fileno())
+            self._loop.call_later(_ACCEPT_AGAIN, self._listen_again)
             return
         _, uid, _ = _PEER.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
         if uid in (os.geteuid(), 0):
@@ -157,8 +173,8 @@ class Hub:
             sock.close()
 
     def _listen_again(self) -> None:
-        if self._door is not None and self._door.fileno() >= 0:
-            self._loop.register(self._door.fileno(), self._knocked)
+        if self._listener is not None and self._listener.fileno() >= 0:
+            self._loop.register(self._listener.fileno(), self._accept_socket)
 
     def _admit(self, sock: socket.socket) -> None:
         stream = SocketStream(self._poller, sock)
@@ -166,12 +182,12 @@ class Hub:
         self._accept(stream)
 
     def _accept(self, stream: Stream) -> None:
-        self._sessions.add(Session(self, stream))
+        self._handlers.add(ClientHandler(self, stream))
 
     # The objects
 
-    def _host_object(self, kind: Kind, fd: int) -> Hosted:
-        if kind is Kind.CHANNEL:
+    def _host_object(self, kind: ObjectKind, fd: int) -> Hosted:
+        if kind is ObjectKind.CHANNEL:
             return HostedChannel(self._poller, fd)
         return HostedCounter(self._poller, fd)
 
@@ -187,14 +203,25 @@ def remove_directory(path: str) -> None:
     shutil.rmtree(path, ignore_errors=True)
 
 
-def _bind(door: socket.socket, address: str) -> None:
-    try:
-        door.bind(address)
-    except OSError as error:
-        if error.errno != errno.ENAMETOOLONG and "too long" not in str(error):
-            raise
-        raise OSError(
-            errno.ENAMETOOLONG,
-            f"the path {address!r} is too long for a unix socket: set FIBER_RUNTIME_DIRECTORY "
-            "(runtime_directory) to a directory with a short path",
-        ) from error
+def _listen(parent: str | None) -> tuple[socket.socket, str]:
+    """A socket in a directory of its own in ``parent``, or in the system's place for such."""
+    directory = tempfile.mkdtemp(prefix="fiber-", dir=parent)
+    path = os.path.join(directory, "hub")
+    with contextlib.ExitStack() as undo:
+        undo.callback(remove_directory, directory)
+        with naming_the_limit("opening the hub"):
+            sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        undo.callback(sock.close)
+        sock.bind(path)
+        sock.listen(4096)
+        undo.pop_all()
+    return sock, path
+
+
+def _problem(error: OSError) -> str:
+    return (
+        "no pipe, queue or event can be shared with another process of this host: Fiber keeps a "
+        f"socket for it in a temporary directory, and there can be none ({error}). Set "
+        "FIBER_RUNTIME_DIRECTORY (runtime_directory) to a directory that can be written to and has "
+        "a short path, and start the program again"
+    )

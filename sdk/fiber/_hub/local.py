@@ -31,7 +31,7 @@ class QuietSocket(socket.socket):
         self.close()
 
 
-class Impatient(socket.socket):
+class NonWaitingSocket(socket.socket):
     """Another's socket, whose sends never wait.
 
     The descriptor's own mode will not do: O_NONBLOCK is shared by all that hold the socket.
@@ -58,7 +58,7 @@ class Impatient(socket.socket):
         self.detach()
 
 
-def blocking(sock: _Socket) -> _Socket:
+def without_timeout(sock: _Socket) -> _Socket:
     """Free ``sock`` of the program's default timeout, which is for the user's own sockets."""
     if sock.gettimeout() is not None:
         sock.settimeout(None)
@@ -68,13 +68,13 @@ def blocking(sock: _Socket) -> _Socket:
 class LocalChannel(UnixChannel):
     """A channel that can also be asked not to wait, whoever else uses the same end."""
 
-    __slots__ = ("_impatient",)
+    __slots__ = ("_non_waiting",)
 
-    prompt = True
+    can_try_send = True
 
     def __init__(self, sock: socket.socket) -> None:
         super().__init__(sock)
-        self._impatient: Impatient | None = None
+        self._non_waiting: NonWaitingSocket | None = None
 
     @classmethod
     def pair(cls) -> tuple[LocalChannel, LocalChannel]:
@@ -85,7 +85,7 @@ class LocalChannel(UnixChannel):
     @classmethod
     def from_fd(cls, fd: int) -> LocalChannel:
         """Take over a descriptor."""
-        return cls(blocking(QuietSocket(fileno=fd)))
+        return cls(without_timeout(QuietSocket(fileno=fd)))
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room but not, as ``send``, until a bulky one is read."""
@@ -93,9 +93,9 @@ class LocalChannel(UnixChannel):
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
-        sock = self._impatient
+        sock = self._non_waiting
         if sock is None:
-            sock = self._impatient = blocking(Impatient(fileno=self._sock.fileno()))
+            sock = self._non_waiting = without_timeout(NonWaitingSocket(fileno=self._sock.fileno()))
         try:
             packet.send(sock, payload, buffers, ballast=True)
         except BlockingIOError:
@@ -111,9 +111,9 @@ class LocalChannel(UnixChannel):
 
     def close(self) -> None:
         """Close this holder's descriptor."""
-        impatient, self._impatient = self._impatient, None
-        if impatient is not None:
-            impatient.detach()  # the same descriptor
+        non_waiting, self._non_waiting = self._non_waiting, None
+        if non_waiting is not None:
+            non_waiting.detach()  # the same descriptor
         super().close()
 
     def __del__(self) -> None:

@@ -15,23 +15,38 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum, IntFlag
+from typing import NamedTuple
 
 VERSION = 1
 KEY_BYTES = 32
 
 
-class Kind(IntEnum):
+class HubAddress(NamedTuple):
+    """How to reach a hub.  The key opens everything that the hub hosts: never show it."""
+
+    host: str
+    path: str
+    """Of its unix socket; empty if it could not open one."""
+    key: bytes
+    problem: str = ""
+    """Why it could not, and what to do."""
+
+    def __repr__(self) -> str:
+        return f"HubAddress(host={self.host!r}, path={self.path!r})"
+
+
+class ObjectKind(IntEnum):
     """What an object is."""
 
     CHANNEL = 1
     COUNTER = 2
 
 
-class Terms(IntFlag):
+class GrantFlags(IntFlag):
     """How long a grant lasts."""
 
     REUSABLE = 1  # beyond its first use
-    BOUND = 2  # no longer than the stream on which it was asked for
+    ENDS_WITH_STREAM = 2  # with the one on which it was asked for
 
 
 class Op(IntEnum):
@@ -39,10 +54,10 @@ class Op(IntEnum):
 
     HELLO = 1  # version, key
     CONNECT = 2  # host
-    REGISTER = 3  # kind, terms; a descriptor beside it -> object, grant
+    REGISTER = 3  # kind, flags; a descriptor beside it -> object, grant
     FETCH = 4  # object, grant -> a descriptor beside the reply
     ATTACH = 5  # object, grant
-    GRANT = 6  # object, terms -> object, grant
+    GRANT = 6  # object, flags -> object, grant
     RELEASE = 7  # grant; silent
     CANCEL = 8  # answers the request of this number NO, if it is still waiting; otherwise silent
     SYNC = 9  # withdraws what is waiting -> nothing

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fiber._hub.hosted import Hosted
-from fiber._hub.protocol import Kind
+from fiber._hub.protocol import ObjectKind
 from fiber._transport.unix import naming_the_limit
 
 
@@ -37,19 +37,23 @@ class Entry:
 class Registry:
     """The objects of one hub.  Any thread.
 
-    ``soon`` has something done in a moment, and takes no lock for it.
+    A finalizer or signal handler that shares something may interrupt a thread that holds the lock,
+    and takes it again.  So between any two lines everything is in order, and ``register`` makes
+    sure that what it found is still there once it holds it.
+
+    ``call_soon`` has something done in a moment, and takes no lock for it.
     """
 
     def __init__(
         self,
-        host: Callable[[Kind, int], Hosted],
+        host: Callable[[ObjectKind, int], Hosted],
         discard: Callable[[Hosted], None],
-        soon: Callable[..., None],
-    ):
+        call_soon: Callable[..., None],
+    ) -> None:
         self._host = host
         self._discard = discard
-        self._soon = soon
-        self._lock = threading.Lock()
+        self._call_soon = call_soon
+        self._lock = threading.RLock()
         # Ids are unguessable only in so far as nobody without the hub's key gets to ask for one.
         self._numbers = itertools.count(1)
         self._entries: dict[int, Entry] = {}
@@ -57,22 +61,27 @@ class Registry:
         self._grants: dict[int, Entry] = {}
         self._reusable: set[int] = set()
 
-    def register(self, kind: Kind, fd: int, *, reusable: bool) -> tuple[int, int]:
+    def register(self, kind: ObjectKind, fd: int, *, reusable: bool) -> tuple[int, int]:
         """Host what ``fd`` refers to, which stays the caller's; its number and a grant."""
         identity = _identity(kind, fd)
         with self._lock:
+            grant = next(self._numbers)
             entry = self._by_identity.get(identity)
-            if entry is None:
+            if entry is None or not self._hold(entry, grant):
                 with naming_the_limit("sharing a pipe or queue with another process"):
                     hosted = self._host(kind, os.dup(fd))
-                entry = Entry(next(self._numbers), hosted, identity)
+                entry = Entry(next(self._numbers), hosted, identity, grants={grant})
                 self._entries[entry.number] = self._by_identity[identity] = entry
-            return entry.number, self._grant(entry, reusable)
+            self._note(entry, grant, reusable)
+            return entry.number, grant
 
     def grant(self, number: int, *, reusable: bool) -> int:
         """One more grant for an object."""
         with self._lock:
-            return self._grant(self._find(number), reusable)
+            entry, grant = self._find(number), next(self._numbers)
+            self._hold(entry, grant)
+            self._note(entry, grant, reusable)
+            return grant
 
     def fetch(self, number: int, grant: int) -> int:
         """A descriptor for someone on this host; uses up a plain grant."""
@@ -109,12 +118,12 @@ class Registry:
 
     def release_soon(self, grant: int) -> None:
         """The same for finalizers, which run anywhere, even where this thread holds a lock."""
-        self._soon(self.release, grant)
+        self._call_soon(self.release, grant)
 
     def close(self) -> None:
         """Let go of everything."""
         with self._lock:
-            for entry in self._entries.values():
+            for entry in list(self._entries.values()):
                 self._discard(entry.hosted)
             self._entries.clear()
             self._by_identity.clear()
@@ -133,33 +142,38 @@ class Registry:
             )
         return entry
 
-    def _grant(self, entry: Entry, reusable: bool) -> int:
-        grant = next(self._numbers)
+    def _hold(self, entry: Entry, grant: int) -> bool:
+        """Keep the object; False if its last holder has just let go of it."""
         entry.grants.add(grant)
-        self._grants[grant] = entry
+        return entry.number in self._entries
+
+    def _note(self, entry: Entry, grant: int, reusable: bool) -> None:
         if reusable:
             self._reusable.add(grant)
-        return grant
+        self._grants[grant] = entry
 
     def _use(self, entry: Entry, grant: int) -> None:
         if grant and grant not in self._reusable:
             self._end(entry, grant)
 
     def _end(self, entry: Entry, grant: int) -> None:
-        del self._grants[grant]
+        self._grants.pop(grant, None)
         self._reusable.discard(grant)
         entry.grants.discard(grant)
         self._drop_if_unused(entry)
 
     def _drop_if_unused(self, entry: Entry) -> None:
-        if not entry.attached and not entry.grants and entry.number in self._entries:
-            del self._entries[entry.number], self._by_identity[entry.identity]
+        if entry.attached or entry.grants:
+            return
+        if self._entries.pop(entry.number, None) is not None:
+            if self._by_identity.get(entry.identity) is entry:
+                del self._by_identity[entry.identity]
             self._discard(entry.hosted)
 
 
-def _identity(kind: Kind, fd: int) -> tuple[int, int]:
+def _identity(kind: ObjectKind, fd: int) -> tuple[int, int]:
     """What two descriptors of one kernel object have in common, while it exists."""
-    if kind is Kind.CHANNEL:
+    if kind is ObjectKind.CHANNEL:
         status = os.fstat(fd)
         if not stat.S_ISSOCK(status.st_mode):
             raise ValueError(f"descriptor {fd} is not a socket")

@@ -7,79 +7,80 @@ are as many streams as threads ever used the object at once.
 from __future__ import annotations
 
 import os
-import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import Any
 
-from fiber._hub.access import Access
-from fiber._hub.client import Line, Reply, Unreachable
-from fiber._hub.protocol import ONE, TWO, Op, Status
+from fiber._hub.client import HubStream, Reply, Unreachable
+from fiber._hub.protocol import ONE, TWO, HubAddress, Op, Status
 from fiber._transport.unix import wait_readable
+from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
+from fiber.errors import ConnectionClosed
 
 
 class RemoteObject:
-    """An object that lives elsewhere, and stays there as long as this is open."""
+    """An object that lives elsewhere, and stays there as long as this is open.
 
-    def __init__(self, home: Access, number: int, grant: int) -> None:
+    No lock: whatever interrupts a thread here, a finalizer or a signal's handler, may use the same
+    object.  A stream is for whoever has taken it out of the idle ones.
+    """
+
+    def __init__(self, home: HubAddress, number: int, grant: int) -> None:
         self.home = home
         self.number = number
-        self._lock = threading.Lock()
         self._pid = os.getpid()
         self._closed = False
         # Opened at once, so that the grant is used up, but without waiting: whoever unpickles this
         # may be the very thread that carries the answer.  An error shows at the first request.
-        self._idle = [self._open(grant)]
+        self._idle = deque([self._open(grant)])
 
     @contextmanager
-    def line(self) -> Iterator[Line]:
+    def stream(self) -> Iterator[HubStream]:
         """A stream to the object's hub that nobody else uses."""
-        line = self._take_line()
-        try:
-            late = line.settle()
+        with self._take(self._idle) as stream:
+            late = stream.settle()
             if late is not None:
                 self._settled(*late)
-            yield line
-        finally:
-            self._give_back(line)
+            yield stream
 
     def close(self) -> None:
         """Let go of the object."""
-        with self._lock:
-            self._closed = True
-            idle, self._idle = self._idle, []
-        for line in idle:
-            line.close()
+        self._closed = True
+        _close_all(self._idle)
 
     def __del__(self) -> None:
         if hasattr(self, "_idle"):  # otherwise its first stream could not be opened
             self.close()
 
-    def _open(self, grant: int = 0) -> Line:
-        return Line(self.home, [TWO.pack(Op.ATTACH, 0, self.number, grant)])
+    def _open(self, grant: int = 0) -> HubStream:
+        return HubStream(self.home, [TWO.pack(Op.ATTACH, 0, self.number, grant)])
 
-    def _take_line(self) -> Line:
-        with self._lock:
-            if self._closed:
-                raise OSError("handle is closed")
-            if self._pid != os.getpid():
-                self._forked()
-            if self._idle:
-                return self._idle.pop()
-        return self._open()
+    @contextmanager
+    def _take(self, idle: deque[HubStream]) -> Iterator[HubStream]:
+        self._check()
+        try:
+            stream = idle.pop()
+        except IndexError:
+            stream = self._open()
+        try:
+            yield stream
+        finally:
+            idle.append(stream)
+            if self._closed:  # in the meantime
+                _close_all(idle)
 
-    def _give_back(self, line: Line) -> None:
-        with self._lock:
-            if not self._closed:
-                self._idle.append(line)
-                return
-        line.close()
+    def _check(self) -> None:
+        if self._closed:
+            raise OSError("handle is closed")
+        if self._pid != os.getpid():
+            self._forked()
 
     def _forked(self) -> None:
         """Someone else forked us: the streams are our parent's, which keeps the object there."""
         self._pid = os.getpid()
-        self._idle = []
+        self._idle.clear()
 
     def _settled(self, operation: Op, reply: Reply) -> None:
         """A request that was given up (Ctrl-C) had been granted by then."""
@@ -88,19 +89,19 @@ class RemoteObject:
 class RemoteChannel(RemoteObject):
     """One end of a message pipe on another host; a ``SharedChannel``."""
 
-    prompt = False
+    can_try_send = False
 
-    def __init__(self, home: Access, number: int, grant: int) -> None:
+    def __init__(self, home: HubAddress, number: int, grant: int) -> None:
         self._late: deque[Reply] = deque()
-        self._watch: Line | None = None
-        self._watch_lock = threading.Lock()
+        # One; more once threads have asked for a descriptor at the same moment.
+        self._watching: deque[HubStream] = deque()
         super().__init__(home, number, grant)
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message; returns when it can be received."""
         try:
-            with self.line() as line:
-                reply = line.ask(Op.SEND, buffers=[memoryview(payload), *buffers])
+            with self.stream() as stream:
+                reply = stream.ask(Op.SEND, buffers=[memoryview(payload), *buffers])
         except Unreachable as error:
             raise BrokenPipeError(str(error)) from error
         if reply.status is Status.BROKEN:
@@ -120,15 +121,19 @@ class RemoteChannel(RemoteObject):
         assert message is not None
         return message
 
+    def recv_object(self) -> Any:
+        """The next message, unpickled."""
+        return packet.loads(self.recv())
+
     def try_recv(self) -> Message | None:
         """The next message if one is there; EOFError at the end."""
         return self._receive(Op.TRY_RECV)
 
     def _receive(self, operation: Op) -> Message | None:
-        with self.line() as line:
-            reply = self._late.popleft() if self._late else line.ask(operation)
+        with self.stream() as stream:
+            reply = self._late.popleft() if self._late else stream.ask(operation)
         if reply.status is Status.EOF:
-            raise EOFError("the other end is closed")
+            raise ConnectionClosed()
         if reply.status is Status.NO:
             return None
         (more,) = reply.values
@@ -138,8 +143,8 @@ class RemoteChannel(RemoteObject):
 
     def poll(self, timeout: float | None) -> bool:
         """Whether ``recv`` would return or raise at once."""
-        with self.line() as line:
-            return bool(self._late) or line.ask(Op.POLL, timeout=timeout).status is Status.OK
+        with self.stream() as stream:
+            return bool(self._late) or stream.ask(Op.POLL, timeout=timeout).status is Status.OK
 
     def fileno(self) -> int:
         """A descriptor that is readable if, at this moment, there is something to receive.
@@ -147,34 +152,28 @@ class RemoteChannel(RemoteObject):
         It becomes so when there is.  It may stay so for too long if another holder receives it:
         ask again for the truth.
         """
-        with self._watch_lock:
-            if self._closed:
-                raise OSError("handle is closed")
-            if self._watch is None:
-                self._watch = self._open()
-            if self._watch.ask(Op.CHECK).status is Status.OK:
-                wait_readable(self._watch.fileno(), None)
-            return self._watch.fileno()
+        with self._take(self._watching) as watching:
+            if watching.ask(Op.CHECK).status is Status.OK:
+                wait_readable(watching.fileno(), None)
+            return watching.fileno()
 
     def close(self) -> None:
         """Let go of this end."""
         super().close()
-        with self._watch_lock:
-            if self._watch is not None:
-                self._watch.close()
-                self._watch = None
+        _close_all(self._watching)
 
     def _watch_again(self) -> None:
         """The descriptor says that there is something, and there is not."""
-        with self._watch_lock:
-            if self._watch is not None:
-                while wait_readable(self._watch.fileno(), 0):
-                    self._watch.receive()
-                self._watch.say(Op.WATCH)
+        for _ in range(len(self._watching)):
+            with self._take(self._watching) as watching:
+                while wait_readable(watching.fileno(), 0):
+                    watching.receive()
+                watching.say(Op.WATCH)
+            self._watching.rotate()
 
     def _forked(self) -> None:
         super()._forked()
-        self._watch = None
+        self._watching.clear()
 
     def _settled(self, operation: Op, reply: Reply) -> None:
         if reply.parts:
@@ -186,37 +185,43 @@ class RemoteCounter(RemoteObject):
 
     def add(self, n: int = 1) -> None:
         """Raise the count; returns when it is done."""
-        with self.line() as line:
-            line.ask(Op.ADD, n, form=ONE)
+        with self.stream() as stream:
+            stream.ask(Op.ADD, n, form=ONE)
 
     def take(self, timeout: float | None) -> bool:
         """Lower the count by one once it is above zero; False when ``timeout`` is over."""
-        with self.line() as line:
-            return line.ask(Op.TAKE, timeout=timeout).status is Status.OK
+        with self.stream() as stream:
+            return stream.ask(Op.TAKE, timeout=timeout).status is Status.OK
 
     def clear(self) -> int:
         """Set the count to zero and say what it was."""
-        with self.line() as line:
-            (count,) = line.ask(Op.CLEAR).values
+        with self.stream() as stream:
+            (count,) = stream.ask(Op.CLEAR).values
         return count
 
     def value(self) -> int:
         """The count now."""
-        with self.line() as line:
-            (count,) = line.ask(Op.VALUE).values
+        with self.stream() as stream:
+            (count,) = stream.ask(Op.VALUE).values
         return count
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until the count is above zero, without lowering it."""
-        with self.line() as line:
-            return line.ask(Op.WAIT, timeout=timeout).status is Status.OK
+        with self.stream() as stream:
+            return stream.ask(Op.WAIT, timeout=timeout).status is Status.OK
 
     def changed(self, since: int, timeout: float | None) -> bool:
         """Wait until the count is not ``since``; False when ``timeout`` is over."""
-        with self.line() as line:
-            reply = line.ask(Op.CHANGED, since, form=ONE, timeout=timeout)
+        with self.stream() as stream:
+            reply = stream.ask(Op.CHANGED, since, form=ONE, timeout=timeout)
             return reply.status is Status.OK
 
     def _settled(self, operation: Op, reply: Reply) -> None:
         if operation is Op.TAKE:
             self.add(1)
+
+
+def _close_all(streams: deque[HubStream]) -> None:
+    while streams:
+        with suppress(IndexError):  # someone else has closed the last one
+            streams.pop().close()

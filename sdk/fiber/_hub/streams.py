@@ -62,7 +62,7 @@ class Stream(Protocol):
         """End it, once what was sent has left, and say why.  The handler hears nothing more."""
 
 
-class Deaf:
+class NullHandler:
     """The handler of a stream that nobody listens to any more."""
 
     def on_message(self, message: Message) -> None:
@@ -82,7 +82,7 @@ class SocketStream:
 
     def __init__(self, poller: Poller, sock: socket.socket) -> None:
         sock.setblocking(False)
-        self.handler: Handler = Deaf()
+        self.handler: Handler = NullHandler()
         self._poller = poller
         self._sock = sock
         self._waiting: deque[tuple[BytesLike, Sequence[memoryview], Sequence[int]]] = deque()
@@ -123,7 +123,7 @@ class SocketStream:
 
     def finish(self, reason: str = "") -> None:
         """End it once all is sent."""
-        self.handler = Deaf()
+        self.handler = NullHandler()
         if reason:
             self.send(protocol.gone(reason))
         self._finishing = True
@@ -209,11 +209,11 @@ class SocketStream:
         for _, _, fds in self._waiting:
             _close_all(fds)
         self._waiting.clear()
-        handler, self.handler = self.handler, Deaf()
+        handler, self.handler = self.handler, NullHandler()
         handler.on_closed(reason)
 
 
-class Splice:
+class _Forwarder:
     """Passes on what comes from one stream to another, no faster than that one takes it."""
 
     def __init__(self, source: Stream, sink: Stream) -> None:
@@ -237,7 +237,7 @@ class Splice:
 
 def splice(one: Stream, other: Stream) -> None:
     """Make one stream of two."""
-    one.handler, other.handler = Splice(one, other), Splice(other, one)
+    one.handler, other.handler = _Forwarder(one, other), _Forwarder(other, one)
 
 
 def _size(payload: BytesLike, buffers: Sequence[memoryview]) -> int:

@@ -3,7 +3,7 @@
 ::
 
     process ── unix stream ── its hub ══ link ══ master ══ link ══ another hub
-                                │ splice              │ splice         │ session
+                                │ splice              │ splice         │ handler
 
 Many tunnels share a link with everything else that travels there.  So a message goes in pieces of
 at most PIECE bytes, and a tunnel has at most WINDOW bytes under way: the receiver gives credit as
@@ -22,7 +22,7 @@ import struct
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
-from fiber._hub.streams import Deaf, Handler, Stream, splice
+from fiber._hub.streams import Handler, NullHandler, Stream, splice
 from fiber._wire import messages
 from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
 from fiber._wire.packet import BytesLike, Message
@@ -46,7 +46,7 @@ class TunnelStream:
     passes_descriptors = False
 
     def __init__(self, number: int, send: Send, forget: Callable[[int], None]) -> None:
-        self.handler: Handler = Deaf()
+        self.handler: Handler = NullHandler()
         self._number = number
         self._send_frame = send
         self._forget = forget
@@ -95,7 +95,7 @@ class TunnelStream:
 
     def finish(self, reason: str = "") -> None:
         """End it once all is sent."""
-        self.handler = Deaf()
+        self.handler = NullHandler()
         if self._closed or self._finishing is not None:
             return
         self._finishing = reason
@@ -132,7 +132,7 @@ class TunnelStream:
             self._closed = True
             self._waiting.clear()
             self._forget(self._number)
-            handler, self.handler = self.handler, Deaf()
+            handler, self.handler = self.handler, NullHandler()
             while self._early:  # sent before the end
                 handler.on_message(self._early.popleft())
             handler.on_closed(reason)
@@ -234,7 +234,7 @@ class Tunnels:
         return len(self._streams)
 
 
-class Switch:
+class Router:
     """Knows over which link each host is reached."""
 
     def __init__(self, host: str, accept: Callable[[Stream], None]) -> None:

@@ -447,7 +447,7 @@ class Executor:
         self._loop.call_soon(self._unusable, batch, error.decode().error)
 
     def _unusable(self, batch: Batch, error: BaseException) -> None:
-        """The function of a batch cannot be unpickled by its worker, which has dropped it."""
+        """A worker cannot unpickle the function of a batch, and has dropped it."""
         if self._ledger.batches.get(batch.seq) is not batch:
             return  # its worker is gone
         if batch.job is not None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from fiber import reduction
 from fiber._engine.chunks import Pace
-from fiber._hub.grants import GrantSet
+from fiber._hub.handles import GrantSet
 
 FUNCTIONS = 128
 """Functions that are recognized when they come again."""

@@ -15,11 +15,11 @@ from multiprocessing import process as mp_process
 from multiprocessing import spawn, util
 from typing import TYPE_CHECKING, Any
 
-from fiber import config, reduction
+from fiber import config, inherited, reduction
 from fiber._agent import child
 from fiber._agent.port import AgentPort, ChildObserver, ChildPort, ChildSpec, ExitReport
-from fiber._hub import access
-from fiber._hub.grants import GrantSet, collecting_grants
+from fiber._hub import client as hub_client
+from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.hub import Hub
 from fiber._runtime import methods
 from fiber._transport.loop import Loop
@@ -49,16 +49,16 @@ class Runtime:
             raise
         reduction.readers_are_remote(not self.backend.same_host)
         self.loop.start_thread("fiber-io")
-        access.serve(self.hub)
+        hub_client.set_local_hub(self.hub)
 
     def _make_hub(self) -> Hub | None:
         # One hub a host: a process that Fiber started uses the one that its agent has.
-        if access.told() is not None:
+        if hub_client.inherited_address() is not None:
             return None
         return Hub(self.loop, self.host, self.config.runtime_directory)
 
     def _close_hub(self) -> None:
-        access.serve(None)
+        hub_client.set_local_hub(None)
         if self.hub is not None:
             self.hub.close()
 
@@ -105,7 +105,7 @@ class Runtime:
         data["host"] = agent.host
         # What such a process starts itself runs on its own host.
         data["calls"] = [
-            (config.install, (replace(self.config, backend="local"),)),
+            (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (methods.inherit, (methods.chosen, methods.preload)),
         ]
         del data["start_method"]
@@ -157,6 +157,7 @@ def _modules_of(process: Any) -> list[str]:
     """What the zygote may import once for all: where class and target live, and our own modules."""
     target = getattr(process, "_target", None)
     names = {type(process).__module__, str(getattr(target, "__module__", ""))}
+    names = {name for name in names if not name.startswith("fiber._runtime.")}  # they stay here
     return sorted(names & sys.modules.keys() - {"__main__"}) + [
         name for name in _OURS if name in sys.modules
     ]
@@ -205,5 +206,5 @@ def _forget() -> None:
 
 
 os.register_at_fork(after_in_child=_forget)
-access.start_with(runtime)
+hub_client.set_hub_starter(runtime)
 config.guard(lambda: _runtime is not None)

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from fiber import reduction
 from fiber._engine.ledger import Batch, Job
-from fiber._hub.grants import GrantSet
+from fiber._hub.handles import GrantSet
 from fiber._runtime.functions import Function, name_of
 from fiber._runtime.input_stream import InputStream
 from fiber._wire import work

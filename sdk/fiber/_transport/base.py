@@ -7,7 +7,7 @@ Both have two implementations: kernel objects for holders on the host where the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from fiber._wire.packet import BytesLike, Message
 
@@ -22,7 +22,10 @@ class Channel(Protocol):
         """Send one message; BrokenPipeError when nobody can ever read it."""
 
     def recv(self) -> Message:
-        """The next message; EOFError when nobody can ever send one."""
+        """The next message; ConnectionClosed when nobody can ever send one."""
+
+    def recv_object(self) -> Any:
+        """The same, unpickled."""
 
     def try_recv(self) -> Message | None:
         """The next message if one is there."""
@@ -57,3 +60,24 @@ class Counter(Protocol):
 
     def close(self) -> None:
         """Let go of it."""
+
+
+class SharedChannel(Channel, Protocol):
+    """A channel that a queue can use: it never has to wait."""
+
+    @property
+    def can_try_send(self) -> bool:
+        """Whether ``try_send`` is worth a try."""
+
+    def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message, waiting for room but not until it is read."""
+
+    def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send one message if there is room for it now."""
+
+
+class SharedCounter(Counter, Protocol):
+    """A counter whose every change can be waited for."""
+
+    def changed(self, since: int, timeout: float | None) -> bool:
+        """Wait until the count is not ``since``; False when ``timeout`` is over."""

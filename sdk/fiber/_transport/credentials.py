@@ -1,12 +1,11 @@
 """Who may talk to whom: a certificate authority per run, one certificate for each side.
 
-nng checks the server's name in the certificate, not its address, so one certificate serves a
+An agent checks the master's name in its certificate, not its address, so one certificate serves a
 master behind any address.
 """
 
 from __future__ import annotations
 
-import base64
 import datetime
 import json
 import os
@@ -58,22 +57,32 @@ class Credentials:
                 ) from error
         return cls(**values)
 
-    def to_environment(self) -> str:
-        """One value for an environment variable."""
-        values = {name: getattr(self, name) for name in _FILES}
-        return base64.b64encode(json.dumps(values).encode()).decode()
+    def to_descriptor(self) -> int:
+        """A descriptor from which they can be read once, by whoever inherits it."""
+        values = json.dumps({name: getattr(self, name) for name in _FILES}).encode()
+        reader, writer = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        try:
+            if os.write(writer, values) < len(values):
+                raise ConfigError(f"credentials of {len(values)} bytes are too long for a pipe")
+        except BaseException:
+            os.close(reader)
+            raise
+        finally:
+            os.close(writer)
+        return reader
 
     @classmethod
-    def from_environment(cls, value: str) -> Credentials:
-        """Read what ``to_environment`` made.  The error does not repeat the value."""
+    def from_descriptor(cls, descriptor: int) -> Credentials:
+        """Read what ``to_descriptor`` wrote, and close it.  The error does not repeat anything."""
         try:
-            values = json.loads(base64.b64decode(value, validate=True))
+            with open(descriptor, "rb") as file:
+                values = json.loads(file.read())
             return cls(**{name: str(values[name]) for name in _FILES})
-        except (ValueError, KeyError, TypeError):
-            # Whatever else may stand in an environment variable.
+        except (OSError, OverflowError, ValueError, KeyError, TypeError):
+            # Whatever else a descriptor may bring.
             raise ConfigError(
-                f"the credentials in the environment ({len(value)} characters) cannot be read: "
-                "they are cut short or not Fiber's. Hand them over as the master made them."
+                f"the credentials on descriptor {descriptor} cannot be read: it is not open, or "
+                "brings what is cut short or not Fiber's. Hand them over as the master made them."
             ) from None
 
     def expires(self) -> datetime.datetime:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import random
 import secrets
+import select
 import socket
 import threading
 import time
 from collections.abc import Callable
 
-from fiber._transport import handshake
+from fiber._transport import address as addresses
+from fiber._transport import handshake, tls
 from fiber._transport.credentials import Credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
-from fiber._transport.link import Link, Patience, Poller, Timer
-from fiber._transport.nng import Pipe, Socket, SocketClosed, Unreachable, Untrusted, url_of
-from fiber._transport.session_link import SessionLink
+from fiber._transport.link import Keepalive, Link, SelectorEventLoop, Wire
+from fiber._transport.nng import Connection
+from fiber._transport.resumable_link import ResumableLink
+from fiber._transport.sealing import Secrets
 from fiber._wire.messages import ProtocolError
 from fiber.errors import AuthenticationError, FiberError, LinkError
 
@@ -27,11 +32,16 @@ _CONNECT = 1.0
 seldom, and always where a Service led when it asked first: to a pod that is gone, say."""
 
 _GREET = 15.0
-"""Seconds from there to the welcome.  A thousand agents may dial one master at the same time, each
-of which costs it milliseconds; but its host may vanish in the middle and say no more."""
+"""Seconds from there to the welcome and the end of TLS.  A thousand agents may dial one master at
+the same time, each of which costs it milliseconds; but its host may vanish in the middle and say no
+more."""
 
 _LONGER = 2
-"""How much more patient an agent is than its master."""
+"""How much longer an agent bears silence than its master."""
+
+
+class Unreachable(Exception):
+    """Nobody took the connection, or saw it through."""
 
 
 class AgentDialer:
@@ -40,12 +50,12 @@ class AgentDialer:
 
     Calls back once, on the loop's thread: ``on_link`` with the link, or ``on_failed`` with an
     AuthenticationError, VersionMismatch or LinkError.  A link that breaks later is dialled again
-    until it is lost.
+    until it is lost.  ``connect`` makes the connection, if that is not done by dialling.
     """
 
     def __init__(
         self,
-        loop: Poller,
+        loop: SelectorEventLoop,
         address: str,
         credentials: Credentials,
         identity: Identity,
@@ -53,67 +63,66 @@ class AgentDialer:
         on_link: Callable[[Link], None],
         on_failed: Callable[[FiberError | AuthenticationError], None],
         timeout: float | None = 30.0,
+        connect: Callable[[str], socket.socket] | None = None,
     ) -> None:
+        addresses.parse(address)
         self._loop = loop
         self._address = address
         self._credentials = credentials
+        self._context = tls.context_of(credentials, listens=False)
         self._identity = identity
         self._on_link = on_link
         self._on_failed = on_failed
         self._timeout = timeout
-        self._session = secrets.token_hex(16)
-        self._link: SessionLink | None = None
+        self._connect = connect or _connect
+        self._name = secrets.token_hex(16)
+        self._link: ResumableLink | None = None
         self._obstacle = "nothing was tried"
         self.lost_grace: float | None = None
         """What the master says of its loss, once there is a link."""
         self._over = threading.Event()
-        self._url = url_of(address)
-        self._socket = self._open()
+        self._lock = threading.Lock()
+        self._sock: socket.socket | None = None
+        """Where the master's answer is waited for; under the lock."""
         self._deadline = None if timeout is None else loop.call_later(timeout, self._too_late)
-        self._greeting: Timer | None = None
         self._start()
 
     def close(self) -> None:
         """Give up dialling, or drop the link without a farewell.  Calls nobody back."""
         self._loop.call_soon(self._stop)
 
-    def _open(self) -> Socket:
-        return Socket(
-            self._loop,
-            self._credentials,
-            dials=True,
-            on_message=self._message,
-            on_gone=self._gone,
-            on_pipe=self._introduce,
-        )
-
     def _start(self, *, pause: float = 0.0) -> None:
-        # A dial that does not block never reports a failure, so it gets a thread.
+        link = self._link
+        welcomed, arrived = (link.heard, link.arrived) if link else (False, 0)
+        hello = Hello(self._identity, self._name, arrived, welcomed).encode()
+        # Names are resolved and connections made by calls that block, so they get a thread.
         dial = threading.Thread(
-            target=self._dial, args=(self._socket, pause), name="fiber-dial", daemon=True
+            target=self._dial, args=(hello, pause), name="fiber-dial", daemon=True
         )
         dial.start()
 
-    def _dial(self, ours: Socket, pause: float) -> None:
+    # On the thread that dials
+
+    def _dial(self, hello: bytes, pause: float) -> None:
         began = time.monotonic()
-        while not self._pause(began, pause) and ours is self._socket:
+        while not self._pause(began, pause):
             began = time.monotonic()
             try:
-                _reach(self._address)
-                self._loop.call_soon(self._await_welcome)
-                ours.dial(self._url)
-                self._obstacle = "it took the connection and said nothing"
-                return
-            except Untrusted as error:
+                met = self._meet(hello)
+            except tls.Untrusted as error:
                 self._obstacle = str(error)
                 if self._link is None:
                     self._loop.call_soon(self._distrust)
                     return
-            except SocketClosed:
+            except ProtocolError as error:
+                self._loop.call_soon(self._no_master, error)
                 return
-            except Unreachable as error:
+            except (Unreachable, tls.HungUp) as error:
                 # Nobody there yet, or no way there yet.
                 self._obstacle = str(error)
+            else:
+                self._loop.call_soon(self._answered, *met)
+                return
             pause = min(max(2 * pause, _PAUSE_MIN), _PAUSE_MAX)
 
     def _pause(self, since: float, seconds: float) -> bool:
@@ -121,67 +130,91 @@ class AgentDialer:
         until = since + seconds * random.uniform(0.5, 1.0)
         return self._over.wait(max(until - time.monotonic(), 0.0))
 
-    def _await_welcome(self) -> None:
-        self._cancel_greeting()
-        self._greeting = self._loop.call_later(_GREET, self._hang_up)
-
-    def _hang_up(self) -> None:
-        """Drop a connection that came to nothing, in whatever state, and dial anew."""
-        if self._over.is_set():
-            return
-        self._socket.close()
+    def _meet(self, hello: bytes) -> tuple[bytes, int, Secrets]:
+        """The master's answer, and the connection without TLS."""
+        sock = self._connect(self._address)
+        exchange = tls.Exchange(sock, self._context, self._credentials.server_name)
         try:
-            self._socket = self._open()
-        except FiberError as error:
+            with self._lock:
+                self._sock = exchange.sock
+            deadline = time.monotonic() + _GREET
+            answer = self._finish(exchange, exchange.ask(hello), deadline)
+            return answer, *self._finish(exchange, exchange.end(), deadline)
+        finally:
+            with self._lock:
+                self._sock = None
+            exchange.close()
+
+    def _finish(self, exchange: tls.Exchange, steps: tls.Steps[tls._T], deadline: float) -> tls._T:
+        """Take the steps, waiting before each until it can be taken."""
+        poller = select.poll()
+        try:
+            while not self._over.is_set():
+                poller.register(exchange.sock, next(steps))
+                if not poller.poll(max(deadline - time.monotonic(), 0.0) * 1000):
+                    raise Unreachable("it took the connection and said nothing")
+        except StopIteration as finished:
+            return finished.value  # type: ignore[no-any-return]  # typeshed cannot know
+        raise Unreachable("it was given up")
+
+    # On the loop's thread
+
+    def _answered(self, answer: bytes, descriptor: int, secrets: Secrets) -> None:
+        if self._over.is_set():
+            os.close(descriptor)
+            return
+        try:
+            welcome = self._welcome_in(answer)
+        except (FiberError, AuthenticationError) as error:
+            os.close(descriptor)
             self._fail(error)
         else:
-            self._start()
+            self._welcomed(welcome, descriptor, secrets)
 
-    def _gone(self, pipe: Pipe) -> None:
-        pipe.disconnected()
-        if not self._over.is_set():
-            self._start(pause=_PAUSE_MIN)
-
-    def _introduce(self, pipe: Pipe) -> None:
-        link = self._link
-        arrived = link.arrived if link else 0
-        pipe.put(Hello(self._identity, self._session, arrived, welcomed=link is not None).encode())
-
-    def _message(self, pipe: Pipe, datagram: bytes) -> None:
-        if pipe.link is not None:
-            pipe.link.datagram(pipe, datagram)
-            return
+    def _welcome_in(self, answer: bytes) -> Welcome:
+        """What the master says, if it is a welcome."""
         try:
-            greeting = handshake.decode(datagram)
+            greeting = handshake.decode(answer)
         except ProtocolError as error:
-            self._fail(LinkError(f"what answers at {self._address} is no master: {error}"))
-            return
+            raise self._stranger(error) from error
         mismatch = handshake.mismatch(self._identity, greeting.identity)
         if mismatch is not None:
-            self._fail(mismatch)
-        elif isinstance(greeting, Welcome):
-            self._welcomed(pipe, greeting)
-        else:
-            reason = greeting.reason if isinstance(greeting, Refusal) else "it is an agent itself"
-            self._fail(LinkError(f"the master at {self._address} refused this agent: {reason}"))
+            raise mismatch
+        if isinstance(greeting, Welcome):
+            return greeting
+        reason = greeting.reason if isinstance(greeting, Refusal) else "it is an agent itself"
+        raise LinkError(f"the master at {self._address} refused this agent: {reason}")
 
-    def _welcomed(self, pipe: Pipe, welcome: Welcome) -> None:
+    def _welcomed(self, welcome: Welcome, descriptor: int, secrets: Secrets) -> None:
         link = self._link
         if link is None:
             # An agent answers at all times; user code in the master may hold the interpreter long.
             lost_after = _LONGER * welcome.lost_after
-            patience = Patience(welcome.heartbeat, welcome.suspect_after, lost_after)
-            link = SessionLink(
-                self._loop, welcome.identity, patience, on_end=lambda _: self._stop()
+            keepalive = Keepalive(welcome.heartbeat, welcome.suspect_after, lost_after)
+            link = ResumableLink(
+                self._loop, welcome.identity, keepalive, lambda _: self._stop(), dials=True
             )
-        self._cancel_greeting()
+        try:
+            connection = Connection(
+                self._loop, descriptor, secrets, on_datagram=link.datagram, on_gone=self._gone
+            )
+        except FiberError as error:
+            # No descriptors, which may pass.
+            self._obstacle = str(error)
+            self._start(pause=_PAUSE_MAX)
+            return
         self.lost_grace = welcome.lost_grace
-        pipe.link = link
-        link.connected(pipe, welcome.arrived)
+        link.connected(connection, welcome.arrived)
         if self._link is None:
             self._cancel_deadline()
             self._link = link
             self._on_link(link)
+
+    def _gone(self, wire: Wire) -> None:
+        if self._link is not None:
+            self._link.disconnected(wire)
+        if not self._over.is_set():
+            self._start(pause=_PAUSE_MIN)
 
     def _too_late(self) -> None:
         self._fail(
@@ -191,11 +224,17 @@ class AgentDialer:
             )
         )
 
+    def _no_master(self, error: ProtocolError) -> None:
+        self._fail(self._stranger(error))
+
+    def _stranger(self, error: ProtocolError) -> LinkError:
+        return LinkError(f"what answers at {self._address} is no master: {error}")
+
     def _distrust(self) -> None:
         self._fail(
             AuthenticationError(
-                f"this agent and what answers at {self._address} do not trust each other: the TLS "
-                "handshake failed. The credentials are those of another run, or expired (this "
+                f"this agent and what answers at {self._address} do not trust each other: "
+                f"{self._obstacle}. The credentials are those of another run, or expired (this "
                 f"agent's are for {self._credentials.server_name} until "
                 f"{self._credentials.expires():%Y-%m-%d %H:%M} UTC), or it is no master. Give the "
                 "agent the credentials that this master made."
@@ -214,24 +253,24 @@ class AgentDialer:
     def _stop(self) -> None:
         self._over.set()
         self._cancel_deadline()
-        self._cancel_greeting()
-        self._socket.close()
+        with self._lock, contextlib.suppress(OSError):
+            if self._sock is not None:  # wakes the thread that waits for it
+                socket.socket.shutdown(self._sock, socket.SHUT_RDWR)
+        if self._link is not None:
+            self._link.disconnect()
 
     def _cancel_deadline(self) -> None:
         if self._deadline is not None:
             self._deadline.cancel()
 
-    def _cancel_greeting(self) -> None:
-        if self._greeting is not None:
-            self._greeting.cancel()
 
-
-def _reach(address: str) -> None:
-    """Raise Unreachable, soon, if no connection can be made at this moment: nng sets no limit."""
-    host, _, port = address.rpartition(":")
+def _connect(address: str) -> socket.socket:
+    """A connection; Unreachable, soon, if none can be made at this moment."""
     try:
-        socket.create_connection((host.strip("[]"), int(port)), _CONNECT).close()
+        sock = socket.create_connection(addresses.parse(address), _CONNECT)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     except TimeoutError as error:
         raise Unreachable(f"no answer within {_CONNECT:g} s") from error
     except OSError as error:
         raise Unreachable(str(error.strerror or error).lower()) from error
+    return sock

@@ -1,15 +1,15 @@
 """Who is there: the first words on a connection, before it belongs to a link.
 
     agent                                master
-      │  Hello: identity, session,         │
+      │  Hello: identity, link,            │
       │         how much has arrived       │
-      ├───────────────────────────────────►│  versions fit, session new or known?
+      ├───────────────────────────────────►│  versions fit, link new or known?
       │◄───────────────────────────────────┤
-         Welcome: identity, how much has arrived, patience       or      Refusal: identity, reason
+         Welcome: identity, how much has arrived, keepalive      or      Refusal: identity, reason
 
-The same exchange resumes a session on a new connection.  The layout is one byte for the kind and
-JSON.  The fields of an identity stay what they are in every version, so that two sides that do not
-understand each other can still say why.
+The same exchange resumes a link on a new connection.  It takes place within TLS.  The layout is one
+byte for the kind and JSON.  The fields of an identity stay what they are in every version, so that
+two sides that do not understand each other can still say why.
 """
 
 from __future__ import annotations
@@ -47,12 +47,13 @@ class Hello(NamedTuple):
     """An agent's first words."""
 
     identity: Identity
-    session: str
-    """Names the session; random, so that a master that restarted takes it for no other."""
+    link: str
+    """Names the link; random, so that a master that restarted takes it for no other, and nobody
+    else can name it."""
     arrived: int
     """The master's datagrams that the agent has."""
     welcomed: bool
-    """Whether a master accepted this session before: then only that master can go on with it."""
+    """Whether a master has spoken on this link: then only that master can go on with it."""
 
     def encode(self) -> bytes:
         """The datagram."""
@@ -60,13 +61,13 @@ class Hello(NamedTuple):
 
 
 class Welcome(NamedTuple):
-    """The master goes on with the agent's session."""
+    """The master takes the agent's link, or goes on with it."""
 
     identity: Identity
     arrived: int
     """The agent's datagrams that the master has."""
     heartbeat: float
-    """How patient the master is: the fields of a ``Patience``."""
+    """How long the master bears silence: the fields of a ``Keepalive``."""
     suspect_after: float
     lost_after: float
     lost_grace: float | None = None
@@ -152,7 +153,7 @@ def _identity(fields: Mapping[str, Any]) -> Identity:
 def _read_hello(identity: Identity, fields: Mapping[str, Any]) -> Hello:
     if identity.protocol != PROTOCOL:  # another version may put other things here
         return Hello(identity, "", 0, False)
-    return Hello(identity, str(fields["session"]), int(fields["arrived"]), bool(fields["welcomed"]))
+    return Hello(identity, str(fields["link"]), int(fields["arrived"]), bool(fields["welcomed"]))
 
 
 def _read_welcome(identity: Identity, fields: Mapping[str, Any]) -> Welcome:

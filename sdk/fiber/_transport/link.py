@@ -2,8 +2,8 @@
 
 A link carries frames both ways, each once and in order, also across a break of the connection under
 it.  It ends when one side closes it or when nothing was heard for too long; then it stays ended.
-``session_link.SessionLink`` is the one implementation; ``listener``, ``dialer`` and ``memory`` make
-them.
+``resumable_link.ResumableLink`` is the one implementation; ``listener``, ``dialer`` and ``memory``
+make them.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 from fiber._transport.handshake import Identity
-from fiber._transport.session import HEARTBEAT, Frame, Statistics
+from fiber._transport.stream import HEARTBEAT, Frame, Statistics
 
 
-class Patience(NamedTuple):
+class Keepalive(NamedTuple):
     """How long silence is borne, in seconds."""
 
     heartbeat: float = HEARTBEAT
@@ -26,7 +26,7 @@ class Patience(NamedTuple):
     """The link ends; whatever comes later is dropped."""
 
 
-DEFAULT_PATIENCE = Patience()
+DEFAULT_KEEPALIVE = Keepalive()
 
 
 class LinkObserver(Protocol):
@@ -74,13 +74,13 @@ class Link(Protocol):
 
 
 class Wire(Protocol):
-    """What a link puts its datagrams on: one connection, which may lose them or break."""
+    """What a link puts its datagrams on: a connection, which keeps their order until it breaks."""
 
     def put(self, datagram: bytes) -> None:
-        """Send it, or lose it; never blocks for long and never raises."""
+        """Send it; never blocks and never raises."""
 
-    def doubt(self) -> None:
-        """Nothing came for a while: replace the connection if that is this side's to do."""
+    def break_off(self) -> None:
+        """End the connection, as if it had broken: whoever dials dials again."""
 
     def close(self) -> None:
         """Let go of the connection."""
@@ -93,7 +93,7 @@ class Timer(Protocol):
         """Never call it."""
 
 
-class Scheduler(Protocol):
+class EventLoop(Protocol):
     """What a link needs of the loop: its clock and its turns."""
 
     def now(self) -> float:
@@ -106,7 +106,7 @@ class Scheduler(Protocol):
         """Call it once, later."""
 
 
-class Poller(Scheduler, Protocol):
+class SelectorEventLoop(EventLoop, Protocol):
     """A loop that also watches descriptors."""
 
     def register(self, fd: int, callback: Callable[[], None]) -> None:

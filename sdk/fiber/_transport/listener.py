@@ -2,60 +2,61 @@
 
 from __future__ import annotations
 
+import os
+import socket
 from collections.abc import Callable
 
-from fiber._transport import handshake
+from fiber._transport import handshake, tls
+from fiber._transport.acceptor import Acceptor, Newcomer
 from fiber._transport.credentials import Credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
-from fiber._transport.link import DEFAULT_PATIENCE, Link, Patience, Poller
-from fiber._transport.nng import Pipe, Socket
-from fiber._transport.session_link import SessionLink
+from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, Link, SelectorEventLoop
+from fiber._transport.nng import Connection
+from fiber._transport.resumable_link import ResumableLink
+from fiber._transport.sealing import Secrets
 from fiber._wire.messages import ProtocolError
-
-_HANG_UP_AFTER = 1.0
-"""Seconds for a refusal to arrive before its pipe is closed."""
+from fiber.errors import FiberError
 
 
 class MasterListener:
-    """The master's end of all its links: one socket that agents dial.
+    """The master's end of all its links: one address that agents dial.
 
     ``address`` is ``host:port``; port 0 takes a free one, and ``address`` then says which.  The
     callbacks run on the loop's thread: ``on_agent`` must attach an observer to the new link,
-    ``on_refused`` hears why someone who had the right credentials was turned away.  ``lost_grace``
-    is told to the agents: for so many seconds they wait for another master if this one is lost.
+    ``on_refused`` hears who was turned away and why.  ``lost_grace`` is told to the agents: for so
+    many seconds they wait for another master if this one is lost.
     """
 
     def __init__(
         self,
-        loop: Poller,
+        loop: SelectorEventLoop,
         address: str,
         credentials: Credentials,
         *,
         on_agent: Callable[[Link], None],
         on_refused: Callable[[str], None],
-        patience: Patience = DEFAULT_PATIENCE,
+        keepalive: Keepalive = DEFAULT_KEEPALIVE,
         lost_grace: float | None = None,
     ) -> None:
         self._loop = loop
         self._on_agent = on_agent
         self._on_refused = on_refused
-        self._patience = patience
+        self._keepalive = keepalive
         self._lost_grace = lost_grace
         self._identity = Identity.of_this_process("the master")
-        self._links: dict[str, SessionLink] = {}
+        self._links: dict[str, ResumableLink] = {}
         self._closing: list[Callable[[], None]] | None = None
-        self._socket = Socket(
-            loop,
-            credentials,
-            dials=False,
-            on_message=self._message,
-            on_gone=Pipe.disconnected,
+        self._acceptor = Acceptor(
+            address,
+            tls.context_of(credentials, listens=True),
+            on_hello=lambda newcomer, words: loop.call_soon(self._greet, newcomer, words),
+            on_refused=lambda reason: loop.call_soon(on_refused, reason),
         )
-        try:
-            self.address = self._socket.listen(address)
-        except BaseException:
-            self._socket.close()
-            raise
+        self.address = self._acceptor.address
+
+    def take(self, sock: socket.socket, origin: str) -> None:
+        """Serve a connection to an agent that came by another way than ``address``."""
+        self._acceptor.take(sock, origin)
 
     def close(
         self,
@@ -64,9 +65,9 @@ class MasterListener:
         linger: float = 1.0,
         then: Callable[[], None] | None = None,
     ) -> None:
-        """Close every link as ``Link.close`` does, then the socket, then call ``then``.
+        """Close every link as ``Link.close`` does, then the door, then call ``then``.
 
-        Who dials meanwhile is refused: nng cannot stop listening without breaking its pipes.
+        Who comes meanwhile is refused.
         """
         self._loop.call_soon(self._close, reason, linger, then)
 
@@ -80,31 +81,26 @@ class MasterListener:
 
     def _finish_closing(self) -> None:
         if not self._links and self._closing is not None:
-            self._socket.close()
+            self._acceptor.close()
             finished, self._closing = self._closing, []
             for then in finished:
                 then()
 
-    def _message(self, pipe: Pipe, datagram: bytes) -> None:
-        if pipe.link is not None:
-            pipe.link.datagram(pipe, datagram)
-        elif not pipe.refused:
-            self._greet(pipe, datagram)
-
-    def _greet(self, pipe: Pipe, datagram: bytes) -> None:
+    def _greet(self, newcomer: Newcomer, words: bytes) -> None:
+        """Somebody with the right credentials has said its first words."""
         try:
-            hello = handshake.decode(datagram)
+            hello = handshake.decode(words)
         except ProtocolError as error:
-            self._refuse(pipe, f"someone connected who is no agent of Fiber: {error}")
+            self._refuse(newcomer, f"someone connected who is no agent of Fiber: {error}")
             return
         if not isinstance(hello, Hello):
-            self._refuse(pipe, f"{hello.identity.name!r} connected and is no agent")
+            self._refuse(newcomer, f"{hello.identity.name!r} connected and is no agent")
             return
         reason = self._objection(hello)
         if reason:
-            self._refuse(pipe, reason)
+            self._refuse(newcomer, reason)
         else:
-            self._welcome(pipe, hello)
+            self._welcome(newcomer, hello)
 
     def _objection(self, hello: Hello) -> str:
         error = handshake.mismatch(self._identity, hello.identity)
@@ -112,37 +108,59 @@ class MasterListener:
             return str(error)
         if self._closing is not None:
             return "this master is ending"
-        if hello.welcomed and hello.session not in self._links:
+        if hello.welcomed and hello.link not in self._links:
             return (
-                f"the session of {hello.identity.name!r} is not known here: this master began "
+                f"the link of {hello.identity.name!r} is not known here: this master began "
                 "after it, or had given that agent up as lost"
             )
         return ""
 
-    def _refuse(self, pipe: Pipe, reason: str) -> None:
-        pipe.refused = True
-        pipe.put(Refusal(self._identity, reason).encode())
-        self._loop.call_later(_HANG_UP_AFTER, pipe.close)
-        self._on_refused(reason)
+    def _refuse(self, newcomer: Newcomer, reason: str) -> None:
+        newcomer.turn_away(Refusal(self._identity, reason).encode())
+        self._on_refused(f"{reason} ({newcomer.origin})")
 
-    def _welcome(self, pipe: Pipe, hello: Hello) -> None:
-        link = self._links.get(hello.session)
+    def _welcome(self, newcomer: Newcomer, hello: Hello) -> None:
+        link = self._links.get(hello.link)
+        if link is not None:
+            # What its last connection might still bring is not to arrive: the agent is told now how
+            # much has.
+            link.disconnect()
+        arrived = link.arrived if link else 0
+        welcome = Welcome(self._identity, arrived, *self._keepalive, self._lost_grace)
+        newcomer.welcome(
+            welcome.encode(),
+            lambda descriptor, secrets: self._loop.call_soon(
+                self._connect, hello, arrived, descriptor, secrets
+            ),
+        )
+
+    def _connect(self, hello: Hello, arrived: int, descriptor: int, secrets: Secrets) -> None:
+        """Go on without TLS."""
+        link = self._links.get(hello.link)
+        if self._closing is not None or (link.arrived if link else 0) != arrived:
+            os.close(descriptor)  # this master ends, or the agent has come by another connection
+            return
         new = link is None
         if link is None:
-            link = SessionLink(
-                self._loop,
-                hello.identity,
-                self._patience,
-                on_end=lambda _: self._forget(hello.session),
+            link = ResumableLink(
+                self._loop, hello.identity, self._keepalive, lambda _: self._forget(hello.link)
             )
-            self._links[hello.session] = link
-        pipe.link = link
-        welcome = Welcome(self._identity, link.arrived, *self._patience, self._lost_grace)
-        pipe.put(welcome.encode())
-        link.connected(pipe, hello.arrived)
+        try:
+            connection = Connection(
+                self._loop,
+                descriptor,
+                secrets,
+                on_datagram=link.datagram,
+                on_gone=link.disconnected,
+            )
+        except FiberError as error:
+            self._on_refused(f"{hello.identity.name!r} cannot be served: {error}")
+            return
+        self._links[hello.link] = link
+        link.connected(connection, hello.arrived)
         if new:
             self._on_agent(link)
 
-    def _forget(self, session: str) -> None:
-        self._links.pop(session, None)
+    def _forget(self, link: str) -> None:
+        self._links.pop(link, None)
         self._finish_closing()

@@ -13,11 +13,8 @@ from collections.abc import Callable
 from typing import Any
 
 from fiber._transport.handshake import Identity
-from fiber._transport.link import DEFAULT_PATIENCE, Patience
-from fiber._transport.session_link import SessionLink
-
-_NNG_HOLDS = 3
-"""Messages that wait to be sent; a further one is dropped, as nng does."""
+from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive
+from fiber._transport.resumable_link import ResumableLink
 
 
 class SimulatedTimer:
@@ -34,11 +31,11 @@ class SimulatedTimer:
 
 
 class SimulatedLoop:
-    """A loop whose time passes only in ``run_for`` and ``run_until``; a ``Scheduler``."""
+    """A loop whose time passes only in ``run_for`` and ``run_until``; an ``EventLoop``."""
 
     def __init__(self) -> None:
         self._now = 0.0
-        self._ready: deque[Callable[[], None]] = deque()
+        self._ready: deque[Callable[[], object]] = deque()
         self._timers: list[tuple[float, int, SimulatedTimer]] = []
         self._sequence = itertools.count()
 
@@ -46,11 +43,9 @@ class SimulatedLoop:
         """Simulated seconds since the beginning."""
         return self._now
 
-    def call_soon(self, callback: Callable[..., None], *args: Any) -> None:
+    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
         """Call it in the next turn."""
         self._ready.append(lambda: callback(*args))
-
-    interrupt = call_soon
 
     def call_later(
         self, seconds: float, callback: Callable[..., None], *args: Any
@@ -99,7 +94,7 @@ class Cable:
         delay: tuple[float, float] = (0.0001, 0.001),
         drop: float = 0.0,
         redial_after: float = 0.1,
-        patience: Patience = DEFAULT_PATIENCE,
+        keepalive: Keepalive = DEFAULT_KEEPALIVE,
     ) -> None:
         self.delay = delay
         self.drop = drop
@@ -108,10 +103,12 @@ class Cable:
         self.is_cut = False
         self._redial_after = redial_after
         self._wires: tuple[MemoryWire, ...] = ()
-        self._ended: set[SessionLink] = set()
+        self._ended: set[ResumableLink] = set()
         self.agent, self.master = (
-            SessionLink(loop, Identity.of_this_process(peer), patience, self._ended.add)
-            for peer in ("the master", "agent")
+            ResumableLink(
+                loop, Identity.of_this_process(peer), keepalive, self._ended.add, dials=dials
+            )
+            for peer, dials in (("the master", True), ("agent", False))
         )
         self._connect()
 
@@ -149,33 +146,28 @@ class Cable:
 class MemoryWire:
     """One end of one connection; a ``Wire``."""
 
-    def __init__(self, cable: Cable, link: SessionLink) -> None:
+    def __init__(self, cable: Cable, link: ResumableLink) -> None:
         self.other: MemoryWire | None = None
         self._cable = cable
         self._link = link
-        self._waiting = 0
         self._free_at = 0.0
 
     def put(self, datagram: bytes) -> None:
         """Send it, or lose it."""
         cable = self._cable
         lost = cable.is_cut or cable.random.random() < cable.drop
-        if lost or self._waiting == _NNG_HOLDS or self.other is None:
+        if lost or self.other is None:
             return
-        self._waiting += 1
         # Never before what was sent earlier.
         self._free_at = max(self._free_at, cable.loop.now() + cable.random.uniform(*cable.delay))
         cable.loop.call_later(self._free_at - cable.loop.now(), self._arrive, self.other, datagram)
 
-    def doubt(self) -> None:
-        """Only the agent dials."""
-        if self._link is self._cable.agent:
-            self._cable.break_off()
-
-    def close(self) -> None:
-        """Hang up."""
+    def break_off(self) -> None:
+        """Break the connection, of which both sides hear."""
         if self.other is not None:
             self._cable.break_off()
+
+    close = break_off
 
     def disconnect(self) -> None:
         """The connection broke."""
@@ -183,6 +175,5 @@ class MemoryWire:
         self._link.disconnected(self)
 
     def _arrive(self, other: MemoryWire, datagram: bytes) -> None:
-        self._waiting -= 1
         if self.other is other:
             other._link.datagram(other, datagram)

@@ -49,13 +49,33 @@ def _block(sock: socket.socket) -> None:
         sock.settimeout(None)
 
 
+# How a receiver looks for an answer before it sleeps (decision 15)
+
+_LOOK = 50e-6
+"""Seconds that it looks: more than it takes to wake a processor on which the other end sleeps."""
+
+_SOON = 15e-6
+"""Seconds in which the answer has to come, so that looking for the next one is worth it."""
+
+_TRIES = 8
+"""Answers in a row that may come later than that, while the other end wakes up."""
+
+_SLEEPS = 255
+"""Answers for which it sleeps at once after looking was not worth it."""
+
+_last_asked = 0
+"""The id of the channel on which this process sent last."""
+
+
 class UnixChannel:
     """A ``SOCK_SEQPACKET`` socket whose messages are packets."""
 
-    __slots__ = ("_sock",)
+    __slots__ = ("_sleeps", "_sock", "_tries")
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
+        self._tries = _TRIES
+        self._sleeps = 0
 
     @classmethod
     def pair(cls) -> tuple[UnixChannel, UnixChannel]:
@@ -77,14 +97,39 @@ class UnixChannel:
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room; a bulky one until it is read."""
+        global _last_asked
+        _last_asked = id(self)
         if packet.send(self._sock, payload, buffers, ballast=True):
             poller = select.poll()
             poller.register(self._sock, select.POLLOUT)
             poller.poll()
 
     def recv(self) -> Message:
-        """The next message, EOFError at the end."""
+        """The next message, ConnectionClosed at the end."""
         return packet.receive(self._sock)
+
+    def recv_object(self) -> Any:
+        """The next message, unpickled; ConnectionClosed at the end."""
+        if _last_asked == id(self):
+            if self._sleeps:
+                self._sleeps -= 1
+            elif (message := self._look()) is not None:
+                return packet.loads(message)
+        return packet.receive_object(self._sock)
+
+    def _look(self) -> Message | None:
+        """The answer, if it comes soon."""
+        begin = time.perf_counter()
+        while (message := self.try_recv()) is None:
+            if time.perf_counter() - begin > _LOOK:
+                self._tries = 0
+                break
+        else:
+            soon = time.perf_counter() - begin < _SOON
+            self._tries = _TRIES if soon else self._tries - 1
+        if not self._tries:
+            self._tries, self._sleeps = _TRIES, _SLEEPS
+        return message
 
     def try_recv(self) -> Message | None:
         """The next message if one is there."""

@@ -8,9 +8,10 @@ is forgotten when its turn comes.
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
-import threading
+from collections import deque
 from collections.abc import Iterable
 
 RETAINED_LIMIT = 1 << 25
@@ -53,28 +54,34 @@ class Block:
 
 
 class Arena:
-    """The blocks of this process.  Thread-safe; a forked child starts with none."""
+    """The blocks of this process.  Any thread; a forked child starts with none.
+
+    No lock, which a finalizer that sends something large could meet: a block is for whoever has
+    taken it out.
+    """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._blocks: list[Block] = []
+        self._blocks: deque[Block] = deque()
         os.register_at_fork(after_in_child=self._forget)
 
     def _forget(self) -> None:
         # Parent and child would both believe that a free block is theirs alone.
-        self._lock = threading.Lock()
-        blocks, self._blocks = self._blocks, []
+        blocks, self._blocks = self._blocks, deque()
         for block in blocks:
             block.close()
 
     def claim(self, size: int) -> Block:
         """A block with room for ``size`` bytes, marked busy.  Give it back with ``settle``."""
         capacity = -(-size // _GRAIN) * _GRAIN
-        with self._lock:
-            for index, block in enumerate(self._blocks):
-                if block.flag[0] == _FREE and size <= block.capacity <= 4 * capacity:
-                    block.flag[0] = _BUSY
-                    return self._blocks.pop(index)
+        for _ in range(len(self._blocks)):
+            try:
+                block = self._blocks.popleft()
+            except IndexError:
+                break
+            if block.flag[0] == _FREE and size <= block.capacity <= 4 * capacity:
+                block.flag[0] = _BUSY
+                return block
+            self._blocks.append(block)
         return Block(capacity)
 
     def settle(self, block: Block, *, sent: bool) -> None:
@@ -84,15 +91,16 @@ class Arena:
         if block.capacity > RETAINED_LIMIT:
             block.close()
             return
-        with self._lock:
-            self._blocks.append(block)
-            while self._too_much():
-                self._blocks.pop(0).close()
+        self._blocks.append(block)
+        while self._too_much():
+            with contextlib.suppress(IndexError):  # others have taken them all
+                self._blocks.popleft().close()
 
     def _too_much(self) -> bool:
-        if len(self._blocks) > RETAINED_BLOCKS:
+        blocks = tuple(self._blocks)  # in one piece, whoever changes it meanwhile
+        if len(blocks) > RETAINED_BLOCKS:
             return True
-        return sum(block.capacity for block in self._blocks) > RETAINED_LIMIT
+        return sum(block.capacity for block in blocks) > RETAINED_LIMIT
 
 
 def fill(block: Block, parts: Iterable[memoryview], offsets: Iterable[int]) -> None:

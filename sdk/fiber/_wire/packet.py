@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, release
-from fiber.errors import TooManyOpenFiles
+from fiber.errors import ConnectionClosed, TooManyOpenFiles
 
 BytesLike: TypeAlias = bytes | bytearray | memoryview
 
@@ -232,8 +232,24 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
     return offsets, end
 
 
+def receive_object(sock: socket.socket) -> Any:
+    """``loads(receive(sock))``, without a Message between them where the packet is a small one."""
+    free = _buffers.free
+    buffer = free.pop() if free else bytearray(_RECEIVE)
+    ours = True
+    try:
+        size, ancillary, flags, _ = _recvmsg(sock, buffer, _ANCILLARY_ONE, _CLOEXEC)
+        if size and not buffer[0]:
+            return pickle.loads(memoryview(buffer)[1:size])
+        ours = False
+    finally:
+        if ours:
+            free.append(buffer)
+    return loads(_receive_parts(memoryview(buffer), buffer, size, ancillary, flags))
+
+
 def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True) -> Message:
-    """Receive one packet; EOFError when no one can ever send again.
+    """Receive one packet; ConnectionClosed when no one can ever send again.
 
     Without ``wait``, or on a non-blocking socket, BlockingIOError says that there is none.
     ``descriptors`` makes room for those that the sender attached; without it only the memfd of a
@@ -278,7 +294,7 @@ def _receive_parts(
     lent = Message(view[:0], [], fds, buffer)
     try:
         if not size:
-            raise EOFError("the other end is closed")
+            raise ConnectionClosed()
         if flags & socket.MSG_CTRUNC:
             # Descriptors were attached and this process had no room for them.
             raise TooManyOpenFiles("receiving a descriptor")

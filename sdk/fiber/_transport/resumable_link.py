@@ -1,4 +1,4 @@
-"""The one implementation of a link: a session, the loop that drives it, the wire of the moment.
+"""The one implementation of a link: a stream, the loop that drives it, the wire of the moment.
 
 Who touches what: ``send``, ``close`` and ``attach`` come from any thread and only leave a note for
 the loop; everything else happens on the loop's thread.  The transport under it (``listener``,
@@ -13,8 +13,8 @@ from collections import deque
 from collections.abc import Callable
 
 from fiber._transport.handshake import Identity
-from fiber._transport.link import LinkObserver, Patience, Scheduler, Timer, Wire
-from fiber._transport.session import Frame, Session, Statistics
+from fiber._transport.link import EventLoop, Keepalive, LinkObserver, Timer, Wire
+from fiber._transport.stream import Frame, Gap, ResumableStream, Statistics
 from fiber._wire.messages import ProtocolError
 
 _BYE, _BYE_HEARD = b"\x20", b"\x21"
@@ -36,21 +36,25 @@ class _State(enum.Enum):
     ENDED = enum.auto()
 
 
-class SessionLink:
+class ResumableLink:
     """A link over one wire after the other; a ``Link``."""
 
     def __init__(
         self,
-        loop: Scheduler,
+        loop: EventLoop,
         peer: Identity,
-        patience: Patience,
-        on_end: Callable[[SessionLink], None],
+        keepalive: Keepalive,
+        on_end: Callable[[ResumableLink], None],
+        *,
+        dials: bool = False,
     ) -> None:
+        """``dials``: whether this side replaces a connection, and so may give one up."""
         self.peer = peer
         self._loop = loop
-        self._patience = patience
+        self._keepalive = keepalive
         self._on_end = on_end
-        self._session = Session(loop.now(), heartbeat=patience.heartbeat)
+        self._dials = dials
+        self._stream = ResumableStream(loop.now(), heartbeat=keepalive.heartbeat)
         self._state = _State.OPEN
         self._wire: Wire | None = None
         self._suspect = False
@@ -67,7 +71,12 @@ class SessionLink:
     @property
     def arrived(self) -> int:
         """How much of the peer's has arrived, for the handshake."""
-        return self._session.arrived
+        return self._stream.arrived
+
+    @property
+    def heard(self) -> bool:
+        """Whether the peer has ever said anything."""
+        return self._stream.heard
 
     def attach(self, observer: LinkObserver) -> None:
         """Whom to tell.  What arrived before waits for it."""
@@ -92,7 +101,7 @@ class SessionLink:
 
     def statistics(self) -> Statistics:
         """What it holds now and has done so far."""
-        return self._session.statistics()
+        return self._stream.statistics()
 
     def connected(self, wire: Wire, arrived: int) -> None:
         """Go on over ``wire``, whose other end has ``arrived`` of our datagrams."""
@@ -102,15 +111,20 @@ class SessionLink:
         if self._wire is not None:
             self._unplug().close()
         try:
-            self._session.connected(arrived, self._loop.now())
+            self._stream.connected(arrived, self._loop.now())
         except ProtocolError as error:
-            # A peer that forgot what it had acknowledged is not the one that this session was with.
+            # A peer that forgot what it had acknowledged is not the one that this link was with.
             wire.close()
             self._lose(str(error))
             return
         self._wire = wire
         self._heard()
         self._flush()
+
+    def disconnect(self) -> None:
+        """Let go of the wire: the peer has, and comes with another one."""
+        if self._wire is not None:
+            self._unplug().close()
 
     def disconnected(self, wire: Wire) -> None:
         """``wire`` broke; one that was replaced before does not matter."""
@@ -120,7 +134,7 @@ class SessionLink:
         if self._state is _State.LEAVING:
             self._end()
 
-    def datagram(self, wire: Wire, datagram: bytes) -> None:
+    def datagram(self, wire: Wire, datagram: Frame) -> None:
         """Take what came over ``wire``; nothing that a replaced wire still brings."""
         if wire is not self._wire or self._state is _State.ENDED:
             return
@@ -131,15 +145,18 @@ class SessionLink:
             if self._state is _State.LEAVING:
                 self._end()
         else:
-            self._take(datagram)
+            self._take(wire, datagram)
 
     def refused(self, reason: str) -> None:
         """The peer does not go on with it."""
         self._lose(reason)
 
-    def _take(self, datagram: bytes) -> None:
+    def _take(self, wire: Wire, datagram: Frame) -> None:
         try:
-            frames = self._session.received(datagram, self._loop.now())
+            frames = self._stream.received(datagram, self._loop.now())
+        except Gap:
+            wire.break_off()
+            return
         except ProtocolError as error:
             # Past this point nothing that it says can be relied upon.
             self._lose(f"it broke the protocol: {error}")
@@ -184,22 +201,22 @@ class SessionLink:
             self._outbox.clear()
             return
         while self._outbox:
-            self._session.send(self._outbox.popleft())
+            self._stream.send(self._outbox.popleft())
         self._speak()
 
     def _speak(self) -> None:
         now = self._loop.now()
         if self._wire is not None:
-            for datagram in self._session.outgoing(now):
+            for datagram in self._stream.outgoing(now):
                 self._wire.put(datagram)
-            if self._state is _State.CLOSING and self._session.idle:
+            if self._state is _State.CLOSING and self._stream.idle:
                 self._state = _State.LEAVING
                 self._wire.put(self._farewell)
-        self._wind(now)
+        self._set_timer(now)
 
-    def _wind(self, now: float) -> None:
+    def _set_timer(self, now: float) -> None:
         """Set the timer; one that is due too early only looks again."""
-        due = self._session.next_timer()
+        due = self._stream.next_timer()
         if self._timer is not None:
             if self._timer_due <= due:
                 return
@@ -209,15 +226,15 @@ class SessionLink:
 
     def _tick(self) -> None:
         self._timer = None
-        silent = self._session.tick(self._loop.now())
-        if silent >= self._patience.lost_after:
+        silent = self._stream.tick(self._loop.now())
+        if silent >= self._keepalive.lost_after:
             broken = "" if self._wire else "the connection broke, and "
             self._lose(f"{broken}nothing was heard for {silent:.0f} s")
             return
-        if silent >= self._patience.suspect_after and not self._suspect:
+        if silent >= self._keepalive.suspect_after and not self._suspect:
             self._suspect = True
-            if self._wire is not None:
-                self._wire.doubt()
+            if self._wire is not None and self._dials:
+                self._wire.break_off()
             if observer := self._observer:
                 observer.on_suspect()
         self._speak()
@@ -225,7 +242,7 @@ class SessionLink:
     def _unplug(self) -> Wire:
         wire, self._wire = self._wire, None
         assert wire is not None
-        self._session.disconnected()
+        self._stream.disconnected()
         return wire
 
     def _close(self, reason: str, linger: float, then: Callable[[], None] | None) -> None:

@@ -13,10 +13,9 @@ import pytest
 from fiber._transport import dialer
 from fiber._transport.credentials import MasterCredentials, make_credentials
 from fiber._transport.handshake import Hello, Identity
-from fiber._transport.link import Patience
-from fiber._transport.nng import Socket, url_of
+from fiber._transport.link import Keepalive
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
-from unit.nng_site import Site, free_port, port_of
+from unit.link_site import Site, free_port, port_of, say, vanish
 
 
 @pytest.fixture(scope="module")
@@ -109,15 +108,15 @@ def test_a_host_that_vanishes_before_the_welcome_is_dialled_anew(
     address = f"127.0.0.1:{free_port()}"
     with contextlib.ExitStack() as held:
         if before == "another welcome":
-            listener, _ = site.listener(address, Patience())
+            listener, former = site.listener(address, Keepalive())
             _, agent = site.dialer(address)
-            assert agent.link
-            site.on_loop(listener._socket.close)
+            former.link.send(b"known")
+            agent.wait(lambda: agent.frames)
+            site.on_loop(lambda: vanish(listener))
         silent = held.enter_context(socket.create_server(("127.0.0.1", port_of(address))))
         if before == "the first welcome":
             _, agent = site.dialer(address, timeout=None)
-        for _ in range(2):  # one to see whether somebody is there, then the one that matters
-            held.enter_context(silent.accept()[0])
+        held.enter_context(silent.accept()[0])
         silent.close()
         _, master = site.listener(address)
         if before == "the first welcome":
@@ -196,17 +195,8 @@ def test_another_patch_level_of_python_will_do(site: Site) -> None:
 
 def test_who_is_no_agent_is_refused(site: Site) -> None:
     listener, master = site.listener()
-    stranger = Socket(
-        site.loop,
-        site.credentials.agent_half(),
-        dials=True,
-        on_message=lambda *_: None,
-        on_gone=lambda _: None,
-        on_pipe=lambda pipe: pipe.put(b"GET / HTTP/1.1"),
-    )
-    stranger.dial(url_of(listener.address))
+    say(listener.address, site.credentials.agent_half(), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
-    site.on_loop(stranger.close)
     assert "no agent of Fiber" in master.refusals[0]
 
 

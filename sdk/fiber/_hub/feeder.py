@@ -7,10 +7,11 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from multiprocessing import util
+from queue import SimpleQueue
 from typing import Any
 
-from fiber._hub.handles import SharedChannel, SharedCounter
 from fiber._hub.local import LocalCounter
+from fiber._transport.base import SharedChannel, SharedCounter
 
 
 class Slots:
@@ -47,7 +48,7 @@ class Slots:
         return not self._free.wait(0)
 
 
-class Tally:
+class ItemCount:
     """The places of a queue without a maximum: only items that have left their process count.
 
     Its operations while a feeder runs are none: a system call lets go of the interpreter, and two
@@ -85,18 +86,21 @@ class Tally:
         return False
 
 
-class Backlog:
-    """What did not fit into the channel when it was put, and the thread that sends it on.
+class Feeder:
+    """Sends what did not fit into the channel when it was put, on a thread of its own.
 
     It ends with its ``owner``, a queue, which it does not hold; nor does it hold the end that
     reads: once nobody can ever read, nothing has to be waited for.
+
+    No lock: ``put`` may be interrupted at any line by a finalizer or a signal's handler that puts
+    into the same queue, or raises.  What they share are operations that the interpreter does whole.
     """
 
     def __init__(
         self,
         owner: Any,
         outbox: SharedChannel,
-        slots: Slots | Tally,
+        slots: Slots | ItemCount,
         *,
         on_error: Callable[[Exception, Any], None],
         close: Callable[[], None],
@@ -106,29 +110,32 @@ class Backlog:
         self._slots = slots
         self._on_error = on_error
         self._close_outbox = close
-        self._items: deque[tuple[bytes, list[memoryview]]] = deque()
-        self._changed = threading.Condition(threading.Lock())
-        self._thread: threading.Thread | None = None
-        self._idle = True
-        self._closing = False
-        self._join: util.Finalize | None = None
+        self._unsent: deque[tuple[bytes, list[memoryview]]] = deque()
+        # True when there are items, False at the end.
+        self._wake: SimpleQueue[bool] = SimpleQueue()
+        self._sending = False
+        # What a thread takes out before it feeds.  Whoever finds it there starts a thread; of two,
+        # the second one ends.
+        self._vacancy = [True]
+        self._joins: list[util.Finalize] = []
         self._join_cancelled = False
 
     def put(self, payload: bytes, buffers: list[memoryview]) -> None:
         """Send a message now if it is its turn and there is room, otherwise later."""
-        with self._changed:
-            if self._idle and self._outbox.prompt and self._send_now(payload, buffers):
-                return
-            # The arrays behind the buffers are their owner's to change once ``put`` has returned.
-            self._items.append((payload, [memoryview(bytearray(view)) for view in buffers]))
-            if self._idle:
-                self._idle = False
-                self._wake_feeder()
+        # In this order: what the feeder has taken out, it had said before that it is sending.
+        nothing_to_overtake = not self._unsent and not self._sending
+        if nothing_to_overtake and self._outbox.can_try_send and self._send_now(payload, buffers):
+            return
+        # The arrays behind the buffers are their owner's to change once ``put`` has returned.
+        self._unsent.append((payload, [memoryview(bytearray(view)) for view in buffers]))
+        self._wake.put(True)
+        if self._vacancy:
+            self._start_thread()
 
     @property
     def waiting(self) -> int:
         """How many messages wait."""
-        return len(self._items)
+        return len(self._unsent)
 
     def _send_now(self, payload: bytes, buffers: list[memoryview]) -> bool:
         self._slots.sending()
@@ -144,57 +151,54 @@ class Backlog:
 
     def close(self) -> None:
         """Take no more; let go of the channel once everything is sent."""
-        with self._changed:
-            self._closing = True
-            if self._thread is None:
-                self._close_outbox()
-            self._changed.notify()
+        if self._vacancy and not self._unsent:
+            self._close_outbox()
+            return
+        if self._vacancy:  # a ``put`` was interrupted before it started the thread
+            self._start_thread()
+        self._wake.put(False)
 
     def join(self) -> None:
         """Wait until everything is sent."""
-        if self._join is not None:
-            self._join()
+        for join in self._joins:
+            join()
 
     def cancel_join(self) -> None:
         """Do not wait for it when the process ends."""
         self._join_cancelled = True
-        if self._join is not None:
-            self._join.cancel()
+        for join in self._joins:
+            join.cancel()
 
-    def _wake_feeder(self) -> None:
-        if self._thread is not None:
-            self._changed.notify()
-            return
-        self._thread = threading.Thread(target=self._feed, name="QueueFeederThread", daemon=True)
-        self._thread.start()
+    def _start_thread(self) -> None:
+        thread = threading.Thread(target=self._feed, name="QueueFeederThread", daemon=True)
         util.Finalize(self._owner(), self.close, exitpriority=10)
         if not self._join_cancelled:
-            thread = weakref.ref(self._thread)
-            self._join = util.Finalize(self._thread, _join, [thread], exitpriority=-5)
+            join = util.Finalize(thread, _join, [weakref.ref(thread)], exitpriority=-5)
+            self._joins.append(join)
+        thread.start()
 
     def _feed(self) -> None:
-        while self._has_items():
-            try:
-                while self._items:
-                    item = self._items.popleft()
-                    self._slots.sending()
-                    self._outbox.post(*item)
-            except (BrokenPipeError, EOFError):
-                self._items.clear()  # nobody can ever read them
-            except OSError as error:
-                self._failed(error)
+        try:
+            self._vacancy.pop()
+        except IndexError:
+            return
+        more = True
+        while more:
+            more = self._wake.get()
+            self._sending = True
+            while self._unsent:
+                self._send(*self._unsent.popleft())
+            self._sending = False
         self._close_outbox()
 
-    def _has_items(self) -> bool:
-        """Wait for items; False once there will be none."""
-        with self._changed:
-            while not self._items:
-                if self._closing:
-                    return False
-                # From here on ``put`` may send by itself again: nothing is left to overtake.
-                self._idle = True
-                self._changed.wait()
-            return True
+    def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
+        try:
+            self._slots.sending()
+            self._outbox.post(payload, buffers)
+        except (BrokenPipeError, EOFError):
+            self._unsent.clear()  # nobody can ever read them
+        except OSError as error:
+            self._failed(error)
 
     def _failed(self, error: OSError) -> None:
         self._slots.not_sent()
@@ -207,5 +211,5 @@ class Backlog:
 
 def _join(thread: weakref.ref[threading.Thread]) -> None:
     running = thread()
-    if running is not None:
+    if running is not None and running.ident is not None:  # otherwise it was not to be started
         running.join()

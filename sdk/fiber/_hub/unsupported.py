@@ -31,7 +31,7 @@ def refuse(name: str) -> NoReturn:
     )
 
 
-def absent(name: str) -> Callable[..., Any]:
+def unsupported(name: str) -> Callable[..., Any]:
     """A function that stands where multiprocessing has a function ``name``, and refuses."""
 
     def stand_in(*_args: Any, **_options: Any) -> NoReturn:
@@ -42,7 +42,7 @@ def absent(name: str) -> Callable[..., Any]:
     return stand_in
 
 
-class Absent:
+class Unsupported:
     """Base of the classes that stand where multiprocessing has one, for annotations and
     ``isinstance``: whoever makes an object is refused.
     """

@@ -1,20 +1,20 @@
-"""A reliable, ordered stream of frames over a link that may lose, repeat or break off.
+"""A stream of frames, each once and in order, over one connection after the other.
 
-nng drops a message without a word when the queue of its pipe is full, and forgets what was under
-way when a pipe breaks.  A session makes up for both.  It is pure: the caller tells it the time and
-carries its datagrams::
+A connection keeps the order and loses nothing until it breaks; then what was under way may have
+arrived or not.  The stream makes up for that, and notices a peer that is silent.  It is pure: the
+caller tells it the time and carries its datagrams::
 
-    send(frame) ─► queue ─► outgoing(now) ─► [datagram] ─ ─ ─ ─► received(datagram, now) ─► [frame]
+    send(frame) ─► queue ─► outgoing(now) ─► [datagram] ─────► received(datagram, now) ─► [frame]
                                ▲    │ unacknowledged                          │
-                               └────┴──────────── acknowledgement ◄─ ─ ─ ─ ─ ─┘
+                               └────┴──────────── acknowledgement ◄───────────┘
 
 * Datagrams with frames are numbered from 1; every datagram carries the number up to which
-  everything arrived.  The receiver takes only the next number: what is older is a repetition, what
-  is newer means that one is missing, which it says at once.
-* At most WINDOW datagrams are unacknowledged, so small frames that wait for room travel together.
-* Acknowledgements ride on what is sent anyway.  The sender asks for one at once when it cannot go
-  on without it; otherwise the receiver waits ACK_DELAY for something to ride on.
-* After a break both sides say how far they got and the rest is sent again.
+  everything arrived.  The next number is taken, an older one is a repetition.  A newer one means
+  that the connection lost something, as none should: ``Gap``.
+* What is not acknowledged is kept, and sent again on the next connection: both sides then say how
+  far they got.  It is at most WINDOW datagrams and WINDOW_BYTES, so a peer that is slow, or a
+  connection that stands still, costs no more memory than that; what waits travels together.
+* Acknowledgements ride on what is sent anyway, within ACK_DELAY or a quarter of the window.
 
 Layout (little endian): kind:u8, flags:u8, pad:u16, count:u32, number:u64, acknowledged:u64, then
 length:u32 * count and the frames.  A frame larger than a datagram goes on in the next one.
@@ -24,41 +24,43 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 from fiber._wire.messages import ProtocolError
 
 Frame: TypeAlias = bytes | bytearray
 
-WINDOW = 2
-"""Datagrams under way.  nng holds three messages of a pipe; one place is for acknowledgements."""
+WINDOW = 256
+WINDOW_BYTES = 4 << 20
+"""What may be under way."""
 
 BUDGET = 256 * 1024
-"""Bytes of frames in a datagram.  Over TLS larger ones are hardly faster, and delay the next."""
+"""Bytes of frames in a datagram: one is sealed while the one before it is sent."""
 
 ACK_DELAY = 0.02
-"""Seconds that an acknowledgement nobody waits for may wait for something to ride on."""
-
-RESEND_MIN, RESEND_MAX = 1.0, 10.0
-"""Bounds of the wait for an acknowledgement.  What follows tells of a loss much sooner, mostly."""
+"""Seconds that an acknowledgement may wait for something to ride on."""
 
 HEARTBEAT = 3.0
-"""Seconds without sending after which a session says that it is alive."""
+"""Seconds without sending after which a stream says that it is alive."""
 
 DATA, CONTROL = 1, 2
 
-_ACK_NOW = 1
 _CONTINUES = 2
 _UNFINISHED = 4
-_MISSING = 8
 
 _HEADER = struct.Struct("<BBxxIQQ")
 _LENGTH = 4
 
+LARGEST = _HEADER.size + BUDGET + _LENGTH
+"""Bytes of the longest datagram."""
+
+
+class Gap(ProtocolError):
+    """The connection lost a datagram: it must not be relied upon any more."""
+
 
 class Statistics(NamedTuple):
-    """What a session holds now and has done so far."""
+    """What a stream holds now and has done so far."""
 
     queued_frames: int
     queued_bytes: int
@@ -77,16 +79,8 @@ class Statistics(NamedTuple):
     breaks: int
 
 
-@dataclass(slots=True)
-class _Sent:
-    number: int
-    datagram: bytes
-    at: float
-    resent: bool = False
-
-
-class Session:
-    """One end of a session; begins disconnected."""
+class ResumableStream:
+    """One end of a stream; begins disconnected."""
 
     def __init__(
         self,
@@ -94,29 +88,31 @@ class Session:
         *,
         heartbeat: float = HEARTBEAT,
         window: int = WINDOW,
+        window_bytes: int = WINDOW_BYTES,
         budget: int = BUDGET,
     ) -> None:
         self._heartbeat = heartbeat
         self._tick = heartbeat / 3
         self._window = window
+        self._window_bytes = window_bytes
         self._budget = budget
         self._connected = False
         self._queue: deque[Frame] = deque()
         self._queued_bytes = 0
         self._offset = 0
-        self._next = 1
-        self._unacknowledged: deque[_Sent] = deque()
+        self._sent = 0
         self._acknowledged = 0
+        self._unacknowledged: deque[bytes] = deque()
+        """Datagrams from ``_acknowledged + 1`` to ``_sent``."""
+        self._unacknowledged_bytes = 0
+        self._repeat = False
         self._received = 0
-        self._partial: list[bytes] = []
+        self._partial: list[Frame] = []
         self._ack_due: float | None = None
-        self._missing = False
-        self._resend = False
-        self._resend_due: float | None = None
-        self._resend_after = RESEND_MIN
-        self._backoff = 1.0
-        self._round_trip = 0.0
+        self._unanswered = self._unanswered_bytes = 0
+        """What arrived since the last acknowledgement that we sent."""
         self._last_sent = self._ticked = now
+        self._speak_now = False
         self._silent = 0.0
         self._counts = dict.fromkeys(Statistics._fields[5:], 0)
 
@@ -130,6 +126,11 @@ class Session:
         """The number of the last datagram taken: what the peer must know to resume."""
         return self._received
 
+    @property
+    def heard(self) -> bool:
+        """Whether the peer has ever said anything."""
+        return bool(self._counts["datagrams_received"])
+
     def send(self, frame: Frame) -> None:
         """Queue a frame; the next ``outgoing`` takes it along if there is room."""
         self._queue.append(frame)
@@ -137,50 +138,51 @@ class Session:
         self._counts["frames_sent"] += 1
 
     def connected(self, arrived: int, now: float) -> None:
-        """There is a link, and the peer has taken our datagrams up to ``arrived``."""
-        if not self._acknowledged <= arrived < self._next:
+        """There is a connection, and the peer has taken our datagrams up to ``arrived``."""
+        if not self._acknowledged <= arrived <= self._sent:
             raise ProtocolError(
                 f"it cannot resume after datagram {arrived}: it has acknowledged "
-                f"{self._acknowledged} of {self._next - 1}"
+                f"{self._acknowledged} of {self._sent}"
             )
         self._connected = True
-        self._acknowledge(arrived, now)
-        self._resend = bool(self._unacknowledged)
-        self._backoff = 1.0
-        self._ack_due = None
-        self._last_sent = now
+        self._acknowledge(arrived)
+        self._repeat = bool(self._unacknowledged)
+        self._speak_now = True  # so that both sides know soon that it works
         self._heard(now)
 
     def disconnected(self) -> None:
-        """The link broke; what was under way counts as not arrived."""
+        """The connection broke; what was under way counts as not arrived."""
         self._connected = False
-        self._resend_due = self._ack_due = None
+        self._ack_due = None
         self._counts["breaks"] += 1
 
     def outgoing(self, now: float) -> list[bytes]:
-        """What to put on the link now."""
+        """What to put on the connection now."""
         if not self._connected:
             return []
-        must_resend = self._resend or (self._resend_due is not None and self._resend_due <= now)
-        again = self._again(now) if must_resend else []
-        fresh = []
-        while self._queue and len(self._unacknowledged) < self._window:
-            fresh.append(self._pack(now))
-        if self._missing or (not fresh and self._must_speak(now)):
-            fresh.append(self._control())
-        if fresh:  # a repetition carries the acknowledgement of its day
-            self._ack_due = None
-        datagrams = again + fresh
+        datagrams: list[bytes] = []
+        if self._repeat:
+            self._repeat = False
+            datagrams += self._unacknowledged
+            self._counts["resent"] += len(datagrams)
+        fresh = len(datagrams)
+        while self._queue and self._has_room():
+            datagrams.append(self._pack())
+        if len(datagrams) > fresh:
+            self._answered()
+        elif self._must_speak(now):  # a repetition carries the acknowledgement of its day
+            datagrams.append(_HEADER.pack(CONTROL, 0, 0, self._sent, self._received))
+            self._answered()
         if datagrams:
             self._last_sent = now
             self._counts["datagrams_sent"] += len(datagrams)
             self._counts["bytes_sent"] += sum(map(len, datagrams))
         return datagrams
 
-    def received(self, datagram: bytes, now: float) -> list[Frame]:
-        """Take a datagram from the link; the frames that it completes, in order.
+    def received(self, datagram: Frame, now: float) -> list[Frame]:
+        """Take a datagram from the connection; the frames that it completes, in order.
 
-        ProtocolError if no session can have sent it.
+        ProtocolError if no stream can have sent it, ``Gap`` if one before it is missing.
         """
         try:
             kind, flags, count, number, acknowledged = _HEADER.unpack_from(datagram)
@@ -188,14 +190,24 @@ class Session:
             raise ProtocolError(f"a datagram of {len(datagram)} bytes has no header") from None
         if kind not in (DATA, CONTROL):
             raise ProtocolError(f"a datagram is of unknown kind {kind}")
+        if acknowledged > self._sent:
+            raise ProtocolError(
+                f"it acknowledges datagram {acknowledged}, but only {self._sent} were sent"
+            )
         self._heard(now)
         self._counts["datagrams_received"] += 1
         self._counts["bytes_received"] += len(datagram)
-        self._acknowledge(acknowledged, now)
+        self._acknowledge(acknowledged)
+        if number > self._received + (kind == DATA):
+            self._counts["missed"] += 1
+            raise Gap(f"datagram {number} came where {self._received + 1} was expected")
         if kind == CONTROL:
-            self._resend |= bool(flags & _MISSING and self._unacknowledged)
             return []
-        return self._take(datagram, flags, count, number, now)
+        if number <= self._received:
+            self._counts["repeated"] += 1
+            self._ack_due = now
+            return []
+        return self._take(datagram, flags, count, now)
 
     def tick(self, now: float) -> float:
         """Seconds without a word from the peer, leaving out the time when this process did not run.
@@ -214,8 +226,6 @@ class Session:
             due = min(due, self._last_sent + self._heartbeat)
             if self._ack_due is not None:
                 due = min(due, self._ack_due)
-            if self._resend_due is not None:
-                due = min(due, self._resend_due)
         return due
 
     def statistics(self) -> Statistics:
@@ -224,31 +234,27 @@ class Session:
             queued_frames=len(self._queue),
             queued_bytes=self._queued_bytes,
             unacknowledged_datagrams=len(self._unacknowledged),
-            unacknowledged_bytes=sum(len(sent.datagram) for sent in self._unacknowledged),
+            unacknowledged_bytes=self._unacknowledged_bytes,
             partial_bytes=sum(map(len, self._partial)),
             **self._counts,
         )
 
+    def _has_room(self) -> bool:
+        return (
+            len(self._unacknowledged) < self._window
+            and self._unacknowledged_bytes < self._window_bytes
+        )
+
     def _must_speak(self, now: float) -> bool:
         ack_is_due = self._ack_due is not None and self._ack_due <= now
-        return ack_is_due or self._last_sent + self._heartbeat <= now
+        return ack_is_due or self._speak_now or self._last_sent + self._heartbeat <= now
 
-    def _again(self, now: float) -> list[bytes]:
-        if not self._resend:  # it was the timer
-            self._backoff *= 2
-        self._resend = False
-        for sent in self._unacknowledged:
-            sent.resent = True
-        self._counts["resent"] += len(self._unacknowledged)
-        self._last_sent = now
-        self._arm(now)
-        return [sent.datagram for sent in self._unacknowledged]
+    def _answered(self) -> None:
+        self._ack_due = None
+        self._speak_now = False
+        self._unanswered = self._unanswered_bytes = 0
 
-    def _arm(self, now: float) -> None:
-        wait = min(self._resend_after * self._backoff, RESEND_MAX)
-        self._resend_due = now + wait if self._unacknowledged else None
-
-    def _pack(self, now: float) -> bytes:
+    def _pack(self) -> bytes:
         """Number and wrap as many queued frames as fit."""
         flags = _CONTINUES if self._offset else 0
         chunks: list[Frame | memoryview] = []
@@ -267,66 +273,41 @@ class Session:
                 break
             self._queue.popleft()
             self._offset = 0
-        if self._queue or len(self._unacknowledged) + 1 == self._window:
-            flags |= _ACK_NOW
-        return self._number(flags, chunks, now)
+        return self._number(flags, chunks)
 
-    def _number(self, flags: int, chunks: list[Frame | memoryview], now: float) -> bytes:
+    def _number(self, flags: int, chunks: list[Frame | memoryview]) -> bytes:
         count = len(chunks)
-        head = _HEADER.pack(DATA, flags, count, self._next, self._received)
+        self._sent += 1
+        head = _HEADER.pack(DATA, flags, count, self._sent, self._received)
         lengths = struct.pack(f"<{count}I", *map(len, chunks))
         datagram = b"".join((head, lengths, *chunks))
-        self._unacknowledged.append(_Sent(self._next, datagram, now))
-        self._next += 1
-        if self._resend_due is None:
-            self._arm(now)
+        self._unacknowledged.append(datagram)
+        self._unacknowledged_bytes += len(datagram)
         return datagram
-
-    def _control(self) -> bytes:
-        flags = _MISSING if self._missing else 0
-        self._missing = False
-        return _HEADER.pack(CONTROL, flags, 0, 0, self._received)
 
     def _heard(self, now: float) -> None:
         self._silent = 0.0
         self._ticked = now
 
-    def _acknowledge(self, arrived: int, now: float) -> None:
-        if arrived >= self._next:
-            raise ProtocolError(
-                f"it acknowledges datagram {arrived}, but only {self._next - 1} were sent"
-            )
-        if arrived <= self._acknowledged:
-            return
-        self._acknowledged = arrived
-        while self._unacknowledged and self._unacknowledged[0].number <= arrived:
-            sent = self._unacknowledged.popleft()
-            if not sent.resent:  # a repetition cannot tell which copy was acknowledged
-                self._measured(now - sent.at)
-        self._backoff = 1.0
-        self._arm(now)
+    def _acknowledge(self, arrived: int) -> None:
+        while self._acknowledged < arrived:
+            self._acknowledged += 1
+            self._unacknowledged_bytes -= len(self._unacknowledged.popleft())
 
-    def _measured(self, round_trip: float) -> None:
-        self._round_trip += (round_trip - self._round_trip) / 8
-        self._resend_after = max(RESEND_MIN, 3 * self._round_trip)
-
-    def _take(
-        self, datagram: bytes, flags: int, count: int, number: int, now: float
-    ) -> list[Frame]:
-        if number != self._received + 1:
-            repeated = number <= self._received
-            self._counts["repeated" if repeated else "missed"] += 1
-            self._missing |= not repeated
-            self._ack_due = now
-            return []
+    def _take(self, datagram: Frame, flags: int, count: int, now: float) -> list[Frame]:
         frames = self._unpack(datagram, flags, count)
-        self._received = number
+        self._received += 1
         self._counts["frames_received"] += len(frames)
-        due = now if flags & _ACK_NOW else now + ACK_DELAY
-        self._ack_due = due if self._ack_due is None else min(due, self._ack_due)
+        self._unanswered += 1
+        self._unanswered_bytes += len(datagram)
+        many = 4 * self._unanswered >= self._window
+        if many or 4 * self._unanswered_bytes >= self._window_bytes:
+            self._ack_due = now
+        elif self._ack_due is None:
+            self._ack_due = now + ACK_DELAY
         return frames
 
-    def _unpack(self, datagram: bytes, flags: int, count: int) -> list[Frame]:
+    def _unpack(self, datagram: Frame, flags: int, count: int) -> list[Frame]:
         at = _HEADER.size + _LENGTH * count
         fits = count > 0 and at <= len(datagram)
         lengths = struct.unpack_from(f"<{count}I", datagram, _HEADER.size) if fits else ()
@@ -342,8 +323,8 @@ class Session:
             at += length
         return self._join(chunks, flags)
 
-    def _join(self, chunks: list[bytes], flags: int) -> list[Frame]:
-        frames: list[Frame] = list(chunks)
+    def _join(self, chunks: list[Frame], flags: int) -> list[Frame]:
+        frames = list(chunks)
         if flags & _CONTINUES:
             self._partial.append(chunks[0])
             if flags & _UNFINISHED and len(chunks) == 1:

@@ -1,4 +1,4 @@
-"""A hub's side of one stream: who it is, what it is attached to, what it waits for."""
+"""A hub's side of one client's stream: who it is, what it is attached to, what it waits for."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Protocol
 
 from fiber._hub import protocol
 from fiber._hub.hosted import HostedChannel, HostedCounter
-from fiber._hub.protocol import HEAD, ONE, TWO, Kind, Op, Status, Terms
+from fiber._hub.protocol import HEAD, ONE, TWO, GrantFlags, ObjectKind, Op, Status
 from fiber._hub.registry import Entry, NoSuchObject, Registry
-from fiber._hub.streams import Deaf, Stream
+from fiber._hub.streams import NullHandler, Stream
 from fiber._wire.packet import Message
 
 
-class Home(Protocol):
-    """What a session needs of its hub."""
+class HandlerHub(Protocol):
+    """What a handler needs of its hub."""
 
     key: bytes
     registry: Registry
@@ -24,28 +24,28 @@ class Home(Protocol):
     def connect(self, host: str, stream: Stream) -> None:
         """Go on with ``stream`` at the hub of ``host``."""
 
-    def ended(self, session: Session) -> None:
-        """The session is over."""
+    def ended(self, handler: ClientHandler) -> None:
+        """The client is gone."""
 
 
-class Refused(Exception):
+class RequestRefused(Exception):
     """The stream has to end; says why."""
 
 
-class Request:
+class PendingRequest:
     """One request; answered once."""
 
-    __slots__ = ("_number", "_session")
+    __slots__ = ("_handler", "_number")
 
-    def __init__(self, session: Session, number: int) -> None:
-        self._session = session
+    def __init__(self, handler: ClientHandler, number: int) -> None:
+        self._handler = handler
         self._number = number
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
         """Send the reply."""
-        if self._session.waiting is self:
-            self._session.waiting = None
-        self._session.stream.send(ONE.pack(status, self._number, value), buffers)
+        if self._handler.waiting is self:
+            self._handler.waiting = None
+        self._handler.stream.send(ONE.pack(status, self._number, value), buffers)
 
     @property
     def number(self) -> int:
@@ -53,12 +53,12 @@ class Request:
         return self._number
 
 
-class Session:
+class ClientHandler:
     """Serves one stream; its ``Handler``."""
 
-    def __init__(self, home: Home, stream: Stream) -> None:
+    def __init__(self, home: HandlerHub, stream: Stream) -> None:
         self.stream = stream
-        self.waiting: Request | None = None
+        self.waiting: PendingRequest | None = None
         self._home = home
         self._admitted = False
         self._entry: Entry | None = None
@@ -73,7 +73,7 @@ class Session:
                 self._admit(operation, message.payload)
             else:
                 _OPERATIONS[operation](self, message)
-        except Refused as refusal:
+        except RequestRefused as refusal:
             self._end(str(refusal))
         except NoSuchObject as error:
             self._end(str(error))
@@ -108,32 +108,32 @@ class Session:
         self._bound.clear()
         self._home.ended(self)
 
-    def _cancel(self) -> Request | None:
+    def _cancel(self) -> PendingRequest | None:
         """Withdraw the request that waits."""
         request, self.waiting = self.waiting, None
         if request is not None and self._entry is not None:
             self._entry.hosted.withdraw(request)
         return request
 
-    def _request(self, message: Message) -> Request:
+    def _request(self, message: Message) -> PendingRequest:
         """A request to be answered later; ends the one before."""
         self._cancel()
-        self.waiting = Request(self, HEAD.unpack_from(message.payload)[1])
+        self.waiting = PendingRequest(self, HEAD.unpack_from(message.payload)[1])
         return self.waiting
 
     # Getting in
 
     def _admit(self, operation: Op, payload: memoryview) -> None:
         if operation is not Op.HELLO:
-            raise Refused("a stream to a hub begins with a greeting")
+            raise RequestRefused("a stream to a hub begins with a greeting")
         _, _, version, key = protocol.HELLO.unpack(payload)
         if version != protocol.VERSION:
-            raise Refused(
+            raise RequestRefused(
                 f"this hub speaks version {protocol.VERSION} of its protocol, the other side "
                 f"{version}: install the same fiberpool on both sides"
             )
         if not hmac.compare_digest(key, self._home.key):
-            raise Refused("the key is not this hub's: the handle belongs to another program")
+            raise RequestRefused("the key is not this hub's: the handle belongs to another program")
         self._admitted = True
 
     def hello(self, message: Message) -> None:
@@ -143,7 +143,7 @@ class Session:
     def connect(self, message: Message) -> None:
         """Go on at another host's hub."""
         host = protocol.text(message.payload)
-        self.stream.handler = Deaf()
+        self.stream.handler = NullHandler()
         self._leave()
         self._home.connect(host, self.stream)
 
@@ -151,20 +151,20 @@ class Session:
 
     def register(self, message: Message) -> None:
         """Host a descriptor."""
-        _, number, kind, terms = TWO.unpack(message.payload)
+        _, number, kind, flags = TWO.unpack(message.payload)
         (fd,) = message.fds
-        reusable = bool(terms & Terms.REUSABLE)
-        entry, grant = self._home.registry.register(Kind(kind), fd, reusable=reusable)
-        self._granted(number, entry, grant, terms)
+        reusable = bool(flags & GrantFlags.REUSABLE)
+        entry, grant = self._home.registry.register(ObjectKind(kind), fd, reusable=reusable)
+        self._granted(number, entry, grant, flags)
 
     def grant(self, message: Message) -> None:
         """Give a grant for an object that the sender uses."""
-        _, number, entry, terms = TWO.unpack(message.payload)
-        grant = self._home.registry.grant(entry, reusable=bool(terms & Terms.REUSABLE))
-        self._granted(number, entry, grant, terms)
+        _, number, entry, flags = TWO.unpack(message.payload)
+        grant = self._home.registry.grant(entry, reusable=bool(flags & GrantFlags.REUSABLE))
+        self._granted(number, entry, grant, flags)
 
-    def _granted(self, number: int, entry: int, grant: int, terms: int) -> None:
-        if terms & Terms.BOUND:
+    def _granted(self, number: int, entry: int, grant: int, flags: int) -> None:
+        if flags & GrantFlags.ENDS_WITH_STREAM:
             self._bound.add(grant)
         self.stream.send(TWO.pack(Status.OK, number, entry, grant))
 
@@ -176,14 +176,14 @@ class Session:
         """Hand over a descriptor."""
         _, number, entry, grant = TWO.unpack(message.payload)
         if not self.stream.passes_descriptors:
-            raise Refused("a descriptor cannot be handed to another host")
+            raise RequestRefused("a descriptor cannot be handed to another host")
         fd = self._home.registry.fetch(entry, grant)
         self.stream.send(HEAD.pack(Status.OK, number), (), [fd])
 
     def attach(self, message: Message) -> None:
         """Begin to use an object."""
         if self._entry is not None:
-            raise Refused("a stream is for one object")
+            raise RequestRefused("a stream is for one object")
         _, _, entry, grant = TWO.unpack(message.payload)
         self._entry = self._home.registry.attach(entry, grant)
 
@@ -203,13 +203,13 @@ class Session:
 
     def _channel(self) -> HostedChannel:
         if self._entry is None or not isinstance(self._entry.hosted, HostedChannel):
-            raise Refused("the stream is not attached to a channel")
+            raise RequestRefused("the stream is not attached to a channel")
         return self._entry.hosted
 
     def send(self, message: Message) -> None:
         """Send a message."""
         if not message.buffers:
-            raise Refused("there is no message to send")
+            raise RequestRefused("there is no message to send")
         self._channel().send(self._request(message), message.buffers)
 
     def recv(self, message: Message) -> None:
@@ -247,7 +247,7 @@ class Session:
 
     def _counter(self) -> HostedCounter:
         if self._entry is None or not isinstance(self._entry.hosted, HostedCounter):
-            raise Refused("the stream is not attached to a counter")
+            raise RequestRefused("the stream is not attached to a counter")
         return self._entry.hosted
 
     def add(self, message: Message) -> None:
@@ -256,7 +256,7 @@ class Session:
         try:
             counter.add(n)
         except BlockingIOError:
-            raise Refused("the count is as high as it can be") from None
+            raise RequestRefused("the count is as high as it can be") from None
         self._request(message).answer(Status.OK)
 
     def take(self, message: Message) -> None:
@@ -280,6 +280,6 @@ class Session:
         self._counter().changed(self._request(message), ONE.unpack(message.payload)[2])
 
 
-_OPERATIONS: dict[Op, Callable[[Session, Message], None]] = {
-    operation: getattr(Session, operation.name.lower()) for operation in Op
+_OPERATIONS: dict[Op, Callable[[ClientHandler, Message], None]] = {
+    operation: getattr(ClientHandler, operation.name.lower()) for operation in Op
 }

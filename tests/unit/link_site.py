@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import select
 import socket
 import threading
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Generator
+from typing import Any, TypeVar
 
 import pynng
 
+from fiber._transport import tls
 from fiber._transport.credentials import Credentials, MasterCredentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
-from fiber._transport.link import Link, Patience
+from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
-from fiber._transport.session import Frame
+from fiber._transport.stream import Frame
 
 # Once used, nng keeps threads and two descriptors for as long as the process lives.  The census of
 # what tests leave behind begins after the collection, and so after this.
 pynng.Pair1().close()
 
+T = TypeVar("T")
 DEADLINE = 10.0
-SHORT = Patience(heartbeat=0.1, suspect_after=0.8, lost_after=2.0)
+SHORT = Keepalive(heartbeat=0.1, suspect_after=0.8, lost_after=2.0)
 
 
 class Notes:
@@ -83,7 +86,7 @@ class Site:
         self._closing: list[Callable[[], None]] = []
 
     def listener(
-        self, address: str = "127.0.0.1:0", patience: Patience = SHORT
+        self, address: str = "127.0.0.1:0", keepalive: Keepalive = SHORT
     ) -> tuple[MasterListener, Notes]:
         notes = Notes()
         listener = MasterListener(
@@ -92,7 +95,7 @@ class Site:
             self.credentials,
             on_agent=notes.on_link,
             on_refused=notes.on_refused,
-            patience=patience,
+            keepalive=keepalive,
         )
         self._closing.append(lambda: self.close(listener, linger=0.1))
         return listener, notes
@@ -104,6 +107,7 @@ class Site:
         credentials: Credentials | None = None,
         identity: Identity | None = None,
         timeout: float | None = DEADLINE,
+        connect: Callable[[str], socket.socket] | None = None,
     ) -> tuple[AgentDialer, Notes]:
         notes = Notes()
         dialling = AgentDialer(
@@ -114,6 +118,7 @@ class Site:
             on_link=notes.on_link,
             on_failed=notes.on_failed,
             timeout=timeout,
+            connect=connect,
         )
         self._closing.append(dialling.close)
         return dialling, notes
@@ -125,8 +130,14 @@ class Site:
         return master, agent
 
     def on_loop(self, function: Callable[[], Any]) -> Any:
-        done, results = threading.Event(), []
-        self.loop.call_soon(lambda: (results.append(function()), done.set())[0])
+        done = threading.Event()
+        results: list[Any] = []
+
+        def call() -> None:
+            results.append(function())
+            done.set()
+
+        self.loop.call_soon(call)
         assert done.wait(DEADLINE)
         return results[0]
 
@@ -151,6 +162,40 @@ def port_of(address: str) -> int:
     return int(address.rpartition(":")[2])
 
 
+def wires_of(listener: MasterListener) -> list[Any]:
+    return [link._wire for link in listener._links.values() if link._wire is not None]
+
+
 def break_connections(listener: MasterListener) -> None:
-    for pipe in list(listener._socket._pipes.values()):
-        pipe.close()
+    for wire in wires_of(listener):
+        wire.break_off()
+
+
+def vanish(listener: MasterListener) -> None:
+    """As a killed process would."""
+    for wire in wires_of(listener):
+        wire.close()
+    listener._acceptor.close()
+
+
+def say(address: str, credentials: Credentials, words: bytes) -> bytes:
+    """What a master answers to the first words of somebody with the right credentials."""
+    sock = socket.create_connection(("127.0.0.1", port_of(address)))
+    exchange = tls.Exchange(
+        sock, tls.context_of(credentials, listens=False), credentials.server_name
+    )
+    try:
+        return complete(exchange, exchange.ask(words))
+    finally:
+        exchange.close()
+
+
+def complete(exchange: tls.Exchange, steps: Generator[int, None, T]) -> T:
+    poller = select.poll()
+    while True:
+        try:
+            poller.register(exchange.sock, next(steps))
+        except StopIteration as finished:
+            value: T = finished.value
+            return value
+        assert poller.poll(DEADLINE * 1000)

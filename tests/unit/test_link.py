@@ -15,9 +15,9 @@ import pytest
 
 from fiber._transport.credentials import MasterCredentials, make_credentials
 from fiber._transport.handshake import Identity
-from fiber._transport.link import Patience
+from fiber._transport.link import Keepalive
 from fiber._transport.listener import MasterListener
-from unit.nng_site import DEADLINE, SHORT, Site, break_connections
+from unit.link_site import DEADLINE, SHORT, Site, break_connections, vanish
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +100,8 @@ def test_many_agents_share_one_socket(site: Site) -> None:
 @pytest.mark.parametrize("times", [1, 5])
 def test_a_broken_connection_loses_and_repeats_nothing(site: Site, times: int) -> None:
     # nng may not notice the break; then the agent's suspicion makes it dial again.
-    patience = Patience(heartbeat=0.1, suspect_after=0.5, lost_after=60)
-    listener, master = site.listener(patience=patience)
+    keepalive = Keepalive(heartbeat=0.1, suspect_after=0.5, lost_after=60)
+    listener, master = site.listener(keepalive=keepalive)
     _, agent = site.dialer(listener.address)
     sent = [b"%d " % number * 5000 for number in range(300)]
     assert agent.link is not master.link
@@ -119,10 +119,11 @@ def test_a_broken_connection_loses_and_repeats_nothing(site: Site, times: int) -
 
 
 def test_a_master_that_began_anew_refuses_the_old_session(site: Site) -> None:
-    listener, _ = site.listener(patience=Patience())
+    listener, former = site.listener(keepalive=Keepalive())
     _, agent = site.dialer(listener.address)
-    assert agent.link
-    site.on_loop(listener._socket.close)  # as a killed process would
+    former.link.send(b"known")
+    agent.wait(lambda: agent.frames)
+    site.on_loop(lambda: vanish(listener))
     _, successor = site.listener(listener.address)
     agent.wait(lambda: agent.events)
     assert "not known here" in agent.events[0]
@@ -165,7 +166,7 @@ def test_a_blocked_loop_does_not_lose_its_peers(site: Site) -> None:
 
 
 def test_a_stopped_agent_is_suspect_until_it_goes_on(site: Site) -> None:
-    listener, master = site.listener(patience=SHORT._replace(lost_after=60))
+    listener, master = site.listener(keepalive=SHORT._replace(lost_after=60))
     with remote_agent(listener, site.credentials) as process:
         master.wait(lambda: master.frames)
         process.send_signal(signal.SIGSTOP)
@@ -188,11 +189,10 @@ def test_a_killed_agent_is_lost(site: Site) -> None:
 
 ECHO = """
 import os, sys
-from fiber._transport import dialer
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
-from fiber._transport.link import Patience
+from fiber._transport.link import Keepalive
 from fiber._transport.loop import Loop
 
 class Echo:
@@ -211,7 +211,7 @@ def on_failed(error):
     loop.stop()
 
 echo, loop = Echo(), Loop()
-credentials = Credentials.from_environment(os.environ["CREDENTIALS"])
+credentials = Credentials.from_descriptor(int(os.environ["CREDENTIALS"]))
 identity = Identity.of_this_process("echo")
 AgentDialer(loop, sys.argv[1], credentials, identity, on_link=on_link, on_failed=on_failed)
 loop.run()
@@ -224,10 +224,13 @@ def remote_agent(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """An agent in a process of its own that sends back what it gets."""
     path = os.pathsep.join(entry for entry in sys.path if entry)
-    environment = {"CREDENTIALS": credentials.agent_half().to_environment(), "PYTHONPATH": path}
+    descriptor = credentials.agent_half().to_descriptor()
     process = subprocess.Popen(
-        [sys.executable, "-c", ECHO, listener.address], env={**os.environ, **environment}
+        [sys.executable, "-c", ECHO, listener.address],
+        env={**os.environ, "CREDENTIALS": str(descriptor), "PYTHONPATH": path},
+        pass_fds=(descriptor,),
     )
+    os.close(descriptor)
     try:
         yield process
     finally:
@@ -237,7 +240,6 @@ def remote_agent(
 
 FORKER = """
 import os, sys, threading, warnings
-from fiber._transport import dialer
 from fiber._transport.credentials import make_credentials
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop

@@ -1,0 +1,153 @@
+"""The process of an agent on this machine, and the thread that starts them."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+from fiber._agent.zygote_process import interpreter_arguments
+from fiber._transport.credentials import Credentials
+from fiber._transport.loop import Loop
+
+_PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
+"""Seconds from one attempt to start a process to the next, growing."""
+
+_MAY_PASS = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
+"""What keeps the system from starting a process, until others have ended."""
+
+_STATEMENT = "import runpy; runpy.run_module('fiber.agent', run_name='__main__')"
+
+
+class AgentProcess:
+    """One process, from before its start to after its end.
+
+    ``on_end`` is called once with how it ended, or why it never began, on the loop's thread.
+    """
+
+    def __init__(self, loop: Loop, on_end: Callable[[str], None]) -> None:
+        self._loop = loop
+        self._on_end = on_end
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._unwanted = False
+        self.delayed = False
+        """Whether something keeps it from starting now."""
+
+    @property
+    def pid(self) -> int | None:
+        """Its id, once it has begun."""
+        return None if self._process is None else self._process.pid
+
+    def start(self, environment: Mapping[str, str], credentials: Credentials) -> None:
+        """Start it, with the credentials on a descriptor that only it inherits; or OSError."""
+        with self._lock:
+            if self._unwanted:
+                return
+            descriptor = credentials.to_descriptor()
+            try:
+                self._process = subprocess.Popen(
+                    interpreter_arguments(sys.executable, _STATEMENT),
+                    env={**environment, "FIBER_AGENT_CREDENTIALS": f"fd:{descriptor}"},
+                    stdin=subprocess.DEVNULL,
+                    pass_fds=(descriptor,),
+                    process_group=0,
+                )
+            finally:
+                os.close(descriptor)
+            self.delayed = False
+            self._watched = os.pidfd_open(self._process.pid)
+        self._loop.register(self._watched, self._ended)
+
+    def fail(self, reason: str) -> None:
+        """It will not be started."""
+        self._loop.call_soon(self._on_end, reason)
+
+    def kill(self) -> None:
+        """It is out of reach, though it may run: nothing of it is wanted any more."""
+        with self._lock:
+            self._unwanted = True
+            if self._process is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    self._process.kill()
+
+    def wait(self, timeout: float) -> None:
+        """Wait for its end, by force after ``timeout`` seconds.  It must not be started later."""
+        process = self._process
+        if process is None:
+            return
+        try:
+            process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def _ended(self) -> None:
+        assert self._process is not None
+        status = self._process.poll()
+        if status is None:
+            return
+        self._loop.unregister(self._watched)
+        os.close(self._watched)
+        self._on_end(f"its process ended with status {status}")
+
+
+class Launcher:
+    """A thread that starts agents, one after the other.
+
+    Starting a process takes milliseconds and may fail, so the loop does not do it; nor would a
+    thread of its own for each be there when the system has no more of them to give.
+    """
+
+    def __init__(
+        self, credentials: Credentials, timeout: float, on_trouble: Callable[[str], None]
+    ) -> None:
+        """``on_trouble`` is told, on the thread, what keeps one from starting that is tried again
+        for ``timeout`` seconds.
+        """
+        self._credentials = credentials
+        self._timeout = timeout
+        self._on_trouble = on_trouble
+        self._wanted: queue.SimpleQueue[tuple[AgentProcess, str, Mapping[str, str]] | None]
+        self._wanted = queue.SimpleQueue()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fiber-launch", daemon=True)
+        self._thread.start()
+
+    def launch(self, process: AgentProcess, name: str, environment: Mapping[str, str]) -> None:
+        """Start it as soon as possible.  Any thread; returns at once."""
+        self._wanted.put((process, name, environment))
+
+    def close(self) -> None:
+        """Start nothing more."""
+        self._closing.set()
+        self._wanted.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (wanted := self._wanted.get()) is not None and not self._closing.is_set():
+            self._start(*wanted)
+
+    def _start(self, process: AgentProcess, name: str, environment: Mapping[str, str]) -> None:
+        deadline = time.monotonic() + self._timeout
+        pause = _PAUSE_MIN
+        while True:
+            try:
+                process.start(environment, self._credentials)
+                return
+            except OSError as error:
+                reason = f"its process cannot be started: {error}"
+                if error.errno not in _MAY_PASS or time.monotonic() + pause > deadline:
+                    process.fail(reason)
+                    return
+            process.delayed = True
+            self._on_trouble(f"agent {name} has to wait, {reason}; next attempt in {pause:g} s")
+            if self._closing.wait(pause):
+                return
+            pause = min(2 * pause, _PAUSE_MAX)

@@ -1,0 +1,17 @@
+"""What the first process or pool of a program does before it imports the rest of Fiber."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+
+from fiber import config
+from fiber._agent import zygote_process
+
+
+def start_zygote() -> None:
+    """Have the zygote start and import while this process does."""
+    if "fiber._runtime.state" in sys.modules or config.current().backend != "local":
+        return
+    with contextlib.suppress(OSError):  # whoever needs it will try again, and say what is wrong
+        zygote_process.start_early()

@@ -1,0 +1,285 @@
+"""The door: takes connections, and lets pass who proves in time to have the pool's credentials.
+
+It has a thread and a loop of its own.  TLS costs milliseconds of processor time for each who comes,
+be it a thousand agents or strangers without end, and the program's own loop must not wait for that;
+one thread is all that they get together.  Nothing on it blocks, OpenSSL runs without the
+interpreter's lock, and who is slow holds up nobody but himself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import resource
+import select
+import socket
+import ssl
+from collections.abc import Callable
+
+from fiber._transport import address as addresses
+from fiber._transport import tls
+from fiber._transport.admission import Admission
+from fiber._transport.loop import Loop
+from fiber._transport.sealing import Secrets
+from fiber._wire.messages import ProtocolError
+from fiber.errors import LinkError, TooManyOpenFiles
+
+_DEADLINE = 10.0
+"""Seconds for a newcomer to prove itself, all in all."""
+
+_MOST = 512
+"""Newcomers at the same time; half of them from one address, as a relay or a NAT has one for all.
+Never more than a quarter of the descriptors that this process may have."""
+
+_TURN = 16
+"""Connections taken in one turn, so that those under way have theirs."""
+
+_PAUSE = 0.2
+"""Seconds without accepting when there is no descriptor left."""
+
+_LAST_WORD = 1.0
+"""Seconds for the peer to read why it was turned away: closing at once might destroy that."""
+
+_TOLD = 256
+"""Different complaints that are told; who varies his address or fault must not fill the log."""
+
+_BACKLOG = 1024
+
+_SHORT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+
+
+class Acceptor:
+    """Listens on ``address`` (port 0: a free one), which then says where it really does.
+
+    ``on_hello`` is called on its thread with a newcomer that has proved itself, and its first
+    words; ``on_refused`` with why one was turned away, once for each address and reason.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        context: ssl.SSLContext,
+        *,
+        on_hello: Callable[[Newcomer, bytes], None],
+        on_refused: Callable[[str], None],
+    ) -> None:
+        self.context = context
+        self.on_hello = on_hello
+        self.loop = Loop()
+        self._on_refused = on_refused
+        self._told: set[tuple[str, str]] = set()
+        descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        most = min(_MOST, max(descriptors // 4, 2))
+        self._admission = Admission(most, most // 2)
+        try:
+            self._door = _listen(address)
+        except BaseException:
+            self.loop.stop()
+            raise
+        self.address = f"{address.rpartition(':')[0]}:{self._door.getsockname()[1]}"
+        self.loop.register(self._door.fileno(), self._accept)
+        self._newcomers: set[Newcomer] = set()
+        self.loop.start_thread("fiber-accept")
+
+    def take(self, sock: socket.socket, origin: str) -> None:
+        """Treat a connection that came by another way, a relay's say, as if it were accepted."""
+        self.loop.call_soon(self._admit, sock, origin, origin)
+
+    def close(self) -> None:
+        """Take nobody any more and hang up on who is under way.  Not on its own thread."""
+        self.loop.call_soon(self._close)
+        self.loop.stop()
+
+    # On its own thread
+
+    def complain(self, host: str, origin: str, what: str) -> None:
+        """Somebody was turned away."""
+        if (host, what) not in self._told and len(self._told) < _TOLD:
+            self._told.add((host, what))
+            self._on_refused(f"{origin} was turned away: {what}")
+
+    def forget(self, newcomer: Newcomer) -> None:
+        """It is gone, or in."""
+        self._admission.leave(newcomer)
+        self._newcomers.discard(newcomer)
+
+    def _accept(self) -> None:
+        for _ in range(_TURN):
+            try:
+                sock, (host, port, *_) = self._door.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:
+                if error.errno in _SHORT_OF_DESCRIPTORS:
+                    self._pause(error)
+                    return
+                continue  # that connection broke before it was taken
+            self._admit(sock, host, f"{host}:{port}")
+
+    def _pause(self, error: OSError) -> None:
+        self.complain("", "whoever comes now", f"{error.strerror}; it is tried again all the time")
+        self.loop.unregister(self._door.fileno())
+        self.loop.call_later(_PAUSE, self._resume)
+
+    def _resume(self) -> None:
+        if self._door.fileno() >= 0:
+            self.loop.register(self._door.fileno(), self._accept)
+
+    def _admit(self, sock: socket.socket, host: str, origin: str) -> None:
+        newcomer = Newcomer(self, host, origin)
+        admitted, leaves = self._admission.enter(newcomer, host, self.loop.now())
+        if isinstance(leaves, Newcomer):
+            leaves.refuse("it said nothing, and others want to come in")
+        if not admitted:
+            self.complain(host, origin, "too many come at the same time")
+            sock.close()
+            return
+        self._newcomers.add(newcomer)
+        try:
+            newcomer.start(sock)
+        except tls.HungUp:
+            self.forget(newcomer)
+
+    def _close(self) -> None:
+        if self._door.fileno() >= 0:
+            self.loop.unregister(self._door.fileno())
+            self._door.close()
+        for newcomer in list(self._newcomers):
+            newcomer.hang_up()
+
+
+class Newcomer:
+    """A connection from its first byte to its last in TLS."""
+
+    def __init__(self, acceptor: Acceptor, host: str, origin: str) -> None:
+        self.origin = origin
+        self._host = host
+        self._acceptor = acceptor
+        self._loop = acceptor.loop
+        self._watched: int | None = None
+
+    def start(self, sock: socket.socket) -> None:
+        """Prove each other and hear its first words; HungUp if it has gone already."""
+        with contextlib.suppress(OSError):  # no TCP, or broken already
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._exchange = tls.Exchange(sock, self._acceptor.context)
+        self._timer = self._loop.call_later(_DEADLINE, self._too_late)
+        self._run(self._exchange.listen(), lambda hello: self._acceptor.on_hello(self, hello))
+
+    def welcome(self, greeting: bytes, then: Callable[[int, Secrets], None]) -> None:
+        """Answer it and end TLS; ``then`` gets the connection, on the acceptor's thread.  Any
+        thread.
+        """
+        self._loop.call_soon(self._answer, greeting, lambda end: then(*end))
+
+    def turn_away(self, greeting: bytes) -> None:
+        """Answer it and hang up.  Any thread."""
+        self._loop.call_soon(self._answer, greeting, lambda end: os.close(end[0]))
+
+    def _answer(self, greeting: bytes, then: Callable[[tuple[int, Secrets]], None]) -> None:
+        if self.gone:
+            return
+
+        def passed(end: tuple[int, Secrets]) -> None:
+            self._leave()
+            then(end)
+
+        self._run(
+            self._exchange.answer(greeting), lambda _: self._run(self._exchange.end(), passed)
+        )
+
+    @property
+    def gone(self) -> bool:
+        """Whether it hung up or was hung up on."""
+        return self._exchange.sock.fileno() < 0
+
+    def refuse(self, what: str) -> None:
+        """Hang up, and tell whom it concerns."""
+        self._acceptor.complain(self._host, self.origin, what)
+        self.hang_up()
+
+    def hang_up(self) -> None:
+        """Let go of it."""
+        self._unwatch()
+        self._exchange.close()
+        self._leave()
+
+    def _leave(self) -> None:
+        self._timer.cancel()
+        self._acceptor.forget(self)
+
+    def _run(self, steps: tls.Steps[tls._T], then: Callable[[tls._T], None]) -> None:
+        """Go on with ``steps`` whenever the connection is ready."""
+
+        def step() -> None:
+            try:
+                self._watch(next(steps), step)
+            except StopIteration as finished:
+                self._unwatch()
+                then(finished.value)
+            except (tls.Untrusted, tls.HungUp, ProtocolError) as error:
+                self._acceptor.complain(self._host, self.origin, str(error))
+                self._part()
+
+        step()
+
+    def _watch(self, event: int, step: Callable[[], None]) -> None:
+        fd = self._exchange.sock.fileno()
+        if self._watched is None:
+            self._watched = fd
+            self._loop.register(fd, step)
+        self._loop.want_write(fd, step if event == select.POLLOUT else None)
+
+    def _unwatch(self) -> None:
+        if self._watched is not None:
+            self._loop.unregister(self._watched)
+            self._watched = None
+
+    def _part(self) -> None:
+        """Let it read the alert that says why, then hang up."""
+        self._unwatch()
+        sock = self._exchange.sock
+        try:
+            socket.socket.shutdown(sock, socket.SHUT_WR)
+        except OSError:  # it has hung up itself
+            self.hang_up()
+            return
+        self._timer.cancel()
+        self._timer = self._loop.call_later(_LAST_WORD, self.hang_up)
+        self._watched = sock.fileno()
+        self._loop.register(self._watched, self._drain)
+
+    def _drain(self) -> None:
+        try:
+            rest = os.read(self._exchange.sock.fileno(), 1 << 16)
+        except BlockingIOError:
+            return
+        except OSError:
+            rest = b""
+        if not rest:
+            self.hang_up()
+
+    def _too_late(self) -> None:
+        self.refuse(f"it did not prove itself within {_DEADLINE:g} s")
+
+
+def _listen(address: str) -> socket.socket:
+    host, port = addresses.parse(address)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        door = socket.create_server((host, port), family=family, backlog=_BACKLOG)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise LinkError(
+                f"cannot listen on {address}: another program uses that port. Stop it, or choose "
+                "another port; port 0 takes a free one."
+            ) from error
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            raise TooManyOpenFiles(f"listening on {address}") from error
+        raise LinkError(
+            f"cannot listen on {address}: {str(error.strerror or error).lower()}. Use an address "
+            "of this host and a port that this user may bind."
+        ) from error
+    door.setblocking(False)
+    return door

@@ -1,0 +1,20 @@
+"""The configuration that a process has from the one that started it, until somebody asks for it.
+
+Most children never do, and what reads configurations takes longer to import than they take to
+start.
+"""
+
+from __future__ import annotations
+
+_configuration: bytes | None = None
+
+
+def keep(pickled: bytes) -> None:
+    """In a child: the pickled ``Config`` of its parent."""
+    global _configuration
+    _configuration = pickled
+
+
+def configuration() -> bytes | None:
+    """What was kept."""
+    return _configuration

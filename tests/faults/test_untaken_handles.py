@@ -1,0 +1,37 @@
+"""Connections in messages that nobody receives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from faults.program import Program
+
+UNTAKEN = """
+    import {library} as library
+    if __name__ == "__main__":
+        process = library.Process(target=int)
+        process.start()
+        process.join()
+        outer, outer_theirs = library.Pipe()
+        ours, theirs = library.Pipe()
+        outer.send(theirs)  # never received
+        for end in theirs, outer_theirs, outer:
+            end.close()
+        print(ours.poll(0.3), flush=True)
+"""
+
+
+@pytest.mark.parametrize("library", ["multiprocessing", "fiber"])
+def test_a_handle_that_nobody_took_holds_its_end_as_long_as_multiprocessings(
+    launch_on: Callable[..., Program], library: str
+) -> None:
+    """Nobody hears that the kernel threw a message away together with its pipe.
+
+    So whoever has lent an end keeps it for the taker that may come, until the program ends.
+    """
+    program = launch_on(UNTAKEN.format(library=library))
+    assert program.line() == "False"
+    assert program.wait() == 0
+    assert program.left() == []

@@ -1,0 +1,233 @@
+"""The door: who is turned away there, when, and what is said of it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import ssl
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from fiber._transport import acceptor, tls
+from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.handshake import Hello, Identity
+from unit.link_site import DEADLINE, Notes, Site, complete, port_of
+
+SOON = 0.3
+HELLO = Hello(Identity.of_this_process("stranger"), "0" * 32, 0, False).encode()
+
+
+@pytest.fixture(scope="module")
+def credentials() -> MasterCredentials:
+    return make_credentials("test")
+
+
+@pytest.fixture
+def site(credentials: MasterCredentials, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setattr(acceptor, "_DEADLINE", SOON)
+    site = Site(credentials)
+    try:
+        yield site
+    finally:
+        site.end()
+
+
+class Visitor:
+    """Goes as far as told, with an agent's credentials."""
+
+    def __init__(self, site: Site, address: str) -> None:
+        half = site.credentials.agent_half()
+        self.sock = socket.create_connection(("127.0.0.1", port_of(address)), DEADLINE)
+        self.exchange = tls.Exchange(
+            self.sock, tls.context_of(half, listens=False), half.server_name
+        )
+
+    def go(self, state: str) -> None:
+        """Up to ``state``, and not a step further."""
+        if state == "connected":
+            return
+        if state == "hello of TLS sent":
+            next(self.exchange.ask(HELLO))
+            return
+        complete(self.exchange, self.exchange._when_ready(self.exchange.sock.do_handshake))
+        if state == "half of its first words":
+            self.exchange.sock.send(self.exchange._ours + (100).to_bytes(4, "big") + b"half")
+        elif state == "welcome":
+            complete(self.exchange, self.exchange._write(HELLO))
+            complete(self.exchange, self.exchange._read())
+
+    def rest(self) -> bytes:
+        """All that still comes, up to the end."""
+        sock = self.exchange.sock
+        raw = socket.socket(fileno=os.dup(sock.fileno()))
+        raw.settimeout(DEADLINE)
+        data = b""
+        try:
+            while more := raw.recv(1 << 16):
+                data += more
+        except ConnectionError:
+            pass
+        finally:
+            raw.close()
+            self.close()
+        return data
+
+    def close(self) -> None:
+        self.exchange.close()
+
+
+STATES = (
+    "connected",
+    "hello of TLS sent",
+    "TLS proved",
+    "half of its first words",
+    "welcome",
+)
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_who_stops_in_the_middle_is_turned_away_in_time_and_told_once(
+    site: Site, state: str
+) -> None:
+    listener, master = site.listener()
+    visitors = [Visitor(site, listener.address) for _ in range(3)]
+    for visitor in visitors:
+        visitor.go(state)
+    _, agent = site.dialer(listener.address)
+    assert agent.link is not master.link  # they hold up nobody
+    for visitor in visitors:
+        visitor.rest()
+    master.wait(lambda: master.refusals)
+    (told,) = master.refusals
+    assert told.startswith("127.0.0.1:")
+    assert told.endswith(f"was turned away: it did not prove itself within {SOON:g} s")
+    assert len(master.links) == 1
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_garbage_in_every_state_is_turned_away_and_told_once(site: Site, state: str) -> None:
+    listener, master = site.listener()
+    for _ in range(3):
+        visitor = Visitor(site, listener.address)
+        visitor.go(state)
+        os.write(visitor.exchange.sock.fileno(), b"GET / HTTP/1.1\r\n\r\n" * 10)
+        visitor.rest()
+    master.wait(lambda: master.refusals)
+    (told,) = master.refusals
+    assert told.startswith("127.0.0.1:")
+    assert "the TLS handshake failed" in told
+    assert master.links == []
+
+
+def test_a_greeting_without_end_is_turned_away(site: Site) -> None:
+    listener, master = site.listener()
+    visitor = Visitor(site, listener.address)
+    visitor.go("TLS proved")
+    visitor.exchange.sock.send(bytes(32) + b"\xff\xff\xff\xff")
+    visitor.rest()
+    master.wait(lambda: master.refusals)
+    assert "its greeting of 4294967295 bytes is too long" in master.refusals[0]
+
+
+def test_a_certificate_of_another_pool_is_told_with_its_fault(site: Site) -> None:
+    listener, master = site.listener()
+    half = make_credentials("test").agent_half()
+    context = tls.context_of(half, listens=False)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    with socket.create_connection(("127.0.0.1", port_of(listener.address)), DEADLINE) as sock:
+        stranger = context.wrap_socket(sock)
+        with pytest.raises(ssl.SSLError, match=r"(?i)unknown.ca|decrypt"):
+            stranger.recv(1)  # it hears why, though the master has nothing to say to it
+        stranger.close()
+    master.wait(lambda: master.refusals)
+    assert "its certificate is refused" in master.refusals[0]
+
+
+def test_a_crowd_from_one_address_is_bounded_and_keeps_nobody_out(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(acceptor, "_MOST", 8)
+    monkeypatch.setattr(acceptor, "_DEADLINE", 60.0)
+    monkeypatch.setattr("fiber._transport.admission._FAIR_CHANCE", 0.2)
+    listener, master = site.listener()
+    crowd = [Visitor(site, listener.address) for _ in range(20)]
+    ended = [visitor for visitor in crowd[4:] if visitor.rest() == b""]
+    assert len(ended) == 16, "no more than half of the bound is for one address"
+    _, agent = site.dialer(listener.address)
+    agent.link.send(b"in")  # one of them had to make room
+    master.wait(lambda: master.frames)
+    for visitor in crowd[:4]:
+        visitor.close()
+    assert any("too many come at the same time" in told for told in master.refusals)
+
+
+class Door:
+    """A listening socket for which the process has no descriptor left, for a while."""
+
+    def __init__(self, door: socket.socket, times: int) -> None:
+        self._door = door
+        self.refusals = times
+
+    def accept(self) -> Any:
+        if self.refusals:
+            self.refusals -= 1
+            raise OSError(errno.EMFILE, "Too many open files")
+        return self._door.accept()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._door, name)
+
+
+def test_without_descriptors_it_goes_on_later_and_says_so_once(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(acceptor, "_PAUSE", 0.05)
+    listener, master = site.listener()
+    door = Door(listener._acceptor._door, times=4)
+    monkeypatch.setattr(listener._acceptor, "_door", door)
+    _, agent = site.dialer(listener.address)
+    assert agent.link is not master.link
+    assert door.refusals == 0
+    assert [told for told in master.refusals if "Too many open files" in told] == master.refusals
+    assert len(master.refusals) == 1
+
+
+def test_connections_that_break_before_they_are_taken_harm_nobody(site: Site) -> None:
+    listener, master = site.listener()
+    for _ in range(20):
+        sock = socket.create_connection(("127.0.0.1", port_of(listener.address)), DEADLINE)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+        sock.close()  # by a reset
+    _, agent = site.dialer(listener.address)
+    assert agent.link is not master.link
+
+
+def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:
+    listener, _ = site.listener()
+    visitors = [Visitor(site, listener.address) for _ in range(3)]
+    visitors[1].go("hello of TLS sent")
+    visitors[2].go("TLS proved")
+    site.close(listener)
+    ends = [threading.Thread(target=visitor.rest) for visitor in visitors]
+    for end in ends:
+        end.start()
+    for end in ends:
+        end.join(DEADLINE)
+        assert not end.is_alive()
+
+
+def test_complaints_are_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(acceptor, "_TOLD", 3)
+    listener, master = site.listener()
+    site.on_loop(lambda: None)
+    for number in range(10):
+        listener._acceptor.complain(f"10.0.0.{number}", f"10.0.0.{number}:1", "nonsense")
+    notes: Notes = master
+    notes.wait(lambda: len(notes.refusals) == 3)
+    site.on_loop(lambda: None)
+    assert len(notes.refusals) == 3

@@ -1,0 +1,279 @@
+"""What an attacker on the path can do: hold up and break off, and nothing else.
+
+``docs/decisions/0015-the-way-in-is-ours.md`` says why.
+"""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from fiber._transport import tls
+from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.handshake import Hello, Identity, Refusal, decode
+from fiber._transport.listener import MasterListener
+from fiber.errors import AuthenticationError, LinkError
+from unit.attacker import CUT, DOWN, MESSAGE, TLS, UP, Path, Unit
+from unit.link_site import DEADLINE, Notes, Site, port_of, say
+
+FRAMES = [b"%d " % number * 50 for number in range(30)]
+HOPS = 8 + 4
+"""Where a message's sealed part begins: behind its length and nng's count of hops."""
+
+
+@pytest.fixture(scope="module")
+def credentials() -> MasterCredentials:
+    return make_credentials("test")
+
+
+@pytest.fixture
+def site(credentials: MasterCredentials) -> Iterator[Site]:
+    site = Site(credentials)
+    try:
+        yield site
+    finally:
+        site.end()
+
+
+class Once:
+    """Applies an attack to the first unit that it is meant for."""
+
+    def __init__(self, meant: Callable[[Unit], bool], attack: Callable[[Any, Unit], Any]) -> None:
+        self._meant = meant
+        self._attack = attack
+        self.seen: list[Unit] = []
+        self.held: list[bytes] = []
+        self.done = threading.Event()
+
+    def __call__(self, unit: Unit) -> list[bytes | None]:
+        self.seen.append(unit)
+        if not self.done.is_set() and self._meant(unit):
+            self.done.set()
+            return list(self._attack(self, unit))
+        held, self.held = self.held, []
+        return [unit.data, *held]
+
+
+def flip(at: int) -> Callable[[Once, Unit], list[bytes]]:
+    def attack(_: Once, unit: Unit) -> list[bytes]:
+        changed = bytearray(unit.data)
+        changed[at % len(changed)] ^= 1
+        return [bytes(changed)]
+
+    return attack
+
+
+def swap(once: Once, unit: Unit) -> list[bytes]:
+    once.held = [unit.data]
+    return []
+
+
+def from_the_other_direction(once: Once, unit: Unit) -> list[bytes]:
+    other = next(u for u in once.seen if u.kind == MESSAGE and u.direction != unit.direction)
+    return [other.data, unit.data]
+
+
+def from_the_beginning(once: Once, unit: Unit) -> list[bytes]:
+    first = next(u for u in once.seen if u.kind == MESSAGE and u.direction == unit.direction)
+    return [first.data, unit.data]
+
+
+ATTACKS: dict[str, Callable[[Once, Unit], Any]] = {
+    "drop": lambda *_: [],
+    "replay": lambda _, unit: [unit.data, unit.data],
+    "replay the first": from_the_beginning,
+    "reorder": swap,
+    "cut": lambda *_: [CUT],
+    "truncate": lambda _, unit: [unit.data[:-5], CUT],
+    "inject": lambda _, unit: [unit.data[:HOPS] + bytes(len(unit.data) - HOPS), unit.data],
+    "inject an empty one": lambda _, unit: [(4).to_bytes(8, "big") + unit.data[8:HOPS], unit.data],
+    "reflect": from_the_other_direction,
+    "change the beginning": flip(HOPS),
+    "change the end": flip(-1),
+    "change the hops": lambda _, unit: [unit.data[: HOPS - 1] + b"\xff" + unit.data[HOPS:]],
+    "announce far too much": flip(1),
+    "announce less": flip(7),
+}
+
+
+def talk(site: Site, path: Path, listener: MasterListener, master: Notes) -> Notes:
+    """An agent over ``path``; both sides say all FRAMES, a few at a time."""
+    _, agent = site.dialer(listener.address, connect=path.connect)
+    sides = (master, agent)
+    for number in range(0, len(FRAMES), 3):
+        for notes in sides:
+            for frame in FRAMES[number : number + 3]:
+                notes.link.send(frame)
+        for notes in sides:
+            notes.wait(lambda notes=notes, number=number: len(notes.frames) >= number + 3)
+    return agent
+
+
+@pytest.fixture
+def path_of(site: Site) -> Iterator[Callable[..., tuple[Path, MasterListener, Notes]]]:
+    paths: list[Path] = []
+
+    def make(meddle: Any) -> tuple[Path, MasterListener, Notes]:
+        listener, master = site.listener()
+        paths.append(Path(listener, meddle))
+        return paths[-1], listener, master
+
+    yield make
+    for path in paths:
+        path.close()
+
+
+@pytest.mark.parametrize("direction", [UP, DOWN])
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_an_attack_on_a_message_costs_a_connection_and_no_more(
+    site: Site, path_of: Any, attack: str, direction: str
+) -> None:
+    once = Once(
+        lambda unit: (unit.direction, unit.kind) == (direction, MESSAGE) and unit.number == 4,
+        ATTACKS[attack],
+    )
+    path, listener, master = path_of(once)
+    agent = talk(site, path, listener, master)
+    assert once.done.is_set()
+    assert path.connections == 2, "it was noticed, and the agent dialled again"
+    assert agent.frames == master.frames == FRAMES
+    assert not [event for event in (*agent.events, *master.events) if "lost" in event]
+    assert len(master.links) == 1
+
+
+def test_a_delay_costs_time(site: Site, path_of: Any) -> None:
+    goes_on = threading.Event()
+
+    def delay(_: Once, unit: Unit) -> list[bytes]:
+        goes_on.wait(0.3)  # the length of the delay, which is what is tested
+        return [unit.data]
+
+    once = Once(lambda unit: unit.kind == MESSAGE and unit.number == 4, delay)
+    path, listener, master = path_of(once)
+    agent = talk(site, path, listener, master)
+    assert agent.frames == master.frames == FRAMES
+    assert path.connections == 1
+
+
+RECORD_ATTACKS: dict[str, Callable[[Once, Unit], Any]] = {
+    "drop": lambda *_: [],
+    "replay": lambda _, unit: [unit.data, unit.data],
+    "cut": lambda *_: [CUT],
+    "truncate": lambda _, unit: [unit.data[:-1], CUT],
+    "change the beginning": flip(5),
+    "change the end": flip(-1),
+    "change the version": flip(2),
+    "garbage": lambda _, unit: [b"\x17\x03\x03\x00\x20" + bytes(32)],
+}
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 3])
+@pytest.mark.parametrize("direction", [UP, DOWN])
+@pytest.mark.parametrize("attack", RECORD_ATTACKS)
+def test_an_attack_on_the_handshake_ends_it(
+    site: Site, path_of: Any, attack: str, direction: str, number: int, monkeypatch: Any
+) -> None:
+    """It may cost the connection, or this agent its life; but nobody takes a wrong word."""
+    monkeypatch.setattr("fiber._transport.acceptor._DEADLINE", 0.4)
+    monkeypatch.setattr("fiber._transport.dialer._GREET", 0.4)
+    once = Once(
+        lambda unit: (unit.direction, unit.kind, unit.number) == (direction, TLS, number),
+        RECORD_ATTACKS[attack],
+    )
+    path, listener, master = path_of(once)
+    _, agent = site.dialer(listener.address, connect=path.connect)
+    agent.wait(lambda: agent.links or agent.errors)
+    if agent.errors:
+        assert isinstance(agent.errors[0], AuthenticationError | LinkError)
+        assert master.links == []
+    else:
+        agent.link.send(b"in order")
+        master.wait(lambda: master.frames)
+        assert master.frames == [b"in order"]
+
+
+def test_a_whole_conversation_replayed_is_nobody(site: Site, path_of: Any) -> None:
+    once = Once(lambda _: False, lambda *_: [])
+    path, listener, master = path_of(once)
+    talk(site, path, listener, master)
+    with socket.create_connection(("127.0.0.1", port_of(listener.address)), DEADLINE) as again:
+        for unit in [unit for unit in once.seen if unit.direction == UP]:
+            try:
+                again.sendall(unit.data)
+            except ConnectionError:
+                break  # it was turned away in the middle
+        master.wait(lambda: master.refusals)
+    assert "was turned away: the TLS handshake failed" in master.refusals[0]
+    assert len(master.links) == 1
+    assert master.frames == FRAMES
+
+
+def test_two_connections_have_nothing_in_common(site: Site, path_of: Any) -> None:
+    """What is said anew on a new connection is sealed anew."""
+    once = Once(lambda unit: unit.kind == MESSAGE and unit.number == 4, lambda *_: [CUT])
+    path, listener, master = path_of(once)
+    talk(site, path, listener, master)
+    sealed = [unit.data[HOPS:] for unit in once.seen if unit.kind == MESSAGE]
+    assert len(set(sealed)) == len(sealed)
+    assert not [data for data in sealed if FRAMES[0][:20] in data]
+
+
+@pytest.mark.parametrize("claims", ["to go on with a link", "to begin one that is another's"])
+def test_a_stolen_agents_key_opens_no_other_agents_link(site: Site, claims: str) -> None:
+    listener, master = site.listener()
+    _, agent = site.dialer(listener.address)
+    agent.link.send(b"mine")
+    master.wait(lambda: master.frames)
+    known = Identity.of_this_process("agent-1", host="here")
+    guess = "0" * 32  # the name of a link is as long as a key, and travels in TLS only
+    hello = Hello(known, guess, 0, claims == "to go on with a link")
+    answer = decode(say(listener.address, site.credentials.agent_half(), hello.encode()))
+    assert isinstance(answer, Refusal) == hello.welcomed
+    agent.link.send(b"still mine")
+    master.wait(lambda: len(master.frames) == 2)
+    assert master.events == agent.events == []
+
+
+def test_the_path_with_a_stolen_agents_key_is_no_master(site: Site) -> None:
+    """Nor can who has such a key sit in the middle: an agent expects the master's name."""
+    half = site.credentials.agent_half()
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_verify_locations(cadata=half.authority)
+    tls._load_own(context, half)
+    with socket.create_server(("127.0.0.1", 0)) as door:
+        _, agent = site.dialer(f"127.0.0.1:{door.getsockname()[1]}")
+        sock, _ = door.accept()
+        with pytest.raises(ssl.SSLError), context.wrap_socket(sock, server_side=True):
+            pass
+        sock.close()
+        agent.wait(lambda: agent.errors)
+    assert isinstance(agent.errors[0], AuthenticationError)
+    assert "certificate is refused" in str(agent.errors[0])
+
+
+@pytest.mark.filterwarnings("ignore:ssl.TLSVersion:DeprecationWarning")
+@pytest.mark.parametrize("who", ["agent", "master"])
+def test_nobody_is_talked_into_an_older_tls(
+    site: Site, monkeypatch: pytest.MonkeyPatch, who: str
+) -> None:
+    def older(credentials: Any, *, listens: bool) -> ssl.SSLContext:
+        context = made(credentials, listens=listens)
+        if listens == (who == "master"):
+            context.minimum_version = ssl.TLSVersion.TLSv1_2
+            context.maximum_version = ssl.TLSVersion.TLSv1_2
+        return context
+
+    made = tls.context_of
+    monkeypatch.setattr(tls, "context_of", older)
+    listener, master = site.listener()
+    _, agent = site.dialer(listener.address)
+    agent.wait(lambda: agent.errors)
+    assert isinstance(agent.errors[0], AuthenticationError)
+    master.wait(lambda: master.refusals)
+    assert "unsupported protocol" in master.refusals[0] or "protocol version" in master.refusals[0]
+    assert master.links == []
