@@ -132,10 +132,10 @@ class ExecutorMaster:
         if plan.bite < len(plan.tasks) and style == "map":
             style = "stream"
         if style == "call" and self._rng.random() < 0.7:
-            style = "apply"
+            style = "direct call"
         self.world.note("the user opens job %d, a %s", account.number, style)
         try:
-            getattr(self, f"_{style}")(account, future)
+            getattr(self, f"_{style.replace(' ', '_')}")(account, future)
         except (ValueError, StartError) as error:
             self._expect_refusal(error)
             self.world.note("job %d is refused: %s", account.number, type(error).__name__)
@@ -182,11 +182,12 @@ class ExecutorMaster:
             self.world.note("job %d goes no further: %s", account.number, type(error).__name__)
             self._open_calls[account.number] -= account.fed - fed
             account.fed = fed
+            account.delivered &= account.everything  # some of these could not be sent
             account.closed = account.refused = True
             if not self._open_calls[account.number]:
                 future.set_done()
 
-    def _apply(self, account: Account, future: Outcomes) -> None:
+    def _direct_call(self, account: Account, future: Outcomes) -> None:
         """One call after the other has its result."""
         if account.plan.tasks:
             body = partial(self._apply_all, account)

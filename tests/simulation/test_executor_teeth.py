@@ -232,8 +232,7 @@ def forgets_who_died_while_lent(patch: Patch) -> None:
 
 
 def never_takes_back_what_nobody_returns(patch: Patch) -> None:
-    patch.setattr(Leases, "_abandon", lambda *_: None)
-    patch.setattr(Leases, "_find_dropped", lambda _: None)
+    patch.setattr(Leases, "_return_abandoned", lambda *_: None)
 
 
 FAULTS: list[Fault] = [
