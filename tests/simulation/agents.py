@@ -155,6 +155,7 @@ class Child:
     def __init__(self, agent: Agent, number: int, observer: ChildObserver) -> None:
         self.name = f"worker {number}"
         self.pid: int | None = None
+        self.start_error: Exception | None = None
         self.host = agent.host
         self.agent = agent
         self.worker = Worker(agent.world, number, self)
@@ -173,8 +174,10 @@ class Child:
         self.agent.down.send(self._put, seq, payload, buffers)
         return True
 
-    def lend(self) -> Channel | None:
+    def lend(self) -> Any:
         """Its channel, for direct use."""
+        if self.gone:
+            return None
         self._channel = self.agent.world.make_channel(self)
         return self._channel
 

@@ -19,14 +19,14 @@ from fiber._runtime.outcome import Pickled
 from fiber._runtime.work_items import Call, WorkItem
 from fiber._wire import work
 from fiber.errors import StartError
-from fiber.process import PoolProcess
+from fiber.process import ForkProcess, PoolProcess
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation, require
 from simulation.outcomes import HEARD, BrokenInput, Outcomes
 from simulation.pool_audit import PoolAudit, Reading
 from simulation.schedule import Act, Job, Schedule, Task
-from simulation.staged import Actor, Interrupted, Stage, StagedProcess
+from simulation.staged import Actor, Interrupted, Stage
 from simulation.wire import ERROR, PlannedError, Wire, perform, perform_nowhere, perform_other
 from simulation.workers import Ref
 from simulation.world import World
@@ -81,8 +81,8 @@ class ExecutorMaster:
         self._stage = Stage(world)
         self._stage.enter()
         self._rng = random.Random(f"{world.schedule.seed} user")
-        stage: Any = self._stage
-        self._executor = make(_options(world.schedule), stage, thread=stage.thread)
+        thread: Any = self._stage.thread
+        self._executor = make(_options(world.schedule), self._stage, thread=thread)
         self._ledger = self._executor._ledger
         self.language = Wire(world.schedule.seed)
         self._audit = Audit(world, self._ledger, Names())
@@ -132,10 +132,10 @@ class ExecutorMaster:
         if plan.bite < len(plan.tasks) and style == "map":
             style = "stream"
         if style == "call" and self._rng.random() < 0.7:
-            style = "apply"
+            style = "direct call"
         self.world.note("the user opens job %d, a %s", account.number, style)
         try:
-            getattr(self, f"_{style}")(account, future)
+            getattr(self, f"_{style.replace(' ', '_')}")(account, future)
         except (ValueError, StartError) as error:
             self._expect_refusal(error)
             self.world.note("job %d is refused: %s", account.number, type(error).__name__)
@@ -182,11 +182,12 @@ class ExecutorMaster:
             self.world.note("job %d goes no further: %s", account.number, type(error).__name__)
             self._open_calls[account.number] -= account.fed - fed
             account.fed = fed
+            account.delivered &= account.everything  # some of these could not be sent
             account.closed = account.refused = True
             if not self._open_calls[account.number]:
                 future.set_done()
 
-    def _apply(self, account: Account, future: Outcomes) -> None:
+    def _direct_call(self, account: Account, future: Outcomes) -> None:
         """One call after the other has its result."""
         if account.plan.tasks:
             body = partial(self._apply_all, account)
@@ -444,7 +445,7 @@ def _user(account: Account) -> str:
 
 def _options(schedule: Schedule) -> PoolOptions:
     return PoolOptions(
-        new_process=partial(PoolProcess, like=StagedProcess),
+        new_process=partial(PoolProcess, like=ForkProcess),
         minimum=schedule.min_workers,
         maximum=schedule.max_workers,
         max_tasks=schedule.left,

@@ -64,7 +64,7 @@ class Oracle:
 
     def begins(self, ref: Ref, worker: Worker) -> None:
         """``worker`` begins a task: the first time, or because an earlier run came to nothing."""
-        if ref == NO_OP:
+        if ref == NO_OP or worker in self._lost:  # cut off: nobody can know, or tell it
             return
         account = self.accounts[ref.job]
         runs = account.runs[ref.task]

@@ -88,11 +88,13 @@ class PoolAudit:
         return decisions
 
     def _ready(self, member: Member, now: float) -> None:
-        require(member in self._workers.members, "an unknown worker is ready")
-        if not member.leaving:
+        before = member.worker
+        self._real.ready(member, now)
+        if member.worker is not before:
+            require(before is None, "a worker is ready twice")
+            require(member in self._workers.members, "an unknown worker is ready")
             self._failures.clear()
             self._told = self.starved = False
-        self._real.ready(member, now)
 
     def _gone(
         self, member: Member, now: float, *, failure: StartFailure | None = None, **rest: Any
@@ -260,6 +262,7 @@ class PoolAudit:
             executor._jobs._streams,
             executor._called,
             executor._exits,
+            executor._last_words,
             executor._leases._lent,
         )
         require(not any(left), "the pool leaves something behind")

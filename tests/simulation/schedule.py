@@ -290,10 +290,10 @@ class _Draw:
                     yield Cut(rng.randint(1, remote), self.time(), seconds)
         if rng.random() < 0.05:
             yield Terminate(self.time())
-        if rng.random() < 0.06:
+        if rng.random() < 0.1:
             at = rng.choice((0.0, 5e-3, self.time()))
             exitcode = rng.choice((1, -9, Famine.REFUSED))
-            yield Famine(at, rng.choice((0.3, 3.0, 15.0, 100.0)), exitcode)
+            yield Famine(at, rng.choice((0.3, 3.0, 15.0, 15.0, 100.0)), exitcode)
             if at:
                 yield Kill(rng.randrange(workers), at + self.time())
 

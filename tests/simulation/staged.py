@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 from fiber._agent import service
-from fiber._backends.remote import RemoteChild
-from fiber._runtime import executor
+from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._runtime import executor, launcher
 from fiber._wire.packet import Message
-from fiber.process import Process
 from simulation.agents import Child
 from simulation.remote_hosts import NoCapture, RemoteHost
 from simulation.schedule import Famine, Refusal
@@ -32,18 +31,12 @@ if TYPE_CHECKING:
     from simulation.world import World
 
 
-class StagedProcess(Process):
-    """Makes the executor's processes leave the start method of this program alone."""
-
-    _start_method = "fork"
-
-
 class Stage:
     """Stands in for the runtime, as an executor's host; a context manager for the rest."""
 
     def __init__(self, world: World) -> None:
         self.loop = world.loop
-        self.config = SimpleNamespace(start_timeout=0.0)
+        self.config = SimpleNamespace(start_timeout=1.0)
         self.rng = random.Random(f"{world.schedule.seed} stage")
         self.world = world
         self._started = 0
@@ -63,6 +56,7 @@ class Stage:
         """Take the places of what cannot be handed over."""
         self._stack.enter_context(mock.patch.object(service, "Capture", NoCapture))
         self._stack.enter_context(mock.patch.object(executor, "_say", self._say))
+        self._stack.enter_context(mock.patch.object(launcher, "Latch", partial(StagedLatch, self)))
         self._stack.enter_context(mock.patch.object(PlannedError, "unpickled", self.run_user_code))
 
     def leave(self) -> None:
@@ -84,9 +78,7 @@ class Stage:
         self._actors.append(actor)
         return actor
 
-    def start(
-        self, process: Any, observer: Any, *, tasks: bool, method: str
-    ) -> Child | RemoteChild:
+    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildPort:
         """Start a worker on some agent."""
         assert self.running is not None
         # What comes of it comes after all that this thread has asked for.
@@ -95,11 +87,27 @@ class Stage:
         famine = self.world.famine()
         if self._started in self._refusals or famine is Famine.REFUSED:
             self.world.note("the start of a worker is refused")
-            raise OSError("too many open files")
+            return self._refuse(observer)
         agent = self.rng.choice([agent for agent in self.world.agents if not agent.lost])
         if isinstance(agent, RemoteHost):
-            return agent.start_for_master(f"start {self._started}", observer)
-        return self.world.start(agent, observer)
+            port: ChildPort = agent.start_for_master(f"start {self._started}", observer)
+        else:
+            port = self.world.start(agent, observer)
+        self.pause()
+        return port
+
+    def _refuse(self, observer: Any) -> ChildPort:
+        """The system has no room for it, as is seen at once, or by its agent."""
+        error = OSError("too many open files")
+        if self.rng.random() < 0.5:
+            raise error
+        port = mock.Mock(spec_set=("start_error", "name", "deliver", "signal"), start_error=None)
+        self.loop.call_soon(self._tell_refusal, port, observer, error)
+        return port
+
+    def _tell_refusal(self, port: Any, observer: Any, error: OSError) -> None:
+        port.start_error = error
+        observer.exited(ExitReport(UNKNOWN, f"could not be started: {error}"))
 
     def run_user_code(self) -> None:
         """What every piece of the user's code does."""
@@ -243,6 +251,29 @@ class Actor:
             self._error = error
         finally:
             self._back.release()
+
+
+class StagedLatch:
+    """In place of a ``Latch`` that one actor waits at."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._set = False
+        self._waiting: Actor | None = None
+
+    def set(self) -> None:
+        """It happens now."""
+        self._set = True
+        if self._waiting is not None:
+            self._waiting.wake()
+
+    def wait(self, timeout: float) -> bool:
+        """In the actor: wait for it."""
+        if not self._set:
+            assert self._stage.running is not None
+            self._waiting = self._stage.running
+            self._waiting.wait(timeout)
+        return self._set
 
 
 class StagedThread:

@@ -231,8 +231,8 @@ def forgets_who_died_while_lent(patch: Patch) -> None:
     patch.setattr(Executor, "_back", lambda self, _: self._advance())
 
 
-def never_returns_leases_of_the_interrupted(patch: Patch) -> None:
-    patch.setattr(Leases, "_abandon", lambda *_: None)
+def never_takes_back_what_nobody_returns(patch: Patch) -> None:
+    patch.setattr(Leases, "_return_abandoned", lambda *_: None)
 
 
 FAULTS: list[Fault] = [
@@ -267,7 +267,7 @@ FAULTS: list[Fault] = [
     lends_what_is_needed,
     forgets_calls_that_take_longer,
     forgets_who_died_while_lent,
-    never_returns_leases_of_the_interrupted,
+    never_takes_back_what_nobody_returns,
 ]
 
 

@@ -15,7 +15,7 @@ from simulation.ledger_master import LedgerMaster, for_ledger
 from simulation.schedule import draw
 from simulation.suites import SUITES, again
 
-SEEDS = range(300)
+SEEDS = range(600)
 """Among these each fault must show."""
 
 
@@ -233,6 +233,8 @@ TELLING = {
         "Ref(job=0, task=0) is given up",
         "is back",
         "is late: Results",
+        "is lent",
+        "is returned",
         "Unreadable",
         "kept=1",
         "gives back [",
@@ -254,6 +256,15 @@ TELLING = {
         "the pool is closed",
         "the pool is terminated",
         "the input of job 0 is broken",
+        "a direct call",
+        "is lent",
+        "is called directly",
+        "is interrupted",
+        "is held back",
+        "comes too late",
+        "the user is told: no worker has started",
+        "the pool does not start",
+        "StartError",
     ),
     "remote": (
         "host 1 is back",
@@ -267,7 +278,7 @@ TELLING = {
 @pytest.mark.parametrize("suite", TELLING)
 def test_everything_happens(suite: str) -> None:
     kinds: Counter[str] = Counter()
-    for seed in range(250):
+    for seed in range(400):
         trace: list[str] = []
         run(draw(seed), SUITES[suite], trace)
         text = "\n".join(trace)

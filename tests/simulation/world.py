@@ -101,7 +101,8 @@ class Loop(SimulatedLoop):
         """Call it in the next turn; if another thread asks, when the seed says."""
         thread = self._thread
         if thread is None:
-            super().call_soon(callback, *args)
+            call: Any = partial(callback, *args)
+            self._ready.append(call)
             return
         self._asked[thread].append(partial(callback, *args))
         due = max(self._now + self.moment(), self._heard_at.get(thread, 0.0))

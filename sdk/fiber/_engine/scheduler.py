@@ -83,8 +83,8 @@ class Scheduler:
         self.workers.add(member)
 
     def ready(self, member: Member, now: float) -> None:
-        """It is ready for work, unless it was told to go."""
-        if not member.leaving and member.worker is None:
+        """It is ready for work, unless it was told to go or is gone: it may be heard of late."""
+        if member in self.workers.members and not member.leaving and member.worker is None:
             self.workers.ready(member, self.ledger.add(member, now, self._max_tasks))
 
     def gone(

@@ -111,6 +111,8 @@ class Executor:
         self._lends = options.max_tasks is None and not options.retryable
         self._exits: dict[WorkerHandle, ExitReport] = {}
         """Ends of workers that callers are using."""
+        self._last_words: dict[WorkerHandle, tuple[tuple[Any, ...], list[memoryview]]] = {}
+        """Answers of theirs that were found when they ended; their callers had not looked yet."""
         self._functions = FunctionCache()
         self._calls = WorkItem(work.CALLS, exact=True)
         self._jobs.open(self._calls)
@@ -399,7 +401,9 @@ class Executor:
         buffers = message.buffers
         message.release()
         kind = words[0]
-        if type(kind) is int:
+        if type(kind) is int and handle.worker is not None and handle.worker.lent:
+            self._last_words[handle] = words, buffers
+        elif type(kind) is int:
             self._answered(words, buffers)
         elif kind == work.READY:
             self._ready(handle)
@@ -487,9 +491,12 @@ class Executor:
         self._jobs.close(item)
         if self._ended_by is not None:
             self._jobs.fail(job, self._ended_by)
+        if handle in self._last_words:
+            self._answered(*self._last_words.pop(handle))
 
     def _back(self, handle: WorkerHandle) -> None:
         """A worker is not lent any more."""
+        self._last_words.pop(handle, None)
         report = self._exits.pop(handle, None)
         if report is not None:
             self.on_exit(handle, report)
