@@ -14,6 +14,11 @@ from fiber._hub.local import LocalCounter
 from fiber._transport.base import SharedChannel, SharedCounter
 
 
+_LOOKS = 100
+"""How often ``size`` looks until no item moves; it may have interrupted the thread that moves one.
+"""
+
+
 class Slots:
     """The places of a queue with a maximum size: a count of those that are free."""
 
@@ -114,6 +119,7 @@ class Feeder:
         # True when there are items, False at the end.
         self._wake: SimpleQueue[bool] = SimpleQueue()
         self._sending = False
+        self._moves = 0  # odd while an item is counted neither here nor there
         # What a thread takes out before it feeds.  Whoever finds it there starts a thread; of two,
         # the second one ends.
         self._vacancy = [True]
@@ -132,10 +138,14 @@ class Feeder:
         if self._vacancy:
             self._start_thread()
 
-    @property
-    def waiting(self) -> int:
-        """How many messages wait."""
-        return len(self._unsent)
+    def size(self) -> int:
+        """How many items there are in the channel and here."""
+        for _ in range(_LOOKS):
+            moves = self._moves
+            size = self._slots.used(len(self._unsent))
+            if moves == self._moves and not moves % 2:
+                break  # none was on its way from here to there meanwhile
+        return size
 
     def _send_now(self, payload: bytes, buffers: list[memoryview]) -> bool:
         self._slots.sending()
@@ -187,13 +197,16 @@ class Feeder:
             more = self._wake.get()
             self._sending = True
             while self._unsent:
-                self._send(*self._unsent.popleft())
+                self._moves += 1
+                item = self._unsent.popleft()
+                self._slots.sending()
+                self._moves += 1
+                self._send(*item)
             self._sending = False
         self._close_outbox()
 
     def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
         try:
-            self._slots.sending()
             self._outbox.post(payload, buffers)
         except (BrokenPipeError, EOFError):
             self._unsent.clear()  # nobody can ever read them
