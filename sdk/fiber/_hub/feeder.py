@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 import weakref
 from collections import deque
 from collections.abc import Callable
@@ -13,10 +14,8 @@ from typing import Any
 from fiber._hub.local import LocalCounter
 from fiber._transport.base import SharedChannel, SharedCounter
 
-
-_LOOKS = 100
-"""How often ``size`` looks until no item moves; it may have interrupted the thread that moves one.
-"""
+_MOVE = 1e-4
+"""Seconds to wait while an item moves: the thread that moves it may have to wait for a processor."""
 
 
 class Slots:
@@ -119,6 +118,7 @@ class Feeder:
         # True when there are items, False at the end.
         self._wake: SimpleQueue[bool] = SimpleQueue()
         self._sending = False
+        self._thread = 0
         self._moves = 0  # odd while an item is counted neither here nor there
         # What a thread takes out before it feeds.  Whoever finds it there starts a thread; of two,
         # the second one ends.
@@ -140,12 +140,13 @@ class Feeder:
 
     def size(self) -> int:
         """How many items there are in the channel and here."""
-        for _ in range(_LOOKS):
+        while True:
             moves = self._moves
             size = self._slots.used(len(self._unsent))
-            if moves == self._moves and not moves % 2:
-                break  # none was on its way from here to there meanwhile
-        return size
+            none_moved = moves == self._moves and not moves % 2
+            if none_moved or threading.get_ident() == self._thread:  # then we interrupted the move
+                return size
+            time.sleep(_MOVE)
 
     def _send_now(self, payload: bytes, buffers: list[memoryview]) -> bool:
         self._slots.sending()
@@ -192,6 +193,7 @@ class Feeder:
             self._vacancy.pop()
         except IndexError:
             return
+        self._thread = threading.get_ident()
         more = True
         while more:
             more = self._wake.get()
