@@ -15,7 +15,7 @@ from fiber._hub.local import LocalCounter
 from fiber._transport.base import SharedChannel, SharedCounter
 
 _MOVE = 1e-4
-"""Seconds to wait while an item moves: the thread that moves it may have to wait for a processor."""
+"""Seconds to wait while an item moves: its thread may have to wait for a processor."""
 
 
 class Slots:
