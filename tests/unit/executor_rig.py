@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +18,7 @@ from fiber._runtime.worker_handle import WorkerHandle
 from fiber._transport.loop import Timer
 from fiber._wire import work
 from fiber._wire.packet import Message
-from fiber.process import Process
+from fiber.process import PoolProcess, Process
 from unit import pool_tasks as tasks
 
 
@@ -112,6 +113,7 @@ class Port:
         self.name = name
         self.host = "here"
         self.pid = 1
+        self.start_error: Exception | None = None
         self.packets: list[tuple[int, bytes]] = []
         self.recalls = 0
         self.signals: list[int] = []
@@ -130,6 +132,9 @@ class Port:
 
     def lend(self) -> None:
         """Nobody uses it directly."""
+
+    def reclaim(self) -> None:
+        """It is never lent."""
 
     @property
     def told_to_end(self) -> bool:
@@ -174,8 +179,11 @@ class Rig:
             loop=self.loop, start=self._start, config=SimpleNamespace(start_timeout=1.0)
         )
         self.threads: dict[str, ManualThread] = {}
-        options = {"process_type": Process, "minimum": count, "maximum": count} | options
-        self.executor = Executor(PoolOptions(**options), host, thread=self._thread)
+        new_process = partial(PoolProcess, like=Process)
+        sizes = {"minimum": count, "maximum": count}
+        self.executor = Executor(
+            PoolOptions(new_process, **(sizes | options)), host, thread=self._thread
+        )
         self.background = self.threads["fiber-pool"]
         if start:
             self.executor.start()
