@@ -7,11 +7,16 @@ BIN := $(VENV)/bin
 # Side by side, and more than there are processors, since some tests wait for what they started. A
 # file's tests stay together: what they share is made once for it.
 FAST_TESTS := tests/contract tests/simulation tests/unit
-FAST := $(BIN)/python -m pytest -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile $(FAST_TESTS)
+SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
+FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
+# What depends most on the interpreter: pickling, starting and ending processes, threads and locks.
+ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback pool pool_deaths \
+	process queues reduction synchronize worker) tests/faults/test_children.py
+OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast e2e lint bench bench-operator conformance crds images cluster cluster-down clean
+.PHONY: help demo test test-fast test-pythons e2e lint bench bench-operator conformance crds images cluster cluster-down clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -22,13 +27,22 @@ demo: $(VENV)/.with-rl
 
 ## make test          every test
 test: $(VENV)/.with-dev $(VENV)/.with-testsuite
+	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
 	$(CLUSTER) prepare
 	$(FAST)
+	@$(MAKE) --no-print-directory test-pythons
 	$(BIN)/python -m pytest $(addprefix --ignore=,$(FAST_TESTS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation
 test-fast: $(VENV)/.with-dev
 	$(FAST)
+
+## make test-pythons  the essential tests on every other supported Python that is found here
+test-pythons: $(VENV)/.made
+	@$(foreach version,$(OTHER_PYTHONS),$(MAKE) --no-print-directory test-python-$(version) &&) true
+
+test-python-%: .venv-%/.with-test
+	.venv-$*/bin/python -m pytest $(SIDE_BY_SIDE) $(ESSENTIAL_TESTS)
 
 ## make e2e           all scenarios on a real cluster: KUBECONFIG, kind or our own
 e2e: $(VENV)/.with-dev
@@ -70,9 +84,9 @@ cluster: $(VENV)/.made
 cluster-down: $(VENV)/.made
 	$(CLUSTER) down
 
-## make clean         remove the environment and what the tools wrote
+## make clean         remove the environments and what the tools wrote
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) .venv-* build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 ##
@@ -93,3 +107,12 @@ $(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench: $(VENV)/.made pyproject.
 $(VENV)/.with-testsuite: $(VENV)/.made
 	.ci/python need-testsuite $(BIN)/python
 	touch $@
+
+.venv-%/.made:
+	.ci/python make-venv .venv-$* "$$(.ci/python find $*)"
+	touch $@
+
+.venv-%/.with-test: .venv-%/.made pyproject.toml
+	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	touch $@
+.PRECIOUS: .venv-%/.made .venv-%/.with-test

@@ -48,7 +48,8 @@ class Claims:
 
     ``release`` is the same for all processes of one release.  ``namespaces`` are claimed for good;
     if there are none, each for which ``holds`` is asked, for as long as it is ``used``.
-    ``on_change`` is called with the namespace and whether this operator acts there now.
+    ``on_change`` is called with the namespace and whether this operator acts there now, also when
+    it turns out that it must not begin to: its pools may have gone while that was not known.
     """
 
     def __init__(
@@ -105,12 +106,14 @@ class Claims:
 
         Where all namespaces are watched it is right that some are served by others.
         """
-        claims = list(self._claims.values())
+        claims, used = list(self._claims.values()), {*self._namespaces, *self._used()}
         tolerant = not self._namespaces and any(claim.guard.held for claim in claims)
         wrong = [
             claim.complaint
             for claim in claims
-            if claim.complaint and not (tolerant and claim.guard.holder)
+            if claim.complaint
+            and claim.namespace in used  # else it is given up when its next step is due
+            and not (tolerant and claim.guard.holder)
         ]
         more = [f"so are {len(wrong) - SHOWN} more namespaces"] if len(wrong) > SHOWN else []
         return wrong[:SHOWN] + more
@@ -163,8 +166,9 @@ class Claims:
             log.warning("%s", complaint, extra=about(claim.namespace, reason=reason))
         elif claim.complaint and not complaint:
             log.info("this operator serves the namespace %s now", claim.namespace)
+        refused = bool(complaint) and not claim.complaint
         claim.complaint = complaint
-        if held != claim.held:
+        if held != claim.held or refused:
             claim.held = held
             self._on_change(claim.namespace, held)
 

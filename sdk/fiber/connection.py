@@ -33,6 +33,10 @@ __all__ = [
 
 
 _LAST_MOMENT = 0.05
+"""Seconds from the end of a connection to that of the process that held it, at most."""
+
+_NEWS = 2.0
+"""Seconds that news of an end may take on a busy machine."""
 
 
 class Connection:
@@ -136,7 +140,11 @@ class Connection:
             process = reference()
             popen = getattr(process, "_popen", None)
             # The kernel closes what a process held moments before its parent hears of its death.
-            if popen is not None and popen.wait(_LAST_MOMENT) is not None:
+            if popen is None:
+                continue
+            if popen.wait(_LAST_MOMENT) is None and _is_dead(popen.pid):
+                popen.wait(_NEWS)
+            if popen.report is not None:
                 return ConnectionClosed(process.name, popen.report.reason)
         return error
 
@@ -210,6 +218,15 @@ def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
     second = Connection(other, readable=duplex)
     first._other_given_to, second._other_given_to = second._given_to, first._given_to
     return first, second
+
+
+def _is_dead(pid: int | None) -> bool:
+    """Whether a process of this host has ended, heard of or not."""
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as stat:
+            return stat.read().rpartition(b")")[2].split()[0] in (b"Z", b"X")
+    except OSError:
+        return True
 
 
 def _as_bytes(message: Message) -> bytes:

@@ -119,7 +119,7 @@ class Queue:
 
         Of a queue without a maximum, those that wait in another process for room are not counted.
         """
-        return self._slots.used(self._feeder.waiting)
+        return self._feeder.size()
 
     def empty(self) -> bool:
         """Whether ``get`` would wait."""

@@ -227,12 +227,12 @@ def dumps(
     return _dump(_by_value_pickler(), obj, protocol, buffer_callback)
 
 
-def encode(obj: Any, grants: handles.GrantSet | None = None) -> tuple[bytes, list[memoryview]]:
+def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     """Pickle ``obj`` for a packet: the pickle, and large buffers beside it.
 
-    Connections and queues in it can be unpickled once; with ``grants`` until those are released.
+    Connections and queues in it can be unpickled once.
     """
-    outer = handles.begin_pickling(grants)
+    outer = handles.begin_pickling()
     try:
         return _encode(obj)
     except BaseException:
@@ -259,9 +259,12 @@ def encode_reusable(obj: Any) -> tuple[bytes, list[memoryview], handles.GrantSet
 
     Connections and queues in it can be unpickled for as long as the third value is kept.
     """
-    grants = handles.GrantSet()
-    payload, buffers = encode(obj, grants)
-    return payload, buffers, grants or None
+    outer = handles.begin_pickling(reusable=True)
+    try:
+        payload, buffers = _encode(obj)
+        return payload, buffers, handles.granted()
+    finally:
+        handles.end_pickling(outer)
 
 
 def dump(obj: Any, file: Any, protocol: int | None = None) -> None:

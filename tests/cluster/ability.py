@@ -6,7 +6,8 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from enum import Enum
 from pathlib import Path
 
 from cluster import build, packages
@@ -14,6 +15,28 @@ from cluster.shell import ClusterError, output
 
 # What network namespaces and containers take, by the number of the bit in CapEff.
 _CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_SYS_ADMIN": 21}
+
+
+class Choice(Enum):
+    """Where the end-to-end tests run; the value is how a sentence names it."""
+
+    GIVEN = "the cluster of KUBECONFIG"
+    KIND = "a cluster of kind"
+    OWN = "a cluster of their own on this machine"
+    NONE = "nowhere"
+
+
+def choose(environment: Mapping[str, str]) -> tuple[Choice, list[str]]:
+    """Where they run, and why not on what would come before that."""
+    if environment.get("KUBECONFIG"):
+        return Choice.GIVEN, []
+    reasons = ["KUBECONFIG is not set"]
+    if (lacking := kind_lacks()) is None:
+        return Choice.KIND, reasons
+    reasons.append(f"no kind: {lacking}")
+    if not (hindered := obstacles()):
+        return Choice.OWN, reasons
+    return Choice.NONE, [*reasons, f"no cluster of tests/cluster: {'; '.join(hindered)}"]
 
 
 def kind_lacks() -> str | None:
@@ -41,7 +64,7 @@ def _obstacles() -> Iterator[str]:
         yield "it takes root, and this is an ordinary user"
     elif lacking := _capabilities_lacking():
         yield f"root lacks {' and '.join(lacking)} here, as in most containers"
-    if any(build.missing(folder) for folder in ("kubernetes", "helm")):
+    if any(build.missing(name) for name in ("kubernetes", "helm")):
         try:
             build.find_go()
         except ClusterError as error:

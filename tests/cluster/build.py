@@ -1,4 +1,4 @@
-"""Builds Kubernetes, etcd, Helm and KWOK with Go, at the versions that the go.mod files name.
+"""Builds Kubernetes with its etcd, Helm and KWOK with Go, at the versions of the go.mod files.
 
 Minutes the first time; the programs stay in a folder of the user's cache that bears their
 versions, so that every later start and every other checkout finds them there.
@@ -7,6 +7,7 @@ versions, so that every later start and every other checkout finds them there.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import time
@@ -16,46 +17,73 @@ from pathlib import Path
 from cluster import places
 from cluster.shell import ClusterError, locked, output, say
 
-_RENAMED = {"server": "etcd"}
-"""What Go would name after the folder of its source, and what everybody calls it."""
+# A third of the time: no information for debuggers and, of Kubernetes' own packages, no inlining.
+_COMPILER_FLAGS = ("-gcflags=all=-dwarf=false", "-gcflags=k8s.io/...=-dwarf=false -l")
+_CPU_MINUTES = 7
+"""What Kubernetes and Helm take of a processor where Go has compiled nothing yet."""
 
 
-def build(folders: Iterable[str] = places.MODULES) -> None:
-    """Build what is missing of these modules; returns at once when nothing is."""
-    wanted = [folder for folder in folders if missing(folder)]
+def build(names: Iterable[str] = places.SOURCES) -> None:
+    """Build what is missing of these; returns at once when nothing is."""
+    wanted = [name for name in names if missing(name)]
     if not wanted:
         return
     with locked(places.cache() / "lock", "builds the same programs"):
-        for folder in wanted:
-            if missing(folder):
-                _build(folder)
+        for name in wanted:
+            if missing(name):
+                _build(name)
 
 
-def missing(folder: str) -> list[str]:
-    """The commands of a module that are not built."""
-    commands = places.MODULES[folder][1]
-    return [name for name in commands if not (places.programs() / name).exists()]
+def missing(name: str) -> list[str]:
+    """The programs of this source that are not built."""
+    return [
+        program
+        for program in places.SOURCES[name].programs
+        if not (places.programs() / program).exists()
+    ]
 
 
-def _build(folder: str) -> None:
-    go = find_go()
-    say(f"building {folder} {places.version(folder)} with {go} (minutes, once)")
+def _build(name: str) -> None:
+    go, source = find_go(), places.SOURCES[name]
+    say(f"building {name} {places.version(name)} with {go}, once{_advice(name)}")
     began = time.monotonic()
     # Programs appear when they are whole: a build that is killed leaves nothing that looks built.
     unfinished = places.cache() / "unfinished"
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
     environment = {**os.environ, "CGO_ENABLED": "0", "GOFLAGS": "-mod=readonly -buildvcs=false"}
+    flags = (*_COMPILER_FLAGS, f"-ldflags={_linker_flags(name)}")
     output(
-        *(go, "build", "-o", f"{unfinished}/", "-ldflags", _linker_flags(folder), "tool"),
-        cwd=places.HERE / folder,
+        *(go, "build", "-o", f"{unfinished}/", *flags, source.package),
+        cwd=places.HERE / source.folder,
         env=environment,
     )
     places.programs().mkdir(exist_ok=True)
-    for file in unfinished.iterdir():
-        file.rename(places.programs() / _RENAMED.get(file.name, file.name))
+    (built,) = unfinished.iterdir()
+    built.rename(places.programs() / built.name)
+    for program in source.programs:
+        if program != built.name:  # one program that does what it is called
+            (places.programs() / program).unlink(missing_ok=True)
+            (places.programs() / program).symlink_to(built.name)
     unfinished.rmdir()
-    say(f"built {folder} in {time.monotonic() - began:.0f} s, into {places.programs()}")
+    say(f"built {name} in {time.monotonic() - began:.0f} s, into {places.programs()}")
+
+
+def minutes() -> int:
+    """About how long it takes to build it all where nothing else runs."""
+    return math.ceil(_CPU_MINUTES / len(os.sched_getaffinity(0)))
+
+
+def _advice(name: str) -> str:
+    """What a person who waits for minutes wants to know."""
+    if name != "kubernetes":
+        return ""
+    return (
+        f", for a real cluster on this machine. It takes about {minutes()} minutes where nothing "
+        "else runs, and a download. "
+        "To do without: set KUBECONFIG to a cluster that may be used, install kind and docker, or "
+        "run what needs no cluster: make test-fast"
+    )
 
 
 def find_go() -> str:
@@ -69,11 +97,11 @@ def find_go() -> str:
     return go
 
 
-def _linker_flags(folder: str) -> str:
+def _linker_flags(name: str) -> str:
     """Small programs; those of Kubernetes also know their version, which clients ask for."""
     flags = ["-s", "-w"]
-    if folder == "kubernetes":
-        version = places.version(folder)
+    if name == "kubernetes":
+        version = places.version(name)
         major, minor = version.split(".")[:2]
         values = {
             "gitVersion": f"v{version}",
@@ -87,8 +115,9 @@ def _linker_flags(folder: str) -> str:
     return " ".join(flags)
 
 
-def module_sources(folder: str) -> Path:
+def module_sources(name: str) -> Path:
     """Where Go keeps the sources of a module, and all files that came with them."""
-    command = (find_go(), "mod", "download", "-json", places.MODULES[folder][0])
-    found = json.loads(output(*command, cwd=places.HERE / folder))
+    source = places.SOURCES[name]
+    command = (find_go(), "mod", "download", "-json", source.module)
+    found = json.loads(output(*command, cwd=places.HERE / source.folder))
     return Path(found["Dir"])

@@ -71,6 +71,8 @@ def _up(given: argparse.Namespace) -> None:
     lifecycle.up(given.nodes)
     if given.images:
         _print_images(images.bring_images())
+        for image in images.IMAGES:
+            print(f"# image {image.released(places.CHECKOUT)}, the same")
     _print_environment()
 
 

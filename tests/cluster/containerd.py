@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cluster import places
-from cluster.shell import output, succeeds
+from cluster.shell import answer, output, succeeds
 
 
 class Containerd:
@@ -18,6 +18,10 @@ class Containerd:
     def answers(self) -> bool:
         return self.socket.exists() and succeeds(*self._ctr("version"), timeout=5)
 
+    def answer(self) -> str:
+        """What it says when it is asked, or what is said in its place."""
+        return answer(*self._ctr("version"), timeout=5)
+
     def images(self) -> list[str]:
         return output(*self._ctr("images", "ls", "-q")).split()
 
@@ -27,6 +31,10 @@ class Containerd:
     def load(self, archive: Path) -> None:
         """Import the images of an OCI or docker archive."""
         output(*self._ctr("images", "import", str(archive)))
+
+    def tag(self, reference: str, other: str) -> None:
+        """Give an image that is there another name, which may have been another image's."""
+        output(*self._ctr("images", "tag", "--force", reference, other))
 
     def kill(self, container: str) -> None:
         """SIGKILL to the first process of a container: the others of its pid namespace follow."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from cluster import places
+from cluster import diagnosis, places
 from cluster.daemons import Daemon
-from cluster.kubectl import kubectl
+from cluster.kubectl import answer_of, kubectl
 from cluster.pki import Pki
 from cluster.shell import wait_for
 
@@ -65,10 +65,12 @@ def start_apiserver(pki: Pki) -> None:
 
 def wait_for_apiserver() -> None:
     """Return once the API server says that it is ready."""
+    daemons = [Daemon("etcd"), Daemon("apiserver")]
     wait_for(
         "the API server",
         lambda: kubectl("get", "--raw", "/readyz", check=False) == "ok",
-        complaint=lambda: Daemon("etcd").complaint() or Daemon("apiserver").complaint(),
+        complaint=lambda: diagnosis.end_of(daemons),
+        account=lambda: diagnosis.silence_of(daemons, answer_of("get", "--raw", "/readyz?verbose")),
     )
 
 

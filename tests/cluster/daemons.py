@@ -1,7 +1,8 @@
 """The cluster's processes: started so that they outlive the command, found again, and ended.
 
-What is needed to start one again is kept beside its process id, so that a test can stop it and
-another command can bring it back.
+What is needed to start one again is kept beside its process, so that a test can stop it and another
+command can bring it back. Each is the child of a shell that waits for it and writes down how it
+ended, since nobody else will be there to be told.
 """
 
 from __future__ import annotations
@@ -10,12 +11,22 @@ import json
 import os
 import signal
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
-from cluster import places
-from cluster.shell import wait_for
+from cluster import memory, places
+from cluster.shell import ClusterError, wait_for
 
 _SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+_QUOTED = 15
+# $0 is the record: what the kernel says of this shell, and what it has counted up to now. It is
+# there before the standard output is closed, which is what the starter waits for.
+_KEEPER = (
+    'cat "/proc/$$/stat" /proc/vmstat > "$0.new" && mv "$0.new" "$0" && exec >&2 || exit\n'
+    '"$@"\n'
+    'echo $? > "$0.status"'
+)
 
 
 class Daemon:
@@ -25,7 +36,8 @@ class Daemon:
         self.name = name
         self.log = places.STATE / "log" / f"{name}.log"
         self._command_file = places.STATE / "daemons" / f"{name}.json"
-        self._process_file = places.STATE / "daemons" / f"{name}.pid"
+        self._record = places.STATE / "daemons" / f"{name}.process"
+        self._status_file = places.STATE / "daemons" / f"{name}.process.status"
 
     def start(self, *command: str | Path, namespace: str = "") -> None:
         """Start it with this command, in a network namespace; nothing happens when it runs."""
@@ -42,56 +54,76 @@ class Daemon:
     def start_again(self) -> None:
         """Start it with the command that it had; nothing happens when it runs."""
         if not self.runs():
-            self._process_file.unlink(missing_ok=True)
             self._spawn(json.loads(self._command_file.read_text()))
 
     def _spawn(self, words: list[str]) -> None:
         # The child of a child: nobody here has to wait for it, and it is not taken for a process
         # that a test has left. It knows nothing of the environment of who started it.
         environment = {"PATH": f"{places.programs()}:{_SYSTEM_PATH}", "HOME": "/root"}
-        record = 'echo $$ > "$0.new" && mv "$0.new" "$0" && exec "$@"'
+        self._forget()
         with self.log.open("ab") as log:
             subprocess.run(
-                ["setsid", "--fork", "sh", "-c", record, str(self._process_file), *words],
+                ["setsid", "--fork", "sh", "-c", _KEEPER, str(self._record), *words],
                 stdin=subprocess.DEVNULL,
-                stdout=log,
+                stdout=subprocess.PIPE,
                 stderr=log,
                 env=environment,
                 cwd="/",
                 check=True,
             )
-        wait_for(f"the process of {self.name}", self._process_file.exists, seconds=10)
+        if not self._record.exists():
+            raise ClusterError(f"{self.name} could not be started; {self.last_words()}")
 
     def runs(self) -> bool:
-        return self._pid() is not None
+        return self._keeper() is not None
 
-    def _pid(self) -> int | None:
-        """Its process id, unless it has ended and the number is another's by now."""
-        try:
-            pid = int(self._process_file.read_text())
-            words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-        except (OSError, ValueError):
+    def _keeper(self) -> int | None:
+        """The shell that waits for it; None where it has ended.
+
+        Known by when it began: the number alone may be another's by now, and what it executes
+        cannot be seen at every moment, a process that is about to execute a program has no words.
+        """
+        recorded = _Process.read(self._record)
+        if recorded is None:
             return None
-        command = json.loads(self._command_file.read_text())
-        ours = any(word == command[-1].encode() for word in words)
-        return pid if ours else None
+        found = _Process.of(recorded.pid)
+        alive = found is not None and found.lives and found.began == recorded.began
+        return recorded.pid if alive else None
 
     def kill(self) -> None:
         """End it, and what it has started in its session, at once and without farewell."""
-        if (pid := self._pid()) is not None:
+        if (leader := self._keeper()) is not None:
             try:
-                os.killpg(pid, signal.SIGKILL)
+                os.killpg(leader, signal.SIGKILL)
             except ProcessLookupError:  # it has just ended
                 pass
-            wait_for(f"the end of process {pid}, {self.name}", lambda: not _lives(pid), seconds=30)
-        self._process_file.unlink(missing_ok=True)
+            wait_for(f"the end of {self.name}", lambda: not any(_group(leader)), seconds=30)
+        self._forget()
 
-    def complaint(self) -> str | None:
-        """Why it is no use to wait for it; None while it runs."""
-        if self.runs():
+    def _forget(self) -> None:
+        self._record.unlink(missing_ok=True)
+        self._status_file.unlink(missing_ok=True)
+
+    def status(self) -> int | None:
+        """How it ended, as a shell counts: 128 and more is a signal. None where nobody saw it."""
+        try:
+            return int(self._status_file.read_text())
+        except (OSError, ValueError):
             return None
-        lines = self.log.read_text(errors="replace").splitlines()[-15:]
-        return "\n".join([f"{self.name} has ended; the end of {self.log}:", *lines])
+
+    def killed_meanwhile(self) -> int:
+        """How many processes the kernel has killed for want of memory since this one began."""
+        return memory.kills() - memory.kills(self._record)
+
+    def last_words(self) -> str:
+        """The end of its log."""
+        try:
+            lines = self.log.read_text(errors="replace").splitlines()[-_QUOTED:]
+        except OSError:
+            lines = []
+        if not lines:
+            return f"its log, {self.log}, is empty"
+        return "\n".join([f"the end of its log, {self.log}:", *lines])
 
 
 def all_daemons() -> list[Daemon]:
@@ -99,9 +131,32 @@ def all_daemons() -> list[Daemon]:
     return [Daemon(file.stem) for file in sorted((places.STATE / "daemons").glob("*.json"))]
 
 
-def _lives(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
+class _Process(NamedTuple):
+    """What /proc/PID/stat says of a process."""
+
+    pid: int
+    lives: bool
+    group: int
+    began: int
+    """In ticks since the machine began."""
+
+    @classmethod
+    def read(cls, file: Path) -> _Process | None:
+        try:
+            number, _, rest = file.read_text().partition("\n")[0].partition(" (")
+            state, _, group, *others = rest.rpartition(") ")[2].split()
+            return cls(int(number), state not in "ZX", int(group), int(others[16]))
+        except (OSError, ValueError, IndexError):  # it has ended, or nothing whole was written
+            return None
+
+    @classmethod
+    def of(cls, pid: int) -> _Process | None:
+        return cls.read(Path(f"/proc/{pid}/stat"))
+
+
+def _group(leader: int) -> Iterator[_Process]:
+    """The living processes of a process group."""
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        found = _Process.read(file)
+        if found is not None and found.lives and found.group == leader:
+            yield found

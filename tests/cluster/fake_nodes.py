@@ -9,10 +9,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from cluster import build, places
+from cluster import build, diagnosis, places
 from cluster.control_plane import NODE_LOST_AFTER
 from cluster.daemons import Daemon
-from cluster.kubectl import kubectl, ready_nodes
+from cluster.kubectl import answer_of, kubectl, ready_nodes
 from cluster.shell import wait_for
 
 KEY, VALUE = "kwok.x-k8s.io/node", "fake"
@@ -54,7 +54,8 @@ def _add(count: int) -> None:
     wait_for(
         f"{count} pretended nodes",
         lambda: ready_nodes(f"{KEY}={VALUE}") == count,
-        complaint=kwok.complaint,
+        complaint=lambda: diagnosis.end_of([kwok]),
+        account=lambda: diagnosis.silence_of([kwok], answer_of("get", "nodes")),
     )
 
 

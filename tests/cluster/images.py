@@ -2,6 +2,7 @@
 
 An image's tag is a digest of all that it is made of. So a tag never means two things, nodes that
 have it need not load it again, and checkouts that share a cluster do not get in each other's way.
+On the nodes, what was brought last bears the version as well, which chart and manifests name.
 """
 
 from __future__ import annotations
@@ -78,6 +79,10 @@ class Image:
             digest.update(content)
         return f"{self.name}:{digest.hexdigest()[:12]}"
 
+    def released(self, checkout: Path) -> str:
+        """The name with the version as its tag, as chart and manifests have it."""
+        return f"{self.name}:{_version(checkout)}"
+
 
 OPERATOR = Image(
     "fiber-operator",
@@ -113,6 +118,9 @@ def bring_images() -> dict[str, str]:
         references = {image.name: _up_to_date(image) for image in IMAGES}
         for image in IMAGES:
             load(image.archive, references[image.name])
+            for index in places.nodes():
+                reference = full_name(references[image.name])
+                Containerd(index).tag(reference, full_name(image.released(places.CHECKOUT)))
         return references
 
 

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from cluster import places
-from cluster.shell import output
+from cluster.shell import answer, output
 
 
 def kubectl(*arguments: str, check: bool = True) -> str:
     """What kubectl prints, asked of our cluster."""
-    command = (places.program("kubectl"), "--kubeconfig", places.KUBECONFIG)
-    return output(*command, *arguments, check=check)
+    return output(*_command(), *arguments, check=check)
+
+
+def answer_of(*arguments: str) -> str:
+    """What kubectl prints, or what it complains about."""
+    return answer(*_command(), *arguments)
+
+
+def _command() -> tuple[str | Path, ...]:
+    return (places.program("kubectl"), "--kubeconfig", places.KUBECONFIG)
 
 
 def ready_nodes(selector: str) -> int:

@@ -7,14 +7,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from cluster import build, control_plane, fake_nodes, network, packages, places, remains
+from cluster import build, control_plane, diagnosis, fake_nodes, network, packages, places, remains
 from cluster.daemons import Daemon, all_daemons
-from cluster.kubectl import ready_nodes
+from cluster.kubectl import answer_of, ready_nodes
 from cluster.node import Node
 from cluster.pause import pause_archive
 from cluster.pki import Pki
 from cluster.shell import ClusterError, locked, need_root, say, wait_for
 
+_WHY = (  # each node's own word on whether it is Ready
+    "--output=jsonpath={range .items[*]}{.metadata.name}: "
+    '{.status.conditions[?(@.type=="Ready")].message}{"\\n"}{end}',
+)
 _BUSY = "starts or stops the cluster"
 
 
@@ -61,7 +65,7 @@ def up(count: int) -> None:
     """
     need_root("start the test cluster")
     packages.need(packages.TO_RUN, "run the test cluster")
-    build.build(["kubernetes", "etcd", "helm"])
+    build.build(["kubernetes", "helm"])
     pause_archive()
     with locked(places.LOCK, _BUSY):
         found = keep_or_clear() or Found(str(places.CHECKOUT), str(places.cache()), count)
@@ -96,19 +100,26 @@ def _start(count: int) -> None:
     with ThreadPoolExecutor() as pool:
         starts = [pool.submit(control_plane.start, pki)]
         starts += [pool.submit(node.start) for node in nodes]
-        for begun in starts:
+    complaints = []
+    for begun in starts:
+        try:
             begun.result()
+        except ClusterError as error:
+            complaints.append(str(error))
+    if complaints:
+        raise ClusterError("\n".join(complaints))
     for daemon in all_daemons():  # what is neither plane nor node: KWOK
         daemon.start_again()
     wait_for(
         f"{count} nodes that are Ready",
         lambda: ready_nodes(f"!{fake_nodes.KEY}") >= count,
-        complaint=_first_complaint,
+        complaint=lambda: diagnosis.end_of(all_daemons()),
+        account=lambda: diagnosis.silence_of(_kubelets(count), answer_of("get", "nodes", *_WHY)),
     )
 
 
-def _first_complaint() -> str | None:
-    return next((said for daemon in all_daemons() if (said := daemon.complaint())), None)
+def _kubelets(count: int) -> list[Daemon]:
+    return [Daemon(f"{places.node_name(index)}-kubelet") for index in range(1, count + 1)]
 
 
 def down() -> None:

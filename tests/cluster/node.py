@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from cluster import cgroups, places
+from cluster import cgroups, diagnosis, places
 from cluster.containerd import Containerd
 from cluster.daemons import Daemon
 from cluster.pause import PAUSE, pause_archive
@@ -41,10 +41,12 @@ class Node:
         settings.write_text(self.containerd_settings())
         self._containerd.socket.parent.mkdir(parents=True, exist_ok=True)
         self._start("containerd", "containerd", "--config", settings)
+        daemons = [Daemon(f"{self.name}-containerd")]
         wait_for(
             f"containerd of {self.name}",
             self._containerd.answers,
-            complaint=Daemon(f"{self.name}-containerd").complaint,
+            complaint=lambda: diagnosis.end_of(daemons),
+            account=lambda: diagnosis.silence_of(daemons, self._containerd.answer()),
         )
         if not self._containerd.has(PAUSE):
             self._containerd.load(pause_archive())

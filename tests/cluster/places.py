@@ -9,15 +9,30 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 HERE = Path(__file__).resolve().parent
 CHECKOUT = HERE.parents[1]
 
-# What is built from Go modules: folder of the module, the module whose version counts, commands.
-MODULES = {
-    "kubernetes": (
+
+class Source(NamedTuple):
+    """What one `go build` makes programs of."""
+
+    folder: str
+    """Of the Go module here that names all versions."""
+    package: str
+    module: str
+    """The module whose version is that of the programs."""
+    programs: tuple[str, ...]
+
+
+SOURCES = {
+    "kubernetes": Source(
+        "kubernetes",
+        ".",
         "k8s.io/kubernetes",
         (
+            "etcd",
             "kube-apiserver",
             "kube-controller-manager",
             "kube-scheduler",
@@ -26,9 +41,8 @@ MODULES = {
             "kubectl",
         ),
     ),
-    "helm": ("helm.sh/helm/v3", ("helm",)),
-    "kwok": ("sigs.k8s.io/kwok", ("kwok",)),
-    "etcd": ("go.etcd.io/etcd/server/v3", ("etcd",)),
+    "helm": Source("kubernetes", "helm.sh/helm/v3/cmd/helm", "helm.sh/helm/v3", ("helm",)),
+    "kwok": Source("kwok", "sigs.k8s.io/kwok/cmd/kwok", "sigs.k8s.io/kwok", ("kwok",)),
 }
 
 STATE = Path("/var/lib/fiber-cluster")
@@ -45,11 +59,11 @@ POD_RANGE = "10.244.0.0/16"
 API = f"https://{HOST_IP}:6443"
 
 
-def version(folder: str) -> str:
-    """The version, without its v, of what the module in this folder is there to build."""
-    module = MODULES[folder][0]
+def version(source: str) -> str:
+    """The version, without its v, of what is built of this source."""
+    folder, module = SOURCES[source].folder, SOURCES[source].module
     text = (HERE / folder / "go.mod").read_text(encoding="utf-8")
-    found = re.search(rf"^require {re.escape(module)} v(\S+)", text, re.MULTILINE)
+    found = re.search(rf"^(?:require |\t){re.escape(module)} v(\S+)", text, re.MULTILINE)
     if found is None:
         raise ValueError(f"{folder}/go.mod has no line `require {module} v…`")
     return found[1]
@@ -58,7 +72,7 @@ def version(folder: str) -> str:
 def cache() -> Path:
     """The folder of the built programs; its name has their versions, so it never goes stale."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return home / "fiber" / "-".join(f"{folder}-{version(folder)}" for folder in MODULES)
+    return home / "fiber" / "-".join(f"{name}-{version(name)}" for name in SOURCES)
 
 
 def programs() -> Path:

@@ -10,6 +10,7 @@ import os
 import shutil
 
 from cluster import ability, build, images, packages
+from cluster.ability import Choice
 from cluster.pause import pause_archive
 from cluster.shell import ClusterError, say
 
@@ -19,7 +20,7 @@ def prepare() -> None:
     try:
         if shutil.which("helm") is None:
             build.build(["helm"])
-        if not os.environ.get("KUBECONFIG") and ability.kind_lacks() and not ability.obstacles():
+        if ability.choose(os.environ)[0] is Choice.OWN:
             _prepare_cluster()
     except ClusterError as error:
         say(f"the tests that need a cluster are not prepared: {error}")
@@ -27,6 +28,6 @@ def prepare() -> None:
 
 def _prepare_cluster() -> None:
     packages.need(packages.TO_RUN, "run the test cluster")
-    build.build(["kubernetes", "etcd", "helm"])
+    build.build(["kubernetes", "helm"])
     pause_archive()
     images.build_images()

@@ -41,6 +41,14 @@ def output(
     return done.stdout
 
 
+def answer(*command: str | Path, timeout: float = 30) -> str:
+    """What a command says, also where it fails or is not there."""
+    try:
+        return output(*command, timeout=timeout)
+    except ClusterError as error:
+        return str(error)
+
+
 def succeeds(*command: str | Path, timeout: float = 30) -> bool:
     """Whether a command is there and ends with status 0 in time."""
     try:
@@ -56,14 +64,19 @@ def wait_for(
     *,
     seconds: float = 120,
     complaint: Callable[[], str | None] = lambda: None,
+    account: Callable[[], str] = lambda: "",
 ) -> None:
-    """Ask until it is ready. Ends early with the complaint where there is one."""
+    """Ask until it is ready.
+
+    Raises ClusterError: early with the complaint where there is one, with the account of how
+    things stand where time is up.
+    """
     deadline = time.monotonic() + seconds
     while not ready():
         if (wrong := complaint()) is not None:
             raise ClusterError(f"{what}: {wrong}")
         if time.monotonic() > deadline:
-            raise ClusterError(f"{what}: not there after {seconds:.0f} s")
+            raise ClusterError(f"{what}: not there after {seconds:.0f} s\n{account()}".rstrip())
         time.sleep(0.05)
 
 

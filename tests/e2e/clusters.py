@@ -33,6 +33,7 @@ from cluster import (
     lifecycle,
     places,
 )
+from cluster.ability import Choice
 from cluster.shell import ClusterError, output, wait_for
 
 NODES = 2
@@ -52,6 +53,8 @@ class Cluster:
     kubeconfig: Path
     images: Mapping[str, str]
     """References of fiber-operator and fiber-worker, as a pod names them."""
+    by_version: bool = False
+    """Whether its nodes have these images under the version too, as chart and manifests name it."""
     outside: str | None = None
     """Where pods reach a program that runs beside the tests; None where they cannot."""
     node_lost_after: float = 60
@@ -125,6 +128,7 @@ class Cluster:
 class Own(Cluster):
     """The project's own cluster."""
 
+    by_version = True
     outside = places.HOST_IP
     node_lost_after = control_plane.NODE_LOST_AFTER + 10.0
 
@@ -162,6 +166,8 @@ class Own(Cluster):
 class Kind(Cluster):
     """Nodes in docker containers."""
 
+    by_version = True
+
     def __init__(self, name: str, kubeconfig: Path, *, made: bool) -> None:
         self.description = f"the kind cluster {name}"
         self.kubeconfig = kubeconfig
@@ -172,6 +178,7 @@ class Kind(Cluster):
             self.images = images.build_images()
             for image in images.IMAGES:
                 output("kind", "load", "image-archive", image.archive, "--name", name)
+                self._tag(self.images[image.name], image.released(places.CHECKOUT))
         except BaseException:
             self.close()
             raise
@@ -226,6 +233,12 @@ class Kind(Cluster):
         kill = ("tasks", "kill", "--signal", "SIGKILL", container_id)
         self._inside(node, "ctr", "--namespace", "k8s.io", *kill)
 
+    def _tag(self, reference: str, other: str) -> None:
+        names = map(images.full_name, (reference, other))
+        tag = ("ctr", "--namespace", "k8s.io", "images", "tag", "--force", *names)
+        for node in output("kind", "get", "nodes", "--name", self._name).split():
+            self._inside(node, *tag)
+
     @staticmethod
     def _inside(node: str, *command: str) -> None:
         output("docker", "exec", node, *command)
@@ -243,17 +256,14 @@ class Given(Cluster):
 
 def choose(environment: Mapping[str, str] = os.environ) -> Cluster:
     """The cluster to test on. Raises NoCluster where there is none."""
-    if given := environment.get("KUBECONFIG"):
-        return _given(Path(given), environment)
-    reasons = ["KUBECONFIG is not set"]
-    if lacking := ability.kind_lacks():
-        reasons.append(f"no kind: {lacking}")
-    else:
-        return Kind.make()
-    if obstacles := ability.obstacles():
-        reasons.append(f"no cluster of tests/cluster: {'; '.join(obstacles)}")
-    else:
-        return Own()
+    choice, reasons = ability.choose(environment)
+    match choice:
+        case Choice.GIVEN:
+            return _given(Path(environment["KUBECONFIG"]), environment)
+        case Choice.KIND:
+            return Kind.make()
+        case Choice.OWN:
+            return Own()
     raise NoCluster(
         f"there is no Kubernetes cluster to test on. {'. '.join(reasons)}. Set KUBECONFIG to a "
         "cluster that may be used, or run this where docker and kind are, or as root on Linux "

@@ -177,9 +177,20 @@ class Release:
         try:
             scene.wait(what, condition, 60.0, poll=0.5)
         except AssertionError as error:
-            raise AssertionError(f"{error}\n{self.log()}") from None
+            raise AssertionError(f"{error}\n{self._account()}\n{self.log()}") from None
         finally:
             scene.close()
+
+    def _account(self) -> str:
+        """What keeps the operators from being ready, in their own words."""
+        lines = [self.kubectl("get", "deployments,pods", "--output", "wide")]
+        for pod in self.pods():
+            try:
+                said = self.page("readyz", pod)
+            except Refused as refused:
+                said = str(refused)
+            lines.append(f"/readyz of {pod['metadata']['name']}: {said}")
+        return "\n".join(lines)
 
     def _log(self, pod: Body, lines: int) -> str:
         path = path_of("pods", self.namespace, pod["metadata"]["name"], "log")

@@ -32,6 +32,25 @@ WORK = """
 """
 
 
+SHARE = """
+    import fiber, tempfile
+    def share():
+        carrier, _ = fiber.Pipe()
+        end, _ = fiber.Pipe()
+        carrier.send(end)
+    def try_to_share():
+        try:
+            share()
+        except OSError as error:
+            return str(error)
+    if __name__ == "__main__":
+        {before}
+        with fiber.Pool(1) as pool:
+            print(pool.apply(try_to_share))
+        share()
+"""
+
+
 @pytest.fixture
 def folder() -> Iterator[Path]:
     made = Path(tempfile.mkdtemp(prefix="d-"))
@@ -58,6 +77,31 @@ def test_a_temporary_directory_that_goes_away_while_it_runs(
     assert program.finish() == "1\n[1, 2]\n"
 
 
+NOWHERE = "import tempfile; tempfile.tempdir = '/no/such/directory'"
+
+
+def test_nowhere_to_write_is_no_matter_until_something_is_shared(
+    launch: Callable[..., Program],
+) -> None:
+    script = WORK.replace("ours, theirs", NOWHERE + "\n        ours, theirs", 1)
+    program = launch(script)
+    assert program.finish() == "1\n[1, 2]\n"
+    assert program.left() == []
+
+
+def test_nowhere_to_write_is_said_when_something_is_shared(
+    launch: Callable[..., Program],
+) -> None:
+    program = launch(SHARE.format(before=NOWHERE))
+    in_a_worker = program.line()
+    assert program.wait() == 1
+    for said in (in_a_worker, program.stderr):
+        assert "no pipe, queue or event can be shared" in said
+        assert "/no/such/directory" in said
+        assert "Set FIBER_RUNTIME_DIRECTORY" in said
+    assert program.left() == []
+
+
 def test_a_runtime_directory_that_is_none_is_named(
     launch: Callable[..., Program], folder: Path
 ) -> None:
@@ -74,7 +118,7 @@ def test_a_path_too_long_for_a_socket_says_what_to_set(
 ) -> None:
     deep = folder / ("d" * 100)
     deep.mkdir()
-    program = launch_on(WORK, env={"FIBER_RUNTIME_DIRECTORY": str(deep)})
+    program = launch_on(SHARE.format(before="pass"), env={"FIBER_RUNTIME_DIRECTORY": str(deep)})
     assert program.wait() == 1
     assert "FIBER_RUNTIME_DIRECTORY" in program.stderr
     assert program.left() == []

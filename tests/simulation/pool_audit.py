@@ -262,7 +262,7 @@ class PoolAudit:
             executor._jobs._streams,
             executor._called,
             executor._exits,
-            executor._last_words,
+            executor._receiver._last_words,
             executor._leases._lent,
         )
         require(not any(left), "the pool leaves something behind")

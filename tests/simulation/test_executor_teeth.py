@@ -16,6 +16,7 @@ from fiber._runtime.input_stream import InputStream
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.leases import Lease, Leases
 from fiber._runtime.outcome import Pickled
+from fiber._runtime.receiver import Receiver
 from fiber._runtime.sender import Sender
 from fiber._runtime.work_items import Call
 from fiber._runtime.worker_handle import WorkerHandle
@@ -165,12 +166,12 @@ def pickles_on_the_loop(patch: Patch) -> None:
 
 
 def unpickles_on_the_loop(patch: Patch) -> None:
-    def _unreadable(self: Executor, kind: str, seq: int, error: Pickled) -> None:
+    def _unreadable(self: Receiver, kind: str, seq: int, error: Pickled) -> None:
         error.decode()
         real(self, kind, seq, error)
 
-    real = Executor._unreadable
-    patch.setattr(Executor, "_unreadable", _unreadable)
+    real = Receiver._unreadable
+    patch.setattr(Receiver, "_unreadable", _unreadable)
 
 
 def ignores_the_limit(patch: Patch) -> None:

@@ -12,7 +12,7 @@ import signal
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from fiber._agent.watch import PATIENCE
+from fiber._agent.watchdog import SPLIT_EAGER_AFTER
 from simulation.schedule import Act, Crash, Repeat, Slow, StillBirth, Task
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ class Worker:
         self._began = self._mark = self._world.loop.now()
         # A slow one is too busy for its watch, too.
         if self._stop > 1 and work.unit == 1 and self._slowness == 1:
-            self._later(PATIENCE, self._give_back, work.seq)
+            self._later(SPLIT_EAGER_AFTER, self._give_back, work.seq)
         self._next(work)
 
     def _next(self, work: Work) -> None:

@@ -308,12 +308,12 @@ def test_no_descriptor_left_is_a_clear_error_and_leaks_none(shared: Agent, spare
     begin(shared, os._exit, 0)[1].wait_for_exit()  # its zygote runs
     handed = os.dup(1)
     before = len(os.listdir("/proc/self/fd"))
-    slots = len(shared.board._free)
+    slots = len(shared.progress_table._free)
     with few_descriptors(spare), pytest.raises(TooManyOpenFiles, match="ulimit -n"):
         begin(shared, run_forever, tasks=True, fds=(handed,))
     settled(shared.loop)
     assert len(os.listdir("/proc/self/fd")) == before - 1, "what was handed over is closed"
-    assert len(shared.board._free) >= slots
+    assert len(shared.progress_table._free) >= slots
     _, observer = begin(shared, os._exit, 0)
     assert observer.wait_for_exit().exitcode == 0
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import census
-from fiber._agent.capture import REMEMBERED, Capture
+from fiber._agent.capture import LAST_LINES, Capture
 from fiber._transport.loop import Loop
 
 PATIENCE = 10
@@ -80,7 +80,7 @@ def test_lines_are_passed_on_as_they_come_and_the_rest_at_the_end(captured: Capt
 def test_only_the_last_lines_are_remembered(captured: Captured) -> None:
     captured.write(b"".join(b"line %d\n" % index for index in range(100)))
     captured.hang_up()
-    assert captured.finish() == tuple(f"line {index}" for index in range(100 - REMEMBERED, 100))
+    assert captured.finish() == tuple(f"line {index}" for index in range(100 - LAST_LINES, 100))
     assert len(captured.lines()) == 100
 
 
@@ -126,7 +126,7 @@ def test_the_end_is_not_held_up_by_someone_who_writes_on_for_ever(captured: Capt
     flood = subprocess.Popen(["yes"], stdout=captured.out)
     captured.hang_up()
     captured.wait_for(1000)
-    assert captured.finish() == ("y",) * REMEMBERED
+    assert captured.finish() == ("y",) * LAST_LINES
     assert flood.wait(PATIENCE) == -signal.SIGPIPE
 
 

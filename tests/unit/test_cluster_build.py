@@ -41,7 +41,7 @@ def install_go(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> 
     return calls
 
 
-@pytest.mark.parametrize("folder", places.MODULES)
+@pytest.mark.parametrize("folder", places.SOURCES)
 def test_versions_come_from_the_modules(folder: str) -> None:
     assert all(part.isdigit() for part in places.version(folder).split("."))
     assert f"{folder}-{places.version(folder)}" in places.cache().name
@@ -144,3 +144,31 @@ def test_a_lock_is_waited_for(tmp_path: Path) -> None:
         order.append("first")
     thread.join()
     assert order == ["first", "second"]
+
+
+def test_who_waits_for_kubernetes_is_told_what_for_and_how_long(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install_go(monkeypatch, tmp_path, GO.replace("helm", "kubernetes"))
+    build.build(["kubernetes"])
+    said = capsys.readouterr().err
+    assert "for a real cluster on this machine" in said
+    assert f"about {build.minutes()} minutes" in said
+    for way_out in ("KUBECONFIG", "kind", "make test-fast"):
+        assert way_out in said
+
+
+def test_one_program_bears_the_names_of_all(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    install_go(monkeypatch, tmp_path, GO.replace("helm", "kubernetes"))
+    build.build(["kubernetes"])
+    assert build.missing("kubernetes") == []
+    for name in places.SOURCES["kubernetes"].programs:
+        assert (places.programs() / name).resolve() == places.programs() / "kubernetes"
+
+
+def test_the_program_knows_the_names_that_it_is_given() -> None:
+    main = (places.HERE / "kubernetes" / "main.go").read_text(encoding="utf-8")
+    for name in places.SOURCES["kubernetes"].programs:
+        assert f'"{name}"' in main

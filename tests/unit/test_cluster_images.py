@@ -129,7 +129,7 @@ def test_an_archive_holds_what_its_record_says(builder: Notebook) -> None:
         assert image.archive.read_text() == image.archived() == references[image.name]
 
 
-def test_nodes_get_what_they_do_not_have(
+def test_nodes_get_what_they_do_not_have_and_know_it_by_its_version(
     builder: Notebook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes = {index: FakeNode() for index in (1, 2)}
@@ -138,6 +138,11 @@ def test_nodes_get_what_they_do_not_have(
     references = images.bring_images()
     nodes[2].there.remove(images.full_name(references["fiber-worker"]))
     images.bring_images()
+    for node in nodes.values():
+        assert node.names == {
+            f"docker.io/library/{name}:1.2.3": images.full_name(reference)
+            for name, reference in references.items()
+        }
     assert nodes[1].loaded == [OPERATOR.archive, WORKER.archive]
     assert nodes[2].loaded == [OPERATOR.archive, WORKER.archive, WORKER.archive]
 
@@ -148,6 +153,7 @@ class FakeNode:
     def __init__(self) -> None:
         self.there: set[str] = set()
         self.loaded: list[Path] = []
+        self.names: dict[str, str] = {}
 
     def has(self, reference: str) -> bool:
         return reference in self.there
@@ -155,6 +161,10 @@ class FakeNode:
     def load(self, archive: Path) -> None:
         self.loaded.append(archive)
         self.there.add(images.full_name(archive.read_text()))
+
+    def tag(self, reference: str, other: str) -> None:
+        assert reference in self.there
+        self.names[other] = reference
 
 
 def test_a_build_that_fails_is_done_again(builder: Notebook, checkout: Path) -> None:

@@ -25,7 +25,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def test_everything_for_our_own_cluster(done: list[str]) -> None:
     prepare()
-    assert done == ["helm", "packages", "kubernetes", "etcd", "helm", "pause", "images"]
+    assert done == ["helm", "packages", "kubernetes", "helm", "pause", "images"]
 
 
 def test_a_given_cluster_takes_helm_alone(done: list[str], monkeypatch: pytest.MonkeyPatch) -> None:

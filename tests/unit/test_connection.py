@@ -17,6 +17,9 @@ import pytest
 
 import fiber
 from census import wait_until
+from fiber._transport import unix
+from fiber._transport.unix import UnixChannel
+from fiber._wire.packet import Message
 from fiber.connection import Connection, Pipe
 from fiber.errors import ConnectionClosed, UnpicklableError
 
@@ -368,3 +371,88 @@ def test_what_could_not_be_sent_keeps_no_end_of_another_pipe_open() -> None:
         one.send([inner_other, threading.Lock()])
     inner_other.close()
     assert inner.poll(10), "the hub keeps it"
+
+
+# Looking for an answer before sleeping
+
+
+class Clock:
+    """Goes on by a microsecond at each look at it."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        self.now += 1e-6
+        return self.now
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """When the socket was looked at, by a clock of its own."""
+    clock, times = Clock(), list[float]()
+    try_recv = UnixChannel.try_recv
+
+    def look(channel: UnixChannel) -> Message | None:
+        times.append(clock.now)
+        return try_recv(channel)
+
+    monkeypatch.setattr(unix, "time", clock)
+    monkeypatch.setattr(UnixChannel, "try_recv", look)
+    return times
+
+
+def answer_late(here: Connection, there: Connection, looks: list[float]) -> threading.Thread:
+    """Answer once the receiver has stopped looking."""
+
+    def answer() -> None:
+        assert wait_until(lambda: bool(looks) and looks[-1] > looks[0] + 45e-6, PATIENCE)
+        there.send("late")
+
+    thread = threading.Thread(target=answer)
+    here.send("question")
+    thread.start()
+    return thread
+
+
+def test_who_has_asked_nothing_does_not_look(
+    pipe: tuple[Connection, Connection], looks: list[float]
+) -> None:
+    here, there = pipe
+    here.send(1)
+    assert there.recv() == 1  # what this process sent last went out on the other end
+    assert looks == []
+
+
+def test_who_has_asked_somebody_else_since_does_not_look(
+    pipe: tuple[Connection, Connection], looks: list[float]
+) -> None:
+    here, there = pipe
+    other, its_end = Pipe()
+    there.send("answer")
+    here.send("question")
+    other.send("question")
+    assert here.recv() == "answer"
+    assert looks == []
+    other.close()
+    its_end.close()
+
+
+def test_who_waits_for_an_answer_looks_and_then_sleeps(
+    pipe: tuple[Connection, Connection], looks: list[float]
+) -> None:
+    here, there = pipe
+    thread = answer_late(here, there, looks)
+    assert here.recv() == "late"
+    thread.join()
+    assert 10 < len(looks) < 60
+    looks.clear()
+    for _ in range(255):
+        there.send("answer")
+        here.send("question")
+        assert here.recv() == "answer"
+    assert looks == []
+    there.send("answer")
+    here.send("question")
+    assert here.recv() == "answer"
+    assert len(looks) == 1

@@ -258,6 +258,20 @@ async def test_a_pool_that_went_meanwhile_is_forgotten(world: World) -> None:
 
 
 @played()
+async def test_a_pool_that_went_while_its_namespace_was_claimed_is_forgotten(world: World) -> None:
+    """As with a namespace that is being deleted: no Lease can be made in it any more."""
+    await world.until(lambda: acts(world.program))
+    refusal = Fault("create", "leases", status=403, reason="Forbidden", times=10**6, late=5)
+    world.api.faults.append(refusal)
+    world.make_pool()
+    await world.until(lambda: list(world.program.queue.known()) != [])
+    world.store.delete("fiberpools", NAMESPACE, "es")
+    await world.settled(10)
+    assert list(world.program.queue.known()) == []
+    assert world.program.health.ready() == []
+
+
+@played()
 async def test_many_complaints_are_short(world: World) -> None:
     logging.getLogger("fiber_operator.claims").setLevel(logging.ERROR)
     await world.until(lambda: acts(world.program))

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from fiber._agent import worker as worker_module
-from fiber._agent.watch import Watch
+from fiber._agent.watchdog import Watchdog
 from fiber._agent.worker import FUNCTIONS, Worker
 from fiber._wire import packet, work
 from unit import pool_tasks as tasks
@@ -61,8 +61,8 @@ class Rig:
 
     def __init__(self, retryable: tuple[type[BaseException], ...] = ()) -> None:
         self.channel = Channel()
-        self.board = memoryview(bytearray(16)).cast("Q")
-        self.worker = Worker(self.channel, self.board, retryable)
+        self.progress = memoryview(bytearray(16)).cast("Q")
+        self.worker = Worker(self.channel, self.progress, retryable)
         self._seq = 0
 
     def give(
@@ -95,8 +95,8 @@ class Rig:
 @pytest.fixture
 def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
     """A worker that takes its time: however slow this machine is, it gives nothing back."""
-    monkeypatch.setattr(Watch, "begin", lambda self, answer: None)
-    monkeypatch.setattr(worker_module, "LONG_PATIENCE", 60.0)
+    monkeypatch.setattr(Watchdog, "begin", lambda self, batch: None)
+    monkeypatch.setattr(worker_module, "SPLIT_AFTER", 60.0)
     return Rig()
 
 
@@ -238,7 +238,7 @@ def test_stop(rig: Rig) -> None:
 
 def test_each_task_is_noted_before_it_runs(rig: Rig) -> None:
     seen: list[tuple[int, int]] = []
-    tasks.state["note"] = lambda: seen.append((rig.board[0], rig.board[1]))
+    tasks.state["note"] = lambda: seen.append((rig.progress[0], rig.progress[1]))
     try:
         seq = rig.give(note, range(4))
     finally:
@@ -248,7 +248,7 @@ def test_each_task_is_noted_before_it_runs(rig: Rig) -> None:
 
 def test_of_short_tasks_each_few_are_noted(rig: Rig) -> None:
     seen: list[int] = []
-    tasks.state["note"] = lambda: seen.append(rig.board[1])
+    tasks.state["note"] = lambda: seen.append(rig.progress[1])
     try:
         rig.give(note, range(7), stride=3)
     finally:
@@ -416,7 +416,7 @@ def test_a_batch_that_takes_too_long_gives_back_what_is_left(impatient: Rig) -> 
 
 
 def test_chunks_are_not_taken_apart(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_module, "LONG_PATIENCE", 0.0)
+    monkeypatch.setattr(worker_module, "SPLIT_AFTER", 0.0)
     rig.give(tasks.square, list(range(100)), stride=4, unit=10)
     (kept,) = [words[2] for words in rig.channel.said if words[2] is not None]
     assert kept == 10

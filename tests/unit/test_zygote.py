@@ -22,7 +22,7 @@ import pytest
 import census
 from fiber import reduction
 from fiber._agent import child, zygote, zygote_process
-from fiber._agent.board import Board
+from fiber._agent.progress import ProgressTable
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
 from fiber.process import Process
@@ -34,11 +34,17 @@ PATIENCE = 10
 class Master:
     """The agent's end of a zygote, spoken by hand."""
 
-    def __init__(self, board: Board, *, preload: bool = False, heirloom: str | None = None) -> None:
+    def __init__(
+        self,
+        progress_table: ProgressTable,
+        *,
+        preload: bool = False,
+        cleanup_directory: str | None = None,
+    ) -> None:
         self.process, self.sock = zygote_process.launch()
         self.sock.settimeout(PATIENCE)
-        setup = (zygote.SETUP, (os.getpid(),), preload, heirloom)
-        packet.send(self.sock, pickle.dumps(setup), fds=[board.fd])
+        setup = (zygote.SETUP, (os.getpid(),), preload, cleanup_directory)
+        packet.send(self.sock, pickle.dumps(setup), fds=[progress_table.fd])
 
     def start(self, number: int, **options: Any) -> None:
         """Ask for a child that runs for ever, unless ``options`` say otherwise."""
@@ -71,14 +77,14 @@ class Master:
         self.process.wait(PATIENCE)
 
 
-def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.Start:
+def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.StartRequest:
     process = Process(target=target, args=args)
     preparation = spawn.get_preparation_data(process.name)
     preparation |= {"authkey": b"key", "host": "here", "calls": [], "same_host": True}
     preparation |= options.pop("preparation", {})
     for key in ("start_method", "init_main_from_name", "init_main_from_path"):
         preparation.pop(key, None)
-    return zygote.Start(
+    return zygote.StartRequest(
         method=options.pop("method", "fork"),
         preparation=pickle.dumps(preparation),
         payload=reduction.dump_process(process, same_host=True)[0],
@@ -87,20 +93,20 @@ def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.
         captured=False,
         open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
         hub=None,
-        elders=(os.getpid(),),
+        ancestors=(os.getpid(),),
     )
 
 
 @pytest.fixture
-def board() -> Iterator[Board]:
-    made = Board()
+def progress_table() -> Iterator[ProgressTable]:
+    made = ProgressTable()
     yield made
     made.close()
 
 
 @pytest.fixture
-def master(board: Board) -> Iterator[Master]:
-    made = Master(board)
+def master(progress_table: ProgressTable) -> Iterator[Master]:
+    made = Master(progress_table)
     yield made
     made.close()
 
@@ -161,8 +167,8 @@ def test_its_children_do_not_outlive_its_own_sudden_death(master: Master) -> Non
     assert census.wait_until(lambda: all(gone(pid) for pid in pids), PATIENCE)
 
 
-def test_a_hang_up_ends_it(board: Board) -> None:
-    master = Master(board)
+def test_a_hang_up_ends_it(progress_table: ProgressTable) -> None:
+    master = Master(progress_table)
     pid = master.started(1)
     master.close()
     assert gone(pid)
@@ -171,8 +177,8 @@ def test_a_hang_up_ends_it(board: Board) -> None:
 def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
     script = """
         import os, signal, subprocess
-        from unit.test_zygote import Board, Master
-        master = Master(Board())
+        from unit.test_zygote import ProgressTable, Master
+        master = Master(ProgressTable())
         child, socket = master.started(1), master.sock.fileno()
         holder = subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL, pass_fds=[socket])
         print(holder.pid, master.process.pid, child, flush=True)
@@ -188,12 +194,12 @@ def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
 
 @pytest.mark.parametrize("moment", ["at once", "later"])
 def test_it_removes_the_directory_of_an_agent_that_was_killed(moment: str, tmp_path: Path) -> None:
-    directory = tmp_path / "heirloom"
+    directory = tmp_path / "cleanup_directory"
     directory.mkdir()
     script = f"""
         import os, signal
-        from unit.test_zygote import Board, Master
-        master = Master(Board(), heirloom={str(directory)!r})
+        from unit.test_zygote import ProgressTable, Master
+        master = Master(ProgressTable(), cleanup_directory={str(directory)!r})
         if {moment!r} == "later":
             master.started(1)
         os.kill(os.getpid(), signal.SIGKILL)
@@ -202,8 +208,10 @@ def test_it_removes_the_directory_of_an_agent_that_was_killed(moment: str, tmp_p
     assert census.wait_until(lambda: not directory.exists(), PATIENCE)
 
 
-def test_told_to_quit_it_leaves_the_directory_to_its_agent(board: Board, tmp_path: Path) -> None:
-    master = Master(board, heirloom=str(tmp_path))
+def test_told_to_quit_it_leaves_the_directory_to_its_agent(
+    progress_table: ProgressTable, tmp_path: Path
+) -> None:
+    master = Master(progress_table, cleanup_directory=str(tmp_path))
     master.started(1)
     master.say(zygote.QUIT)
     master.close()
@@ -214,8 +222,8 @@ def test_told_to_quit_it_leaves_the_directory_to_its_agent(board: Board, tmp_pat
 def test_a_child_whose_zygote_died_first_does_not_live_on(parent: str) -> None:
     script = f"""
         import os
-        from fiber._agent.child import die_with
-        die_with({parent})
+        from fiber._agent.child import die_with_parent
+        die_with_parent({parent})
         print("alive")
     """
     alive = parent == "os.getppid()"
@@ -236,23 +244,27 @@ def _run(script: str, expect: int, env: Mapping[str, str] = os.environ) -> str:
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_once_its_imports_made_forking_unsafe_it_forks_no_more(board: Board, method: str) -> None:
-    master = Master(board, preload=True)
+def test_once_its_imports_made_forking_unsafe_it_forks_no_more(
+    progress_table: ProgressTable, method: str
+) -> None:
+    master = Master(progress_table, preload=True)
     threads = {"preload": ["unit.threads_at_import"]}
     master.started(1, method="spawn")
     for number in (2, 3):
         master.start(number, preparation=threads)
         kind, who, reason = master.hear()
-        assert (kind, who) == (zygote.UNFIT, number)
+        assert (kind, who) == (zygote.FORK_UNSAFE, number)
         assert "started at import" in reason
     assert master.started(4, method="spawn") > 0, "a new interpreter is safe all the same"
     master.close()
 
 
-def test_the_main_module_is_imported_once_for_all(board: Board, tmp_path: Path) -> None:
+def test_the_main_module_is_imported_once_for_all(
+    progress_table: ProgressTable, tmp_path: Path
+) -> None:
     main, log = tmp_path / "main_module.py", tmp_path / "log"
     main.write_text(f"import os\nwith open({str(log)!r}, 'a') as f:\n    f.write('imported\\n')\n")
-    master = Master(board, preload=True)
+    master = Master(progress_table, preload=True)
     for number in range(3):
         preparation = {"preload": [], "sys_path": [str(tmp_path), *sys.path]}
         master.started(number, preparation={**preparation, "preload": ["main_module"]})
@@ -261,29 +273,31 @@ def test_the_main_module_is_imported_once_for_all(board: Board, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("code", ["raise SystemExit(3)", "raise KeyboardInterrupt", "1 / 0"])
-def test_an_import_that_fails_does_not_end_it(board: Board, tmp_path: Path, code: str) -> None:
+def test_an_import_that_fails_does_not_end_it(
+    progress_table: ProgressTable, tmp_path: Path, code: str
+) -> None:
     (tmp_path / "broken_module.py").write_text(code)
-    master = Master(board, preload=True)
+    master = Master(progress_table, preload=True)
     preparation = {"preload": ["broken_module"], "sys_path": [str(tmp_path), *sys.path]}
     assert master.started(1, preparation=preparation) > 0
     master.close()
 
 
 def test_an_executable_that_is_not_there_is_named(
-    board: Board, capfd: pytest.CaptureFixture[str]
+    progress_table: ProgressTable, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    master = Master(board)
+    master = Master(progress_table)
     master.started(1, method="spawn", executable="/no/such/python")
     assert master.hear() == (zygote.EXITED, 1, 1)
     master.close()
     assert "No such file or directory: '/no/such/python'" in capfd.readouterr().err
 
 
-def test_more_descriptors_than_it_was_born_to_hold(board: Board) -> None:
+def test_more_descriptors_than_it_was_born_to_hold(progress_table: ProgressTable) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
     try:
-        master = Master(board)
+        master = Master(progress_table)
         first = master.started(1)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
@@ -307,13 +321,13 @@ def test_more_descriptors_than_it_was_born_to_hold(board: Board) -> None:
 
 
 @pytest.fixture
-def inside(board: Board) -> Iterator[tuple[zygote.Zygote, socket.socket]]:
+def inside(progress_table: ProgressTable) -> Iterator[tuple[zygote.Zygote, socket.socket]]:
     ours, theirs = socketpair("a test")
     ours.settimeout(PATIENCE)
     watched = os.pidfd_open(os.getpid())
-    made = zygote.Zygote(theirs, board, [watched], preload=False)
+    made = zygote.Zygote(theirs, progress_table, [watched], preload=False)
     yield made, ours
-    for fd in (watched, made._deaths, made._deaths_in):
+    for fd in (watched, made._sigchld, made._sigchld_in):
         os.close(fd)
     ours.close()
     theirs.close()
@@ -367,13 +381,13 @@ def test_descriptors_that_nobody_took_are_closed_in_the_child(
 # Started before anything needs it
 
 
-def test_one_that_was_started_early_is_the_next_one(board: Board) -> None:
+def test_one_that_was_started_early_is_the_next_one(progress_table: ProgressTable) -> None:
     zygote_process.start_early()
     early = zygote_process._early
     assert early is not None
     zygote_process.start_early()
     assert zygote_process._early is early, "one is enough"
-    master = Master(board)
+    master = Master(progress_table)
     assert master.process is early.process
     master.started(1)
     master.close()

@@ -16,9 +16,9 @@ import threading
 from typing import Any
 
 from fiber._agent import zygote
-from fiber._agent.board import Board
 from fiber._agent.local_child import LocalChild
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink, close_all
 from fiber._hub import client as hub_client
 from fiber._hub.hub import Hub
@@ -37,11 +37,11 @@ class Agent:
     def __init__(self, loop: Loop, host: str, hub: Hub | None = None) -> None:
         self.host = host
         self.loop = loop
-        self.board = Board()
+        self.progress_table = ProgressTable()
         self._hub = hub
         self._ids = itertools.count(1)
         self._children: dict[int, LocalChild] = {}
-        self._forsaken: dict[int, int | None] = {}
+        self._abandoned: dict[int, int | None] = {}
         self._zygotes: list[ZygoteLink] = []
         self._closed = False
 
@@ -66,7 +66,7 @@ class Agent:
             child.start(self._zygote(), self._access())
         except Exception as error:
             child.start_error = error
-            self._gone(child, 1, f"could not be started: {error}")
+            self._child_exited(child, 1, f"could not be started: {error}")
 
     def close(self) -> None:
         """Kill every child and end the zygotes.  Not on the loop's thread."""
@@ -79,7 +79,7 @@ class Agent:
             self._close(zygotes, taken)
         for link in zygotes:
             link.quit()
-        self.loop.call_soon(self.board.close)
+        self.loop.call_soon(self.progress_table.close)
 
     def _close(self, zygotes: list[ZygoteLink], taken: threading.Event) -> None:
         self._closed = True
@@ -98,49 +98,51 @@ class Agent:
             self._access()  # makes the hub's directory, if there is to be one
             directory = None if self._hub is None else self._hub.directory
             self._zygotes.append(
-                ZygoteLink(self, self.loop, self.board.fd, directory, preload=preload)
+                ZygoteLink(self, self.loop, self.progress_table.fd, directory, preload=preload)
             )
         return self._zygotes[-1]
 
     # What zygotes say, on the loop's thread
 
-    def heard(self, link: ZygoteLink, answer: tuple[Any, ...]) -> None:
+    def on_reply(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
         """An answer of a zygote about one of our children."""
-        child = self._children.get(answer[1])
+        child = self._children.get(reply[1])
         if child is None:
-            self._heard_of_forsaken(link, answer)
-        elif answer[0] == zygote.STARTED:
-            child.pid = answer[2]
+            self._on_reply_about_abandoned(link, reply)
+        elif reply[0] == zygote.STARTED:
+            child.pid = reply[2]
             child.release_descriptors()
-            child.observer.started(answer[2])
-        elif answer[0] == zygote.EXITED:
-            self._gone(child, answer[2], describe(answer[2]))
-        elif answer[0] == zygote.FAILED:
-            self._gone(child, 1, f"could not be started: {answer[2]}")
-        elif answer[0] == zygote.UNFIT:
-            self._start_elsewhere(child)
+            child.observer.started(reply[2])
+        elif reply[0] == zygote.EXITED:
+            self._child_exited(child, reply[2], describe(reply[2]))
+        elif reply[0] == zygote.FAILED:
+            self._child_exited(child, 1, f"could not be started: {reply[2]}")
+        elif reply[0] == zygote.FORK_UNSAFE:
+            self._restart_elsewhere(child)
 
-    def forsake(self, child: LocalChild) -> None:
+    def abandon(self, child: LocalChild) -> None:
         """It was killed before it was born, and its zygote may be busy for long: it is gone now."""
         if child.pid is None and child.id in self._children:
-            self._forsaken[child.id], child.slot = child.slot, None
-            self._gone(child, -signal.SIGKILL, describe(-signal.SIGKILL))
+            self._abandoned[child.id], child.slot = child.slot, None
+            self._child_exited(child, -signal.SIGKILL, describe(-signal.SIGKILL))
 
-    def _heard_of_forsaken(self, link: ZygoteLink, answer: tuple[Any, ...]) -> None:
-        if answer[0] == zygote.STARTED:
-            link.send(zygote.SIGNAL, answer[1], signal.SIGKILL)
-        elif (slot := self._forsaken.pop(answer[1], None)) is not None:
-            self.board.release(slot)  # it can no longer write there
+    def _on_reply_about_abandoned(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
+        if reply[0] == zygote.STARTED:
+            link.send(zygote.SIGNAL, reply[1], signal.SIGKILL)
+        elif (slot := self._abandoned.pop(reply[1], None)) is not None:
+            self.progress_table.release(slot)  # it can no longer write there
 
-    def zygote_gone(self, link: ZygoteLink) -> None:
+    def on_zygote_exit(self, link: ZygoteLink) -> None:
         """A zygote died, and its children with it."""
         if link in self._zygotes:
             self._zygotes.remove(link)
-        bereft = [child for child in self._children.values() if child.zygote is link]
-        for child in bereft:
-            self._gone(child, -signal.SIGKILL, "killed by SIGKILL, together with its zygote")
+        orphaned = [child for child in self._children.values() if child.zygote is link]
+        for child in orphaned:
+            self._child_exited(
+                child, -signal.SIGKILL, "killed by SIGKILL, together with its zygote"
+            )
 
-    def _start_elsewhere(self, child: LocalChild) -> None:
+    def _restart_elsewhere(self, child: LocalChild) -> None:
         """Its zygote must not be forked: one that imports nothing serves it and all after it.
 
         What the old one runs already lives on there.
@@ -151,26 +153,26 @@ class Agent:
         try:
             child.start(self._zygote(preload=self._zygotes[-1] is not old), self._access())
         except Exception as error:
-            self._gone(child, 1, f"could not be started: {error}")
+            self._child_exited(child, 1, f"could not be started: {error}")
             return
-        deserted = all(other.zygote is not old for other in self._children.values())
-        if deserted and old is not None:
+        unused = all(other.zygote is not old for other in self._children.values())
+        if unused and old is not None:
             old.send(zygote.QUIT)
 
-    def _gone(self, child: LocalChild, exitcode: int, reason: str) -> None:
+    def _child_exited(self, child: LocalChild, exitcode: int, reason: str) -> None:
         del self._children[child.id]
-        unread, running = self._bury(child)
+        unread, running = self._release(child)
         if child.fault is not None:
             reason = f"killed by its agent: {child.fault}"
         child.observer.exited(ExitReport(exitcode, reason, unread, running, host=self.host))
 
-    def _bury(self, child: LocalChild) -> tuple[tuple[int, ...], tuple[int, int] | None]:
+    def _release(self, child: LocalChild) -> tuple[tuple[int, ...], tuple[int, int] | None]:
         """Give back what it had; what it never read and what it was running."""
-        unread = child.hang_up()
+        unread = child.drain_and_close()
         if child.slot is None:
             return unread, None
-        running = self.board.running(child.slot)
-        self.board.release(child.slot)
+        running = self.progress_table.running(child.slot)
+        self.progress_table.release(child.slot)
         return unread, running
 
 

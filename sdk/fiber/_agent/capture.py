@@ -10,7 +10,7 @@ from collections.abc import Callable
 from fiber._transport.loop import Loop
 from fiber._transport.unix import naming_the_limit
 
-REMEMBERED = 20
+LAST_LINES = 20
 """Lines kept to explain a death."""
 
 _CHUNK = 1 << 16
@@ -29,7 +29,7 @@ class Capture:
             self._reader, self._writer = os.pipe2(os.O_CLOEXEC)
         os.set_blocking(self._reader, False)
         self._rest = b""
-        self._lines: deque[str] = deque(maxlen=REMEMBERED)
+        self._lines: deque[str] = deque(maxlen=LAST_LINES)
         self._closed = False
         loop.register(self._reader, self._readable)
 

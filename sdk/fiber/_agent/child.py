@@ -16,7 +16,7 @@ from multiprocessing import process as mp_process
 from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
-from fiber._agent.board import Board
+from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import client as hub_client
 from fiber._hub.protocol import HubAddress
@@ -29,7 +29,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 _descriptors: list[int] = []
 _task_channel: UnixChannel | None = None
 _progress: memoryview | None = None
-elders: tuple[int, ...] = ()
+ancestors: tuple[int, ...] = ()
 """Pids of the processes that this one ends with: its parent first; none in a program that Fiber did
 not start.
 """
@@ -37,14 +37,14 @@ host = ""
 """The host that this process belongs to; empty in a program that Fiber did not start."""
 
 
-class Start(NamedTuple):
+class StartRequest(NamedTuple):
     """What a zygote is told of one child, and the child of itself; descriptors come beside it."""
 
     method: str
     preparation: bytes
     payload: bytes
     slot: int | None
-    """Its place on the progress board; a worker's first descriptor is its task channel."""
+    """Its place on the progress table; a worker's first descriptor is its task channel."""
     executable: str | None
     captured: bool
     """Whether its output goes to its agent, which wants it line by line."""
@@ -52,13 +52,13 @@ class Start(NamedTuple):
     """Its limits of descriptors, soft and hard: those of its agent's process."""
     hub: HubAddress | None
     """Where it finds the hub of its host."""
-    elders: tuple[int, ...]
+    ancestors: tuple[int, ...]
     """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
 
 
 def lineage() -> tuple[int, ...]:
     """This process's pid and those of the processes that it ends with."""
-    return os.getpid(), *elders
+    return os.getpid(), *ancestors
 
 
 def task_channel() -> UnixChannel:
@@ -88,36 +88,36 @@ def take_descriptor(index: int) -> int:
     return fd
 
 
-def die_with(parent: int) -> None:
+def die_with_parent(parent: int) -> None:
     """Have the kernel kill this process when its zygote dies."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
 
-def adopt_orphans() -> None:
+def become_subreaper() -> None:
     """Have the kernel make this process the parent of what our children leave behind."""
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def run(start: Start, fds: list[int], board: Board, agent: int) -> int:
+def run(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> int:
     """Run what was asked for and return the exit code."""
     if start.method == "spawn":
-        _exec(start, fds, board, agent)
+        _exec(start, fds, progress_table, agent)
     # What the zygote's imports registered, say to remove a folder, is not for each child to do.
     atexit._clear()
     atexit.register(util._exit_function)  # type: ignore[attr-defined]
-    return _run(start, fds, board, agent)
+    return _run(start, fds, progress_table, agent)
 
 
-def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
-    global _task_channel, _progress, _descriptors, elders
-    elders = start.elders
+def _run(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> int:
+    global _task_channel, _progress, _descriptors, ancestors
+    ancestors = start.ancestors
     _adopt_stdio(fds, captured=start.captured)
     rest = fds[2:]
     if start.slot is not None:
         _task_channel = UnixChannel.from_fd(rest.pop(0))
-        _progress = board.slot(start.slot)
+        _progress = progress_table.slot(start.slot)
     _descriptors = rest
     try:
         return _load_and_run(start, agent)
@@ -127,7 +127,7 @@ def _run(start: Start, fds: list[int], board: Board, agent: int) -> int:
         util._flush_std_streams()  # type: ignore[attr-defined]
 
 
-def _load_and_run(start: Start, agent: int) -> int:
+def _load_and_run(start: StartRequest, agent: int) -> int:
     try:
         process = _load(start)
     except BaseException:
@@ -139,7 +139,7 @@ def _load_and_run(start: Start, agent: int) -> int:
     return int(process._bootstrap(parent_sentinel=agent))
 
 
-def _load(start: Start) -> Any:
+def _load(start: StartRequest) -> Any:
     data: dict[str, Any] = pickle.loads(start.preparation)
     if start.hub is not None:
         hub_client.set_hub_address(start.hub)
@@ -225,13 +225,13 @@ def _report_birth_failure() -> None:
             _task_channel.send(pickle.dumps(("birth", traceback.format_exc())))
 
 
-def _exec(start: Start, fds: list[int], board: Board, agent: int) -> None:
+def _exec(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> None:
     """Replace this forked process by a fresh interpreter that goes on in ``spawned``."""
     again = os.memfd_create("fiber-start")
-    plan = (tuple(start._replace(method="fork")), fds, board.fd, agent)
+    plan = (tuple(start._replace(method="fork")), fds, progress_table.fd, agent)
     with os.fdopen(os.dup(again), "wb") as file:
         pickle.dump(plan, file)
-    for fd in (*fds, board.fd, agent, again):
+    for fd in (*fds, progress_table.fd, agent, again):
         os.set_inheritable(fd, True)
     executable = os.fsdecode(start.executable or sys.executable)
     statement = f"from fiber._agent.child import spawned; spawned({again})"
@@ -245,11 +245,11 @@ def spawned(plan_fd: int) -> None:
     """Entry point of a child in an interpreter of its own."""
     with os.fdopen(plan_fd, "rb") as file:
         file.seek(0)
-        fields, fds, board, agent = pickle.load(file)
-    for fd in (*fds, board, agent):
+        fields, fds, progress_table, agent = pickle.load(file)
+    for fd in (*fds, progress_table, agent):
         os.set_inheritable(fd, False)
     code = 1
     try:
-        code = _run(Start(*fields), fds, Board(board), agent)
+        code = _run(StartRequest(*fields), fds, ProgressTable(progress_table), agent)
     finally:
         os._exit(code)

@@ -16,9 +16,9 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from fiber._agent import zygote
-from fiber._agent.board import Board
-from fiber._agent.child import Start, lineage
+from fiber._agent.child import StartRequest, lineage
 from fiber._agent.port import ChildObserver, ChildSpec
+from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
 from fiber._hub.protocol import HubAddress
 from fiber._transport.loop import Loop
@@ -36,9 +36,9 @@ class Owner(Protocol):
 
     host: str
     loop: Loop
-    board: Board
+    progress_table: ProgressTable
 
-    def forsake(self, child: LocalChild) -> None:
+    def abandon(self, child: LocalChild) -> None:
         """It was killed before it was born.  On the loop's thread."""
 
 
@@ -71,11 +71,11 @@ class LocalChild:
             raise
 
     def _make_channel(self) -> None:
-        slot = self._owner.board.claim()
+        slot = self._owner.progress_table.claim()
         try:
             ours, theirs = socketpair("starting a pool worker")
         except BaseException:
-            self._owner.board.release(slot)
+            self._owner.progress_table.release(slot)
             raise
         ours.setblocking(False)
         self.slot = slot
@@ -94,7 +94,7 @@ class LocalChild:
         self.zygote = zygote
         spec = self._spec
         fds = self._descriptors()
-        request = Start(
+        request = StartRequest(
             spec.method,
             spec.preparation,
             spec.payload,
@@ -103,7 +103,7 @@ class LocalChild:
             captured=spec.stdio is not None,
             open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
             hub=hub,
-            elders=lineage(),
+            ancestors=lineage(),
         )
         zygote.start(self.id, request, fds)
 
@@ -166,14 +166,14 @@ class LocalChild:
         if self.zygote is not None:
             self.zygote.send(zygote.SIGNAL, self.id, signum)
         if signum == signal.SIGKILL and self.pid is None:
-            self._owner.forsake(self)
+            self._owner.abandon(self)
 
     def condemn(self, fault: Exception) -> None:
         """Something to or from it is lost for good: only its end can tell the master so."""
         self.fault = self.fault or fault
         self.signal(signal.SIGKILL)
 
-    def hang_up(self) -> tuple[int, ...]:
+    def drain_and_close(self) -> tuple[int, ...]:
         """It is gone: hear its last words, recall what it never read.  On the loop."""
         self.release_descriptors()
         if self._ours is None or self._theirs is None:

@@ -1,4 +1,4 @@
-"""The loop of a pool worker: read a batch, run its tasks, answer.
+"""The loop of a pool worker: read a batch, run its tasks, send the results.
 
 A worker reads one message at a time, so that what it has not read can be taken back from the
 kernel.  Before each task (or, for very short ones, each few) it notes in shared memory where it
@@ -17,8 +17,8 @@ from itertools import islice, starmap
 from typing import Any
 
 from fiber._agent import child
-from fiber._agent.answer import Answer, Sender, encode_error
-from fiber._agent.watch import LONG_PATIENCE, Watch
+from fiber._agent.batch_results import BatchResults, Sender, encode_error
+from fiber._agent.watchdog import SPLIT_AFTER, Watchdog
 from fiber._wire import work
 from fiber._wire.packet import Message
 
@@ -30,8 +30,8 @@ SMALL = frozenset({int, float, bool, type(None)})
 
 _Function = Callable[..., Any]
 
-_ANSWERED = object()
-"""In place of a function: the batch has its answer."""
+_REPLIED = object()
+"""In place of a function: the batch was replied to."""
 
 
 def run(
@@ -65,26 +65,26 @@ def run(
 
 
 class Worker:
-    """Runs batches.  ``board``: two shared words, sequence number and index of what runs."""
+    """Runs batches.  ``progress``: two shared words, sequence number and index of what runs."""
 
     def __init__(
-        self, channel: Sender, board: memoryview, retryable: tuple[type[BaseException], ...] = ()
+        self, channel: Sender, progress: memoryview, retryable: tuple[type[BaseException], ...] = ()
     ) -> None:
         self._channel = channel
-        self._board = board
+        self._progress = progress
         self._retryable = retryable
         self._functions: OrderedDict[int, _Function] = OrderedDict()
-        self._watch = Watch()
+        self._watchdog = Watchdog()
         self._interruptible = False
 
     def close(self) -> None:
         """End its second thread, if it has one."""
-        self._watch.stop()
+        self._watchdog.stop()
 
     def interrupt(self, signum: int, frame: object) -> None:
         """The handler of SIGINT: KeyboardInterrupt in the task that runs, and nowhere else.
 
-        Between tasks it would lose a batch, or half of an answer.
+        Between tasks it would lose a batch, or half of its results.
         """
         if self._interruptible:
             raise KeyboardInterrupt
@@ -97,12 +97,12 @@ class Worker:
         head = work.Head._make(work.HEAD.unpack_from(payload, work.SEQ.size))
         try:
             if head.kind != work.STOP:
-                self._answer(seq, head, payload[work.BODY :], message.buffers, started)
+                self._run_message(seq, head, payload[work.BODY :], message.buffers, started)
         finally:
             message.release()
         return head.kind != work.STOP
 
-    def _answer(
+    def _run_message(
         self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview], started: float
     ) -> None:
         if head.kind == work.CALLS and head.size == 1:
@@ -113,17 +113,17 @@ class Worker:
             function: Any = _Caller(buffers)
         else:
             function = self._function(seq, head, body, buffers)
-            if function is _ANSWERED:
+            if function is _REPLIED:
                 return
             try:
                 items = pickle.loads(body[head.size :], buffers=buffers[head.buffers :])
             except BaseException as error:
-                self._say(work.UNREADABLE, seq, encode_error(error))
+                self._reply(work.UNREADABLE, seq, encode_error(error))
                 return
-        answer = self._start(seq, items, started, exact=not head.stride)
+        batch = self._start(seq, items, started, eager=not head.stride)
         self._note(seq)
-        self._run(answer, function, head, started)
-        answer.flush()
+        self._run(batch, function, head, started)
+        batch.flush()
 
     def _run_call(
         self, seq: int, body: memoryview, buffers: list[memoryview], started: float
@@ -137,137 +137,139 @@ class Worker:
             self._interruptible = False
         except BaseException as error:
             self._interruptible = False
-            answer = self._start(seq, (), started, exact=True)
-            answer.fail(error)
-            answer.flush()
+            batch = self._start(seq, (), started, eager=True)
+            batch.fail(error)
+            batch.flush()
             if isinstance(error, SystemExit):
                 raise
             return
         if type(value) in SMALL:
-            self._say(seq, 0, None, time.perf_counter() - started, [value], ())
+            self._reply(seq, 0, None, time.perf_counter() - started, [value], ())
         else:
-            answer = self._start(seq, (), started, exact=True)
-            answer.add(value)
-            answer.flush()
+            batch = self._start(seq, (), started, eager=True)
+            batch.add(value)
+            batch.flush()
 
-    def _start(self, seq: int, items: Any, started: float, *, exact: bool) -> Answer:
-        return Answer(
+    def _start(self, seq: int, items: Any, started: float, *, eager: bool) -> BatchResults:
+        return BatchResults(
             self._channel,
             seq,
             iter(items),
             len(items),
-            exact=exact,
+            eager=eager,
             started=started,
             retryable=self._retryable,
         )
 
     def _note(self, seq: int) -> None:
         """Note that the first task of a batch begins."""
-        board = self._board
-        board[0] = 0
-        board[1] = 0
-        board[0] = seq
+        progress = self._progress
+        progress[0] = 0
+        progress[1] = 0
+        progress[0] = seq
 
     def _function(
         self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview]
     ) -> Any:
-        """The function of a batch, whatever it is: to call it may be the error; or _ANSWERED."""
+        """The function of a batch, whatever it is: to call it may be the error; or _REPLIED."""
         functions = self._functions
         if head.size:
             try:
                 function = pickle.loads(body[: head.size], buffers=buffers[: head.buffers])
             except BaseException as error:
-                self._say(work.BROKEN, seq, encode_error(error))
-                return _ANSWERED
+                self._reply(work.BROKEN, seq, encode_error(error))
+                return _REPLIED
             functions[head.function] = function
             if len(functions) > FUNCTIONS:
                 functions.popitem(last=False)
         elif head.function not in functions:
-            self._say(work.UNKNOWN, seq)
-            return _ANSWERED
+            self._reply(work.UNKNOWN, seq)
+            return _REPLIED
         return functions[head.function]
 
-    def _say(self, *words: Any) -> None:
+    def _reply(self, *words: Any) -> None:
         self._channel.send(pickle.dumps(words))
 
     # Running
 
-    def _run(self, answer: Answer, function: _Function, head: work.Head, started: float) -> None:
+    def _run(
+        self, batch: BatchResults, function: _Function, head: work.Head, started: float
+    ) -> None:
         # Chunks that the user asked for stay whole; anything else can be taken apart.
-        if answer.total > 1 and head.unit == 1:
-            self._watch.begin(answer)
+        if batch.total > 1 and head.unit == 1:
+            self._watchdog.begin(batch)
         if head.stride > 1:
             apply = starmap if head.kind == work.STAR else map
-            self._run_in_strides(answer, lambda some: apply(function, some), head, started)
+            self._run_in_strides(batch, lambda some: apply(function, some), head, started)
         else:
             single = _spread(function) if head.kind == work.STAR else function
-            if answer.exact:
-                self._run_exactly(answer, single)
+            if batch.eager:
+                self._run_eagerly(batch, single)
             else:
-                self._run_singly(answer, single, head, started)
-        self._watch.end()
+                self._run_singly(batch, single, head, started)
+        self._watchdog.end()
 
-    def _run_exactly(self, answer: Answer, function: _Function) -> None:
+    def _run_eagerly(self, batch: BatchResults, function: _Function) -> None:
         """One task after the other: its place noted, its result kept as it is right after it."""
-        board, values, plain = self._board, answer.values, work.PLAIN
-        for index, item in enumerate(answer.rest):
-            board[1] = index
+        progress, values, plain = self._progress, batch.values, work.PLAIN
+        for index, item in enumerate(batch.remaining):
+            progress[1] = index
             try:
                 self._interruptible = True
                 value = function(item)
                 self._interruptible = False
             except BaseException as error:
                 self._interruptible = False
-                self._failed(answer, error)
+                self._failed(batch, error)
                 continue
             if type(value) in plain:
                 values.append(value)
             else:
-                answer.add(value)
+                batch.add(value)
 
     def _run_singly(
-        self, answer: Answer, function: _Function, head: work.Head, started: float
+        self, batch: BatchResults, function: _Function, head: work.Head, started: float
     ) -> None:
         """One task after the other: its place noted, its result looked at once all are there."""
-        board, values = self._board, answer.values
-        for index, item in enumerate(answer.rest):
-            board[1] = index
+        progress, values = self._progress, batch.values
+        for index, item in enumerate(batch.remaining):
+            progress[1] = index
             try:
                 self._interruptible = True
                 value = function(item)
                 self._interruptible = False
             except BaseException as error:
                 self._interruptible = False
-                self._failed(answer, error)
+                self._failed(batch, error)
             else:
                 values.append(value)
-            if time.perf_counter() - started > LONG_PATIENCE and not len(values) % head.unit:
-                answer.settle()
-                answer.give_back()
-        answer.settle()
+            if time.perf_counter() - started > SPLIT_AFTER and not len(values) % head.unit:
+                batch.encode_new()
+                batch.return_unstarted()
+        batch.encode_new()
 
     def _run_in_strides(
         self,
-        answer: Answer,
+        batch: BatchResults,
         apply: Callable[[Iterable[Any]], Iterator[Any]],
         head: work.Head,
         started: float,
     ) -> None:
         """Several tasks at a time, at the speed of ``map``; chunks end where they should."""
-        values, unit = answer.values, head.unit
+        values, unit = batch.values, head.unit
         while True:
-            done = self._board[1] = len(values)
+            done = self._progress[1] = len(values)
             size = head.stride if unit == 1 else min(head.stride, unit - done % unit)
-            more = self._extend(answer, apply(islice(answer.rest, size)), size)
-            answer.settle()
+            more = self._extend(batch, apply(islice(batch.remaining, size)), size)
+            batch.encode_new()
             if not more:
                 return
-            if time.perf_counter() - started > LONG_PATIENCE and len(values) % unit == 0:
-                answer.give_back()
+            if time.perf_counter() - started > SPLIT_AFTER and len(values) % unit == 0:
+                batch.return_unstarted()
 
-    def _extend(self, answer: Answer, results: Iterator[Any], size: int) -> bool:
+    def _extend(self, batch: BatchResults, results: Iterator[Any], size: int) -> bool:
         """Run the tasks of one stride; False if they were the last ones."""
-        values = answer.values
+        values = batch.values
         stop = len(values) + size
         while True:
             try:
@@ -276,24 +278,24 @@ class Worker:
                 self._interruptible = False
             except BaseException as error:
                 self._interruptible = False
-                if answer.begun() > len(values):  # or else SIGINT came after the last of them
-                    self._failed(answer, error)
+                if batch.started() > len(values):  # or else SIGINT came after the last of them
+                    self._failed(batch, error)
                 continue
             if len(values) == stop:
                 return True
-            if answer.begun() == len(values):
+            if batch.started() == len(values):
                 return False
             # ``extend`` takes a task's StopIteration for the end of all.
-            answer.fail(StopIteration())
+            batch.fail(StopIteration())
 
-    def _failed(self, answer: Answer, error: BaseException) -> None:
-        answer.fail(error)
+    def _failed(self, batch: BatchResults, error: BaseException) -> None:
+        batch.fail(error)
         if isinstance(error, SystemExit):
             # It ends this process, as in multiprocessing; what was done before it counts.
-            self._watch.end()
-            if not answer.exact:
-                answer.settle()
-            answer.give_back()
+            self._watchdog.end()
+            if not batch.eager:
+                batch.encode_new()
+            batch.return_unstarted()
             raise error
 
 

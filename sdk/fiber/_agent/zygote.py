@@ -5,11 +5,12 @@ imports once what its children need, so that forking is cheap.  As their parent 
 sends them signals (a pid that only we can reap cannot be someone else's).  It ends, and they with
 it, when its agent's process does.
 
-Packets from the agent: ``(SETUP, elders, preload, heirloom)``, first and once, with the descriptor
-of the progress board; ``(START, child, start, descriptor count)``, ``(SIGNAL, child, signum)``,
+Packets from the agent: ``(SETUP, ancestors, preload, cleanup directory)``, first and once, with the
+descriptor of the progress table; ``(START, child, start request)``, ``(SIGNAL, child, signum)``,
 ``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
-``(UNFIT, child, reason)``: this zygote's imports made forking unsafe, start that child elsewhere.
+``(FORK_UNSAFE, child, reason)``: this zygote's imports made forking unsafe, start that child
+elsewhere.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ import warnings
 from typing import Any, NoReturn
 
 from fiber._agent import child as child_module
-from fiber._agent.board import Board
-from fiber._agent.child import Start
+from fiber._agent.child import StartRequest
+from fiber._agent.progress import ProgressTable
 from fiber._wire import packet
 
 SETUP, START, SIGNAL, DESCRIPTORS, QUIT = range(5)
-STARTED, FAILED, EXITED, UNFIT = range(4)
+STARTED, FAILED, EXITED, FORK_UNSAFE = range(4)
 
-_HELD = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+_SHUTDOWN_SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 GRACE = 0.75
 """Seconds that children have, after the agent's process died, to notice it and end by themselves.
@@ -44,48 +45,53 @@ GRACE = 0.75
 
 
 class Zygote:
-    """One loop over descriptors: the agent's requests, deaths of children, deaths of elders.
+    """One loop over descriptors: the agent's requests, deaths of children, deaths of ancestors.
 
-    ``elders``: pidfds of the agent's process, which comes first, and of those that started it.
+    ``ancestors``: pidfds of the agent's process, which comes first, and of those that started it.
     """
 
     def __init__(
-        self, control: socket.socket, board: Board, elders: list[int], *, preload: bool
+        self,
+        control: socket.socket,
+        progress_table: ProgressTable,
+        ancestors: list[int],
+        *,
+        preload: bool,
     ) -> None:
         self._control = control
-        self._board = board
-        self._elders = elders
+        self._progress_table = progress_table
+        self._ancestors = ancestors
         self._preload = preload
-        self._unfit: str | None = None
+        self._fork_unsafe: str | None = None
         self._pid = os.getpid()
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
         self._descriptors: tuple[int, list[int]] = (0, [])  # child, what came ahead for it
-        self._deaths, self._deaths_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+        self._sigchld, self._sigchld_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self._poller = select.poll()
-        for fd in (control.fileno(), self._deaths, *elders):
+        for fd in (control.fileno(), self._sigchld, *ancestors):
             self._poller.register(fd, select.POLLIN)
 
     def run(self) -> bool:
-        """Serve until told to quit or an elder is gone, then kill what is left.
+        """Serve until told to quit or an ancestor is gone, then kill what is left.
 
         Whether it was told to.
         """
         self._listen_to_signals()
         while True:
             ready = {fd for fd, _ in self._poller.poll()}
-            if self._deaths in ready:
+            if self._sigchld in ready:
                 self._reap()
             try:
                 if self._control.fileno() in ready and not self._serve():
-                    self._end(0)
+                    self._kill_children(0)
                     return True
             except (EOFError, ConnectionError):
                 # A dying process closes its descriptors a moment before it counts as dead.
-                ready.update(self._elders)
-            # All generations below an elder start to count at the same moment.
-            if not ready.isdisjoint(self._elders):
-                self._end(GRACE)
+                ready.update(self._ancestors)
+            # All generations below an ancestor start to count at the same moment.
+            if not ready.isdisjoint(self._ancestors):
+                self._kill_children(GRACE)
                 return False
 
     def _listen_to_signals(self) -> None:
@@ -97,22 +103,22 @@ class Zygote:
         # A terminal with `stty tostop` stops whole groups that are not its own when they print.
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, lambda *_: None)
-        signal.set_wakeup_fd(self._deaths_in, warn_on_full_buffer=False)
+        signal.set_wakeup_fd(self._sigchld_in, warn_on_full_buffer=False)
 
     def _serve(self) -> bool:
         message = packet.receive(self._control, descriptors=True)
         fds, message.fds = message.fds, []
         request: tuple[Any, ...] = packet.loads(message)
         if request[0] == DESCRIPTORS:
-            self._descriptors = (request[1], [*self._kept_for(request[1]), *fds])
+            self._descriptors = (request[1], [*self._early_descriptors(request[1]), *fds])
         elif request[0] == START:
-            fds = [*self._kept_for(request[1]), *fds]
-            self._start(request[1], Start(*request[2]), fds)
+            fds = [*self._early_descriptors(request[1]), *fds]
+            self._start(request[1], StartRequest(*request[2]), fds)
         elif request[0] == SIGNAL:
             self._signal(request[1], request[2])
         return bool(request[0] != QUIT)
 
-    def _kept_for(self, child: int) -> list[int]:
+    def _early_descriptors(self, child: int) -> list[int]:
         """What came ahead for it; what is left of a START that never came is closed."""
         (owner, fds), self._descriptors = self._descriptors, (0, [])
         if owner == child:
@@ -120,37 +126,37 @@ class Zygote:
         _close_all(fds)
         return []
 
-    def _start(self, child: int, start: Start, fds: list[int]) -> None:
-        if start.method == "fork" and not self._fit(start):
-            self._say(UNFIT, child, self._unfit)
+    def _start(self, child: int, start: StartRequest, fds: list[int]) -> None:
+        if start.method == "fork" and not self._is_fork_safe(start):
+            self._reply(FORK_UNSAFE, child, self._fork_unsafe)
             _close_all(fds)
             return
         # Until the child has undone it, it ignores what we ignore: a signal sent to it right after
         # its birth has to wait, not to be lost.
-        signal.pthread_sigmask(signal.SIG_BLOCK, _HELD)
+        signal.pthread_sigmask(signal.SIG_BLOCK, _SHUTDOWN_SIGNALS)
         try:
             pid = os.fork()
             if pid == 0:
-                self._become(start, fds)
+                self._run_child(start, fds)
         except OSError as error:
-            self._say(FAILED, child, f"the system refused a new process: {error.strerror}")
+            self._reply(FAILED, child, f"the system refused a new process: {error.strerror}")
             return
         finally:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, _HELD)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _SHUTDOWN_SIGNALS)
             _close_all(fds)
         self._pids[child] = pid
         self._children[pid] = child
-        self._say(STARTED, child, pid)
+        self._reply(STARTED, child, pid)
 
-    def _fit(self, start: Start) -> bool:
+    def _is_fork_safe(self, start: StartRequest) -> bool:
         """Whether this process may be forked, after it has imported what it shall."""
         if self._preload:
             self._preload = False
-            self._unfit = _preload(start.preparation)
+            self._fork_unsafe = _preload(start.preparation)
             self._listen_to_signals()  # an import may have set its own
-        return self._unfit is None
+        return self._fork_unsafe is None
 
-    def _become(self, start: Start, fds: list[int]) -> NoReturn:
+    def _run_child(self, start: StartRequest, fds: list[int]) -> NoReturn:
         """In the forked process: drop what is the zygote's and run the child."""
         code = 1
         try:
@@ -158,14 +164,14 @@ class Zygote:
             for signum in (signal.SIGCHLD, signal.SIGTERM, signal.SIGHUP):
                 signal.signal(signum, signal.SIG_DFL)
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, _HELD)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _SHUTDOWN_SIGNALS)
             self._control.close()
-            os.close(self._deaths)
-            os.close(self._deaths_in)
-            _close_all(self._elders[1:])
-            child_module.die_with(self._pid)
+            os.close(self._sigchld)
+            os.close(self._sigchld_in)
+            _close_all(self._ancestors[1:])
+            child_module.die_with_parent(self._pid)
             resource.setrlimit(resource.RLIMIT_NOFILE, start.open_files)
-            code = child_module.run(start, fds, self._board, self._elders[0])
+            code = child_module.run(start, fds, self._progress_table, self._ancestors[0])
         except BaseException:
             # The user's own errors do not come here: these are of the system, or Fiber's.
             import traceback  # rarely needed, and long to import
@@ -181,7 +187,7 @@ class Zygote:
 
     def _reap(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            os.read(self._deaths, 4096)
+            os.read(self._sigchld, 4096)
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -192,18 +198,18 @@ class Zygote:
             child = self._children.pop(pid, None)
             if child is not None:
                 del self._pids[child]
-                self._say(EXITED, child, os.waitstatus_to_exitcode(status))
+                self._reply(EXITED, child, os.waitstatus_to_exitcode(status))
 
-    def _say(self, *answer: Any) -> None:
+    def _reply(self, *answer: Any) -> None:
         # An agent that is gone shows on its own descriptor.
         with contextlib.suppress(OSError):
             packet.send(self._control, pickle.dumps(answer))
 
-    def _end(self, grace: float) -> None:
+    def _kill_children(self, grace: float) -> None:
         deadline = time.monotonic() + grace
         while self._pids and (left := deadline - time.monotonic()) > 0:
             waiter = select.poll()
-            waiter.register(self._deaths, select.POLLIN)
+            waiter.register(self._sigchld, select.POLLIN)
             waiter.poll(left * 1000)
             self._reap()
         for pid in self._children:
@@ -212,7 +218,7 @@ class Zygote:
             pid, status = os.waitpid(-1, 0)
             child = self._children.pop(pid, None)
             if child is not None:
-                self._say(EXITED, child, os.waitstatus_to_exitcode(status))
+                self._reply(EXITED, child, os.waitstatus_to_exitcode(status))
 
 
 def _preload(preparation: bytes) -> str | None:
@@ -248,7 +254,7 @@ def main(control: int, agent: int) -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     if agent == 1:
         # In a container nobody else would reap them: the agent waits for what it started only.
-        child_module.adopt_orphans()
+        child_module.become_subreaper()
     # What every child needs, while the program that started us early is busy with its own imports.
     import fiber._agent.worker  # noqa: F401
 
@@ -257,34 +263,39 @@ def main(control: int, agent: int) -> None:
         message = packet.receive(sock, descriptors=True)
     except (EOFError, ConnectionError):
         return  # nothing was ever asked of it
-    (board,), message.fds = message.fds, []
-    _, elders, preload, heirloom = packet.loads(message)
-    _serve(sock, board, elders, heirloom, preload=preload)
+    (progress_table,), message.fds = message.fds, []
+    _, ancestors, preload, cleanup_directory = packet.loads(message)
+    _run_zygote(sock, progress_table, ancestors, cleanup_directory, preload=preload)
 
 
-def _serve(
+def _run_zygote(
     sock: socket.socket,
-    board: int,
-    elders: tuple[int, ...],
-    heirloom: str | None,
+    progress_table: int,
+    ancestors: tuple[int, ...],
+    cleanup_directory: str | None,
     *,
     preload: bool,
 ) -> None:
-    """``elders``: pids, the agent's first.  ``heirloom``: a directory to remove should they die
+    """Be the zygote that was asked for.
+
+    ``ancestors``: pids, the agent's first.  ``cleanup_directory``: to be removed should they die
     before they can do so themselves.
     """
-    watched = _watch(elders)
-    told_to = bool(watched) and Zygote(sock, Board(board), watched, preload=preload).run()
-    if heirloom is not None and not told_to:
+    watched = _pidfds(ancestors)
+    told_to = (
+        bool(watched)
+        and Zygote(sock, ProgressTable(progress_table), watched, preload=preload).run()
+    )
+    if cleanup_directory is not None and not told_to:
         import shutil  # rarely needed: whoever waits for the first child waits for our imports
 
-        shutil.rmtree(heirloom, ignore_errors=True)
+        shutil.rmtree(cleanup_directory, ignore_errors=True)
 
 
-def _watch(elders: tuple[int, ...]) -> list[int]:
+def _pidfds(ancestors: tuple[int, ...]) -> list[int]:
     """Pidfds; none if one of them died before we could watch it."""
     try:
-        watched = [os.pidfd_open(pid) for pid in elders]
+        watched = [os.pidfd_open(pid) for pid in ancestors]
     except ProcessLookupError:
         return []
-    return watched if os.getppid() == elders[0] else []  # its pid may be another's by now
+    return watched if os.getppid() == ancestors[0] else []  # its pid may be another's by now

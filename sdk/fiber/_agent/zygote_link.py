@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from fiber._agent import zygote, zygote_process
-from fiber._agent.child import Start, lineage
+from fiber._agent.child import StartRequest, lineage
 from fiber._agent.zygote_process import is_standard_stream
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
@@ -23,10 +23,10 @@ _QUIT_TIMEOUT = 10.0
 class ZygoteObserver(Protocol):
     """Hears what a zygote says; on the loop's thread."""
 
-    def heard(self, link: ZygoteLink, answer: tuple[Any, ...]) -> None:
+    def on_reply(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
         """What became of a child."""
 
-    def zygote_gone(self, link: ZygoteLink) -> None:
+    def on_zygote_exit(self, link: ZygoteLink) -> None:
         """The zygote died, and its children with it.  Once, and last."""
 
 
@@ -37,29 +37,29 @@ class ZygoteLink:
         self,
         observer: ZygoteObserver,
         loop: Loop,
-        board: int,
-        heirloom: str | None,
+        progress_table: int,
+        cleanup_directory: str | None,
         *,
         preload: bool,
     ) -> None:
         self._observer = observer
         self._loop = loop
         self._gone = threading.Event()
-        self._answered = False
+        self._has_replied = False
         with naming_the_limit("starting the zygote"):
-            own_board = os.dup(board)  # what is sent is closed
+            own_table = os.dup(progress_table)  # what is sent is closed
             try:
                 self._process, self._sock = zygote_process.launch()
             except BaseException:
-                os.close(own_board)
+                os.close(own_table)
                 raise
         self._sock.setblocking(False)
         self._outbox = Outbox(loop, self._sock)
-        setup = (zygote.SETUP, lineage(), preload, heirloom)
-        self._outbox.send(pickle.dumps(setup), fds=[own_board])
+        setup = (zygote.SETUP, lineage(), preload, cleanup_directory)
+        self._outbox.send(pickle.dumps(setup), fds=[own_table])
         loop.register(self._sock.fileno(), self._receive)
 
-    def start(self, child: int, request: Start, fds: list[int]) -> None:
+    def start(self, child: int, request: StartRequest, fds: list[int]) -> None:
         """Ask for a child that gets ``fds``, which are this object's from now on."""
         while len(fds) > packet.MAX_DESCRIPTORS:
             some, fds = fds[: packet.MAX_DESCRIPTORS], fds[packet.MAX_DESCRIPTORS :]
@@ -72,7 +72,7 @@ class ZygoteLink:
 
     def quit(self) -> None:
         """End it and its children, and wait for that; on any thread but the loop's."""
-        if self._answered:
+        if self._has_replied:
             self._loop.call_soon(self.send, zygote.QUIT)
             if not self._loop.running:
                 self.send(zygote.QUIT)
@@ -90,7 +90,7 @@ class ZygoteLink:
 
     def _receive(self) -> None:
         try:
-            answer = packet.loads(packet.receive(self._sock))
+            reply = packet.loads(packet.receive(self._sock))
         except BlockingIOError:
             return
         except (EOFError, ConnectionError):
@@ -98,11 +98,11 @@ class ZygoteLink:
             self._outbox.close()
             self._sock.close()
             self._process.wait()
-            self._observer.zygote_gone(self)
+            self._observer.on_zygote_exit(self)
             self._gone.set()
             return
-        self._answered = True
-        self._observer.heard(self, answer)
+        self._has_replied = True
+        self._observer.on_reply(self, reply)
 
 
 def dup_or_null(fd: int) -> int:

@@ -3,7 +3,7 @@
 Pure: numbers in, numbers out.  A message should carry some milliseconds of work, so that its cost
 disappears beside it: tasks of a second travel one by one, tasks of a microsecond by the thousand.
 That a message may turn out to carry far more is the worker's business: it gives back what it has
-not begun (``_agent/watch.py``).
+not begun (``_agent/watchdog.py``).
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 import weakref
 from collections import deque
 from collections.abc import Callable
@@ -12,6 +13,9 @@ from typing import Any
 
 from fiber._hub.local import LocalCounter
 from fiber._transport.base import SharedChannel, SharedCounter
+
+_MOVE = 1e-4
+"""Seconds to wait while an item moves: its thread may have to wait for a processor."""
 
 
 class Slots:
@@ -114,6 +118,8 @@ class Feeder:
         # True when there are items, False at the end.
         self._wake: SimpleQueue[bool] = SimpleQueue()
         self._sending = False
+        self._thread = 0
+        self._moves = 0  # odd while an item is counted neither here nor there
         # What a thread takes out before it feeds.  Whoever finds it there starts a thread; of two,
         # the second one ends.
         self._vacancy = [True]
@@ -132,10 +138,15 @@ class Feeder:
         if self._vacancy:
             self._start_thread()
 
-    @property
-    def waiting(self) -> int:
-        """How many messages wait."""
-        return len(self._unsent)
+    def size(self) -> int:
+        """How many items there are in the channel and here."""
+        while True:
+            moves = self._moves
+            size = self._slots.used(len(self._unsent))
+            none_moved = moves == self._moves and not moves % 2
+            if none_moved or threading.get_ident() == self._thread:  # then we interrupted the move
+                return size
+            time.sleep(_MOVE)
 
     def _send_now(self, payload: bytes, buffers: list[memoryview]) -> bool:
         self._slots.sending()
@@ -182,18 +193,22 @@ class Feeder:
             self._vacancy.pop()
         except IndexError:
             return
+        self._thread = threading.get_ident()
         more = True
         while more:
             more = self._wake.get()
             self._sending = True
             while self._unsent:
-                self._send(*self._unsent.popleft())
+                self._moves += 1
+                item = self._unsent.popleft()
+                self._slots.sending()
+                self._moves += 1
+                self._send(*item)
             self._sending = False
         self._close_outbox()
 
     def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
         try:
-            self._slots.sending()
             self._outbox.post(payload, buffers)
         except (BrokenPipeError, EOFError):
             self._unsent.clear()  # nobody can ever read them

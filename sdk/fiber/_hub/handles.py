@@ -95,7 +95,7 @@ def counter(handle: Handle) -> SharedCounter:
 
 def handle_for(end: Any) -> Handle:
     """What to pickle in place of a channel or counter."""
-    grants = _single_use if _pickling.grants is None else _pickling.grants
+    grants = _grants()
     if isinstance(end, RemoteObject):
         return grants.for_remote(end)
     spawning: Any = mp_context.get_spawning_popen()
@@ -185,11 +185,11 @@ class _SingleUse:
         if hub is None:
             with self._stream(home) as stream:
                 handle = _register(stream, home, kind, fd, GrantFlags(0))
-            _pickling.undo_by(lambda: self._release(handle))
+            _undo_by(lambda: self._release(handle))
             return handle
         registry = hub.registry
         number, grant = registry.register(kind, fd, reusable=False)
-        _pickling.undo_by(lambda: registry.release(grant))
+        _undo_by(lambda: registry.release(grant))
         return HubHandle(home, number, grant)
 
     def for_remote(self, end: RemoteObject) -> HubHandle:
@@ -197,7 +197,7 @@ class _SingleUse:
         with end.stream() as stream:
             reply = stream.ask(Op.GRANT, end.number, GrantFlags(0), form=TWO)
         handle = HubHandle(end.home, *reply.values)
-        _pickling.undo_by(lambda: _release_remote(end, handle.grant))
+        _undo_by(lambda: _release_remote(end, handle.grant))
         return handle
 
     @contextlib.contextmanager
@@ -234,47 +234,74 @@ def _release_remote(end: RemoteObject, grant: int) -> None:
         stream.say(Op.RELEASE, grant, form=ONE)
 
 
-class _Pickling(threading.local):
-    """What this thread is pickling: where its handles get their grants, and how to undo those."""
+class Pickling:
+    """One pickling: where its handles get their grants, and how to take back those for one use."""
 
-    def __init__(self) -> None:
-        self.grants: GrantSet | None = None
-        self.undo: list[Callable[[], None]] | None = None
+    __slots__ = ("grants", "undo")
 
-    def undo_by(self, step: Callable[[], None]) -> None:
-        """Remember how a grant is taken back, if anybody is to ask."""
-        if self.undo is not None:
-            self.undo.append(step)
+    def __init__(self, grants: GrantSet | None = None) -> None:
+        self.grants = grants
+        self.undo: list[Callable[[], None]] = []
 
 
-_pickling = _Pickling()
+class _ThisThread(threading.local):
+    """What this thread is pickling, if it said so."""
+
+    pickling: Pickling | None = None
+
+
+# Stand for picklings that have met no handle yet, as nearly all of them never do.
+_ONE_USE, _REUSABLE = Pickling(), Pickling()
+_this_thread = _ThisThread()
 _single_use = _SingleUse()
 
-Outer: TypeAlias = tuple[GrantSet | None, list[Callable[[], None]] | None]
 
-
-def begin_pickling(grants: GrantSet | None = None) -> Outer:
-    """Handles pickled on this thread get their grants from ``grants``, or work once.
+def begin_pickling(*, reusable: bool = False) -> Pickling | None:
+    """Handles pickled on this thread work once, or until ``granted()`` is released.
 
     The result is for ``end_pickling``: this may be a signal's handler that runs in the middle of
     another pickling.
     """
-    outer = _pickling.grants, _pickling.undo
-    _pickling.grants, _pickling.undo = grants, []
+    outer = _this_thread.pickling
+    _this_thread.pickling = _REUSABLE if reusable else _ONE_USE
     return outer
+
+
+def granted() -> GrantSet | None:
+    """What was granted to reusable handles, if there are any."""
+    pickling = _this_thread.pickling
+    return None if pickling is None else pickling.grants
 
 
 def undo_pickling() -> None:
     """It did not work out: what was granted meanwhile for one use, nobody will ever use."""
-    undo, _pickling.undo = _pickling.undo or [], []
-    for step in undo:
+    pickling = _this_thread.pickling
+    if pickling is None:
+        return
+    while pickling.undo:
         with contextlib.suppress(OSError, Unreachable):  # the hub is gone, and all with it
-            step()
+            pickling.undo.pop()()
 
 
-def end_pickling(outer: Outer) -> None:
+def end_pickling(outer: Pickling | None) -> None:
     """Go on with what ``begin_pickling`` interrupted."""
-    _pickling.grants, _pickling.undo = outer
+    _this_thread.pickling = outer
+
+
+def _undo_by(step: Callable[[], None]) -> None:
+    """Remember how a grant is taken back, if anybody is to ask."""
+    if _this_thread.pickling is not None:
+        _this_thread.pickling.undo.append(step)
+
+
+def _grants() -> GrantSet | _SingleUse:
+    """Where the handle that is being pickled gets its grant."""
+    if _this_thread.pickling is _ONE_USE:
+        _this_thread.pickling = Pickling()
+    elif _this_thread.pickling is _REUSABLE:
+        _this_thread.pickling = Pickling(GrantSet())
+    pickling = _this_thread.pickling
+    return _single_use if pickling is None or pickling.grants is None else pickling.grants
 
 
 @contextlib.contextmanager
@@ -284,7 +311,7 @@ def collecting_grants(*, reusable: bool = True) -> Iterator[GrantSet]:
     If the block raises, it is released.  Not ``reusable``: each works once.
     """
     grants = GrantSet(reusable=reusable)
-    outer = begin_pickling(grants)
+    outer, _this_thread.pickling = _this_thread.pickling, Pickling(grants)
     try:
         yield grants
     except BaseException:

@@ -12,7 +12,6 @@ import os
 import stat
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 from fiber._hub.hosted import Hosted
 from fiber._hub.protocol import ObjectKind
@@ -23,15 +22,17 @@ class NoSuchObject(LookupError):
     """The grant was used up or released, or nobody holds the object any more."""
 
 
-@dataclass(eq=False)
 class Entry:
     """A hosted object and its holders."""
 
-    number: int
-    hosted: Hosted
-    identity: tuple[int, int]
-    attached: int = 0
-    grants: set[int] = field(default_factory=set)
+    __slots__ = ("attached", "grants", "hosted", "identity", "number")
+
+    def __init__(self, number: int, hosted: Hosted, identity: tuple[int, int]) -> None:
+        self.number = number
+        self.hosted = hosted
+        self.identity = identity
+        self.attached = 0
+        self.grants: set[int] = set()
 
 
 class Registry:
@@ -70,7 +71,8 @@ class Registry:
             if entry is None or not self._hold(entry, grant):
                 with naming_the_limit("sharing a pipe or queue with another process"):
                     hosted = self._host(kind, os.dup(fd))
-                entry = Entry(next(self._numbers), hosted, identity, grants={grant})
+                entry = Entry(next(self._numbers), hosted, identity)
+                entry.grants.add(grant)
                 self._entries[entry.number] = self._by_identity[identity] = entry
             self._note(entry, grant, reusable)
             return entry.number, grant

@@ -21,7 +21,6 @@ thread, values whose unpickling could stay ``Pickled``.
 from __future__ import annotations
 
 import math
-import pickle
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -30,7 +29,6 @@ from typing import Any, Protocol
 
 from fiber._agent.port import UNKNOWN, ExitReport
 from fiber._engine.chunks import FLOOR
-from fiber._engine.ledger import Batch
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import StartFailure
 from fiber._runtime.background import BackgroundThread
@@ -42,7 +40,8 @@ from fiber._runtime.latch import Latch
 from fiber._runtime.launcher import Launcher
 from fiber._runtime.leases import ADOPTED, UNAVAILABLE, Leases
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.outcome import Failure, Pickled, decode, outcomes
+from fiber._runtime.outcome import Failure, decode
+from fiber._runtime.receiver import Receiver
 from fiber._runtime.sender import Sender
 from fiber._runtime.work_items import Call, Future, WorkItem, pickle_call
 from fiber._runtime.worker_handle import WorkerHandle
@@ -108,11 +107,19 @@ class Executor:
         self._leases = Leases(
             self._scheduler, self._loop, on_adopted=self._adopt, on_back=self._back
         )
+        self._receiver = Receiver(
+            self._loop,
+            self._background,
+            self._scheduler,
+            self._jobs,
+            self._sender,
+            self._leases,
+            advance=self._advance,
+            on_ready=self._ready,
+        )
         self._lends = options.max_tasks is None and not options.retryable
         self._exits: dict[WorkerHandle, ExitReport] = {}
         """Ends of workers that callers are using."""
-        self._last_words: dict[WorkerHandle, tuple[tuple[Any, ...], list[memoryview]]] = {}
-        """Answers of theirs that were found when they ended; their callers had not looked yet."""
         self._functions = FunctionCache()
         self._calls = WorkItem(work.CALLS, exact=True)
         self._jobs.open(self._calls)
@@ -393,81 +400,15 @@ class Executor:
         self._wake = None
         self._advance()
 
-    # What workers say
+    # What becomes of batches
 
     def on_message(self, handle: WorkerHandle, message: Message) -> None:
         """A packet from a worker."""
-        words = pickle.loads(message.payload)
-        buffers = message.buffers
-        message.release()
-        kind = words[0]
-        if type(kind) is int and handle.worker is not None and handle.worker.lent:
-            self._last_words[handle] = words, buffers
-        elif type(kind) is int:
-            self._answered(words, buffers)
-        elif kind == work.READY:
-            self._ready(handle)
-        elif kind == work.BIRTH:
-            handle.complaint = words[1]
-        elif kind == work.UNKNOWN:
-            self.on_recalled(handle, [words[1]])
-        else:
-            self._unreadable(kind, words[1], Pickled(work.ERROR, words[2], ()))
-
-    def _answered(self, words: tuple[Any, ...], buffers: list[memoryview]) -> None:
-        seq, offset, kept, seconds, values, odd = words
-        results = outcomes(values, odd, buffers) if odd else values
-        receipt = self._ledger.receive(
-            seq, offset, len(results), self._loop.now(), seconds=seconds, kept=kept
-        )
-        self._scheduler.workers.did_something()
-        self._sender.settled(seq)
-        if receipt is not None:
-            item: WorkItem = receipt.job.owner
-            waited = item.future is None and receipt.size and receipt.item(receipt.start).blocking
-            if waited and self._lends:
-                # First: who waited for it may call again at once.
-                self._leases.offer(receipt.batch.worker.key)
-            self._jobs.put(receipt, results, mixed=bool(odd))
-        self._advance()
-
-    def _unreadable(self, kind: str, seq: int, error: Pickled) -> None:
-        """A worker cannot unpickle a batch, or its function: then no task of its job can run."""
-        batch = self._ledger.batches.get(seq)
-        self._sender.settled(seq)
-        if kind == work.UNREADABLE:
-            self._sender.split(seq, error)
-        elif batch is not None:
-            self._sender.dropped(batch)
-            self._background.submit(self._unpickle_fault, batch, error)
-        self._advance()
-
-    def _unpickle_fault(self, batch: Batch, error: Pickled) -> None:
-        """On the background thread: whatever a worker found with a function is the user's."""
-        self._loop.call_soon(self._unusable, batch, error.decode().error)
-
-    def _unusable(self, batch: Batch, error: BaseException) -> None:
-        """A worker cannot unpickle the function of a batch, and has dropped it."""
-        if self._ledger.batches.get(batch.seq) is not batch:
-            return  # its worker is gone
-        if batch.job is not None:
-            self._jobs.fail(batch.job, error)
-        self._sender.take_back(batch)
-        self._advance()
+        self._receiver.take(handle, message)
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
         """A worker will never see these batches."""
-        if handle.worker is None:
-            return
-        for seq in seqs:
-            self._sender.settled(seq)
-            batch = self._ledger.batches.get(seq)
-            if batch is not None and batch.job is not None:
-                function = batch.job.owner.function
-                if function is not None:
-                    handle.known.pop(function.id, None)
-        self._ledger.put_back(handle.worker, seqs, self._loop.now())
-        self._advance()
+        self._receiver.recalled(handle, seqs)
 
     def _timed_out(self, seq: int) -> None:
         """A task had its time."""
@@ -491,12 +432,11 @@ class Executor:
         self._jobs.close(item)
         if self._ended_by is not None:
             self._jobs.fail(job, self._ended_by)
-        if handle in self._last_words:
-            self._answered(*self._last_words.pop(handle))
+        self._receiver.replay(handle)
 
     def _back(self, handle: WorkerHandle) -> None:
         """A worker is not lent any more."""
-        self._last_words.pop(handle, None)
+        self._receiver.forget(handle)
         report = self._exits.pop(handle, None)
         if report is not None:
             self.on_exit(handle, report)

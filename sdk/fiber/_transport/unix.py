@@ -49,7 +49,7 @@ def _block(sock: socket.socket) -> None:
         sock.settimeout(None)
 
 
-# How a receiver looks for an answer before it sleeps (decision 15)
+# How a receiver looks for an answer before it sleeps (decision 16)
 
 _LOOK = 50e-6
 """Seconds that it looks: more than it takes to wake a processor on which the other end sleeps."""

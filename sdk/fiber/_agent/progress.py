@@ -1,4 +1,4 @@
-"""The progress board: shared memory in which each pool worker says which task it is running.
+"""The progress table: shared memory in which each pool worker says which task it is running.
 
 When a worker dies, its agent reads here which task to blame.  Saying so is one store into memory.
 """
@@ -13,7 +13,7 @@ _SLOT = 2  # words: sequence number of the batch, index of the task in it
 _SLOTS = 1 << 16  # sparse: only pages that are used exist
 
 
-class Board:
+class ProgressTable:
     """Slots of one agent.  The memory is shared with its children by descriptor."""
 
     def __init__(self, fd: int | None = None) -> None:

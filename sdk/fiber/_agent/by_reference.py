@@ -30,13 +30,13 @@ def dumps(
     return file.getvalue()
 
 
-def find(name: str, mark: str | None) -> Any:
+def find(name: str, tracker_id: str | None) -> Any:
     """What ``__main__`` calls ``name``.
 
     Here, or in a process between here and there, it may have come by value itself: then it is what
-    cloudpickle knows by ``mark``.
+    cloudpickle knows by ``tracker_id``.
     """
-    if mark is not None and (known := _marked().get(mark)) is not None:
+    if tracker_id is not None and (known := _classes_by_tracker_id().get(tracker_id)) is not None:
         return known
     try:
         return operator.attrgetter(name)(sys.modules["__main__"])
@@ -50,22 +50,22 @@ def find(name: str, mark: str | None) -> Any:
 def _pickler() -> Any:
     import cloudpickle
 
-    class ByName(cloudpickle.Pickler):  # type: ignore[misc]
+    class ByReference(cloudpickle.Pickler):  # type: ignore[misc]
         dispatch_table: ClassVar[Any] = ChainMap(
             cast("Any", ForkingPickler)._extra_reducers, cloudpickle.Pickler.dispatch_table
         )
 
         def reducer_override(self, obj: Any) -> Any:
             if isinstance(obj, type | FunctionType) and obj.__module__ == "__main__":
-                mark = _mark(obj)
-                if mark is not None or "<" not in obj.__qualname__:
-                    return find, (obj.__qualname__, mark)
+                tracker_id = _tracker_id(obj)
+                if tracker_id is not None or "<" not in obj.__qualname__:
+                    return find, (obj.__qualname__, tracker_id)
             return super().reducer_override(obj)
 
-    return ByName
+    return ByReference
 
 
-def _mark(obj: Any) -> str | None:
+def _tracker_id(obj: Any) -> str | None:
     """What cloudpickle calls a class that came by value, in every process that it came through."""
     from cloudpickle import cloudpickle
 
@@ -73,7 +73,7 @@ def _mark(obj: Any) -> str | None:
     return marks.get(obj) if isinstance(obj, type) else None
 
 
-def _marked() -> Any:
+def _classes_by_tracker_id() -> Any:
     from cloudpickle import cloudpickle
 
     return getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_ID", {})

@@ -1,7 +1,8 @@
-"""What a pool worker answers to one batch: results collected, made safe to send, sent in pieces.
+"""The results of one batch of a pool worker: collected, made safe to send, sent in pieces.
 
-Two threads meet here: the one that runs the tasks appends, the watch (``watch.py``) may send what
-is there.  A value counts as there once it is in ``values``; what belongs to it is stored before.
+Two threads meet here: the one that runs the tasks appends, the watchdog (``watchdog.py``) may send
+what is there.  A value counts as there once it is in ``values``; what belongs to it is stored
+before.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from multiprocessing.reduction import ForkingPickler
 from operator import length_hint
 from typing import Any, Protocol
 
-from fiber._agent import by_name
+from fiber._agent import by_reference
 from fiber._wire import packet, work
 
 
@@ -25,24 +26,24 @@ class Sender(Protocol):
         """Send one message, waiting for room."""
 
 
-class Answer:
-    """The results of batch ``seq``: of ``total`` tasks, of which ``rest`` yields those to begin.
+class BatchResults:
+    """The results of batch ``seq``: of ``total`` tasks; ``remaining`` yields those to begin.
 
-    With ``exact``, each value is safe to send as soon as it is in ``values``; without, values come
-    straight from the tasks, and ``settle`` makes them so.
+    With ``eager``, each value is safe to send as soon as it is in ``values``; without, values come
+    straight from the tasks, and ``encode_new`` makes them so.
     """
 
     __slots__ = (
         "_buffers",
         "_channel",
+        "_encoded",
+        "_encoded_up_to",
+        "_last_sent",
         "_lock",
-        "_mark",
-        "_odd",
         "_retryable",
         "_sent",
-        "_settled",
-        "exact",
-        "rest",
+        "eager",
+        "remaining",
         "seq",
         "total",
         "values",
@@ -52,25 +53,25 @@ class Answer:
         self,
         channel: Sender,
         seq: int,
-        rest: Iterator[Any],
+        remaining: Iterator[Any],
         total: int,
         *,
-        exact: bool,
+        eager: bool,
         started: float,
         retryable: tuple[type[BaseException], ...] = (),
     ) -> None:
         self.seq = seq
-        self.rest = rest
+        self.remaining = remaining
         self.total = total
-        self.exact = exact
+        self.eager = eager
         self.values: list[Any] = []
-        self._settled = 0
+        self._encoded_up_to = 0
         self._sent = 0
-        self._odd: list[tuple[int, int, bytes, int]] = []
+        self._encoded: list[tuple[int, int, bytes, int]] = []
         self._buffers: list[memoryview] = []
         self._channel = channel
         self._lock = threading.Lock()
-        self._mark = started
+        self._last_sent = started
         self._retryable = retryable
 
     def add(self, value: Any) -> None:
@@ -89,18 +90,18 @@ class Answer:
         """Take the next task's error."""
         again = bool(self._retryable) and isinstance(error, self._retryable)
         kind = work.AGAIN if again else work.ERROR
-        self._odd.append((len(self.values), kind, encode_error(error), 0))
+        self._encoded.append((len(self.values), kind, encode_error(error), 0))
         self.values.append(None)
 
-    def settle(self) -> None:
+    def encode_new(self) -> None:
         """Make safe to send what came since the last time."""
-        first, values = self._settled, self.values
+        first, values = self._encoded_up_to, self.values
         if not work.is_plain(values[first:]):
             for at in range(first, len(values)):
                 if type(values[at]) not in work.PLAIN:
                     self._pickle(at, values[at])
                     values[at] = None
-        self._settled = len(values)
+        self._encoded_up_to = len(values)
         if self._buffers:
             self.flush()
 
@@ -113,37 +114,39 @@ class Answer:
             try:
                 data, buffers = _pickle_unusual(value)
             except BaseException:
-                self._odd.append((position, work.ERROR, encode_error(unsendable(error, value)), 0))
+                self._encoded.append(
+                    (position, work.ERROR, encode_error(unsendable(error, value)), 0)
+                )
                 return
         self._buffers += buffers
-        self._odd.append((position, work.VALUE, data, len(buffers)))
+        self._encoded.append((position, work.VALUE, data, len(buffers)))
 
-    def begun(self) -> int:
+    def started(self) -> int:
         """How many tasks have begun."""
         with self._lock:
-            return self.total - length_hint(self.rest)
+            return self.total - length_hint(self.remaining)
 
     def flush(self) -> None:
         """Send what can be sent."""
         with self._lock:
             self._send(None)
 
-    def give_back(self) -> None:
+    def return_unstarted(self) -> None:
         """Send what can be sent, and give back every task that has not begun."""
         with self._lock:
             # Taking them from the iterator is atomic: either the running thread gets a task or we.
-            left = len(list(self.rest))
+            left = len(list(self.remaining))
             self.total -= left
             self._send(self.total if left else None)
 
     def _send(self, kept: int | None) -> None:
-        first, stop = self._sent, len(self.values) if self.exact else self._settled
+        first, stop = self._sent, len(self.values) if self.eager else self._encoded_up_to
         if first == stop and kept is None:
             return
-        odd = [(at - first, kind, data, n) for at, kind, data, n in self._odd if at < stop]
+        odd = [(at - first, kind, data, n) for at, kind, data, n in self._encoded if at < stop]
         buffers = self._buffers[: sum(entry[3] for entry in odd)]
         now = time.perf_counter()
-        head = (self.seq, first, kept, now - self._mark)
+        head = (self.seq, first, kept, now - self._last_sent)
         done = len(odd)
         try:
             data = pickle.dumps((*head, self.values[first:stop], odd), 5)
@@ -154,8 +157,8 @@ class Answer:
             # No memory or no descriptor for it here; to say so takes little of either.
             odd = [(at, work.ERROR, encode_error(error), 0) for at in range(stop - first)]
             self._channel.send(pickle.dumps((*head, [None] * len(odd), odd), 5))
-        self._sent, self._mark = stop, now
-        del self._odd[:done], self._buffers[: len(buffers)]
+        self._sent, self._last_sent = stop, now
+        del self._encoded[:done], self._buffers[: len(buffers)]
 
 
 def _pickle_unusual(value: Any) -> tuple[bytes, list[memoryview]]:
@@ -164,8 +167,8 @@ def _pickle_unusual(value: Any) -> tuple[bytes, list[memoryview]]:
         # Sockets and the like need multiprocessing's reducers, which only its pickler knows.
         return bytes(ForkingPickler.dumps(value)), []
     except BaseException:
-        data, buffers = packet.dumps(value, by_name.dumps)
-        return (data, buffers) if len(buffers) <= work.BUFFERS else (by_name.dumps(value), [])
+        data, buffers = packet.dumps(value, by_reference.dumps)
+        return (data, buffers) if len(buffers) <= work.BUFFERS else (by_reference.dumps(value), [])
 
 
 def encode_error(error: BaseException) -> bytes:
@@ -174,7 +177,7 @@ def encode_error(error: BaseException) -> bytes:
 
     wrapped = ExceptionWithTraceback(error, error.__traceback__)
     refusals = []
-    for dumps in (pickle.dumps, by_name.dumps):
+    for dumps in (pickle.dumps, by_reference.dumps):
         try:
             data = dumps(wrapped)
             pickle.loads(data)

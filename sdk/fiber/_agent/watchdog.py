@@ -11,38 +11,38 @@ import queue
 import threading
 import time
 
-from fiber._agent.answer import Answer
+from fiber._agent.batch_results import BatchResults
 
-PATIENCE = 10e-3
+SPLIT_EAGER_AFTER = 10e-3
 """Seconds that a batch may run before it is taken apart, if its results are wanted one by one."""
 
-LONG_PATIENCE = 40e-3
+SPLIT_AFTER = 40e-3
 """The same for other batches.  Both are some times what a message was meant to carry."""
 
 
-class Watch:
+class Watchdog:
     """Watches over one batch after the other.  Sleeps while there is none."""
 
     def __init__(self) -> None:
-        self._watched: Answer | None = None
+        self._batch: BatchResults | None = None
         self._asleep = False
         self._wake: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._started = False
         self._stopped = False
 
-    def begin(self, answer: Answer) -> None:
-        """The batch of ``answer`` starts to run."""
-        self._watched = answer
+    def begin(self, batch: BatchResults) -> None:
+        """``batch`` starts to run."""
+        self._batch = batch
         if self._asleep:
             self._asleep = False
             self._wake.put(None)
         elif not self._started:
             self._started = True
-            threading.Thread(target=self._run, name="fiber-watch", daemon=True).start()
+            threading.Thread(target=self._run, name="fiber-watchdog", daemon=True).start()
 
     def end(self) -> None:
         """It has run."""
-        self._watched = None
+        self._batch = None
 
     def stop(self) -> None:
         """There will be no more."""
@@ -55,21 +55,21 @@ class Watch:
             # Nothing to watch, or nothing more to do for it.  What begins between these lines is
             # seen by the second; what begins later puts something in.
             self._asleep = True
-            if self._watched is None or self._watched.seq == seen:
+            if self._batch is None or self._batch.seq == seen:
                 self._wake.get()
-            answer = self._outlast()
-            if answer is not None:
-                seen = answer.seq
+            batch = self._wait_for_slow_batch()
+            if batch is not None:
+                seen = batch.seq
                 try:
-                    answer.give_back()
+                    batch.return_unstarted()
                 except OSError:  # the dispatcher is gone, and this process will follow
                     return
-                del answer  # its results must not live until the next batch
+                del batch  # its results must not live until the next batch
 
-    def _outlast(self) -> Answer | None:
+    def _wait_for_slow_batch(self) -> BatchResults | None:
         """Wait for a batch that runs for too long; None if they end before that."""
-        while (answer := self._watched) is not None:
-            time.sleep(PATIENCE if answer.exact else LONG_PATIENCE)
-            if self._watched is answer:
-                return answer
+        while (batch := self._batch) is not None:
+            time.sleep(SPLIT_EAGER_AFTER if batch.eager else SPLIT_AFTER)
+            if self._batch is batch:
+                return batch
         return None
