@@ -160,32 +160,38 @@ class ExecutorMaster:
         self._open_calls[account.number] = self._open_calls.get(account.number, 0) + stop - start
         self.world.oracle.fed(account.number, stop - start)
         for index in range(start, stop):
-            one = Outcomes(self, account, index)
-            item: Any = (account.number, index)
-            if plan.tasks[index].act is Act.UNSENDABLE:
-                item = (self._stage.bad_item(item),)
-            self._executor.call(one, perform, item, {}, plan.timeout)
+            try:
+                self._call_one(account, index)
+            except (ValueError, StartError) as error:
+                self._expect_refusal(error)
+                self._goes_no_further(account, future, stop - index)
+                return
         if not account.closed:
             self._later(plan.pause, account, self._go_on_calling, account, future, stop)
         elif not plan.tasks:
             future.set_done()
 
+    def _call_one(self, account: Account, index: int) -> None:
+        one = Outcomes(self, account, index)
+        self._executor.call(one, perform, self._call_item(account, index), {}, account.plan.timeout)
+
+    def _call_item(self, account: Account, index: int) -> Any:
+        item = account.number, index
+        unsendable = account.plan.tasks[index].act is Act.UNSENDABLE
+        return (self._stage.bad_item(item),) if unsendable else item
+
     def _go_on_calling(self, account: Account, future: Outcomes, start: int) -> None:
-        if account.cancelled or account.refused:
-            return
-        fed = account.fed
-        try:
+        if not account.cancelled and not account.refused:
             self._call(account, future, start)
-        except (ValueError, StartError) as error:
-            # What was asked before counts.
-            self._expect_refusal(error)
-            self.world.note("job %d goes no further: %s", account.number, type(error).__name__)
-            self._open_calls[account.number] -= account.fed - fed
-            account.fed = fed
-            account.delivered &= account.everything  # some of these could not be sent
-            account.closed = account.refused = True
-            if not self._open_calls[account.number]:
-                future.set_done()
+
+    def _goes_no_further(self, account: Account, future: Outcomes, refused: int) -> None:
+        """What was asked before counts."""
+        self.world.note("job %d goes no further", account.number)
+        account.fed -= refused
+        account.closed = account.refused = True
+        self._open_calls[account.number] -= refused
+        if not self._open_calls[account.number] and not account.cancelled:
+            future.set_done()
 
     def _direct_call(self, account: Account, future: Outcomes) -> None:
         """One call after the other has its result."""
@@ -199,33 +205,28 @@ class ExecutorMaster:
     def _apply_all(self, account: Account, actor: Actor) -> None:
         plan = account.plan
         self._open_calls[account.number] = 0
-        for index, task in enumerate(plan.tasks):
-            item: Any = (account.number, index)
-            if task.act is Act.UNSENDABLE:
-                item = (self._stage.bad_item(item),)
+        for index in range(len(plan.tasks)):
             account.fed += 1
             account.closed = account.fed == len(plan.tasks)
             self._open_calls[account.number] += 1
-            self._apply_one(Outcomes(self, account, index, actor), item)
+            self._apply_one(Outcomes(self, account, index, actor), index)
             if account.cancelled or account.refused:
                 return
             if account.fed % plan.bite == 0 and plan.pause:
                 actor.sleep(plan.pause)
 
-    def _apply_one(self, one: Outcomes, item: Any) -> None:
+    def _apply_one(self, one: Outcomes, index: int) -> None:
         account = one.account
+        item, timeout = self._call_item(account, index), account.plan.timeout
         try:
-            outcome = self._executor.call_and_wait(one, perform, item, {}, account.plan.timeout)
+            outcome = self._executor.call_and_wait(one, perform, item, {}, timeout)
         except PlannedError:
             one.answered(Pickled(work.ERROR, ERROR, ()))
         except Interrupted:
             one.interrupted()
         except (ValueError, StartError) as error:
             self._expect_refusal(error)
-            self.world.note("job %d goes no further: %s", account.number, type(error).__name__)
-            account.fed -= 1
-            account.closed = account.refused = True
-            self.world.oracle.finished(account.number)
+            self._goes_no_further(account, self._futures[account.number], 1)
         else:
             if outcome is not HEARD:
                 one.answered(outcome)

@@ -40,6 +40,7 @@ class Stage:
         self.rng = random.Random(f"{world.schedule.seed} stage")
         self.world = world
         self._started = 0
+        self._interrupts = self.rng.random() < 0.3
         self._refusals = {
             fault.start for fault in world.schedule.faults if isinstance(fault, Refusal)
         }
@@ -69,8 +70,8 @@ class Stage:
         self.world.note("the user is told: %s", news)
 
     def thread(self, name: str) -> StagedThread:
-        """In place of a BackgroundThread."""
-        return StagedThread(self, name)
+        """In place of a BackgroundThread; sometimes one that may be interrupted, which is slow."""
+        return InterruptedThread(self, name) if self._interrupts else StagedThread(self, name)
 
     def act(self, name: str, body: Callable[[Actor], None]) -> Actor:
         """A thread that does ``body``, once it is resumed."""
@@ -80,9 +81,9 @@ class Stage:
 
     def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildPort:
         """Start a worker on some agent."""
-        assert self.running is not None
-        # What comes of it comes after all that this thread has asked for.
-        self.running.sleep(self.loop.heard_in(self.running.name) + self.loop.moment())
+        if self.running is not None:
+            # What comes of it comes after all that this thread has asked for.
+            self.running.sleep(self.loop.heard_in(self.running.name) + self.loop.moment())
         self._started += 1
         famine = self.world.famine()
         if self._started in self._refusals or famine is Famine.REFUSED:
@@ -158,8 +159,9 @@ class Actor:
         self.name = name
         self._stage = stage
         self._body = body
-        self._turn = threading.Semaphore(0)
-        self._back = threading.Semaphore(0)
+        self._turn, self._back = threading.Lock(), threading.Lock()
+        self._turn.acquire()
+        self._back.acquire()
         self._entries: deque[Any] = deque()
         self._waits = False
         self._alarm: Any = None
@@ -277,36 +279,49 @@ class StagedLatch:
 
 
 class StagedThread:
-    """In place of a ``BackgroundThread``: the same, as an actor."""
+    """In place of a ``BackgroundThread``: does each thing at once, when its turn has come."""
 
     def __init__(self, stage: Stage, name: str) -> None:
         self._stage = stage
         self._name = name
-        self._actor: Actor | None = None
+        self._entries: deque[Any] = deque()
         self.stopped = False
 
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
         """Have it done later, in order."""
-        if self.stopped:
-            return False
-        if self._actor is None:
-            self._actor = self._stage.act(self._name, self._run)
-            self._actor.put((action, args))
-            self._stage.loop.call_later(self._stage.loop.moment(), self._actor.start)
-        else:
-            self._actor.put((action, args))
-        return True
+        if not self.stopped:
+            self._put(partial(action, *args))
+        return not self.stopped
 
     def stop(self) -> None:
         """Take nothing more."""
         self.stopped = True
-        if self._actor is not None:
-            self._actor.put(None)
+
+    def _put(self, action: Callable[[], object]) -> None:
+        self._entries.append(action)
+        self._stage.loop.call_later(self._stage.loop.moment(), self._do_next)
+
+    def _do_next(self) -> None:
+        with self._stage.loop.off_thread(self._name):
+            self._entries.popleft()()
+
+
+class InterruptedThread(StagedThread):
+    """Another one, which may pause within what it does."""
+
+    def __init__(self, stage: Stage, name: str) -> None:
+        super().__init__(stage, name)
+        self._actor: Actor | None = None
+
+    def _put(self, action: Callable[[], object]) -> None:
+        if self._actor is None:
+            self._actor = self._stage.act(self._name, self._run)
+            self._stage.loop.call_later(self._stage.loop.moment(), self._actor.start)
+        self._actor.put(action)
 
     def _run(self, actor: Actor) -> None:
-        while (entry := actor.get()) is not None:
-            action, args = entry
-            action(*args)
+        while True:
+            actor.get()()
 
 
 class Interrupted(BaseException):

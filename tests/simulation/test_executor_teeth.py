@@ -23,7 +23,7 @@ from fiber._runtime.worker_handle import WorkerHandle
 from simulation.explore import first_failure
 from simulation.suites import SUITES
 
-SEEDS = range(400)
+SEEDS = range(1200)
 """Among these each fault must show."""
 
 Patch = pytest.MonkeyPatch
