@@ -13,31 +13,16 @@ import threading
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import fiber
 from unit import pool_tasks as tasks
+from unit.pool_programs import ENVIRON, is_alive, run_program, wait_until
 
 PATIENCE = tasks.PATIENCE
-
-
-def wait_until(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {PATIENCE:g} s: {what}"
-        time.sleep(0.001)
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 # The end
@@ -251,21 +236,6 @@ def test_a_fork_of_the_program_cannot_use_its_pool() -> None:
 # Programs
 
 
-@pytest.fixture(autouse=True)
-def _programs_find_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]), prepend=os.pathsep)
-
-
-def run_program(text: str, **options: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(text)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        **options,
-    )
-
-
 @pytest.mark.parametrize("ending", ["", "pool.close()", "raise SystemExit(3)", "1 / 0"])
 def test_a_program_may_end_with_a_living_pool(ending: str) -> None:
     done = run_program(f"""
@@ -325,6 +295,7 @@ def test_ctrl_c_ends_a_wait(tmp_path: Path, call: str) -> None:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        env=os.environ | ENVIRON,
     )
     pids = tasks.wait_until_announced(path, 1 if call == "pool.apply" else 2)
     os.killpg(program.pid, signal.SIGINT)  # as a terminal does: the whole group
@@ -452,6 +423,6 @@ def test_classes_of_a_main_that_goes_by_value_come_back_as_themselves(backend: s
                 except Trouble as error:
                     print(error.args)
         """,
-        env=os.environ | {"FIBER_BACKEND": backend},
+        {"FIBER_BACKEND": backend},
     )
     assert (done.stdout, done.stderr) == ("True 3 True\n(4,)\n", "")
