@@ -289,10 +289,10 @@ class IMapIterator:
     """Iterator over the results of ``imap``, in order."""
 
     _buffer_type: type[_Buffer] = _OrderedBuffer
+    _cancel: Callable[[], None] | None = None
 
     def __init__(self, pool: Owner) -> None:
         self._buffer = self._buffer_type(pool)
-        self._cancel: Callable[[], None] | None = None
 
     def __iter__(self) -> Iterator[Any]:
         return self
