@@ -174,6 +174,10 @@ def unpickles_on_the_loop(patch: Patch) -> None:
     patch.setattr(Receiver, "_unreadable", _unreadable)
 
 
+def blames_what_was_dropped(patch: Patch) -> None:
+    patch.setattr(Sender, "dropped", lambda *_: None)
+
+
 def ignores_the_limit(patch: Patch) -> None:
     patch.setattr(InputStream, "_room", lambda _, limit: 1000)
 
@@ -258,6 +262,7 @@ FAULTS: list[Fault] = [
     tells_of_no_loss,
     pickles_on_the_loop,
     unpickles_on_the_loop,
+    blames_what_was_dropped,
     ignores_the_limit,
     reads_everything,
     forgets_who_waits_for_room,
