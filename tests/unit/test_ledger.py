@@ -221,7 +221,7 @@ def test_pinned_tasks_of_a_worker_that_is_spent_are_for_another() -> None:
     ledger.pin(job, worker, "x")
     answer(ledger, batch)
     assert ledger.spent() == [worker]
-    assert ledger.homeless() == [job]
+    assert ledger.jobs_for_newcomers() == {job}
     ledger.add("next", 0.0)
     assert assign_all(ledger)[0].items == ["x"]
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import fiber
+from fiber._engine import worker_set
 from fiber.errors import StartError, WorkerDied
 from fiber.pool import Pool
 from unit import pool_tasks as tasks
@@ -231,6 +232,14 @@ def test_a_timeout_for_all_tasks(tmp_path: Path) -> None:
 # Birth
 
 
+@pytest.fixture
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What fails to start is given up as soon as it may be."""
+    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", 0.0)
+    monkeypatch.setattr(worker_set, "KILLED_PATIENCE", 0.0)
+
+
+@pytest.mark.usefixtures("_impatient")
 def test_an_initializer_that_raises_is_told_and_not_tried_for_ever(tmp_path: Path) -> None:
     path = tmp_path / "runs"
     pool = fiber.Pool(2, tasks.refuse_counted, (path,))
@@ -246,6 +255,7 @@ def test_an_initializer_that_raises_is_told_and_not_tried_for_ever(tmp_path: Pat
     assert tasks.runs(path) <= 5
 
 
+@pytest.mark.usefixtures("_impatient")
 def test_outstanding_calls_hear_of_it() -> None:
     pool = fiber.Pool(2, tasks.start_slowly, (Path("/nowhere"),))
     results = [pool.apply_async(tasks.square, (n,)) for n in range(3)]
@@ -265,6 +275,7 @@ def test_outstanding_calls_hear_of_it() -> None:
     pool.join()
 
 
+@pytest.mark.usefixtures("_impatient")
 def test_workers_that_die_at_birth_are_not_tried_for_ever(tmp_path: Path) -> None:
     path = tmp_path / "runs"
     pool = fiber.Pool(1, tasks.vanish, (path,))
@@ -273,6 +284,37 @@ def test_workers_that_die_at_birth_are_not_tried_for_ever(tmp_path: Path) -> Non
     pool.terminate()
     pool.join()
     assert tasks.runs(path) == 3
+
+
+def test_workers_are_tried_for_a_time_and_not_a_number_of_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", PATIENCE)
+    with fiber.Pool(1, tasks.fail_until, (tmp_path / "runs", 4)) as pool:
+        assert pool.apply(tasks.square, (3,)) == 9
+    pool.join()
+    assert tasks.runs(tmp_path / "runs") == 5
+
+
+def test_a_wave_of_kills_is_outlived(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_set, "KILLED_PATIENCE", PATIENCE)
+    with fiber.Pool(4, tasks.killed_until, (tmp_path / "runs", 7)) as pool:
+        assert pool.map(tasks.square, range(10)) == [x * x for x in range(10)]
+    pool.join()
+    assert tasks.runs(tmp_path / "runs") >= 8
+
+
+def test_who_waits_long_for_workers_is_told_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", PATIENCE)
+    monkeypatch.setattr(worker_set, "SAID_AFTER", 0.0)
+    with fiber.Pool(1, tasks.fail_until, (tmp_path / "runs", 4)) as pool:
+        assert pool.apply(tasks.square, (3,)) == 9
+    pool.join()
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("fiber: no worker has started")
+    assert "it raised an error" in line
 
 
 def test_an_initializer_that_does_not_pickle() -> None:

@@ -13,31 +13,16 @@ import threading
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import fiber
 from unit import pool_tasks as tasks
+from unit.pool_programs import ENVIRON, is_alive, run_program, wait_until
 
 PATIENCE = tasks.PATIENCE
-
-
-def wait_until(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {PATIENCE:g} s: {what}"
-        time.sleep(0.001)
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 # The end
@@ -141,14 +126,16 @@ def test_terminate_twice_and_after_close() -> None:
     pool.join()
 
 
-def test_a_callback_may_terminate_the_pool() -> None:
+def test_a_callback_may_terminate_the_pool(tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
     pool = fiber.Pool(2)
+    result = pool.apply_async(tasks.wait_for, (gate,), callback=lambda _: pool.terminate())
     waiting = pool.map_async(tasks.sleep, [600] * 100, 1)
-    result = pool.apply_async(tasks.square, (3,), callback=lambda _: pool.terminate())
+    gate.touch()
     with pytest.raises(fiber.FiberError, match="terminated"):
         waiting.get(PATIENCE)
     pool.join()
-    assert result.get(PATIENCE) == 9
+    assert result.get(PATIENCE) == "gate"
 
 
 def test_terminate_while_the_input_is_read() -> None:
@@ -249,21 +236,6 @@ def test_a_fork_of_the_program_cannot_use_its_pool() -> None:
 # Programs
 
 
-@pytest.fixture(autouse=True)
-def _programs_find_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]), prepend=os.pathsep)
-
-
-def run_program(text: str, **options: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(text)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        **options,
-    )
-
-
 @pytest.mark.parametrize("ending", ["", "pool.close()", "raise SystemExit(3)", "1 / 0"])
 def test_a_program_may_end_with_a_living_pool(ending: str) -> None:
     done = run_program(f"""
@@ -323,6 +295,7 @@ def test_ctrl_c_ends_a_wait(tmp_path: Path, call: str) -> None:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        env=os.environ | ENVIRON,
     )
     pids = tasks.wait_until_announced(path, 1 if call == "pool.apply" else 2)
     os.killpg(program.pid, signal.SIGINT)  # as a terminal does: the whole group
@@ -402,11 +375,11 @@ def test_busy_workers_do_not_leave(tmp_path: Path) -> None:
         results = [pool.apply_async(tasks.announce_and_wait, (path, gate)) for _ in range(3)]
         pids = set(tasks.wait_until_announced(path, 3))
         # A timer that comes after any with which the pool, by now, may watch for idle workers.
-        passed, loop = threading.Event(), pool._dispatcher._loop
+        passed, loop = threading.Event(), pool._executor._loop
         loop.call_later(0.04, passed.set)
         assert passed.wait(PATIENCE)
-        staying = [link.process for link in pool._dispatcher.crew.staying()]
-        assert {process.pid for process in staying if process is not None} == pids
+        staying = [process for process in pool._pool if not process._handle.leaving]
+        assert {process.pid for process in staying} == pids
         gate.touch()
         assert [result.get(PATIENCE) for result in results] == ["gate"] * 3
     pool.join()
@@ -450,29 +423,6 @@ def test_classes_of_a_main_that_goes_by_value_come_back_as_themselves(backend: s
                 except Trouble as error:
                     print(error.args)
         """,
-        env=os.environ | {"FIBER_BACKEND": backend},
+        {"FIBER_BACKEND": backend},
     )
     assert (done.stdout, done.stderr) == ("True 3 True\n(4,)\n", "")
-
-
-def test_a_signal_handler_may_terminate_the_pool_that_it_interrupts() -> None:
-    done = run_program("""
-        import signal, threading
-        import fiber
-        from fiber._engine.ledger import Ledger
-        assign = Ledger.assign
-        def interrupted(self, now):
-            if armed and threading.current_thread() is threading.main_thread():
-                armed.pop()
-                signal.raise_signal(signal.SIGTERM)
-            return assign(self, now)
-        armed = []
-        Ledger.assign = interrupted
-        pool = fiber.Pool(1)
-        signal.signal(signal.SIGTERM, lambda *_: pool.terminate())
-        armed.append(True)
-        pool.apply_async(abs, (1,))
-        pool.join()
-        print("ended")
-    """)
-    assert (done.stdout, done.stderr) == ("ended\n", "")

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import threading
+from multiprocessing import TimeoutError
 from typing import Any
 
 import pytest
-from fiber._runtime.reader import Reader
 
-from fiber._engine.chunks import Pace
-from fiber._engine.ledger import Ledger
-from fiber._runtime.outcome import Encoded
+from fiber._runtime.outcome import Failure, Pickled
 from fiber._wire import work
 from fiber.results import ApplyResult, IMapIterator
 
@@ -47,8 +45,8 @@ def test_an_interrupted_wait_leaves_the_result_to_others(monkeypatch: pytest.Mon
     with pytest.raises(Stop):
         found.wait()
     monkeypatch.undo()
-    found.put(0, [Encoded(work.VALUE, b"I3\n.", [])], True)
-    found.end()
+    found.add_results(0, [Pickled(work.VALUE, b"I3\n.", [])], True)
+    found.set_done()
     assert found.get(0) == 3
 
 
@@ -56,7 +54,7 @@ def test_waiting_in_vain_leaves_nothing() -> None:
     found = result()
     for _ in range(3):
         found.wait(0)
-    assert found._waiters == []
+    assert found._done._waiters._locks == []
 
 
 def test_all_who_wait_go_on() -> None:
@@ -64,39 +62,91 @@ def test_all_who_wait_go_on() -> None:
     threads = [threading.Thread(target=found.wait) for _ in range(3)]
     for thread in threads:
         thread.start()
-    found.put(0, [1], False)
-    found.end()
+    found.add_results(0, [1], False)
+    found.set_done()
     for thread in threads:
         thread.join()
     assert found.get() == 1
 
 
-def test_the_last_results_come_before_the_end() -> None:
+def iterator() -> IMapIterator:
     pool: Any = None
-    iterator = IMapIterator(pool)
-    iterator._buffer.put(0, [1], False)
-    iterator._buffer.end()
-    assert iterator._buffer.wait(0) == 1
+    return IMapIterator(pool)
+
+
+def test_the_last_results_come_before_the_end() -> None:
+    found = iterator()
+    found._buffer.add_results(0, [1], False)
+    found._buffer.set_done()
+    assert found._buffer.wait(0) == 1
     with pytest.raises(StopIteration):
-        iterator._buffer.wait(None)
+        found._buffer.wait(None)
 
 
-def test_a_reader_that_looks_whether_it_must_wait_can_be_released_already() -> None:
-    ledger = Ledger()
-    job = ledger.open(pace=Pace())
-    reader = Reader(job, threading.Lock(), limit=1)
-    full = reader._full
+def test_results_that_come_early_wait_for_their_turn() -> None:
+    found = iterator()
+    found._buffer.add_results(2, [2, 3], False)
+    with pytest.raises(TimeoutError):
+        found.next(0)
+    found._buffer.add_results(0, [0, 1], False)
+    assert [found.next(0) for _ in range(4)] == [0, 1, 2, 3]
 
-    def consumed_meanwhile() -> bool:
-        was_full = full()
-        if reader._read:
-            assert reader._blocked, "whoever consumes now would not know that the reader waits"
-        return was_full
 
-    reader._full = consumed_meanwhile  # type: ignore[method-assign]
-    reader._read = 1
-    reader._lock.acquire()
-    reader._lock.release()
-    reader.stopped = True
-    reader._wait()
-    assert not reader._blocked
+def test_waiting_for_an_iterator_in_vain_leaves_nothing() -> None:
+    found = iterator()
+    for _ in range(3):
+        with pytest.raises(TimeoutError):
+            found.next(0)
+    found._buffer.add_results(0, [1], False)
+    assert found._buffer.wait(0) == 1
+    found._buffer.set_done()
+    with pytest.raises(StopIteration):
+        next(found)
+    assert found._buffer._waiters._locks == []
+
+
+def test_all_who_wait_for_an_iterator_go_on() -> None:
+    found = iterator()
+    values: list[Any] = []
+    threads = [threading.Thread(target=lambda: values.extend(found)) for _ in range(5)]
+    for thread in threads:
+        thread.start()
+    for n in range(100):
+        found._buffer.add_results(n, [n], False)
+    found._buffer.set_done()
+    for thread in threads:
+        thread.join()
+    assert sorted(values) == list(range(100))
+
+
+def test_an_interrupted_wait_for_an_iterator_loses_no_result(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = iterator()
+
+    class Interrupted:
+        """The lock of one who waits, and is interrupted as a result comes."""
+
+        def acquire(self, *args: Any) -> bool:
+            if args:
+                found._buffer.add_results(0, [3], False)
+                raise Stop
+            return True
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(threading, "Lock", Interrupted)
+    with pytest.raises(Stop):
+        next(found)
+    monkeypatch.undo()
+    found._buffer.set_done()
+    assert list(found) == [3]
+
+
+def test_what_unpickles_to_an_error_is_raised_and_the_next_is_there() -> None:
+    found = iterator()
+    found._buffer.add_results(0, [Failure(KeyError("one")), 2], True)
+    with pytest.raises(KeyError):
+        next(found)
+    assert next(found) == 2

@@ -54,7 +54,10 @@ class Agent:
             close_all(spec.fds)
             raise RuntimeError(_ENDING)
         child = LocalChild(self, next(self._ids), spec, observer)
-        self.loop.call_soon(self._start, child)
+        if self.loop.on_thread():
+            self._start(child)  # what is asked of it next, in this very turn, finds it there
+        else:
+            self.loop.call_soon(self._start, child)
         return child
 
     def _start(self, child: LocalChild) -> None:
@@ -95,12 +98,14 @@ class Agent:
 
     def _zygote(self, *, preload: bool = True) -> ZygoteLink:
         if not self._zygotes or not preload:
-            self._access()  # makes the hub's directory, if there is to be one
-            directory = None if self._hub is None else self._hub.directory
-            self._zygotes.append(
-                ZygoteLink(self, self.loop, self.progress_table.fd, directory, preload=preload)
-            )
+            table, directory = self.progress_table.fd, self._cleanup_directory
+            self._zygotes.append(ZygoteLink(self, self.loop, table, directory, preload=preload))
         return self._zygotes[-1]
+
+    def _cleanup_directory(self) -> str | None:
+        """The hub's directory, made now if there is to be one."""
+        self._access()
+        return None if self._hub is None else self._hub.directory
 
     # What zygotes say, on the loop's thread
 

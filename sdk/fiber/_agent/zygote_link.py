@@ -6,7 +6,7 @@ import os
 import pickle
 import subprocess
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from fiber._agent import zygote, zygote_process
@@ -38,7 +38,7 @@ class ZygoteLink:
         observer: ZygoteObserver,
         loop: Loop,
         progress_table: int,
-        cleanup_directory: str | None,
+        cleanup_directory: Callable[[], str | None],
         *,
         preload: bool,
     ) -> None:
@@ -55,7 +55,8 @@ class ZygoteLink:
                 raise
         self._sock.setblocking(False)
         self._outbox = Outbox(loop, self._sock)
-        setup = (zygote.SETUP, lineage(), preload, cleanup_directory)
+        # Made at the last moment: from here on the zygote removes it, whoever is killed.
+        setup = (zygote.SETUP, lineage(), preload, cleanup_directory())
         self._outbox.send(pickle.dumps(setup), fds=[own_table])
         loop.register(self._sock.fileno(), self._receive)
 

@@ -136,7 +136,11 @@ class Executor:
 
     def start(self) -> None:
         """Start the first workers; raises what stands in the way of one."""
-        self._loop.depend(self)
+        try:
+            self._loop.depend(self)
+        except BaseException:
+            self._end()
+            raise
         handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
         self._loop.call_soon(self._begin, handles)
         try:

@@ -1,0 +1,295 @@
+"""An executor on a loop, background threads and workers that do nothing by themselves."""
+
+from __future__ import annotations
+
+import pickle
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+from fiber._agent.port import ExitReport
+from fiber._engine.ledger import Batch, Ledger
+from fiber._runtime.executor import Executor
+from fiber._runtime.options import PoolOptions
+from fiber._runtime.work_items import WorkItem
+from fiber._runtime.worker_handle import WorkerHandle
+from fiber._transport.loop import Timer
+from fiber._wire import work
+from fiber._wire.packet import Message
+from fiber.process import PoolProcess, Process
+from unit import pool_tasks as tasks
+
+
+class ManualLoop:
+    """Time passes, and timers fire, when the test says so; one thing is done at a time.
+
+    What is asked for is done at once, or, while it is ``held``, once it is ``released``.
+    """
+
+    def __init__(self) -> None:
+        self.held = False
+        self._time = 0.0
+        self._timers: list[Timer] = []
+        self._ready: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
+        self._running = False
+
+    def now(self) -> float:
+        return self._time
+
+    def on_thread(self) -> bool:
+        return self._running
+
+    def depend(self, dependent: object) -> None:
+        pass
+
+    def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
+        self._ready.append((callback, args))
+        if not self.held:
+            self._run()
+
+    def release(self) -> None:
+        self.held = False
+        self._run()
+
+    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
+        timer = Timer(self._time + seconds, lambda: callback(*args))
+        self._timers.append(timer)
+        return timer
+
+    @property
+    def timers(self) -> list[Timer]:
+        """Those that are to fire."""
+        return [timer for timer in self._timers if timer.callback is not None]
+
+    def pass_time(self, seconds: float) -> None:
+        self._time += seconds
+        for timer in [timer for timer in self.timers if timer.due <= self._time]:
+            self._timers.remove(timer)
+            if timer.callback is not None:
+                self.call_soon(timer.callback)
+
+    def _run(self) -> None:
+        if self._running:
+            return
+        self._running = True
+        try:
+            while self._ready:
+                callback, args = self._ready.popleft()
+                callback(*args)
+        finally:
+            self._running = False
+
+
+class ManualThread:
+    """Does what was submitted when the test says so."""
+
+    def __init__(self, name: str) -> None:
+        self.submitted: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
+        self.stopped = False
+
+    def submit(self, action: Callable[..., object], *args: Any) -> bool:
+        if not self.stopped:
+            self.submitted.append((action, args))
+        return not self.stopped
+
+    def stop(self) -> None:
+        self.stopped = True
+
+    def join(self) -> None:
+        pass
+
+    def run(self) -> None:
+        while self.submitted:
+            action, args = self.submitted.pop(0)
+            action(*args)
+
+
+class Port:
+    """Keeps what is delivered."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.host = "here"
+        self.pid = 1
+        self.start_error: Exception | None = None
+        self.packets: list[tuple[int, bytes]] = []
+        self.recalls = 0
+        self.signals: list[int] = []
+        self.gone = False
+
+    def deliver(self, seq: int, payload: bytes, buffers: Sequence[memoryview] = ()) -> bool:
+        if not self.gone:
+            self.packets.append((seq, payload))
+        return not self.gone
+
+    def take_back(self) -> None:
+        self.recalls += 1
+
+    def signal(self, signum: int) -> None:
+        self.signals.append(signum)
+
+    def lend(self) -> None:
+        """Nobody uses it directly."""
+
+    def reclaim(self) -> None:
+        """It is never lent."""
+
+    @property
+    def told_to_end(self) -> bool:
+        return (0, work.STOP_MESSAGE) in self.packets
+
+
+class Results:
+    """A future that keeps outcomes."""
+
+    def __init__(self) -> None:
+        self.outcomes: dict[int, Any] = {}
+        self.done = 0
+        self.error: BaseException | None = None
+
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+        assert not self.outcomes.keys() & range(start, start + len(outcomes)), "twice"
+        self.outcomes.update(enumerate(outcomes, start))
+
+    def lift_bound(self) -> None:
+        """There is none."""
+
+    def set_done(self) -> None:
+        self.done += 1
+
+    def set_exception(self, error: BaseException) -> None:
+        assert self.error is None
+        self.error = error
+
+
+class Rig:
+    """An executor, with workers that are ready and do what the test says."""
+
+    def __init__(
+        self, count: int, *, start: bool = True, ready: bool = True, **options: Any
+    ) -> None:
+        self.loop = ManualLoop()
+        self.ports: list[Port] = []
+        self.handles: list[WorkerHandle] = []
+        self.refusal: Exception | None = None
+        """What stands in the way of another worker."""
+        host: Any = SimpleNamespace(
+            loop=self.loop, start=self._start, config=SimpleNamespace(start_timeout=1.0)
+        )
+        self.threads: dict[str, ManualThread] = {}
+        new_process = partial(PoolProcess, like=Process)
+        sizes = {"minimum": count, "maximum": count}
+        self.executor = Executor(
+            PoolOptions(new_process, **(sizes | options)), host, thread=self._thread
+        )
+        self.background = self.threads["fiber-pool"]
+        if start:
+            self.executor.start()
+        if ready:
+            self.all_ready()
+
+    def _thread(self, name: str) -> Any:
+        self.threads[name] = ManualThread(name)
+        return self.threads[name]
+
+    def _start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> Port:
+        if self.refusal is not None:
+            raise self.refusal
+        self.ports.append(Port(process.name))
+        self.handles.append(observer)
+        return self.ports[-1]
+
+    @property
+    def ledger(self) -> Ledger:
+        return self.executor._scheduler.ledger
+
+    @property
+    def maps(self) -> list[Any]:
+        """The jobs of the maps that are not done."""
+        return [job for job in self.ledger.jobs if job.owner.future is not None]
+
+    @property
+    def members(self) -> list[Any]:
+        """Workers that are there, or about to be."""
+        return list(self.executor._scheduler.workers.members)
+
+    @property
+    def busy(self) -> list[WorkerHandle]:
+        """Workers that were given something."""
+        return [handle for handle in self.handles if handle.worker and handle.worker.queue]
+
+    def close(self) -> None:
+        """End it, and find nothing left."""
+        self.executor.terminate(RuntimeError("the test is over"))
+        for handle in self.members:
+            self.lose(handle)
+        self.background.run()
+        assert self.executor.ended.is_set()
+        assert not self.members
+        assert not self.ledger.jobs
+        assert not self.ledger.batches
+        assert not self.loop.timers
+        assert all(thread.stopped for thread in self.threads.values())
+
+    # What workers say
+
+    def say(self, handle: WorkerHandle, *words: Any) -> None:
+        handle.said(Message(memoryview(pickle.dumps(words)), [], []))
+
+    def all_ready(self) -> None:
+        """Those that are not say that they are."""
+        for handle in self.handles:
+            if handle.worker is None and handle in self.members:
+                self.say(handle, work.READY)
+
+    def answer(
+        self, handle: WorkerHandle, seq: int, values: list[Any], odd: Sequence[Any] = ()
+    ) -> None:
+        self.say(handle, seq, 0, None, 1e-3, values, list(odd))
+
+    def answer_batch(self, batch: Batch) -> None:
+        self.answer(batch.worker.key, batch.seq, [None] * len(batch.items))
+
+    def answer_all(self) -> None:
+        """Let the workers do all that they are given."""
+        self.background.run()
+        while batches := list(self.ledger.batches.values()):
+            self.answer_batch(batches[0])
+            del batches
+            self.background.run()
+
+    def lose(self, handle: WorkerHandle, **report: Any) -> None:
+        handle.exited(ExitReport(-9, "killed by SIGKILL", host="here", **report))
+
+    # What is asked for
+
+    def call(self, *args: Any, function: Any = tasks.square, **options: Any) -> Results:
+        results = Results()
+        self.executor.call(results, function, args or (3,), {}, **options)
+        return results
+
+    def item(self, results: Results, *, function: Any = tasks.square, **options: Any) -> WorkItem:
+        """A map to come."""
+        known = self.executor.function(function)
+        return WorkItem(work.MAP, function=known, future=results, **options)
+
+    def map(self, items: Any, **options: Any) -> Results:
+        results = Results()
+        self.executor.submit(self.item(results, **options), items)
+        return results
+
+    # What was sent
+
+    def port(self, handle: WorkerHandle) -> Port:
+        assert isinstance(handle.port, Port)
+        return handle.port
+
+    def head(self, handle: WorkerHandle, index: int) -> work.Head:
+        """The head of a message that a worker got."""
+        return work.Head._make(work.HEAD.unpack_from(self.port(handle).packets[index][1]))
+
+    def deliveries(self) -> Iterable[tuple[int, bytes]]:
+        """All that all workers were sent."""
+        return [packet for port in self.ports for packet in port.packets]

@@ -1,0 +1,112 @@
+"""One thing after the other, on a thread that nobody has to wait for."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import weakref
+from collections.abc import Iterator
+from typing import Any, NoReturn
+
+import pytest
+
+from fiber._runtime.background import BackgroundThread
+
+PATIENCE = 15.0
+
+
+@pytest.fixture
+def thread() -> Iterator[BackgroundThread]:
+    thread = BackgroundThread("test-background")
+    yield thread
+    thread.stop()
+    thread.join()
+
+
+def names() -> list[str]:
+    return [thread.name for thread in threading.enumerate()]
+
+
+def test_it_does_things_in_order_on_one_daemon_thread(thread: BackgroundThread) -> None:
+    seen: list[tuple[int, threading.Thread]] = []
+    for n in range(100):
+        assert thread.submit(lambda n: seen.append((n, threading.current_thread())), n)
+    thread.stop()
+    thread.join()
+    assert [n for n, _ in seen] == list(range(100))
+    (where,) = {where for _, where in seen}
+    assert (where.name, where.daemon) == ("test-background", True)
+
+
+def test_the_thread_starts_when_it_is_needed(thread: BackgroundThread) -> None:
+    assert "test-background" not in names()
+    thread.submit(abs, -1)
+    assert "test-background" in names()
+
+
+def test_one_that_was_never_needed_ends_at_once() -> None:
+    thread = BackgroundThread("test-background")
+    thread.stop()
+    thread.join()
+
+
+def test_after_stop_what_was_submitted_is_done_and_no_more_is_taken() -> None:
+    thread = BackgroundThread("test-background")
+    gate, seen = threading.Event(), []
+    thread.submit(gate.wait, PATIENCE)
+    thread.submit(seen.append, 1)
+    thread.stop()
+    thread.stop()
+    assert not thread.submit(seen.append, 2)
+    gate.set()
+    thread.join()
+    assert seen == [1]
+
+
+@pytest.mark.parametrize("kind", [ValueError, SystemExit, KeyboardInterrupt])
+def test_what_raises_is_shown_and_stops_nothing(
+    thread: BackgroundThread, monkeypatch: pytest.MonkeyPatch, kind: type[BaseException]
+) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(sys, "excepthook", lambda *info: shown.append(info[0]))
+    seen: list[int] = []
+
+    def fail() -> NoReturn:
+        raise kind
+
+    thread.submit(fail)
+    thread.submit(seen.append, 1)
+    thread.stop()
+    thread.join()
+    assert (shown, seen) == ([kind], [1])
+
+
+def test_what_it_does_may_stop_and_join_it(thread: BackgroundThread) -> None:
+    done = threading.Event()
+
+    def end() -> None:
+        thread.stop()
+        thread.join()
+        done.set()
+
+    thread.submit(end)
+    assert done.wait(PATIENCE)
+
+
+def test_it_keeps_nothing_of_what_is_done(thread: BackgroundThread) -> None:
+    class Held:
+        def use(self) -> None:
+            pass
+
+    done = threading.Event()
+    gc.disable()
+    try:
+        held = Held()
+        gone = weakref.ref(held, lambda _: done.set())
+        thread.submit(held.use)
+        del held
+        assert done.wait(PATIENCE)
+        assert gone() is None
+    finally:
+        gc.enable()

@@ -1,0 +1,434 @@
+"""The executor against workers, a loop and background threads that do nothing by themselves."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import signal
+import weakref
+from collections.abc import Iterator
+
+import pytest
+
+from fiber._agent.port import ExitReport
+from fiber._engine.ledger import PATIENCE
+from fiber._runtime.executor import KILL_AFTER
+from fiber._runtime.outcome import Failure, Pickled
+from fiber._wire import work
+from fiber.errors import FiberError, WorkerDied
+from unit import pool_tasks as tasks
+from unit.executor_rig import Results, Rig
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = Rig(2)
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def pickled() -> list[int]:
+    """The items that were pickled by code of their own."""
+    pickled: list[int] = []
+    tasks.state["pickled"] = pickled
+    return pickled
+
+
+# Giving
+
+
+def test_a_map(rig: Rig) -> None:
+    results = rig.map(range(4))
+    for handle, port in zip(rig.handles, rig.ports, strict=True):
+        assert [seq for seq, _ in port.packets]
+        for seq, _ in list(port.packets):
+            rig.answer(handle, seq, [seq])
+    assert len(results.outcomes) == 4
+    assert results.done == 1
+
+
+def test_a_call(rig: Rig) -> None:
+    results = rig.call()
+    (handle,) = rig.busy
+    rig.answer(handle, rig.port(handle).packets[0][0], [9])
+    assert (results.outcomes, results.done) == ({0: 9}, 1)
+
+
+def test_many_short_calls_in_a_row_travel_together(rig: Rig) -> None:
+    first = [rig.call() for _ in range(2)]
+    for handle in list(rig.busy):
+        rig.say(handle, rig.port(handle).packets[0][0], 0, None, 1e-7, [9], [])
+    assert [results.done for results in first] == [1, 1]
+    sent = len(list(rig.deliveries()))
+    many = [rig.call() for _ in range(10)]
+    rig.loop.pass_time(1.0)
+    while rig.ledger.batches:
+        rig.answer_batch(next(iter(rig.ledger.batches.values())))
+    assert [results.done for results in many] == [1] * 10
+    assert len(list(rig.deliveries())) - sent < 10
+
+
+def test_a_function_is_sent_once_to_each_worker(rig: Rig) -> None:
+    rig.map(range(4))
+    for handle in rig.handles:
+        assert rig.head(handle, 0).size
+        assert not rig.head(handle, 1).size
+
+
+def test_a_function_that_was_not_read_is_sent_again(rig: Rig) -> None:
+    rig.map(range(4))
+    handle, port = rig.handles[0], rig.ports[0]
+    handle.taken_back([seq for seq, _ in port.packets])
+    assert rig.head(handle, 2).size
+
+
+def test_a_worker_that_forgot_a_function_is_sent_it_again(rig: Rig) -> None:
+    rig.map(range(4))
+    handle, port = rig.handles[0], rig.ports[0]
+    rig.say(handle, work.UNKNOWN, port.packets[1][0])
+    assert rig.head(handle, 2).size
+
+
+def test_the_same_function_has_the_same_identity(rig: Rig) -> None:
+    one = rig.executor.function(tasks.square)
+    assert rig.executor.function(tasks.square) is one
+    assert rig.executor.function(tasks.add).id != one.id
+
+
+def test_users_picklers_do_not_run_on_the_loop(rig: Rig, pickled: list[int]) -> None:
+    rig.map([tasks.Tattling(n) for n in range(6)])
+    assert pickled == []
+    rig.background.run()
+    assert len(pickled) == 4
+    rig.answer(rig.handles[0], rig.ports[0].packets[0][0], [None])
+    assert len(pickled) == 4
+    rig.background.run()
+    assert len(pickled) == 5
+
+
+def test_plain_items_are_sent_from_the_loop(rig: Rig) -> None:
+    rig.map([(n, str(n)) for n in range(6)])
+    rig.answer(rig.handles[0], rig.ports[0].packets[0][0], [None])
+    assert len(rig.ports[0].packets) == 3
+    assert not rig.background.submitted
+
+
+def test_idle_workers_get_what_busy_ones_have_not_read(rig: Rig) -> None:
+    results = rig.map(range(4))
+    idle, busy = rig.handles
+    for seq, _ in list(rig.ports[0].packets):
+        rig.answer(idle, seq, [seq])
+    assert rig.ports[1].recalls == 0
+    rig.loop.pass_time(PATIENCE)
+    assert rig.ports[1].recalls == 1
+    unread = rig.ports[1].packets[1][0]
+    busy.taken_back([unread])
+    rig.answer(idle, rig.ports[0].packets[-1][0], [7])
+    rig.answer(busy, unread, ["late"])
+    rig.answer(busy, rig.ports[1].packets[0][0], [8])
+    assert results.done == 1
+    assert "late" not in results.outcomes.values()
+
+
+def test_an_item_that_does_not_pickle_concerns_its_task_alone(rig: Rig) -> None:
+    results = rig.map([1, tasks.Unpicklable(), 2])
+    rig.answer_all()
+    assert results.done == 1
+    failure = results.outcomes[1]
+    assert type(failure) is Failure
+    assert "cannot be pickled" in str(failure.error)
+    assert [results.outcomes[0], results.outcomes[2]] == [None, None]
+
+
+def test_broadcast(rig: Rig) -> None:
+    results = Results()
+    rig.executor.broadcast(results, tasks.pid, ())
+    assert [len(port.packets) for port in rig.ports] == [1, 1]
+    rig.answer_all()
+    assert (len(results.outcomes), results.done) == (2, 1)
+
+
+# Streams
+
+
+def test_what_is_read_is_fed_and_the_end_is_the_end(rig: Rig) -> None:
+    results = Results()
+    item = rig.item(results)
+    stream = rig.executor.open_stream(item)
+    stream.read(range(3))
+    rig.answer_all()
+    assert (len(results.outcomes), results.done) == (3, 0)
+    rig.executor.finish(item)
+    assert results.done == 1
+
+
+def test_an_error_of_the_input_takes_the_place_of_the_next_task(rig: Rig) -> None:
+    results = Results()
+    item = rig.item(results)
+    rig.executor.open_stream(item).read(range(2))
+    rig.executor.finish(item, KeyError("input"))
+    rig.answer_all()
+    assert results.done == 1
+    assert len(results.outcomes) == 3
+    assert str(results.outcomes[2].error) == "'input'"
+
+
+def test_a_cancelled_stream_lets_its_reader_end(rig: Rig) -> None:
+    item = rig.item(Results())
+    stream = rig.executor.open_stream(item)
+    rig.executor.cancel(item)
+    assert stream.ended
+    stream.read(range(10**9))
+    rig.executor.finish(item)
+    assert not rig.maps
+
+
+# Taking
+
+
+def test_users_values_are_not_unpickled_on_the_loop(rig: Rig) -> None:
+    results = rig.map(range(1))
+    (handle,) = rig.busy
+    data = pickle.dumps(tasks.UnreadableInWorker())
+    seq = rig.port(handle).packets[0][0]
+    rig.answer(handle, seq, [None], [(0, work.VALUE, data, 0)])
+    outcome = results.outcomes[0]
+    assert type(outcome) is Pickled
+    assert outcome.decode() is tasks.identity
+
+
+def test_a_batch_that_its_worker_cannot_read_is_sent_in_pieces(rig: Rig) -> None:
+    results = rig.map(range(2), unit=2)
+    (handle,) = rig.busy
+    error = pickle.dumps(AttributeError("no such class"))
+    rig.say(handle, work.UNREADABLE, rig.port(handle).packets[0][0], error)
+    for handle in list(rig.busy):
+        rig.say(handle, work.UNREADABLE, rig.port(handle).packets[-1][0], error)
+    assert (len(results.outcomes), results.done) == (2, 1)
+    assert all("no such class" in str(o.decode().error) for o in results.outcomes.values())
+
+
+def test_a_finished_request_keeps_nothing(rig: Rig) -> None:
+    # Whoever waits for the collector waits long where large arrays count as one object each.
+    gc.disable()
+    try:
+        found = [rig.map(range(2)), rig.map([]), rig.call(timeout=60.0), cancelled := Results()]
+        item = rig.item(cancelled)
+        rig.executor.submit(item, range(9))
+        rig.executor.cancel(item)
+        del item, cancelled
+        rig.answer_all()
+        dead = [weakref.ref(results) for results in found]
+        del found
+        assert [ref() for ref in dead] == [None] * 4
+    finally:
+        gc.enable()
+
+
+def test_a_cancelled_batch_is_not_sent(rig: Rig, pickled: list[int]) -> None:
+    item = rig.item(Results())
+    rig.executor.submit(item, [tasks.Tattling(n) for n in range(2)])
+    rig.executor.cancel(item)
+    rig.background.run()
+    assert not list(rig.deliveries())
+    assert pickled == []
+    assert len(rig.ledger.idle()) == 2
+
+
+def test_cancelling_what_is_done_or_was_never_submitted_does_nothing(rig: Rig) -> None:
+    results = Results()
+    item = rig.item(results)
+    rig.executor.cancel(item)
+    rig.executor.submit(item, range(2))
+    rig.answer_all()
+    rig.executor.cancel(item)
+    assert results.done == 1
+
+
+# Losing
+
+
+def test_what_was_assigned_and_not_sent_is_not_held_against_its_tasks(
+    rig: Rig, pickled: list[int]
+) -> None:
+    rig.map([tasks.Tattling(n) for n in range(2)])
+    (job,) = rig.maps
+    rig.lose(rig.handles[0])
+    assert job.attempts == {}
+    assert rig.ledger.demand() == 2
+
+
+def test_a_packet_that_nobody_took_is_not_held_against_its_tasks(rig: Rig) -> None:
+    rig.ports[0].gone = rig.ports[1].gone = True
+    rig.map(range(2))
+    (job,) = rig.maps
+    rig.lose(rig.handles[0])
+    rig.lose(rig.handles[1])
+    assert job.attempts == {}
+
+
+def test_what_ran_when_its_worker_died_is_charged_an_attempt(rig: Rig) -> None:
+    results = rig.map(range(1), timeout=60.0)
+    (batch,) = rig.ledger.batches.values()
+    job = batch.job
+    assert job is not None
+    rig.lose(batch.worker.key, running=(batch.seq, 0))
+    assert job.attempts == {0: 1}
+    assert not results.done
+    assert len(rig.loop.timers) == 1, "its deadline counts from its next start"
+
+
+def test_a_task_that_kills_its_workers(rig: Rig) -> None:
+    results = rig.call()
+    for _ in range(4):
+        (handle,) = rig.busy
+        rig.lose(handle, running=(rig.port(handle).packets[-1][0], 0))
+        rig.background.run()
+        rig.all_ready()
+    outcome = results.outcomes[0]
+    assert type(outcome) is Failure
+    assert isinstance(outcome.error, WorkerDied)
+    assert "square" in outcome.error.task
+    assert results.done == 1
+
+
+def test_lost_workers_are_replaced_elsewhere_than_on_the_loop(rig: Rig) -> None:
+    rig.lose(rig.handles[0])
+    assert len(rig.handles) == 2
+    rig.background.run()
+    assert len(rig.handles) == 3
+
+
+def test_a_task_over_its_time_fails_and_its_worker_is_killed(rig: Rig) -> None:
+    results = rig.call(timeout=2.0)
+    (handle,) = rig.busy
+    rig.loop.pass_time(2.0)
+    assert "2 s" in str(results.outcomes[0].error)
+    assert results.done == 1
+    assert rig.port(handle).signals == [signal.SIGKILL]
+    rig.answer(handle, rig.port(handle).packets[0][0], [9])
+    rig.lose(handle)
+    assert (len(results.outcomes), results.done) == (1, 1)
+
+
+# Starting
+
+
+def test_a_pool_whose_first_workers_cannot_be_started_ends() -> None:
+    rig = Rig(2, start=False)
+    rig.refusal = OSError("too many open files")
+    with pytest.raises(OSError, match="too many"):
+        rig.executor.start()
+    rig.close()
+    assert not rig.handles
+
+
+def test_a_worker_that_cannot_be_started_is_tried_again(rig: Rig) -> None:
+    rig.refusal = OSError("too many open files")
+    rig.lose(rig.handles[0])
+    rig.background.run()
+    assert len(rig.members) == 1
+    rig.refusal = None
+    for _ in range(3):
+        rig.loop.pass_time(60.0)
+        rig.background.run()
+    rig.all_ready()
+    assert len(rig.members) == 2
+
+
+def test_a_worker_that_is_not_ready_when_the_pool_is_closed_is_told_to_end() -> None:
+    rig = Rig(1, ready=False)
+    rig.executor.close()
+    assert rig.ports[0].told_to_end
+    rig.lose(rig.handles[0])
+    assert rig.executor.ended.is_set()
+    rig.close()
+
+
+def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
+    rig = Rig(1, ready=False)
+    results = rig.call()
+    for _ in range(60):
+        handle = rig.handles[-1]
+        rig.say(handle, work.BIRTH, "no such device")
+        handle.exited(ExitReport(1, "exit status 1"))
+        rig.loop.pass_time(1.0)
+        rig.background.run()
+        if results.error is not None:
+            break
+    assert "no such device" in str(results.error)
+    with pytest.raises(FiberError, match="no such device"):
+        rig.call()
+    rig.close()
+
+
+# The end
+
+
+def test_after_close_what_is_there_is_done_and_the_workers_leave(rig: Rig) -> None:
+    results = [rig.map(range(5)), rig.call()]
+    rig.executor.close()
+    with pytest.raises(ValueError, match="not running"):
+        rig.call()
+    assert not any(port.told_to_end for port in rig.ports)
+    rig.answer_all()
+    assert [found.done for found in results] == [1, 1]
+    assert all(port.told_to_end for port in rig.ports)
+    for handle in list(rig.handles):
+        handle.exited(ExitReport(0, "exit status 0"))
+    assert rig.executor.ended.is_set()
+
+
+def test_what_was_asked_for_at_the_moment_of_the_end_hears_of_it(rig: Rig) -> None:
+    rig.loop.held = True
+    error = RuntimeError("terminated")
+    rig.executor.terminate(error)
+    found = [rig.map(range(2)), rig.call(), rig.call(timeout=1.0), Results()]
+    item = rig.item(found[-1])
+    stream = rig.executor.open_stream(item)
+    rig.loop.release()
+    stream.read(range(10**9))
+    assert stream.ended
+    assert all(results.error is not None for results in found)
+    assert not rig.ledger.jobs
+    rig.loop.held = False
+
+
+def test_terminate_fails_what_is_not_done(rig: Rig) -> None:
+    error = RuntimeError("terminated")
+    found = [rig.map(range(100)), rig.call(), rig.call(timeout=60.0)]
+    item = rig.item(Results())
+    stream = rig.executor.open_stream(item)
+    rig.executor.terminate(error)
+    assert [results.error for results in found] == [error] * 3
+    assert item.future is not None
+    assert stream.ended
+    assert [port.signals for port in rig.ports] == [[signal.SIGTERM]] * 2
+    rig.loop.pass_time(KILL_AFTER)
+    assert [port.signals[1:] for port in rig.ports] == [[signal.SIGKILL]] * 2
+
+
+def test_nobody_waits_for_a_loop_that_has_failed() -> None:
+    rig = Rig(2)
+    found = [rig.map(range(100)), rig.call()]
+    rig.executor.broken(FiberError("the loop has failed"))
+    assert [str(results.error) for results in found] == ["the loop has failed"] * 2
+    with pytest.raises(FiberError, match="the loop has failed"):
+        rig.call()
+    assert rig.executor.ended.is_set()
+    assert [port.signals[-1:] for port in rig.ports] == [[signal.SIGKILL]] * 2
+
+
+def test_idle_workers_above_the_minimum_leave() -> None:
+    rig = Rig(1, maximum=3, idle_timeout=10.0)
+    rig.map(range(9))
+    rig.background.run()
+    rig.all_ready()
+    assert len(rig.members) == 3
+    rig.answer_all()
+    rig.loop.pass_time(9.0)
+    assert not any(port.told_to_end for port in rig.ports)
+    rig.loop.pass_time(1.5)
+    assert sum(port.told_to_end for port in rig.ports) == 2
+    rig.close()

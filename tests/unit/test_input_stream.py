@@ -1,0 +1,267 @@
+"""Reading no faster than is granted, with nobody but the test to grant it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from fiber._engine.chunks import TARGET, Pace
+from fiber._runtime.input_stream import AHEAD, InputStream
+from unit.ledger_steps import known
+
+SLOW_TASKS = known(1.0, 1)
+"""Of which one is a message."""
+
+
+class Reading:
+    """A stream, what it was told to notify, and a thread that reads it."""
+
+    def __init__(self, unit: int = 1, limit: int | None = None) -> None:
+        self.notified = 0
+        self.read: list[Any] = []
+        self.error: BaseException | None = None
+        self.stream = InputStream(unit, limit, self._notify)
+        self._thread: threading.Thread | None = None
+
+    def _notify(self) -> None:
+        self.notified += 1
+
+    def grant(self, waiting: int = 0, workers: int = 1, pace: Pace = SLOW_TASKS) -> None:
+        self.stream.grant(waiting, workers, pace, TARGET)
+
+    def items(self, iterable: Any) -> Iterator[Any]:
+        for item in iterable:
+            self.read.append(item)
+            yield item
+
+    def here(self, iterable: Any) -> None:
+        """Read on this thread: there is credit enough."""
+        self.stream.read(self.items(iterable))
+
+    def begin(self, iterable: Any) -> None:
+        """Read on a thread of its own."""
+
+        def read() -> None:
+            try:
+                self.here(iterable)
+            except KeyError as error:
+                self.error = error
+
+        self._thread = threading.Thread(target=read)
+        self._thread.start()
+
+    def end(self) -> None:
+        """No more; all that was granted is read by then."""
+        self.stream.end()
+        assert self._thread is not None
+        self._thread.join()
+
+
+def test_all_is_read_and_taken_in_order() -> None:
+    reading = Reading()
+    reading.grant(pace=known(1e-6))
+    reading.here(range(10))
+    assert reading.stream.take() == list(range(10))
+    assert reading.stream.take() == []
+
+
+def test_no_more_is_read_than_was_granted() -> None:
+    reading = Reading()
+    reading.grant(workers=2)
+    finished = threading.Event()
+
+    def items() -> Iterator[int]:
+        yield from range(2 * AHEAD - 1)
+        finished.set()
+        yield from range(1000)
+
+    reading.begin(items())
+    finished.wait()
+    reading.end()
+    assert len(reading.read) <= 2 * AHEAD
+
+
+def test_each_grant_brings_it_to_the_bound_and_none_comes_before_half_is_gone() -> None:
+    reading = Reading()
+    reading.grant(workers=2)
+    reading.grant(workers=2)
+    reading.here(range(2 * AHEAD - 1))
+    assert len(reading.stream.take()) == 2 * AHEAD - 1
+    assert reading.stream._granted == 2 * AHEAD
+    reading.grant(waiting=AHEAD, workers=2)
+    assert reading.stream._granted == 2 * AHEAD, "more than half is left"
+    reading.grant(waiting=AHEAD - 1, workers=2)
+    assert reading.stream._granted == 3 * AHEAD
+
+
+def test_it_reads_ahead_more_of_what_is_quick() -> None:
+    slow, quick = Reading(), Reading()
+    slow.grant()
+    quick.grant(pace=known(1e-5))
+    assert quick.stream._granted > 10 * slow.stream._granted
+
+
+def test_units_are_not_torn_but_for_the_last() -> None:
+    reading = Reading(unit=4)
+    reading.grant(workers=4)
+    taken: list[list[int]] = []
+
+    def items() -> Iterator[int]:
+        for n in range(10):
+            taken.append(reading.stream.take())
+            yield n
+
+    reading.here(items())
+    assert [block for block in taken if block] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert reading.stream.take() == [8, 9]
+
+
+def test_what_is_granted_is_whole_units() -> None:
+    reading = Reading(unit=4, limit=7)
+    reading.grant(workers=4)
+    assert reading.stream._granted == 4
+
+
+def test_who_waits_for_input_is_notified_once() -> None:
+    reading = Reading()
+    reading.grant(workers=10)
+
+    def items() -> Iterator[int]:
+        yield from range(5)
+        assert reading.notified == 1
+        assert reading.stream.take() == list(range(5))
+        reading.stream.await_input()
+        yield from range(5)
+
+    reading.here(items())
+    assert reading.notified == 2
+
+
+def test_input_that_comes_before_it_is_awaited_is_taken() -> None:
+    reading = Reading()
+    reading.grant()
+    assert reading.stream.take() == []
+    reading.stream._awaited = False
+    reading.here([1])  # now, between both
+    reading.stream.await_input()
+    assert reading.stream.take() == [1]
+
+
+def test_what_the_iterable_raises_is_raised_and_what_came_before_is_kept() -> None:
+    reading = Reading()
+    reading.grant()
+
+    def items() -> Iterator[int]:
+        yield 1
+        raise KeyError("input")
+
+    with pytest.raises(KeyError):
+        reading.here(items())
+    assert reading.stream.take() == [1]
+
+
+def test_what_is_no_iterable_is_refused_before_anything_is_waited_for() -> None:
+    with pytest.raises(TypeError):
+        Reading().stream.read(3)  # type: ignore[arg-type]
+
+
+# The end
+
+
+def test_a_reader_that_waits_ends_with_the_stream() -> None:
+    reading = Reading()
+    reading.begin(range(10))
+    reading.end()
+    assert reading.read == []
+
+
+def test_a_reader_ends_with_the_stream_before_it_has_used_its_credit() -> None:
+    reading = Reading()
+    reading.grant(workers=100)
+
+    def items() -> Iterator[int]:
+        yield 1
+        reading.stream.end()
+        yield 2
+        raise AssertionError("it reads on")
+
+    reading.here(items())
+    assert reading.read == [1, 2]
+
+
+def test_nothing_is_granted_after_the_end() -> None:
+    reading = Reading()
+    reading.stream.end()
+    reading.grant()
+    assert reading.stream._granted == 0
+
+
+# The limit
+
+
+def test_no_more_is_read_than_the_limit_allows_until_it_is_consumed() -> None:
+    reading = Reading(limit=2)
+    reading.grant(workers=100)
+    assert reading.stream._granted == 2
+    reading.here(range(1))
+    reading.stream.take()
+    reading.grant(workers=100)
+    assert reading.stream._granted == 2
+    assert reading.notified == 1
+    reading.stream.consume()
+    assert reading.notified == 2, "there is room"
+    reading.stream.consume()
+    assert reading.notified == 2, "as was said already"
+    reading.grant(workers=100)
+    assert reading.stream._granted == 4
+
+
+def test_consuming_is_not_told_to_who_does_not_wait_for_it() -> None:
+    reading = Reading(limit=2)
+    reading.stream.consume()
+    reading.grant()
+    reading.stream.consume()
+    assert reading.notified == 0
+
+
+@pytest.mark.parametrize("counted", [True, False])
+def test_what_is_consumed_while_room_is_counted_is_counted_or_told(
+    counted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reading = Reading(limit=1)
+    reading.grant()
+    reading.here([])
+    room = InputStream._room
+
+    def consumed_meanwhile(stream: InputStream, limit: int) -> int:
+        if counted:
+            stream.consume()
+            return room(stream, limit)
+        found = room(stream, limit)
+        stream.consume()
+        return found
+
+    monkeypatch.setattr(InputStream, "_room", consumed_meanwhile)
+    reading.stream._taken = 1
+    reading.grant()
+    monkeypatch.undo()
+    assert reading.notified == 1, "in vain where it was counted as well"
+    reading.grant()
+    assert reading.stream._granted == 2
+
+
+def test_a_limit_below_a_unit_lets_one_through() -> None:
+    reading = Reading(unit=4, limit=1)
+    reading.grant()
+    assert reading.stream._granted == 4
+
+
+def test_who_waits_for_the_end_lifts_the_limit() -> None:
+    reading = Reading(limit=1)
+    reading.grant(workers=2)
+    reading.stream.lift_limit()
+    reading.grant(workers=2)
+    assert reading.stream._granted == 2 * AHEAD

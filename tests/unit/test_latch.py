@@ -1,0 +1,196 @@
+"""Waiting for something that happens once, interrupted and from many threads."""
+
+from __future__ import annotations
+
+import gc
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from fiber._runtime.latch import Latch, Waiters, as_lock_timeout
+
+PATIENCE = 15.0
+
+
+class Stop(BaseException):
+    """What a signal's handler raises."""
+
+
+def stop(signum: int, frame: Any) -> None:
+    raise Stop
+
+
+@pytest.fixture
+def _signals_raise() -> Iterator[None]:
+    before = signal.signal(signal.SIGUSR1, stop)
+    yield
+    signal.signal(signal.SIGUSR1, before)
+
+
+def test_it_happens_once_and_stays() -> None:
+    latch = Latch()
+    assert not latch.is_set()
+    assert not latch.wait(0)
+    latch.set()
+    latch.set()
+    assert latch.is_set()
+    assert latch.wait()
+    assert latch.wait(0)
+
+
+def test_all_who_wait_go_on() -> None:
+    latch = Latch()
+    went_on: list[bool] = []
+    threads = [
+        threading.Thread(target=lambda: went_on.append(latch.wait(PATIENCE))) for _ in range(20)
+    ]
+    for thread in threads:
+        thread.start()
+    while len(latch._waiters._locks) < len(threads):
+        assert all(thread.is_alive() for thread in threads)
+    latch.set()
+    for thread in threads:
+        thread.join()
+    assert went_on == [True] * len(threads)
+    assert latch._waiters._locks == []
+
+
+def test_two_who_wake_release_each_lock_once() -> None:
+    waiters = Waiters()
+    locks = [waiters.join() for _ in range(1000)]
+    threads = [threading.Thread(target=waiters.wake) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not any(lock.locked() for lock in locks)
+
+
+def test_waiting_in_vain_leaves_nothing() -> None:
+    latch = Latch()
+    for timeout in (0, 0.001, -1.0):
+        assert not latch.wait(timeout)
+    assert latch._waiters._locks == []
+
+
+def test_leaving_while_one_is_released() -> None:
+    waiters = Waiters()
+    lock = waiters.join()
+    waiters.wake()
+    waiters.leave(lock)
+    assert not lock.locked()
+
+
+def test_it_happens_between_a_look_and_the_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    latch = Latch()
+    join = Waiters.join
+
+    def joined_too_late(waiters: Waiters) -> threading.Lock:
+        latch.set()
+        return join(waiters)
+
+    monkeypatch.setattr(Waiters, "join", joined_too_late)
+    assert latch.wait()
+
+
+@pytest.mark.usefixtures("_signals_raise")
+def test_a_signal_that_raises_in_a_wait_leaves_it_to_others() -> None:
+    latch = Latch()
+    main = threading.main_thread()
+
+    def interrupt() -> None:
+        while not latch._waiters._locks:
+            pass
+        signal.pthread_kill(main.ident or 0, signal.SIGUSR1)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(Stop):
+        latch.wait(PATIENCE)
+    thread.join()
+    assert not latch.wait(0)
+    latch.set()
+    assert latch.wait(0)
+
+
+@pytest.mark.usefixtures("_signals_raise")
+def test_a_signal_that_raises_as_the_wait_begins_leaves_it_to_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    latch = Latch()
+    join = Waiters.join
+
+    def interrupted(waiters: Waiters) -> threading.Lock:
+        lock = join(waiters)
+        signal.raise_signal(signal.SIGUSR1)
+        return lock
+
+    monkeypatch.setattr(Waiters, "join", interrupted)
+    with pytest.raises(Stop):
+        latch.wait()
+    monkeypatch.undo()
+    threads = [threading.Thread(target=latch.wait) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    latch.set()
+    for thread in threads:
+        thread.join()
+    assert latch._waiters._locks == []
+
+
+def test_a_handler_may_set_what_it_interrupts_the_wait_for() -> None:
+    latch = Latch()
+    before = signal.signal(signal.SIGUSR1, lambda signum, frame: latch.set())
+    try:
+        timer = threading.Timer(
+            0.01, signal.pthread_kill, (threading.main_thread().ident, signal.SIGUSR1)
+        )
+        timer.start()
+        assert latch.wait(PATIENCE)
+        timer.join()
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+
+
+class Sets:
+    """Sets a latch when it is collected."""
+
+    def __init__(self, latch: Latch) -> None:
+        self.latch = latch
+        self.me = self
+
+    def __del__(self) -> None:
+        self.latch.set()
+
+
+def test_a_finalizer_at_any_allocation_may_set_it() -> None:
+    gc.collect()
+    threshold = gc.get_threshold()
+    gc.disable()
+    try:
+        for count in range(30):
+            latch = Latch()
+            Sets(latch)
+            gc.set_threshold(gc.get_count()[0] + count)
+            gc.enable()
+            latch.wait(0)
+            other = Latch()
+            other.set()
+            assert other.wait()
+            gc.disable()
+            gc.collect()
+            assert latch.wait(0)
+    finally:
+        gc.set_threshold(*threshold)
+        gc.enable()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "as_locks_want_it"),
+    [(None, -1), (-5.0, 0), (0.5, 0.5), (float("inf"), threading.TIMEOUT_MAX)],
+)
+def test_timeouts(seconds: float | None, as_locks_want_it: float) -> None:
+    assert as_lock_timeout(seconds) == as_locks_want_it

@@ -1,0 +1,260 @@
+"""How many workers there should be, and when it is no use to try again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fiber._engine.tasks import Worker
+from fiber._engine.worker_set import (
+    FIRST_PAUSE,
+    IDLE_DEATHS,
+    IDLE_PAUSE,
+    KILLED_PATIENCE,
+    LAST_PAUSE,
+    LAST_PAUSE_AT_WORK,
+    RAISED_PATIENCE,
+    SAID_AFTER,
+    TRIES,
+    StartFailure,
+    WorkerSet,
+)
+from fiber.errors import StartError
+
+RAISED = StartFailure("pool worker 'w'", "exit status 1", "no such device")
+KILLED = StartFailure("pool worker 'w'", "killed by SIGKILL", killed=True)
+
+
+class Member:
+    """A worker's process."""
+
+    def __init__(self) -> None:
+        self.worker: Worker | None = None
+        self.leaving = False
+
+
+@pytest.fixture
+def workers() -> WorkerSet:
+    return WorkerSet(2, 4)
+
+
+def start(workers: WorkerSet, *, ready: bool = False) -> Member:
+    member = Member()
+    workers.add(member)
+    if ready:
+        workers.ready(member, Worker(member, None))
+    return member
+
+
+def fail(workers: WorkerSet, now: float, failure: StartFailure = RAISED) -> None:
+    workers.gone(start(workers), now, failure)
+
+
+def fail_until(workers: WorkerSet, stop: float, failure: StartFailure, now: float = 0.0) -> float:
+    """Start one whenever that may be; each fails at once.  The time of the last."""
+    while True:
+        fail(workers, now, failure)
+        due = workers.next_try()
+        assert due is not None
+        if workers.error is not None or due > stop:
+            return now
+        now = due
+
+
+# How many
+
+
+def test_the_number_of_workers_follows_the_demand_within_bounds(workers: WorkerSet) -> None:
+    assert [workers.wanted(demand) for demand in (0, 1, 2, 3, 4, 100)] == [2, 2, 2, 3, 4, 4]
+    assert workers.missing(3, 0) == 3
+    start(workers)
+    assert workers.missing(3, 0) == 2
+    assert workers.missing(0, 0) == 1
+
+
+def test_newcomers_are_wanted_for_tasks_that_only_they_may_run(workers: WorkerSet) -> None:
+    for _ in range(2):
+        start(workers, ready=True)
+    assert workers.missing(1, 0) == 0
+    assert workers.missing(1, 1) == 1
+    start(workers)
+    assert workers.missing(1, 1) == 0
+    start(workers)
+    assert workers.missing(1, 5) == 0, "more than the maximum"
+
+
+def test_counts(workers: WorkerSet) -> None:
+    one, other = start(workers, ready=True), start(workers)
+    assert (workers.size, workers.starting) == (2, 1)
+    workers.let_go(other)
+    workers.let_go(other)
+    assert (workers.size, workers.starting, workers.staying()) == (1, 0, [one])
+    workers.gone(other, 0.0, RAISED)
+    workers.gone(one, 0.0, RAISED)
+    workers.gone(one, 0.0, RAISED)
+    assert (workers.size, workers.starting, workers.members) == (0, 0, {})
+    assert workers.failures == 0, "who was told to go, or was ready, did not fail to start"
+
+
+def test_as_many_as_are_missing_are_started_at_once(workers: WorkerSet) -> None:
+    assert workers.startable(4, 0.0) == 4
+    assert workers.next_try() is None
+
+
+# Failures
+
+
+@pytest.mark.parametrize(
+    ("failure", "patience"), [(RAISED, RAISED_PATIENCE), (KILLED, KILLED_PATIENCE)]
+)
+def test_it_gives_up_when_none_has_started_for_long(
+    workers: WorkerSet, failure: StartFailure, patience: float
+) -> None:
+    last = fail_until(workers, patience + LAST_PAUSE, failure)
+    assert patience <= last <= patience + LAST_PAUSE
+    assert isinstance(workers.error, StartError)
+    assert workers.error is workers.trouble
+    assert failure.reason in str(workers.error)
+    assert failure.text in str(workers.error)
+
+
+def test_however_many_fail_at_once_that_is_no_reason_to_give_up(workers: WorkerSet) -> None:
+    members = [start(workers) for _ in range(1000)]
+    for member in members:
+        workers.gone(member, 0.5, RAISED)
+    assert workers.error is None
+    assert workers.next_try() == 0.5 + FIRST_PAUSE, "one wave, one pause"
+
+
+def test_however_long_it_takes_there_are_some_tries(workers: WorkerSet) -> None:
+    for at in range(TRIES - 1):
+        fail(workers, 100.0 * at)
+        assert workers.error is None
+    fail(workers, 100.0 * TRIES)
+    assert workers.error is not None
+
+
+def test_one_that_was_killed_after_some_that_raised_may_have_done_nothing_wrong(
+    workers: WorkerSet,
+) -> None:
+    fail_until(workers, RAISED_PATIENCE / 2, RAISED)
+    fail(workers, RAISED_PATIENCE + 1, KILLED)
+    assert workers.error is None
+
+
+def test_a_lost_host_says_nothing_of_its_workers(workers: WorkerSet) -> None:
+    for at in range(100):
+        workers.gone(start(workers), float(at), None)
+    assert (workers.failures, workers.error, workers.next_try()) == (0, None, None)
+
+
+def test_one_that_starts_clears_the_others(workers: WorkerSet) -> None:
+    fail_until(workers, RAISED_PATIENCE / 2, RAISED)
+    member = start(workers, ready=True)
+    assert (workers.failures, workers.next_try()) == (0, None)
+    assert workers.startable(3, 0.0) == 3
+    workers.gone(member, 100.0, None)
+    fail_until(workers, 100.0 + RAISED_PATIENCE / 2, RAISED, 100.0)
+    assert workers.error is None, "time counts from the first failure after it"
+
+
+def test_the_cause_of_a_refusal_is_kept() -> None:
+    cause = OSError("too many open files")
+    error = StartFailure("a pool worker", str(cause), killed=True, cause=cause).error(3)
+    assert error.__cause__ is cause
+    assert "too many open files" in str(error)
+
+
+# Pauses
+
+
+def test_pauses_between_waves_double_up_to_a_limit(workers: WorkerSet) -> None:
+    now, pauses = 0.0, []
+    for _ in range(9):
+        fail(workers, now, KILLED)
+        due = workers.next_try()
+        assert due is not None
+        pauses.append(due - now)
+        now = due
+    assert pauses == pytest.approx([min(FIRST_PAUSE * 2**n, LAST_PAUSE) for n in range(9)])
+
+
+def test_after_a_pause_one_is_tried(workers: WorkerSet) -> None:
+    fail(workers, 10.0)
+    assert workers.startable(4, 10.0) == 0
+    assert workers.startable(4, 10.0 + FIRST_PAUSE) == 1
+    member = start(workers)
+    assert workers.startable(3, 99.0) == 0, "it has not shown yet that they can start"
+    assert workers.next_try() is None
+    workers.ready(member, Worker(member, None))
+    assert workers.startable(3, 10.1) == 3
+
+
+def test_what_fails_in_a_pause_is_of_the_same_wave(workers: WorkerSet) -> None:
+    late = [start(workers) for _ in range(3)]
+    fail(workers, 10.0)
+    for member in late:
+        workers.gone(member, 10.0 + FIRST_PAUSE / 2, RAISED)
+    assert workers.next_try() == 10.0 + FIRST_PAUSE
+
+
+def test_while_others_work_it_tries_again_less_and_less_often(workers: WorkerSet) -> None:
+    at_work = start(workers, ready=True)
+    now = fail_until(workers, 1000.0, RAISED)
+    assert workers.error is None
+    assert workers.trouble is not None
+    assert workers.next_try() == now + LAST_PAUSE_AT_WORK
+    workers.gone(at_work, now, None)
+    assert workers.next_try() == now + LAST_PAUSE, "nobody is at work: it is urgent"
+    fail(workers, now + LAST_PAUSE)
+    assert workers.error is not None
+
+
+def test_workers_that_die_idle_again_and_again_are_replaced_slowly(workers: WorkerSet) -> None:
+    for _ in range(IDLE_DEATHS + workers.maximum):
+        workers.gone(start(workers, ready=True), 5.0, None)
+        assert workers.next_try() is None
+    workers.gone(start(workers, ready=True), 5.0, None)
+    assert workers.next_try() == 5.0 + IDLE_PAUSE
+    start(workers, ready=True)
+    assert workers.next_try() == 5.0 + IDLE_PAUSE, "that one is ready is nothing new"
+    assert workers.startable(2, 5.0 + IDLE_PAUSE) == 1
+    workers.did_something()
+    assert workers.next_try() is None
+    assert workers.error is None
+
+
+def test_who_dies_at_work_is_replaced_at_once(workers: WorkerSet) -> None:
+    batch: Any = object()
+    for _ in range(100):
+        member = start(workers, ready=True)
+        assert member.worker is not None
+        member.worker.queue.append(batch)
+        workers.gone(member, 5.0, None)
+    assert workers.next_try() is None
+
+
+# What is said
+
+
+def test_failures_that_last_are_told_once_while_one_waits(workers: WorkerSet) -> None:
+    fail(workers, 0.0, KILLED)
+    assert workers.news(KILLED, 0.0) == ""
+    fail(workers, SAID_AFTER, KILLED)
+    news = workers.news(KILLED, SAID_AFTER)
+    assert "2 tries" in news
+    assert KILLED.reason in news
+    fail(workers, SAID_AFTER + 1, KILLED)
+    assert workers.news(KILLED, SAID_AFTER + 1) == ""
+    start(workers, ready=True)
+    fail(workers, 100.0, KILLED)
+    assert workers.news(KILLED, 100.0) == ""
+    fail(workers, 100.0 + SAID_AFTER, KILLED)
+    assert workers.news(KILLED, 100.0 + SAID_AFTER) != "", "it is something new"
+
+
+def test_an_error_needs_no_news(workers: WorkerSet) -> None:
+    last = fail_until(workers, 100.0, KILLED)
+    assert workers.error is not None
+    assert workers.news(KILLED, last) == ""
