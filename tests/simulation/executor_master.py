@@ -268,7 +268,7 @@ class ExecutorMaster:
         ]
 
     def _function(self, account: Account) -> Function:
-        account.broken = self._rng.random() < 0.03
+        account.broken = self._rng.random() < 0.08
         some = perform, perform_other
         function = perform_nowhere if account.broken else some[account.number % 2]
         return self._executor.function(function)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from fiber._engine.ledger import Worker
+from fiber._engine.scheduler import Scheduler
 from simulation.explore import run
 from simulation.schedule import Job, Kill, Schedule, Task
 from simulation.suites import PARTS, SUITES, examine_part
@@ -26,3 +28,21 @@ def test_what_a_lent_worker_answers_before_it_dies_counts(seed: int) -> None:
     for at in range(5, 25):
         schedule = Schedule(seed, (job,), faults=(Kill(0, at * 1e-3),))
         assert run(schedule, SUITES["executor"]) is None
+
+
+class Late:
+    """A worker that is ready, and gone, before whoever started it could note how to reach it."""
+
+    def __init__(self) -> None:
+        self.worker: Worker | None = None
+        self.leaving = False
+
+
+def test_a_worker_that_is_gone_is_not_ready() -> None:
+    scheduler = Scheduler(1, 1)
+    member = Late()
+    scheduler.starting(member)
+    scheduler.gone(member, 1.0)
+    scheduler.ready(member, 2.0)
+    assert not scheduler.ledger.workers
+    assert scheduler.decide(3.0).start == 1
