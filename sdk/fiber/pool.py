@@ -322,13 +322,17 @@ class Pool:
         if buffersize is None and isinstance(iterable, (*_SLICEABLE, list)):
             self._submit(item, iterable, chunksize)
             return iterator
-        stream = executor.open_stream(item, buffersize)
-        if buffersize is not None:
-            buffer.stream = stream
-            iterator._cancel = partial(executor.cancel, item)
-        threading.Thread(
-            target=_feed, args=(executor, item, iterable), name="fiber-pool-feeder", daemon=True
-        ).start()
+        try:
+            stream = executor.open_stream(item, buffersize)
+            if buffersize is not None:
+                buffer.stream = stream
+                iterator._cancel = partial(executor.cancel, item)
+            threading.Thread(
+                target=_feed, args=(executor, item, iterable), name="fiber-pool-feeder", daemon=True
+            ).start()
+        except BaseException:  # a stream that nobody reads would be waited for
+            executor.cancel(item)
+            raise
         return iterator
 
     def _item(
