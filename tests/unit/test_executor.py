@@ -7,6 +7,7 @@ import pickle
 import signal
 import weakref
 from collections.abc import Iterator
+from typing import NoReturn
 
 import pytest
 
@@ -313,6 +314,29 @@ def test_a_task_over_its_time_fails_and_its_worker_is_killed(rig: Rig) -> None:
 
 
 # Starting
+
+
+def test_the_first_workers_are_there_when_it_is_started_however_busy_the_loop() -> None:
+    rig = Rig(2, start=False)
+    rig.loop.held = True
+    rig.executor.start()
+    assert len(rig.executor.processes()) == 2
+    rig.loop.release()
+    rig.close()
+
+
+def test_one_that_cannot_wait_for_anything_has_ended() -> None:
+    rig = Rig(2, start=False, ready=False)
+
+    def refuse(dependent: object) -> NoReturn:
+        raise FiberError("the loop has failed")
+
+    rig.loop.depend = refuse  # type: ignore[method-assign]
+    with pytest.raises(FiberError, match="the loop has failed"):
+        rig.executor.start()
+    rig.loop.held = True  # as for ever
+    rig.executor.terminate(RuntimeError("the program ends"))
+    assert rig.executor.ended.is_set()
 
 
 def test_a_pool_whose_first_workers_cannot_be_started_ends() -> None:
