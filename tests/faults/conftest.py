@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from faults.program import LOOPBACK, Program
+from faults.program import LOOPBACK, Program, wait_for
 from faults.runtime import running
 
 BACKENDS = ("local", "loopback")
@@ -54,6 +54,7 @@ def backend(request: pytest.FixtureRequest) -> Iterator[str]:
             # The thread that writes what agents tell lives as long as the runtime.
             loopback: Any = runtime.backend
             loopback._output.write("test", "begins")
+            wait_for(lambda: all(process.agent.joined for process in loopback._processes))
         yield request.param
 
 

@@ -207,6 +207,10 @@ class Ledger:
         """Workers with nothing to do, the one that has been so for longest first."""
         return list(self._load.idle)
 
+    def idle_count(self) -> int:
+        """How many they are."""
+        return len(self._load.idle)
+
     def longest_idle(self) -> Worker | None:
         """The first of them."""
         return next(iter(self._load.idle), None)

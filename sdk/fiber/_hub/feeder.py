@@ -201,11 +201,21 @@ class Feeder:
             while self._unsent:
                 self._moves += 1
                 item = self._unsent.popleft()
-                self._slots.sending()
+                reachable = self._count_as_sent()
                 self._moves += 1
-                self._send(*item)
+                if reachable:
+                    self._send(*item)
             self._sending = False
         self._close_outbox()
+
+    def _count_as_sent(self) -> bool:
+        """False if who keeps the count is gone, and with it the queue."""
+        try:
+            self._slots.sending()
+        except EOFError:
+            self._unsent.clear()
+            return False
+        return True
 
     def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
         try:

@@ -296,8 +296,13 @@ class Executor:
         hurried = now - self._took_calls < FLOOR and job.pace.short
         self._took_calls = now
         busy = job.fed - job.done >= self._scheduler.workers.size
+        # One for each who is idle: whoever turns out to be stuck then holds up no other.
+        for call in calls[: self._ledger.idle_count()]:
+            self._ledger.feed(job, [call])
+            calls = calls[1:]
+            self._advance()
         self._ledger.feed(job, calls)
-        if hurried and busy and not calls[-1].blocking:
+        if hurried and busy and not (calls and calls[-1].blocking):
             self._wake_at(now + TICK)
         else:
             self._advance()

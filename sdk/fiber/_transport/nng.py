@@ -47,7 +47,7 @@ _LARGEST = LARGEST + OVERHEAD + 4
 _QUEUE = 2 * WINDOW
 """Messages that nng keeps for the connection: a link's window, and its acknowledgements."""
 
-_NOTICES = 0.1
+_NOTICES = 1.0
 """Seconds for nng to notice the end of a connection; it takes a fraction of a millisecond."""
 
 _lib, _ffi = _nng.lib, _nng.ffi
