@@ -155,6 +155,7 @@ class Child:
     def __init__(self, agent: Agent, number: int, observer: ChildObserver) -> None:
         self.name = f"worker {number}"
         self.pid: int | None = None
+        self.start_error: Exception | None = None
         self.host = agent.host
         self.agent = agent
         self.worker = Worker(agent.world, number, self)
