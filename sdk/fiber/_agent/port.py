@@ -77,7 +77,8 @@ class DirectChannel(Protocol):
     def receive(self, timeout: float) -> Message | None:
         """The next packet that it sends; None after ``timeout`` seconds, EOFError at its end.
 
-        BrokenPipeError: the end came before what was sent last was on its way.  OSError: a packet came, and the system had no room for it: the worker will be killed.
+        BrokenPipeError: the end came before what was sent last was on its way.  OSError: a packet
+        came, and the system had no room for it: the worker will be killed.
         """
 
     def close(self) -> None:

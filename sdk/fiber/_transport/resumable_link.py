@@ -15,7 +15,7 @@ from collections.abc import Callable
 from fiber._transport.handshake import Identity
 from fiber._transport.link import EventLoop, Keepalive, LinkObserver, Timer, Wire
 from fiber._transport.stream import Frame, Gap, ResumableStream, Statistics
-from fiber._wire.messages import ProtocolError
+from fiber._wire.messages import BytesLike, ProtocolError
 
 _BYE, _BYE_HEARD = b"\x20", b"\x21"
 
@@ -134,8 +134,8 @@ class ResumableLink:
         if self._state is _State.LEAVING:
             self._end()
 
-    def datagram(self, wire: Wire, datagram: Frame) -> None:
-        """Take what came over ``wire``; nothing that a replaced wire still brings."""
+    def datagram(self, wire: Wire, datagram: BytesLike) -> None:
+        """Take what came over ``wire``, without keeping it; nothing that a replaced wire still brings."""
         if wire is not self._wire or self._state is _State.ENDED:
             return
         if datagram[:1] == _BYE:
@@ -151,7 +151,7 @@ class ResumableLink:
         """The peer does not go on with it."""
         self._lose(reason)
 
-    def _take(self, wire: Wire, datagram: Frame) -> None:
+    def _take(self, wire: Wire, datagram: BytesLike) -> None:
         try:
             frames = self._stream.received(datagram, self._loop.now())
         except Gap:
