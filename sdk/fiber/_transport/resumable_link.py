@@ -135,7 +135,7 @@ class ResumableLink:
             self._end()
 
     def datagram(self, wire: Wire, datagram: BytesLike) -> None:
-        """Take what came over ``wire``, without keeping it; nothing that a replaced wire still brings."""
+        """Take, and do not keep, what came over ``wire``; nothing from one that was replaced."""
         if wire is not self._wire or self._state is _State.ENDED:
             return
         if datagram[:1] == _BYE:

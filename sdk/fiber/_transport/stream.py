@@ -321,11 +321,12 @@ class ResumableStream:
             raise ProtocolError("a datagram does not go on where the one before it ended")
         frames: list[Frame] = []
         for length in lengths:
-            frame = self._partial if self._partial is not None else bytearray()
+            frame = bytearray() if self._partial is None else self._partial
             self._partial = None
             frame += memoryview(datagram)[at : at + length]
             frames.append(frame)
             at += length
         if flags & _UNFINISHED:
-            self._partial = frames.pop()
+            self._partial = frame
+            frames.pop()
         return frames
