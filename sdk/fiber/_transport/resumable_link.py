@@ -152,8 +152,9 @@ class ResumableLink:
         self._lose(reason)
 
     def _take(self, wire: Wire, datagram: BytesLike) -> None:
+        now = self._loop.now()
         try:
-            frames = self._stream.received(datagram, self._loop.now())
+            frames = self._stream.received(datagram, now)
         except Gap:
             wire.break_off()
             return
@@ -165,7 +166,10 @@ class ResumableLink:
             self._inbox += frames
         self._heard()
         self._hand_over()
-        self._flush_soon()
+        if self._state is not _State.OPEN or self._stream.wants_to_speak(now):
+            self._flush_soon()
+        elif not self._flush_due:
+            self._set_timer(now)
 
     def _heard(self) -> None:
         if self._suspect:

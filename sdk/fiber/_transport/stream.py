@@ -180,6 +180,12 @@ class ResumableStream:
             self._counts["bytes_sent"] += sum(map(len, datagrams))
         return datagrams
 
+    def wants_to_speak(self, now: float) -> bool:
+        """Whether ``outgoing`` would have something."""
+        return self._connected and (
+            self._repeat or bool(self._queue and self._has_room()) or self._must_speak(now)
+        )
+
     def received(self, datagram: BytesLike, now: float) -> list[Frame]:
         """Take a datagram from the connection, and copy what is in it; the frames that it
         completes, in order.
