@@ -49,7 +49,7 @@ class FakeCluster:
         self._hosts = hosts
         self._output = Output()
         self._agents = {
-            name: RemoteAgent(name, runtime.hub, self._output, on_lost=self._lost)
+            name: RemoteAgent(name, runtime.loop, runtime.hub, self._output, on_lost=self._lost)
             for name in (f"fake-{number}" for number in range(agents))
         }
         self._turns = itertools.cycle(self._agents.values())

@@ -50,7 +50,7 @@ class RemoteHost(Agent):
             drop=self._rng.choice((0.0, 0.0, 0.05)),
         )
         nothing: Any = mock.MagicMock()
-        self._remote = RemoteAgent(name, nothing, nothing, self._lose_remote)
+        self._remote = RemoteAgent(name, loop, nothing, nothing, self._lose_remote)
         here: Any = LocalPort(self)
         self._service = service.AgentService(loop, self._cable.agent, here, nothing, nothing)
         self._cable.agent.attach(self._service)

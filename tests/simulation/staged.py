@@ -19,6 +19,8 @@ from unittest import mock
 
 from fiber._agent import service
 from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._backends import remote
+from fiber._backends.remote_channel import RemoteChannel
 from fiber._runtime import executor, launcher
 from fiber._wire.packet import Message
 from simulation.agents import Child
@@ -56,6 +58,8 @@ class Stage:
     def enter(self) -> None:
         """Take the places of what cannot be handed over."""
         self._stack.enter_context(mock.patch.object(service, "Capture", NoCapture))
+        channel = partial(StagedRemoteChannel, self)
+        self._stack.enter_context(mock.patch.object(remote, "RemoteChannel", channel))
         self._stack.enter_context(mock.patch.object(executor, "_say", self._say))
         self._stack.enter_context(mock.patch.object(launcher, "Latch", partial(StagedLatch, self)))
         self._stack.enter_context(mock.patch.object(PlannedError, "unpickled", self.run_user_code))
@@ -383,5 +387,39 @@ class StagedChannel:
     def end(self) -> None:
         """The worker is gone."""
         self._ended = True
+        if self._reader is not None:
+            self._reader.wake()
+
+
+class StagedRemoteChannel(RemoteChannel):
+    """The channel of a worker on another host: the real one, but for how its callers wait."""
+
+    def __init__(self, stage: Stage, loop: Any, deliver: Callable[..., bool]) -> None:
+        super().__init__(loop, deliver)
+        self._stage = stage
+        self._reader: Actor | None = None
+        stage.world.note("a worker is lent to callers on another host")
+
+    def send(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> None:
+        """Send it a packet."""
+        self._stage.pause()
+        super().send(seq, payload, buffers)
+        self._stage.pause()
+
+    def receive(self, timeout: float) -> Message | None:
+        """The next packet; sometimes Ctrl-C comes first."""
+        message = super().receive(timeout)
+        if self._stage.rng.random() < 0.03:
+            self._stage.world.note("whoever called over there is interrupted")
+            raise Interrupted
+        return message
+
+    def _wait(self, timeout: float) -> None:
+        assert self._stage.running is not None
+        self._reader = self._stage.running
+        self._reader.wait(timeout)
+        self._reader = None
+
+    def _wake(self) -> None:
         if self._reader is not None:
             self._reader.wake()

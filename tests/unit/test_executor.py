@@ -316,15 +316,6 @@ def test_a_task_over_its_time_fails_and_its_worker_is_killed(rig: Rig) -> None:
 # Starting
 
 
-def test_the_first_workers_are_there_when_it_is_started_however_busy_the_loop() -> None:
-    rig = Rig(2, start=False)
-    rig.loop.held = True
-    rig.executor.start()
-    assert len(rig.executor.processes()) == 2
-    rig.loop.release()
-    rig.close()
-
-
 def test_one_that_cannot_wait_for_anything_has_ended() -> None:
     rig = Rig(2, start=False, ready=False)
 

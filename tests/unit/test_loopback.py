@@ -25,6 +25,7 @@ from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._hub.protocol import HubAddress
 from fiber._runtime import state
+from fiber._transport.memory import SimulatedLoop
 from fiber._wire import messages
 from fiber.errors import LinkError, StartError
 from unit.agent_children import Recorder, run_forever
@@ -325,7 +326,7 @@ class Silent:
 @pytest.fixture
 def remote() -> tuple[RemoteAgent, Silent, Recorder]:
     link = Silent()
-    agent = RemoteAgent("far", link, Output(), on_lost=lambda *_: None)  # type: ignore[arg-type]
+    agent = RemoteAgent("far", SimulatedLoop(), link, Output(), on_lost=lambda *_: None)  # type: ignore[arg-type]
     observer = Recorder()
     agent.start(ChildSpec("child", "fork", b"", b"", tasks=True), observer)
     return agent, link, observer

@@ -77,7 +77,8 @@ class DirectChannel(Protocol):
     def receive(self, timeout: float) -> Message | None:
         """The next packet that it sends; None after ``timeout`` seconds, EOFError at its end.
 
-        OSError: a packet came, and the system had no room for it: the worker will be killed.
+        BrokenPipeError: the end came before what was sent last was on its way.  OSError: a packet
+        came, and the system had no room for it: the worker will be killed.
         """
 
     def close(self) -> None:
@@ -104,7 +105,7 @@ class ChildPort(Protocol):
     def lend(self) -> DirectChannel | None:
         """Its task channel for direct use by one thread at a time, until ``reclaim``.
 
-        None where it is not on this host.  On the loop's thread; the observer hears nothing that
+        None if it is gone or cannot be lent.  On the loop's thread; the observer hears nothing that
         it says until then, but of its end.
         """
 

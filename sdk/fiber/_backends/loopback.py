@@ -94,7 +94,7 @@ class LoopbackBackend:
     def _launch(self, pause: float = 0.0) -> _Placed:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
-        agent = RemoteAgent(name, self._hub, self._output, on_lost=self._lost)
+        agent = RemoteAgent(name, self._loop, self._hub, self._output, on_lost=self._lost)
         process = AgentProcess(self._loop, agent.lose)
         launch = self._launcher.launch, process, name, self._environment(name)
         if pause:

@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 
 from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
+from fiber._backends.remote_channel import RemoteChannel
 from fiber._hub.hub import Hub
-from fiber._transport.link import Link
+from fiber._transport.link import EventLoop, Link
 from fiber._transport.stream import Frame
 from fiber._wire import messages, packet
 from fiber._wire.packet import BytesLike
@@ -30,9 +31,15 @@ class RemoteAgent:
     """
 
     def __init__(
-        self, host: str, hub: Hub, output: Output, on_lost: Callable[[RemoteAgent, str], None]
+        self,
+        host: str,
+        loop: EventLoop,
+        hub: Hub,
+        output: Output,
+        on_lost: Callable[[RemoteAgent, str], None],
     ) -> None:
         self.host = host
+        self.loop = loop
         self._hub = hub
         self._tunnels = hub.link(host, self.send, dialer=False)
         self._output = output
@@ -159,6 +166,7 @@ class RemoteChild:
         self._agent = agent
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
+        self._channel: RemoteChannel | None = None
         self._gone = False
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
@@ -170,11 +178,19 @@ class RemoteChild:
         self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
         return True
 
-    def lend(self) -> None:
-        """Its channel is elsewhere."""
+    def lend(self) -> RemoteChannel | None:
+        """Its task channel, for direct use; None if it is gone."""
+        if self._gone:
+            return None
+        self._channel = RemoteChannel(self._agent.loop, self.deliver)
+        return self._channel
 
     def reclaim(self) -> None:
-        """It is never lent."""
+        """Hear what it says again, and what nobody has received."""
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            for message in channel.drain():
+                self.observer.said(message)
 
     def take_back(self) -> None:
         """Recall unread packets."""
@@ -188,7 +204,11 @@ class RemoteChild:
         """Something about this child."""
         if isinstance(message, messages.Said):
             buffers = [memoryview(buffer) for buffer in message.buffers]
-            self.observer.said(packet.Message(memoryview(message.payload), buffers, []))
+            said = packet.Message(memoryview(message.payload), buffers, [])
+            if self._channel is None:
+                self.observer.said(said)
+            else:
+                self._channel.put(said)
         elif isinstance(message, messages.Started):
             self.pid = message.pid
             self.observer.started(message.pid)
@@ -202,5 +222,7 @@ class RemoteChild:
     def end(self, report: ExitReport, crossed: int = 0) -> None:
         """It is gone; the last ``crossed`` packets met the news of that on their way."""
         self._gone = True
+        if self._channel is not None:
+            self._channel.end()
         missed = list(self._latest)[len(self._latest) - crossed :]
         self.observer.exited(report._replace(unread=(*report.unread, *missed)))

@@ -2,7 +2,8 @@
 
 An ``apply`` that went through the loop would wake two threads that only pass it on.  So the
 scheduler lends an idle worker: whoever calls next takes it, sends it the call, waits for the answer
-and leaves it for the next one.  Ray's callers lease workers in the same way.  ::
+and leaves it for the next one.  Ray's callers lease workers in the same way.  What goes to another
+host still passes the loop, whose link it is, but no scheduler.  ::
 
     loop's thread                  any thread                         worker
     offer ──► idle leases ──pop──► run ─────────── send, receive ───► │
@@ -121,6 +122,8 @@ class Leases:
         while True:
             try:
                 message = channel.receive(ATTENTION)
+            except BrokenPipeError:  # it was gone before that was sent
+                return UNAVAILABLE
             except (EOFError, OSError):  # it is gone, as the loop is about to hear
                 return ADOPTED
             if message is None:
@@ -201,9 +204,9 @@ class Leases:
         self._on_back(handle)
 
     def _adopt(self, lease: Lease, seq: int, call: Call) -> None:
-        handle = self._end(lease)
-        self._on_adopted(handle, seq, call)
-        self._on_back(handle)
+        # First what the answer is to: it may be there already.
+        self._on_adopted(lease.handle, seq, call)
+        self._on_back(self._end(lease))
 
     def _abandon(self, lease: Lease) -> None:
         if weakref.ref(lease) in self._lent:  # else it was adopted

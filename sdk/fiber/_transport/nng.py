@@ -65,7 +65,7 @@ class Connection:
         descriptor: int,
         secrets: Secrets,
         *,
-        on_datagram: Callable[[Wire, bytearray], None],
+        on_datagram: Callable[[Wire, memoryview], None],
         on_gone: Callable[[Wire], None],
     ) -> None:
         """Takes over ``descriptor``, whatever happens."""
@@ -160,7 +160,7 @@ class Connection:
                 return
             self._on_datagram(self, datagram)
 
-    def _open(self, message: Any) -> bytearray:
+    def _open(self, message: Any) -> memoryview:
         try:
             body = _ffi.buffer(_lib.nng_msg_body(message), _lib.nng_msg_len(message))
             return self._opener.open(body)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from fiber._transport.handshake import Identity
 from fiber._transport.link import EventLoop, Keepalive, LinkObserver, Timer, Wire
 from fiber._transport.stream import Frame, Gap, ResumableStream, Statistics
-from fiber._wire.messages import ProtocolError
+from fiber._wire.messages import BytesLike, ProtocolError
 
 _BYE, _BYE_HEARD = b"\x20", b"\x21"
 
@@ -134,8 +134,8 @@ class ResumableLink:
         if self._state is _State.LEAVING:
             self._end()
 
-    def datagram(self, wire: Wire, datagram: Frame) -> None:
-        """Take what came over ``wire``; nothing that a replaced wire still brings."""
+    def datagram(self, wire: Wire, datagram: BytesLike) -> None:
+        """Take, and do not keep, what came over ``wire``; nothing from one that was replaced."""
         if wire is not self._wire or self._state is _State.ENDED:
             return
         if datagram[:1] == _BYE:
@@ -151,9 +151,10 @@ class ResumableLink:
         """The peer does not go on with it."""
         self._lose(reason)
 
-    def _take(self, wire: Wire, datagram: Frame) -> None:
+    def _take(self, wire: Wire, datagram: BytesLike) -> None:
+        now = self._loop.now()
         try:
-            frames = self._stream.received(datagram, self._loop.now())
+            frames = self._stream.received(datagram, now)
         except Gap:
             wire.break_off()
             return
@@ -165,7 +166,10 @@ class ResumableLink:
             self._inbox += frames
         self._heard()
         self._hand_over()
-        self._flush_soon()
+        if self._state is not _State.OPEN or self._stream.wants_to_speak(now):
+            self._flush_soon()
+        elif not self._flush_due:
+            self._set_timer(now)
 
     def _heard(self) -> None:
         if self._suspect:

@@ -26,7 +26,7 @@ import struct
 from collections import deque
 from typing import NamedTuple, TypeAlias
 
-from fiber._wire.messages import ProtocolError
+from fiber._wire.messages import BytesLike, ProtocolError
 
 Frame: TypeAlias = bytes | bytearray
 
@@ -107,7 +107,8 @@ class ResumableStream:
         self._unacknowledged_bytes = 0
         self._repeat = False
         self._received = 0
-        self._partial: list[Frame] = []
+        self._partial: bytearray | None = None
+        """What is there of a frame that goes on."""
         self._ack_due: float | None = None
         self._unanswered = self._unanswered_bytes = 0
         """What arrived since the last acknowledgement that we sent."""
@@ -179,8 +180,15 @@ class ResumableStream:
             self._counts["bytes_sent"] += sum(map(len, datagrams))
         return datagrams
 
-    def received(self, datagram: Frame, now: float) -> list[Frame]:
-        """Take a datagram from the connection; the frames that it completes, in order.
+    def wants_to_speak(self, now: float) -> bool:
+        """Whether ``outgoing`` would have something."""
+        return self._connected and (
+            self._repeat or bool(self._queue and self._has_room()) or self._must_speak(now)
+        )
+
+    def received(self, datagram: BytesLike, now: float) -> list[Frame]:
+        """Take a datagram from the connection, and copy what is in it; the frames that it
+        completes, in order.
 
         ProtocolError if no stream can have sent it, ``Gap`` if one before it is missing.
         """
@@ -235,7 +243,7 @@ class ResumableStream:
             queued_bytes=self._queued_bytes,
             unacknowledged_datagrams=len(self._unacknowledged),
             unacknowledged_bytes=self._unacknowledged_bytes,
-            partial_bytes=sum(map(len, self._partial)),
+            partial_bytes=len(self._partial or ()),
             **self._counts,
         )
 
@@ -294,7 +302,7 @@ class ResumableStream:
             self._acknowledged += 1
             self._unacknowledged_bytes -= len(self._unacknowledged.popleft())
 
-    def _take(self, datagram: Frame, flags: int, count: int, now: float) -> list[Frame]:
+    def _take(self, datagram: BytesLike, flags: int, count: int, now: float) -> list[Frame]:
         frames = self._unpack(datagram, flags, count)
         self._received += 1
         self._counts["frames_received"] += len(frames)
@@ -307,7 +315,7 @@ class ResumableStream:
             self._ack_due = now + ACK_DELAY
         return frames
 
-    def _unpack(self, datagram: Frame, flags: int, count: int) -> list[Frame]:
+    def _unpack(self, datagram: BytesLike, flags: int, count: int) -> list[Frame]:
         at = _HEADER.size + _LENGTH * count
         fits = count > 0 and at <= len(datagram)
         lengths = struct.unpack_from(f"<{count}I", datagram, _HEADER.size) if fits else ()
@@ -315,23 +323,16 @@ class ResumableStream:
             raise ProtocolError(
                 f"a datagram of {len(datagram)} bytes does not hold the {count} frames it announces"
             )
-        if bool(flags & _CONTINUES) != bool(self._partial):
+        if bool(flags & _CONTINUES) != (self._partial is not None):
             raise ProtocolError("a datagram does not go on where the one before it ended")
-        chunks = []
+        frames: list[Frame] = []
         for length in lengths:
-            chunks.append(datagram[at : at + length])
+            frame = bytearray() if self._partial is None else self._partial
+            self._partial = None
+            frame += memoryview(datagram)[at : at + length]
+            frames.append(frame)
             at += length
-        return self._join(chunks, flags)
-
-    def _join(self, chunks: list[Frame], flags: int) -> list[Frame]:
-        frames = list(chunks)
-        if flags & _CONTINUES:
-            self._partial.append(chunks[0])
-            if flags & _UNFINISHED and len(chunks) == 1:
-                return []
-            frames[0] = bytearray().join(self._partial)
-            self._partial = []
         if flags & _UNFINISHED:
-            self._partial = [chunks[-1]]
+            self._partial = frame
             frames.pop()
         return frames

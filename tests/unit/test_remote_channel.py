@@ -1,0 +1,145 @@
+"""Direct use of a worker on another host, as ``Leases`` uses it."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from threading import Thread
+from typing import Any
+from unittest import mock
+
+import pytest
+
+from fiber._agent.port import ChildSpec
+from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._transport.memory import SimulatedLoop
+from fiber._wire import messages
+from fiber._wire.packet import Message
+from unit.agent_children import Recorder
+
+FOREVER = 60.0
+
+
+class Far:
+    """The master's side of one worker on another host, and what it sends there."""
+
+    def __init__(self) -> None:
+        self.loop = SimulatedLoop()
+        self.link: Any = mock.Mock()
+        nothing: Any = mock.MagicMock()
+        self.agent = RemoteAgent("far", self.loop, nothing, nothing, on_lost=lambda *_: None)
+        self.observer = Recorder()
+        self.child: RemoteChild = self.agent.start(
+            ChildSpec("child", "fork", b"", b"", tasks=True), self.observer
+        )
+        self.agent.join(self.link)
+
+    def sent(self) -> list[int]:
+        """The packets that the link was given."""
+        self.loop.run_for(0)
+        frames = [messages.decode(call.args[0]) for call in self.link.send.call_args_list]
+        return [frame.seq for frame in frames if isinstance(frame, messages.Deliver)]
+
+    def says(self, word: object) -> None:
+        """The worker sends a packet."""
+        self.agent.on_frame(bytearray(messages.Said(1, pickle.dumps(word)).encode()))
+
+    def ends(self, delivered: int) -> None:
+        """The worker is gone, after so many packets came in time."""
+        self.agent.on_frame(messages.Exited(1, delivered, 0, "exit status 0").encode())
+
+
+@pytest.fixture
+def far() -> Far:
+    return Far()
+
+
+def word(message: Message | None) -> Any:
+    assert message is not None
+    return pickle.loads(message.payload)
+
+
+def test_what_a_borrowed_worker_says_goes_to_its_borrower(far: Far) -> None:
+    channel = far.child.lend()
+    assert channel is not None
+    channel.send(7, b"call")
+    assert far.sent() == [7]
+    far.says("answer")
+    assert word(channel.receive(FOREVER)) == "answer"
+    assert channel.receive(0) is None
+    assert far.observer.words == []
+
+
+def _says(far: Far) -> None:
+    far.says("answer")
+
+
+def _ends(far: Far) -> None:
+    far.ends(delivered=0)
+
+
+@pytest.mark.parametrize("event", [_says, _ends])
+def test_who_waits_is_woken(far: Far, event: Callable[[Far], None]) -> None:
+    channel = far.child.lend()
+    assert channel is not None
+    heard: list[Any] = []
+
+    def receive() -> None:
+        try:
+            heard.append(word(channel.receive(FOREVER)))
+        except EOFError as error:
+            heard.append(error)
+
+    waiting = Thread(target=receive, daemon=True)
+    waiting.start()
+    while not channel._waiting:
+        pass
+    event(far)
+    waiting.join(FOREVER)
+    assert len(heard) == 1
+
+
+def test_what_nobody_received_is_heard_after_all(far: Far) -> None:
+    channel = far.child.lend()
+    assert channel is not None
+    channel.send(7, b"call")
+    far.says("late answer")
+    far.child.reclaim()
+    far.says("more")
+    assert far.observer.words == ["late answer", "more"]
+
+
+def test_an_answer_comes_before_the_end(far: Far) -> None:
+    channel = far.child.lend()
+    assert channel is not None
+    channel.send(7, b"call")
+    assert far.sent() == [7]
+    far.says("last words")
+    far.ends(delivered=1)
+    assert word(channel.receive(FOREVER)) == "last words"
+    with pytest.raises(EOFError):
+        channel.receive(FOREVER)
+    with pytest.raises(BrokenPipeError):
+        channel.send(8, b"call")
+
+
+def test_what_met_the_end_on_its_way_is_named_unread(far: Far) -> None:
+    channel = far.child.lend()
+    assert channel is not None
+    channel.send(7, b"call")
+    assert far.sent() == [7]
+    far.ends(delivered=0)
+    with pytest.raises(EOFError):
+        channel.receive(FOREVER)
+    assert far.observer.report.unread == (7,)
+
+
+def test_what_never_left_is_told_to_its_sender(far: Far) -> None:
+    channel = far.child.lend()
+    assert channel is not None
+    channel.send(7, b"call")  # waits for the loop, which hears of the end first
+    far.ends(delivered=0)
+    with pytest.raises(BrokenPipeError):
+        channel.receive(FOREVER)
+    assert far.sent() == []
+    assert far.observer.report.unread == ()
