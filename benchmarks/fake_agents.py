@@ -1,6 +1,6 @@
 """Agents and workers that are not processes, for what only their number shows.
 
-A `FakeAgent` is an `AgentPort` whose children live in the process of the agent itself: what the
+A `FakeAgent` is an `AgentHandle` whose children live in the process of the agent itself: what the
 master does for them, and what travels to and from them, is as ever, but they cost next to nothing.
 They run their tasks, by the code of a real worker, one after the other on the loop's thread.
 This is the one module that knows Fiber's inner parts, with `agent_host` and `fake_cluster`.
@@ -13,7 +13,7 @@ import pickle
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.worker import Worker
 from fiber._transport.loop import Loop
 from fiber._wire import work
@@ -36,7 +36,7 @@ class FakeBackend:
         self._agent = agent
 
     def place(self) -> Any:
-        """The one agent, an ``AgentPort``."""
+        """The one agent, an ``AgentHandle``."""
         return self._agent
 
     def close(self) -> None:
@@ -44,7 +44,7 @@ class FakeBackend:
 
 
 class FakeAgent:
-    """An `AgentPort` whose children are objects. `on_ready` is called for each that is ready."""
+    """An `AgentHandle` whose children are objects. `on_ready` is called for each that is ready."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class FakeAgent:
 
 
 class FakeChild:
-    """A `ChildPort` of a pool worker."""
+    """A `ChildHandle` of a pool worker."""
 
     def __init__(self, agent: FakeAgent, name: str, number: int, observer: ChildObserver) -> None:
         self.name = name
@@ -102,9 +102,9 @@ class FakeChild:
     def reclaim(self) -> None:
         """It is never lent."""
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         """What was delivered it has run by now, or is just about to."""
-        self._agent.loop.call_soon(self._observer.taken_back, [])
+        self._agent.loop.call_soon(self._observer.recalled, [])
 
     def signal(self, signum: int) -> None:
         """Die of it."""
@@ -116,7 +116,7 @@ class FakeChild:
 
     def send(self, payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
         """What its worker says goes to its observer: a worker's `Sender`."""
-        self._observer.said(Message(memoryview(payload), list(buffers), []))
+        self._observer.received(Message(memoryview(payload), list(buffers), []))
 
     def _run(self, payload: bytes, buffers: list[memoryview]) -> None:
         if not self._gone and not self._agent.runner.run(

@@ -1,6 +1,6 @@
 """Simulated hosts: the lines to them, the kernel's part of a worker's channel, and exit reports.
 
-A ``Child`` is a ``ChildPort`` that keeps what ``ExitReport`` promises: ``unread`` names every
+A ``Child`` is a ``ChildHandle`` that keeps what ``ExitReport`` promises: ``unread`` names every
 packet that was delivered and that the worker never read, wherever it was when the worker died.
 """
 
@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
-from fiber._agent.port import ChildObserver, ExitReport
+from fiber._agent.interface import ChildObserver, ExitReport
 from fiber._transport.link import Keepalive
 from fiber._transport.memory import SimulatedLoop
 from simulation import schedule
@@ -150,7 +150,7 @@ class Channel(Protocol):
 
 
 class Child:
-    """One worker, as the master holds it (a ``ChildPort``) and as its agent does."""
+    """One worker, as the master holds it (a ``ChildHandle``) and as its agent does."""
 
     def __init__(self, agent: Agent, number: int, observer: ChildObserver) -> None:
         self.name = f"worker {number}"
@@ -188,7 +188,7 @@ class Child:
             for message in channel.drain():
                 self.agent.world.loop.call_soon(self._said, message)
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         """Recall the packets that it has not read."""
         self.agent.world.note("%s is asked for its unread batches", self.name)
         self.agent.down.send(self._recall)
@@ -250,14 +250,14 @@ class Child:
 
     def _tell(self, message: Any) -> None:
         self.agent.world.note("%s says %s", self.name, message)
-        self._observer.said(self.agent.world.language.message(message))
+        self._observer.received(self.agent.world.language.message(message))
 
     def _taken_back(self, seqs: list[int]) -> None:
         for seq in seqs:
             self._unread.pop(seq, None)
         if not self.gone:
             self.agent.world.note("%s gives back %s", self.name, seqs)
-            self._observer.taken_back(seqs)
+            self._observer.recalled(seqs)
 
     def _exited(self, exitcode: int, running: tuple[int, int] | None) -> None:
         if not self.gone:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._engine import ledger as engine
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Ledger
@@ -56,13 +56,13 @@ class Member:
     def started(self, pid: int) -> None:
         """It exists."""
 
-    def said(self, message: Any) -> None:
+    def received(self, message: Any) -> None:
         """It said something."""
         self._master.heard(self, message)
 
-    def taken_back(self, seqs: list[int]) -> None:
+    def recalled(self, seqs: list[int]) -> None:
         """It did not read these."""
-        self._master.taken_back(self, seqs)
+        self._master.recalled(self, seqs)
 
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
@@ -187,7 +187,7 @@ class LedgerMaster:
         job = self.jobs.get(account.number)
         if job is not None:
             for worker in self.ledger.cancel(job):
-                worker.key.child.take_back()
+                worker.key.child.recall()
 
     def terminate(self) -> None:
         """Cancel all jobs."""
@@ -252,7 +252,7 @@ class LedgerMaster:
         if job.finished and account.delivered == account.everything:
             self._finished(account)
 
-    def taken_back(self, member: Member, seqs: list[int]) -> None:
+    def recalled(self, member: Member, seqs: list[int]) -> None:
         """A worker did not read these."""
         if member.worker is not None:
             self.ledger.put_back(member.worker, seqs, self._now)
@@ -306,7 +306,7 @@ class LedgerMaster:
         self.world.count()
         self._assign()
         for worker in self.ledger.recall(self._now):
-            worker.key.child.take_back()
+            worker.key.child.recall()
         self._let_go()
         if self._rng.random() < 0.05:
             self._lend()

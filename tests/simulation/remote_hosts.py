@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 from fiber._agent import service
-from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._transport.memory import Cable
 from fiber._wire.packet import Message
@@ -142,13 +142,13 @@ class Seen:
         """It exists."""
         self._observer.started(pid)
 
-    def said(self, message: Message) -> None:
+    def received(self, message: Message) -> None:
         """It said something."""
-        self._observer.said(message)
+        self._observer.received(message)
 
-    def taken_back(self, seqs: list[int]) -> None:
+    def recalled(self, seqs: list[int]) -> None:
         """It did not read these."""
-        self._observer.taken_back(seqs)
+        self._observer.recalled(seqs)
 
     def exited(self, report: ExitReport) -> None:
         """It is gone."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 from fiber._agent import service
-from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
 from fiber._backends import remote
 from fiber._backends.remote_channel import RemoteChannel
 from fiber._runtime import executor, launcher
@@ -83,7 +83,7 @@ class Stage:
         self._actors.append(actor)
         return actor
 
-    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildPort:
+    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildHandle:
         """Start a worker on some agent."""
         if self.running is not None:
             # What comes of it comes after all that this thread has asked for.
@@ -95,13 +95,13 @@ class Stage:
             return self._refuse(observer)
         agent = self.rng.choice([agent for agent in self.world.agents if not agent.lost])
         if isinstance(agent, RemoteHost):
-            port: ChildPort = agent.start_for_master(f"start {self._started}", observer)
+            port: ChildHandle = agent.start_for_master(f"start {self._started}", observer)
         else:
             port = self.world.start(agent, observer)
         self.pause()
         return port
 
-    def _refuse(self, observer: Any) -> ChildPort:
+    def _refuse(self, observer: Any) -> ChildHandle:
         """The system has no room for it, as is seen at once, or by its agent."""
         error = OSError("too many open files")
         if self.rng.random() < 0.5:

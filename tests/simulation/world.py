@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Protocol
 
-from fiber._agent.port import ChildObserver
+from fiber._agent.interface import ChildObserver
 from fiber._transport.loop import Timer
 from fiber._transport.memory import SimulatedLoop
 from simulation import schedule

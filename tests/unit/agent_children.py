@@ -8,7 +8,7 @@ import threading
 from typing import Any, NoReturn
 
 from fiber._agent import child
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._wire import packet
 
 PATIENCE = 10
@@ -20,7 +20,7 @@ class Recorder:
     def __init__(self) -> None:
         self.events: list[str] = []
         self.words: list[Any] = []
-        self.recalled: list[int] | None = None
+        self.unread: list[int] | None = None
         self.pid: int | None = None
         self.report: ExitReport | None = None
         self._changed = threading.Condition()
@@ -29,12 +29,12 @@ class Recorder:
         self.pid = pid
         self._note("started")
 
-    def said(self, message: packet.Message) -> None:
+    def received(self, message: packet.Message) -> None:
         self.words.append(packet.loads(message))
-        self._note("said")
+        self._note("received")
 
-    def taken_back(self, seqs: list[int]) -> None:
-        self.recalled = seqs
+    def recalled(self, seqs: list[int]) -> None:
+        self.unread = seqs
         self._note("taken back")
 
     def exited(self, report: ExitReport) -> None:
@@ -58,8 +58,8 @@ class Recorder:
 
     def wait_for_recall(self) -> list[int]:
         self._wait("taken back")
-        assert self.recalled is not None
-        return self.recalled
+        assert self.unread is not None
+        return self.unread
 
     def wait_for_words(self, count: int) -> list[Any]:
         with self._changed:

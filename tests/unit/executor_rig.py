@@ -9,7 +9,7 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._engine.ledger import Batch, Ledger
 from fiber._runtime.executor import Executor
 from fiber._runtime.options import PoolOptions
@@ -124,7 +124,7 @@ class Port:
             self.packets.append((seq, payload))
         return not self.gone
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         self.recalls += 1
 
     def signal(self, signum: int) -> None:
@@ -236,7 +236,7 @@ class Rig:
     # What workers say
 
     def say(self, handle: WorkerHandle, *words: Any) -> None:
-        handle.said(Message(memoryview(pickle.dumps(words)), [], []))
+        handle.received(Message(memoryview(pickle.dumps(words)), [], []))
 
     def all_ready(self) -> None:
         """Those that are not say that they are."""

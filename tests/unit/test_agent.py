@@ -18,8 +18,8 @@ import census
 from fiber import reduction
 from fiber._agent import zygote_process
 from fiber._agent.agent import Agent
+from fiber._agent.interface import ChildSpec
 from fiber._agent.local_child import LocalChild
-from fiber._agent.port import ChildSpec
 from fiber._transport.loop import Loop
 from fiber.errors import TooManyOpenFiles
 from fiber.process import Process
@@ -126,7 +126,7 @@ def test_a_signal_to_one_that_is_gone_is_nothing(shared: Agent) -> None:
     child, observer = begin(shared, os._exit, 0)
     observer.wait_for_exit()
     child.signal(signal.SIGKILL)
-    child.take_back()
+    child.recall()
     child.deliver(1, b"nobody reads this")
     settled(shared.loop)
     assert observer.events == ["started", "exited"]
@@ -159,11 +159,11 @@ def test_an_answer_that_nobody_can_handle_ends_its_worker(
     """The master must not wait for it."""
     child, observer = begin(shared, answer_sums, tasks=True)
 
-    def said(message: Any) -> None:
+    def received(message: Any) -> None:
         message.release()
         raise ValueError("not this one")
 
-    observer.said = said
+    observer.received = received
     child.deliver(1, pickle.dumps(7))
     report = observer.wait_for_exit()
     assert report.reason == "killed by its agent: not this one"
@@ -206,7 +206,7 @@ def test_what_an_idle_worker_has_not_read_can_be_taken_back(shared: Agent) -> No
     observer.wait_for_words(1)
     for seq in (5, 6, 7):
         child.deliver(seq, b"work")
-    child.take_back()
+    child.recall()
     assert observer.wait_for_recall() == [5, 6, 7]
     end(child, observer)
     assert observer.report is not None

@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import pytest
 
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._engine.ledger import PATIENCE
 from fiber._runtime.executor import KILL_AFTER
 from fiber._runtime.outcome import Failure, Pickled
@@ -80,7 +80,7 @@ def test_a_function_is_sent_once_to_each_worker(rig: Rig) -> None:
 def test_a_function_that_was_not_read_is_sent_again(rig: Rig) -> None:
     rig.map(range(4))
     handle, port = rig.handles[0], rig.ports[0]
-    handle.taken_back([seq for seq, _ in port.packets])
+    handle.recalled([seq for seq, _ in port.packets])
     assert rig.head(handle, 2).size
 
 
@@ -124,7 +124,7 @@ def test_idle_workers_get_what_busy_ones_have_not_read(rig: Rig) -> None:
     rig.loop.pass_time(PATIENCE)
     assert rig.ports[1].recalls == 1
     unread = rig.ports[1].packets[1][0]
-    busy.taken_back([unread])
+    busy.recalled([unread])
     rig.answer(idle, rig.ports[0].packets[-1][0], [7])
     rig.answer(busy, unread, ["late"])
     rig.answer(busy, rig.ports[1].packets[0][0], [8])

@@ -19,7 +19,7 @@ import pytest
 import census
 import fiber
 from fiber import config
-from fiber._agent.port import ChildSpec
+from fiber._agent.interface import ChildSpec
 from fiber._backends import agent_process, loopback
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
@@ -341,7 +341,7 @@ def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
     agent.on_frame(messages.Said(1, pickle.dumps("late"), ()).encode())
     agent.on_frame(messages.Exited(1, 0, 0, "exit status 0").encode())
     assert observer.words == ["in time"]
-    assert observer.events == ["started", "said", "exited"]
+    assert observer.events == ["started", "received", "exited"]
     assert observer.report.reason == "agent far lost: silence"
     assert observer.report.exitcode == -signal.SIGKILL
 

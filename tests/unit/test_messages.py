@@ -103,7 +103,7 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         (bytes([PROTOCOL + 1, 1]), f"protocol version {PROTOCOL + 1}; this process has {PROTOCOL}"),
         (bytes([PROTOCOL, 99]), "unknown kind 99"),
         (Signal(1, 15).encode()[:-1], "of kind signal and 17 bytes is malformed"),
-        (TakeBack(1).encode() + b"!", "of kind take_back and 11 bytes is malformed"),
+        (TakeBack(1).encode() + b"!", "of kind recall and 11 bytes is malformed"),
         (TakenBack(1, (5,)).encode()[:-1], "sequence numbers is cut short"),
         (Said(1, b"", [b"12"]).encode()[:-1], "announces buffers of 2 bytes"),
         (bytes([PROTOCOL, 5]) + bytes(8) + b"\xff\xff\xff\xff", "announces 4294967295 buffers"),

@@ -15,7 +15,7 @@ import pytest
 import census
 import fiber
 from fiber import config, process
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._runtime import popen, state
 from fiber.errors import StartError, UnpicklableError
 from unit.agent_children import run_forever

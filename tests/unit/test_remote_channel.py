@@ -10,7 +10,7 @@ from unittest import mock
 
 import pytest
 
-from fiber._agent.port import ChildSpec
+from fiber._agent.interface import ChildSpec
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._transport.memory import SimulatedLoop
 from fiber._wire import messages

@@ -3,7 +3,7 @@
 In a program with the local backend it lives in the program itself, on its loop; elsewhere it is a
 process of its own (``python -m fiber.agent``) whose ``ChildObserver`` is the link to the master.
 
-Everything happens on the loop's thread.  ``start``, and a child's ``take_back`` and ``signal``,
+Everything happens on the loop's thread.  ``start``, and a child's ``recall`` and ``signal``,
 come from anywhere and only put into the loop's queue; so no lock is needed that a finalizer or a
 signal handler could meet.
 """
@@ -16,8 +16,8 @@ import threading
 from typing import Any
 
 from fiber._agent import zygote
+from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
-from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink, close_all
 from fiber._hub import client as hub_client
@@ -32,7 +32,7 @@ _CLOSE_TIMEOUT = 10.0
 
 
 class Agent:
-    """Runs the children of this host; an ``AgentPort``."""
+    """Runs the children of this host; an ``AgentHandle``."""
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None = None) -> None:
         self.host = host

@@ -1,6 +1,6 @@
 """One child of this host, as its agent holds it: its channel, its signals, its end.
 
-``take_back`` and ``signal`` come from anywhere and only put into the loop's queue; all else is done
+``recall`` and ``signal`` come from anywhere and only put into the loop's queue; all else is done
 on the loop's thread, but for what whoever uses its channel directly does.
 """
 
@@ -17,7 +17,7 @@ from typing import Protocol
 
 from fiber._agent import zygote
 from fiber._agent.child import StartRequest, lineage
-from fiber._agent.port import ChildObserver, ChildSpec
+from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink, close_all, dup_or_null
 from fiber._hub.protocol import HubAddress
@@ -43,7 +43,7 @@ class Owner(Protocol):
 
 
 class LocalChild:
-    """One child of this host; a ``ChildPort``."""
+    """One child of this host; a ``ChildHandle``."""
 
     def __init__(self, owner: Owner, id_: int, spec: ChildSpec, observer: ChildObserver) -> None:
         self.id = id_
@@ -143,7 +143,7 @@ class LocalChild:
         self._loop.pause(self._ours.fileno())
         self._lent = True
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd)
-        return Channel(sock, self.condemn)
+        return Channel(sock, self.abort)
 
     def reclaim(self) -> None:
         """Hear what it says again."""
@@ -151,9 +151,9 @@ class LocalChild:
         if self._ours is not None and self._ours.fileno() >= 0:
             self._loop.resume(self._ours.fileno())
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         """Recall unread packets; answered on the loop."""
-        self._loop.call_soon(self._answer_take_back)
+        self._loop.call_soon(self._send_recalled)
 
     def signal(self, signum: int) -> None:
         """Signal the child through its zygote."""
@@ -168,7 +168,7 @@ class LocalChild:
         if signum == signal.SIGKILL and self.pid is None:
             self._owner.abandon(self)
 
-    def condemn(self, fault: Exception) -> None:
+    def abort(self, fault: Exception) -> None:
         """Something to or from it is lost for good: only its end can tell the master so."""
         self.fault = self.fault or fault
         self.signal(signal.SIGKILL)
@@ -191,9 +191,9 @@ class LocalChild:
         self._theirs.close()
         return tuple(unread)
 
-    def _answer_take_back(self) -> None:
+    def _send_recalled(self) -> None:
         if self._theirs is not None and self._theirs.fileno() >= 0:
-            self.observer.taken_back(self._recall())
+            self.observer.recalled(self._recall())
 
     def _receive(self) -> None:
         if not self._lent:  # it came before, and is for whoever uses the channel now
@@ -206,12 +206,12 @@ class LocalChild:
         except (BlockingIOError, EOFError):
             return False
         except TooManyOpenFiles as error:
-            self.condemn(error)
+            self.abort(error)
             return True
         try:
-            self.observer.said(message)
+            self.observer.received(message)
         except Exception as error:
-            self.condemn(error)
+            self.abort(error)
             raise
         return True
 
@@ -225,7 +225,7 @@ class LocalChild:
             except (BlockingIOError, EOFError):
                 break
             except TooManyOpenFiles as error:
-                self.condemn(error)
+                self.abort(error)
                 continue
             seqs.append(_SEQ.unpack_from(message.payload)[0])
             message.release()
@@ -235,9 +235,9 @@ class LocalChild:
 class Channel:
     """The task channel of a child, for direct use; a ``DirectChannel``."""
 
-    def __init__(self, sock: socket.socket, condemn: Callable[[Exception], None]) -> None:
+    def __init__(self, sock: socket.socket, abort: Callable[[Exception], None]) -> None:
         self._sock = sock
-        self._condemn = condemn
+        self._condemn = abort
         self._poller = select.poll()
         self._poller.register(sock, select.POLLIN)
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 from fiber._agent.agent import Agent
 from fiber._agent.capture import Capture
+from fiber._agent.interface import ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
-from fiber._agent.port import ChildSpec, ExitReport
 from fiber._hub.hub import Hub
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
@@ -135,11 +135,11 @@ class _Observed:
             try:
                 child.deliver(message.seq, message.payload, buffers)
             except OSError as error:
-                child.condemn(error)
+                child.abort(error)
         elif isinstance(message, messages.Signal):
             child.signal(message.signum)
         else:
-            child.take_back()
+            child.recall()
 
     def started(self, pid: int) -> None:
         """It exists."""
@@ -147,12 +147,12 @@ class _Observed:
             self._capture.started()
         self._service.send(messages.Started(self._number, pid))
 
-    def said(self, message: packet.Message) -> None:
+    def received(self, message: packet.Message) -> None:
         """Pass a packet on."""
         self._service.send(messages.Said(self._number, message.payload, message.buffers))
         message.release()
 
-    def taken_back(self, seqs: list[int]) -> None:
+    def recalled(self, seqs: list[int]) -> None:
         """Pass the answer on."""
         self._service.send(messages.TakenBack(self._number, tuple(seqs)))
 

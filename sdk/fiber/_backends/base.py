@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from fiber._agent.port import AgentPort
+from fiber._agent.interface import AgentHandle
 
 
 class Backend(Protocol):
@@ -14,7 +14,7 @@ class Backend(Protocol):
     same_host: bool
     """Whether its agents run on the program's own host, so that descriptors can be handed over."""
 
-    def place(self) -> AgentPort:
+    def place(self) -> AgentHandle:
         """The agent for the next child; waits until there is one, at most the start timeout."""
 
     def close(self) -> None:

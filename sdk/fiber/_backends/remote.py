@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from fiber._agent.port import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
 from fiber._backends.remote_channel import RemoteChannel
 from fiber._hub.hub import Hub
@@ -25,7 +25,7 @@ _REMEMBERED = 1024
 
 
 class RemoteAgent:
-    """An ``AgentPort``.
+    """An ``AgentHandle``.
 
     It takes work before its link is there; what it cannot do it reports as exits.
     """
@@ -154,7 +154,7 @@ class RemoteAgent:
 
 
 class RemoteChild:
-    """A ``ChildPort`` whose child is on another host."""
+    """A ``ChildHandle`` whose child is on another host."""
 
     def __init__(self, agent: RemoteAgent, number: int, name: str, observer: ChildObserver) -> None:
         self.number = number
@@ -190,9 +190,9 @@ class RemoteChild:
         channel, self._channel = self._channel, None
         if channel is not None:
             for message in channel.drain():
-                self.observer.said(message)
+                self.observer.received(message)
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         """Recall unread packets."""
         self._agent.send(messages.TakeBack(self.number))
 
@@ -206,14 +206,14 @@ class RemoteChild:
             buffers = [memoryview(buffer) for buffer in message.buffers]
             said = packet.Message(memoryview(message.payload), buffers, [])
             if self._channel is None:
-                self.observer.said(said)
+                self.observer.received(said)
             else:
                 self._channel.put(said)
         elif isinstance(message, messages.Started):
             self.pid = message.pid
             self.observer.started(message.pid)
         elif isinstance(message, messages.TakenBack):
-            self.observer.taken_back(list(message.seqs))
+            self.observer.recalled(list(message.seqs))
         elif isinstance(message, messages.Output):
             output.write(f"{self.name}@{self.host}", message.text)
         elif isinstance(message, messages.Exited):

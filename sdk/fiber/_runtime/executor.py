@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from fiber._agent.port import UNKNOWN, ExitReport
+from fiber._agent.interface import UNKNOWN, ExitReport
 from fiber._engine.chunks import FLOOR
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import StartFailure
@@ -341,7 +341,7 @@ class Executor:
 
     def _cancel(self, item: WorkItem) -> None:
         for held in self._jobs.cancel(item):
-            held.key.port.take_back()
+            held.key.port.recall()
         self._advance()
 
     def _resume(self, item: WorkItem) -> None:
@@ -378,7 +378,7 @@ class Executor:
         for handle in decisions.end:
             handle.terminate()
         for held in decisions.recall:
-            held.key.port.take_back()
+            held.key.port.recall()
         for handle in decisions.dismiss:
             handle.dismiss()
         if decisions.start:

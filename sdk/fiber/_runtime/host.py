@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fiber._agent.port import ChildPort
+from fiber._agent.interface import ChildHandle
 
 
 class Timer(Protocol):
@@ -47,5 +47,5 @@ class Host(Protocol):
     def config(self) -> Any:
         """Its configuration, of which ``start_timeout`` is wanted."""
 
-    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildPort:
+    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildHandle:
         """Start a worker's process."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from fiber._agent.port import ExitReport
+from fiber._agent.interface import ExitReport
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
 from fiber._runtime.outcome import Failure, Pickled

@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from fiber._agent.port import DirectChannel
+from fiber._agent.interface import DirectChannel
 from fiber._engine.scheduler import Scheduler
 from fiber._runtime.host import Loop, Timer
 from fiber._runtime.outcome import outcomes

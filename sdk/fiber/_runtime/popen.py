@@ -7,7 +7,7 @@ import signal
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 
-from fiber._agent.port import UNKNOWN, ChildPort, ExitReport
+from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
 from fiber._runtime.latch import Latch
 from fiber._runtime.state import runtime
 from fiber._transport.loop import Wakeup
@@ -28,7 +28,7 @@ class Popen:
         self.returncode: int | None = None
         self.report: ExitReport | None = None
         self.pid: int | None = None
-        self._port: ChildPort | None = None
+        self._port: ChildHandle | None = None
         self._born = Latch()
         self._exited = Latch()
         with naming_the_limit("starting a process"):
@@ -47,7 +47,7 @@ class Popen:
             self.close()
             raise
 
-    def _wait_for_birth(self, port: ChildPort) -> None:
+    def _wait_for_birth(self, port: ChildHandle) -> None:
         timeout = runtime().config.start_timeout
         if not self._born.wait(timeout):
             raise StartError(
@@ -67,11 +67,11 @@ class Popen:
         self.pid = pid
         self._born.set()
 
-    def said(self, message: Message) -> None:
+    def received(self, message: Message) -> None:
         """Only pool workers talk."""
         message.release()
 
-    def taken_back(self, seqs: list[int]) -> None:
+    def recalled(self, seqs: list[int]) -> None:
         """Only pool workers are given work."""
 
     def exited(self, report: ExitReport) -> None:

@@ -116,7 +116,7 @@ class Receiver:
             return  # its worker is gone
         if batch.job is not None:
             self._jobs.fail(batch.job, error)
-        self._sender.take_back(batch)
+        self._sender.reassign(batch)
         self._advance()
 
     def recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:

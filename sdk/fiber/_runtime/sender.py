@@ -81,7 +81,7 @@ class Sender:
         if self._ledger.batches.get(batch.seq) is not batch:
             return  # its worker is gone
         if batch.job is None:  # cancelled
-            self.take_back(batch)
+            self.reassign(batch)
         elif encoded is not None:
             self._deliver(item, batch, encoded)
         elif error is not None:
@@ -118,10 +118,10 @@ class Sender:
             self._jobs.put(receipt, [failure])
 
     def dropped(self, batch: Batch) -> None:
-        """Its worker has it no more, and has run nothing of it; ``take_back`` it soon."""
+        """Its worker has it no more, and has run nothing of it; ``reassign`` it soon."""
         self._unsent.add(batch.seq)
 
-    def take_back(self, batch: Batch) -> None:
+    def reassign(self, batch: Batch) -> None:
         """Give it to whoever has time for it, if it is still wanted."""
         self._unsent.discard(batch.seq)
         self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from fiber import config, inherited, reduction
 from fiber._agent import child
-from fiber._agent.port import AgentPort, ChildObserver, ChildPort, ChildSpec, ExitReport
+from fiber._agent.interface import AgentHandle, ChildHandle, ChildObserver, ChildSpec, ExitReport
 from fiber._hub import client as hub_client
 from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.hub import Hub
@@ -69,7 +69,7 @@ class Runtime:
         *,
         tasks: bool = False,
         method: str = "fork",
-    ) -> ChildPort:
+    ) -> ChildHandle:
         """Start ``process`` as a child of some agent; ``tasks`` makes it a pool worker.
 
         Returns at once; the observer hears what becomes of it.  An error in pickling is raised
@@ -93,7 +93,7 @@ class Runtime:
         )
         return agent.start(spec, observer)
 
-    def _preparation(self, process: Any, agent: AgentPort, same_host: bool) -> bytes:
+    def _preparation(self, process: Any, agent: AgentHandle, same_host: bool) -> bytes:
         # pdb leaves its program a main module without one, which multiprocessing does not expect.
         vars(sys.modules["__main__"]).setdefault("__spec__", None)
         try:
@@ -132,8 +132,8 @@ class _Releasing:
 
     def __init__(self, observer: ChildObserver, grants: GrantSet) -> None:
         self.started = observer.started
-        self.said = observer.said
-        self.taken_back = observer.taken_back
+        self.received = observer.received
+        self.recalled = observer.recalled
         self._observer = observer
         self._grants = grants
 

@@ -8,7 +8,7 @@ from multiprocessing import process as mp_process
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from fiber._agent.port import ChildPort, ExitReport
+from fiber._agent.interface import ChildHandle, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._runtime.latch import Latch
 from fiber._transport.loop import Wakeup
@@ -41,7 +41,7 @@ class WorkerHandle:
     def __init__(self, supervisor: Supervisor, host: Any) -> None:
         self.process: BaseProcess | None = None
         """Once it is started."""
-        self.port: ChildPort | None = None
+        self.port: ChildHandle | None = None
         self.worker: Worker | None = None
         """Its entry in the ledger, once it is ready."""
         self.known: dict[int, None] = {}
@@ -80,11 +80,11 @@ class WorkerHandle:
         self._pid = pid
         self._born.set()
 
-    def said(self, message: Message) -> None:
+    def received(self, message: Message) -> None:
         """It sent a packet."""
         self._supervisor.on_message(self, message)
 
-    def taken_back(self, seqs: list[int]) -> None:
+    def recalled(self, seqs: list[int]) -> None:
         """It will never see these."""
         self._supervisor.on_recalled(self, seqs)
 

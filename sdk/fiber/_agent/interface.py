@@ -1,7 +1,8 @@
 """The seam between whoever wants children and whoever runs them.
 
-The master asks through ``AgentPort`` and ``ChildPort`` and hears through ``ChildObserver``.  The
-agent in this process (``agent.py``) and the agent behind a link (``fiber._backends``) both are one.
+The master asks through ``AgentHandle`` and ``ChildHandle`` and hears through ``ChildObserver``.
+The agent in this process (``agent.py``) and the agent behind a link (``fiber._backends``) both are
+one.
 """
 
 from __future__ import annotations
@@ -58,11 +59,11 @@ class ChildObserver(Protocol):
     def started(self, pid: int) -> None:
         """It exists."""
 
-    def said(self, message: Message) -> None:
+    def received(self, message: Message) -> None:
         """It sent a packet on its task channel."""
 
-    def taken_back(self, seqs: list[int]) -> None:
-        """These packets it will never see: the answer to ``take_back``."""
+    def recalled(self, seqs: list[int]) -> None:
+        """These packets it will never see: the answer to ``recall``."""
 
     def exited(self, report: ExitReport) -> None:
         """It is gone, or never came to be.  Exactly once, and last."""
@@ -72,7 +73,7 @@ class DirectChannel(Protocol):
     """The task channel of a pool worker, lent to the threads of the master."""
 
     def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send a packet, as ``ChildPort.deliver`` does; OSError, and nothing sent, if it cannot."""
+        """Send a packet, as ``ChildHandle.deliver`` does; OSError if nothing was sent."""
 
     def receive(self, timeout: float) -> Message | None:
         """The next packet that it sends; None after ``timeout`` seconds, EOFError at its end.
@@ -85,8 +86,8 @@ class DirectChannel(Protocol):
         """Let go of it."""
 
 
-class ChildPort(Protocol):
-    """What the master holds of one child.  Nothing blocks; ``signal`` and ``take_back`` come from
+class ChildHandle(Protocol):
+    """What the master holds of one child.  Nothing blocks; ``signal`` and ``recall`` come from
     anywhere, the rest from the loop's thread.
     """
 
@@ -112,19 +113,19 @@ class ChildPort(Protocol):
     def reclaim(self) -> None:
         """Hear what it says again.  On the loop's thread."""
 
-    def take_back(self) -> None:
+    def recall(self) -> None:
         """Recall the packets that it has not read; the observer hears which."""
 
     def signal(self, signum: int) -> None:
         """Send it a signal; nothing if it is gone."""
 
 
-class AgentPort(Protocol):
+class AgentHandle(Protocol):
     """One agent: starts children on one host."""
 
     host: str
 
-    def start(self, spec: ChildSpec, observer: ChildObserver) -> ChildPort:
+    def start(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
         """Start a child; what goes wrong is told to the observer."""
 
     def close(self) -> None:
