@@ -11,7 +11,7 @@ SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
 FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
 # What depends most on the interpreter: pickling, starting and ending processes, threads and locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback pool pool_deaths \
-	process queues reduction synchronize worker) tests/faults/test_children.py
+	process queues reduction synchronize worker exit_functions) tests/faults/test_children.py
 OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 

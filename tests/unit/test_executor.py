@@ -14,6 +14,7 @@ import pytest
 from fiber._agent.interface import ExitReport
 from fiber._engine.ledger import PATIENCE
 from fiber._runtime.executor import KILL_AFTER
+from fiber._runtime.input_stream import InputStream
 from fiber._runtime.outcome import Failure, Pickled
 from fiber._wire import work
 from fiber.errors import FiberError, WorkerDied
@@ -162,6 +163,22 @@ def test_what_is_read_is_fed_and_the_end_is_the_end(rig: Rig) -> None:
     assert (len(results.outcomes), results.done) == (3, 0)
     rig.executor.finish(item)
     assert results.done == 1
+
+
+def test_an_answer_looks_at_no_stream_that_it_does_not_concern(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    items = [rig.item(Results()) for _ in range(20)]
+    streams = [rig.executor.open_stream(item) for item in items]
+    streams[0].read(range(2))
+    looked_at: list[InputStream] = []
+    take = InputStream.take
+    monkeypatch.setattr(
+        InputStream, "take", lambda stream: looked_at.append(stream) or take(stream)
+    )
+    rig.answer_all()
+    streams[0].read(range(2))
+    assert set(looked_at) <= {streams[0]}
 
 
 def test_an_error_of_the_input_takes_the_place_of_the_next_task(rig: Rig) -> None:

@@ -1,0 +1,70 @@
+"""Results that nobody reads hold back the tasks that would bring more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import fiber
+from fiber import results
+from fiber.pool import Pool
+from unit.pool_programs import wait_until
+
+RESULT = 1 << 16
+HELD = 16 * RESULT
+MANY = 400
+
+Imap = Callable[..., Iterator[bytearray]]
+
+
+@pytest.fixture
+def pool(monkeypatch: pytest.MonkeyPatch) -> Iterator[Pool]:
+    monkeypatch.setattr(results, "HELD", HELD)
+    with fiber.Pool(2) as made:
+        yield made
+    made.join()
+
+
+def _is_held_back(pool: Pool) -> bool:
+    return any(job.paused for job in pool._executor._scheduler.ledger.jobs)
+
+
+def _unread(iterator: Any) -> int:
+    return len(iterator._buffer.items)
+
+
+@pytest.mark.parametrize("method", ["imap", "imap_unordered"])
+@pytest.mark.parametrize("source", [list, iter], ids=["a list", "an iterator"])
+def test_an_iterator_that_nobody_reads_holds_back_its_tasks(
+    pool: Pool, method: str, source: Callable[[Any], Any]
+) -> None:
+    imap: Imap = getattr(pool, method)
+    iterator = imap(bytearray, source([RESULT] * MANY))
+    wait_until(lambda: _is_held_back(pool), "it is held back")
+    # What the workers had already comes, and no more.
+    assert _unread(iterator) < MANY // 2
+    assert sum(map(len, iterator)) == MANY * RESULT
+
+
+def test_other_calls_go_on_meanwhile(pool: Pool) -> None:
+    iterator = pool.imap(bytearray, [RESULT] * MANY)
+    wait_until(lambda: _is_held_back(pool), "it is held back")
+    assert pool.map(abs, range(-9, 0)) == list(range(9, 0, -1))
+    assert len(list(iterator)) == MANY
+
+
+def test_whoever_joins_the_pool_first_gets_all_later(pool: Pool) -> None:
+    iterator = pool.imap(bytearray, [RESULT] * MANY)
+    wait_until(lambda: _is_held_back(pool), "it is held back")
+    pool.close()
+    pool.join()
+    assert len(list(iterator)) == MANY
+
+
+def test_small_results_are_never_held_back(pool: Pool) -> None:
+    iterator = pool.imap(abs, range(100_000))
+    pool.close()
+    wait_until(lambda: _unread(iterator) == 100_000, "all results are there")
+    assert next(iterator) == 0
