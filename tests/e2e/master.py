@@ -31,7 +31,7 @@ from fiber._transport.credentials import Credentials
 from fiber._transport.link import Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
-from fiber._wire.messages import TakeBack
+from fiber._wire.messages import Recall
 from fiber_api import names
 
 ACCOUNT = Path("/var/run/secrets/kubernetes.io/serviceaccount")
@@ -108,7 +108,7 @@ class Agent:
         self._name, self._loop, self._link, self._say = link.peer.name, loop, link, say
         link.attach(self)
         say("joined", name=self._name)
-        link.send(TakeBack(0).encode())  # something harmless, to see it acknowledged
+        link.send(Recall(0).encode())  # something harmless, to see it acknowledged
         self._tell_when_welcomed()
 
     def _tell_when_welcomed(self) -> None:

@@ -26,7 +26,7 @@ MASTER = """
     from fiber._transport.link import Keepalive
     from fiber._transport.listener import MasterListener
     from fiber._transport.loop import Loop
-    from fiber._wire.messages import Shutdown, TakeBack
+    from fiber._wire.messages import Shutdown, Recall
 
     class Observer:
         def on_frame(self, frame): pass
@@ -38,7 +38,7 @@ MASTER = """
     def joined(link):
         links.append(link)
         link.attach(Observer())
-        link.send(TakeBack(0).encode())
+        link.send(Recall(0).encode())
         tell(link)
 
     def tell(link):

@@ -56,7 +56,7 @@ class AgentService:
             self.stop("the master ended", message.grace)
         elif isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
             self._tunnels.on_frame(message)
-        elif isinstance(message, messages.Deliver | messages.Signal | messages.TakeBack):
+        elif isinstance(message, messages.Deliver | messages.Signal | messages.Recall):
             child = self._children.get(message.child)
             if child is not None:  # otherwise its end and this crossed
                 child.obey(message)
@@ -124,7 +124,7 @@ class _Observed:
             # Whatever keeps a child from starting here, the one who asked is the master.
             self.exited(ExitReport(1, f"could not be started: {error}", host=agent.host))
 
-    def obey(self, message: messages.Deliver | messages.Signal | messages.TakeBack) -> None:
+    def obey(self, message: messages.Deliver | messages.Signal | messages.Recall) -> None:
         """What the master wants of it."""
         child = self._child
         if child is None:
@@ -154,7 +154,7 @@ class _Observed:
 
     def recalled(self, seqs: list[int]) -> None:
         """Pass the answer on."""
-        self._service.send(messages.TakenBack(self._number, tuple(seqs)))
+        self._service.send(messages.Recalled(self._number, tuple(seqs)))
 
     def exited(self, report: ExitReport) -> None:
         """Its last lines, then its end."""

@@ -194,7 +194,7 @@ class RemoteChild:
 
     def recall(self) -> None:
         """Recall unread packets."""
-        self._agent.send(messages.TakeBack(self.number))
+        self._agent.send(messages.Recall(self.number))
 
     def signal(self, signum: int) -> None:
         """Send it a signal."""
@@ -212,7 +212,7 @@ class RemoteChild:
         elif isinstance(message, messages.Started):
             self.pid = message.pid
             self.observer.started(message.pid)
-        elif isinstance(message, messages.TakenBack):
+        elif isinstance(message, messages.Recalled):
             self.observer.recalled(list(message.seqs))
         elif isinstance(message, messages.Output):
             output.write(f"{self.name}@{self.host}", message.text)

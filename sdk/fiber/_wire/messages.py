@@ -94,17 +94,17 @@ class Said(NamedTuple):
         return _redacted(self)
 
 
-class TakeBack(NamedTuple):
+class Recall(NamedTuple):
     """Master to agent: recall the packets that the child has not read."""
 
     child: int
 
     def encode(self) -> bytes:
         """The frame."""
-        return _NUMBER.pack(PROTOCOL, _TAKE_BACK, self.child)
+        return _NUMBER.pack(PROTOCOL, _RECALL, self.child)
 
 
-class TakenBack(NamedTuple):
+class Recalled(NamedTuple):
     """Agent to master: these packets the child will never see."""
 
     child: int
@@ -112,7 +112,7 @@ class TakenBack(NamedTuple):
 
     def encode(self) -> bytes:
         """The frame."""
-        head = _NUMBER.pack(PROTOCOL, _TAKEN_BACK, self.child)
+        head = _NUMBER.pack(PROTOCOL, _RECALLED, self.child)
         return head + struct.pack(f"<{len(self.seqs)}Q", *self.seqs)
 
 
@@ -235,8 +235,8 @@ Message: TypeAlias = (
     | Signal
     | Deliver
     | Said
-    | TakeBack
-    | TakenBack
+    | Recall
+    | Recalled
     | Exited
     | Output
     | Log
@@ -273,7 +273,7 @@ def decode(frame: bytes | bytearray) -> Message:
         ) from error
 
 
-_START, _STARTED, _SIGNAL, _DELIVER, _SAID, _TAKE_BACK, _TAKEN_BACK, _EXITED = range(1, 9)
+_START, _STARTED, _SIGNAL, _DELIVER, _SAID, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _LOG, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN, _PROBLEM = range(9, 16)
 
 _HEAD = struct.Struct("<BB")
@@ -347,16 +347,16 @@ def _read_said(view: memoryview) -> Said:
     return Said(_NUMBER.unpack_from(view)[2], *_read_packet(view, _NUMBER.size))
 
 
-def _read_take_back(view: memoryview) -> TakeBack:
-    return TakeBack(_NUMBER.unpack(view)[2])
+def _read_recall(view: memoryview) -> Recall:
+    return Recall(_NUMBER.unpack(view)[2])
 
 
-def _read_taken_back(view: memoryview) -> TakenBack:
+def _read_recalled(view: memoryview) -> Recalled:
     child = _NUMBER.unpack_from(view)[2]
     count, odd = divmod(len(view) - _NUMBER.size, 8)
     if odd:
         raise ValueError("its list of sequence numbers is cut short")
-    return TakenBack(child, struct.unpack_from(f"<{count}Q", view, _NUMBER.size))
+    return Recalled(child, struct.unpack_from(f"<{count}Q", view, _NUMBER.size))
 
 
 def _read_exited(view: memoryview) -> Exited:
@@ -427,8 +427,8 @@ _READERS: dict[int, Callable[[memoryview], Message]] = {
     _SIGNAL: _read_signal,
     _DELIVER: _read_deliver,
     _SAID: _read_said,
-    _TAKE_BACK: _read_take_back,
-    _TAKEN_BACK: _read_taken_back,
+    _RECALL: _read_recall,
+    _RECALLED: _read_recalled,
     _EXITED: _read_exited,
     _OUTPUT: _read_output,
     _LOG: _read_log,
