@@ -154,6 +154,23 @@ def test_a_handler_that_raises_at_any_line_loses_this_call_only(
     assert struck > 10
 
 
+@pytest.mark.usefixtures("_signals_raise")
+@pytest.mark.filterwarnings("ignore:unclosed running:ResourceWarning")
+@pytest.mark.parametrize("method", ["close", "terminate", "__exit__"])
+def test_a_pool_whose_end_was_interrupted_at_any_line_ends_when_it_is_dropped(method: str) -> None:
+    striking = Striking(lambda: signal.raise_signal(signal.SIGUSR1))
+    struck = -1
+    while len(striking.struck) > struck:
+        struck = len(striking.struck)
+        pool = fiber.Pool(min_workers=0, max_workers=1)
+        ended = pool._executor.ended
+        with contextlib.suppress(Stop), striking:
+            getattr(pool, method)()
+        del pool
+        assert ended.wait(PATIENCE)
+    assert struck > 5
+
+
 @each_call
 def test_a_handler_at_any_line_may_use_the_pool(pool: Pool, call: Callable[[Pool], object]) -> None:
     found: list[Any] = []
