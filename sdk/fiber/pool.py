@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -327,9 +326,7 @@ class Pool:
             if buffersize is not None:
                 buffer.stream = stream
                 iterator._cancel = partial(executor.cancel, item)
-            threading.Thread(
-                target=_feed, args=(executor, item, iterable), name="fiber-pool-feeder", daemon=True
-            ).start()
+            executor.read(item, iterable)
         except BaseException:  # a stream that nobody reads would be waited for
             executor.cancel(item)
             raise
@@ -418,8 +415,8 @@ class Pool:
             return  # a copy that came here by a fork: nothing of the pool is here to end
         util.debug("terminating pool")
         self._state = TERMINATE
-        self._terminate.cancel()
         _end(self._executor)
+        self._terminate.cancel()  # last: whoever is interrupted before it leaves that to do
 
     def join(self) -> None:
         """Wait until all workers are gone; after ``close`` or ``terminate``.
@@ -453,17 +450,6 @@ class Pool:
     def __del__(self, _warn: Any = warnings.warn, RUN: str = RUN) -> None:
         if self._state == RUN and self._owner == os.getpid():
             _warn(f"unclosed running multiprocessing pool {self!r}", ResourceWarning, source=self)
-
-
-def _feed(executor: Executor, item: WorkItem, iterable: Iterable[Any]) -> None:
-    """What a feeder thread does: read the input of an imap."""
-    error = None
-    try:
-        assert item.stream is not None
-        item.stream.read(iterable)
-    except BaseException as raised:
-        error = raised
-    executor.finish(item, error)
 
 
 def _end(executor: Executor) -> None:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from multiprocessing.process import BaseProcess
@@ -227,6 +228,10 @@ class Executor:
         loop.call_soon(self._take, item, None)
         return stream
 
+    def read(self, item: WorkItem, iterable: Iterable[Any]) -> None:
+        """Read its stream's input on a thread of its own, and finish it."""
+        self._loop.call_soon(self._start_reading, item, iterable)
+
     def finish(self, item: WorkItem, error: BaseException | None = None) -> None:
         """Its stream has no more tasks; ``error``, if any, takes the place of the next one."""
         self._loop.call_soon(self._finish, item, error)
@@ -334,6 +339,26 @@ class Executor:
         """A stream has input, or room."""
         self._jobs.top_up(item)
         self._advance()
+
+    def _start_reading(self, item: WorkItem, iterable: Iterable[Any]) -> None:
+        # Here, since a signal that strikes in Thread.start() leaves an error of its own.
+        reader = threading.Thread(
+            target=self._read, args=(item, iterable), name="fiber-pool-feeder", daemon=True
+        )
+        try:
+            reader.start()
+        except RuntimeError as error:  # the system has no room for it
+            self._finish(item, error)
+
+    def _read(self, item: WorkItem, iterable: Iterable[Any]) -> None:
+        """On that thread."""
+        error = None
+        try:
+            if item.stream is not None:
+                item.stream.read(iterable)
+        except BaseException as raised:
+            error = raised
+        self.finish(item, error)
 
     def _finish(self, item: WorkItem, error: BaseException | None) -> None:
         self._jobs.end_stream(item, error)
