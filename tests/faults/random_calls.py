@@ -266,7 +266,7 @@ class RandomCalls:
         faulthandler.cancel_dump_traceback_later()
 
     def _make_a_call(self) -> None:
-        rare = self._random.randrange(50) == 0
+        rare = self._random.randrange(20) == 0
         call = self._random.choice(self._rare if rare else self._kinds)
         faulthandler.dump_traceback_later(2 * PATIENCE, exit=True)
         self.calls += 1
