@@ -154,14 +154,14 @@ def _name_culprit(parts: Mapping[str, Any], whole: str, reason: Exception) -> Un
 
 def _refusal(obj: Any) -> str | None:
     """Why ``obj`` does not pickle; None if it does."""
-    outer = handles.begin_pickling()
+    pickling = handles.begin_pickling()
     try:
         dumps(obj)
     except Exception as error:
         return str(error)  # the error itself would keep what our callers hold, in a cycle
     finally:
-        handles.undo_pickling()
-        handles.end_pickling(outer)
+        pickling.take_back()
+        pickling.done = True
     return None
 
 
@@ -232,14 +232,14 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
 
     Connections and queues in it can be unpickled once.
     """
-    outer = handles.begin_pickling()
+    pickling = handles.begin_pickling()
     try:
         return _encode(obj)
     except BaseException:
-        handles.undo_pickling()
+        pickling.take_back()
         raise
     finally:
-        handles.end_pickling(outer)
+        pickling.done = True
 
 
 def _encode(obj: Any) -> tuple[bytes, list[memoryview]]:
@@ -259,12 +259,12 @@ def encode_reusable(obj: Any) -> tuple[bytes, list[memoryview], handles.GrantSet
 
     Connections and queues in it can be unpickled for as long as the third value is kept.
     """
-    outer = handles.begin_pickling(reusable=True)
+    pickling = handles.begin_pickling(reusable=True)
     try:
         payload, buffers = _encode(obj)
-        return payload, buffers, handles.granted()
+        return payload, buffers, pickling.grants
     finally:
-        handles.end_pickling(outer)
+        pickling.done = True
 
 
 def dump(obj: Any, file: Any, protocol: int | None = None) -> None:

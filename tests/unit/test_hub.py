@@ -109,16 +109,27 @@ def test_nothing_collected_is_nothing_to_release(hosts: Hosts) -> None:
     assert not collected
 
 
+def test_a_pickling_that_was_interrupted_before_it_could_end_is_forgotten(hosts: Hosts) -> None:
+    handles.begin_pickling(reusable=True)
+    with hosts.at("a") as hub:
+        one, other = fiber.Pipe()
+        data = pickle.dumps(other)
+        other.close()
+        pickle.loads(data).close()
+        assert len(hub.registry) == 0, "the handle worked once"
+        one.close()
+
+
 def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:
     with hosts.at("a") as hub:
         one, other = fiber.Pipe()
         kept = pickle.dumps(one)
-        outer = handles.begin_pickling()
+        pickling = handles.begin_pickling()
         with pytest.raises(Exception, match="pickle"):
             pickle.dumps([other, threading.Lock()])
         assert len(hub.registry) == 2
-        handles.undo_pickling()
-        handles.end_pickling(outer)
+        pickling.take_back()
+        pickling.done = True
         assert len(hub.registry) == 1
         pickle.loads(kept)
 
@@ -435,9 +446,9 @@ def test_a_child_takes_back_what_it_collected(hosts: Hosts) -> None:
 def test_a_child_takes_back_what_it_could_not_pickle(hosts: Hosts) -> None:
     with hosts.child_at("a") as hub:
         _, end = fiber.Pipe()
-        outer = handles.begin_pickling()
+        pickling = handles.begin_pickling()
         with pytest.raises(Exception, match="pickle"):
             pickle.dumps([end, threading.Lock()])
-        handles.undo_pickling()
-        handles.end_pickling(outer)
+        pickling.take_back()
+        pickling.done = True
         assert wait_until(lambda: len(hub.registry) == 0, PATIENCE)

@@ -16,6 +16,7 @@ import contextlib
 import copyreg
 import os
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
 from multiprocessing import context as mp_context
@@ -235,73 +236,80 @@ def _release_remote(end: RemoteObject, grant: int) -> None:
 
 
 class Pickling:
-    """One pickling: where its handles get their grants, and how to take back those for one use."""
+    """One pickling: where its handles get their grants, and how to take back those for one use.
 
-    __slots__ = ("grants", "undo")
+    It counts until it is ``done`` or forgotten, so whoever is interrupted at any line leaves none.
+    """
 
-    def __init__(self, grants: GrantSet | None = None) -> None:
-        self.grants = grants
+    __slots__ = ("__weakref__", "done", "grants", "reusable", "undo")
+
+    def __init__(self, reusable: bool) -> None:
+        self.reusable = reusable
+        self.grants: GrantSet | None = None
         self.undo: list[Callable[[], None]] = []
+        self.done = False
+
+    def take_back(self) -> None:
+        """It did not work out: what was granted meanwhile for one use, nobody will ever use."""
+        while self.undo:
+            with contextlib.suppress(OSError, Unreachable):  # the hub is gone, and all with it
+                self.undo.pop()()
 
 
 class _ThisThread(threading.local):
-    """What this thread is pickling, if it said so."""
+    """What this thread is pickling, if it said so: the innermost last."""
 
-    pickling: Pickling | None = None
+    def __init__(self) -> None:
+        self.picklings: list[weakref.ref[Pickling]] = []
 
 
-# Stand for picklings that have met no handle yet, as nearly all of them never do.
-_ONE_USE, _REUSABLE = Pickling(), Pickling()
 _this_thread = _ThisThread()
 _single_use = _SingleUse()
 
 
-def begin_pickling(*, reusable: bool = False) -> Pickling | None:
-    """Handles pickled on this thread work once, or until ``granted()`` is released.
+def begin_pickling(*, reusable: bool = False) -> Pickling:
+    """Handles pickled on this thread work once, or until the result's ``grants`` are released.
 
-    The result is for ``end_pickling``: this may be a signal's handler that runs in the middle of
-    another pickling.
+    Until the result is ``done``; this may be a signal's handler that runs in the middle of another
+    pickling, which goes on then.
     """
-    outer = _this_thread.pickling
-    _this_thread.pickling = _REUSABLE if reusable else _ONE_USE
-    return outer
+    pickling = Pickling(reusable)
+    _this_thread.picklings.append(weakref.ref(pickling))
+    return pickling
 
 
-def granted() -> GrantSet | None:
-    """What was granted to reusable handles, if there are any."""
-    pickling = _this_thread.pickling
-    return None if pickling is None else pickling.grants
+def _current() -> Pickling | None:
+    picklings = _this_thread.picklings
+    while picklings:
+        pickling = picklings[-1]()
+        if pickling is not None and not pickling.done:
+            return pickling
+        picklings.pop()
+    return None
 
 
 def undo_pickling() -> None:
-    """It did not work out: what was granted meanwhile for one use, nobody will ever use."""
-    pickling = _this_thread.pickling
-    if pickling is None:
-        return
-    while pickling.undo:
-        with contextlib.suppress(OSError, Unreachable):  # the hub is gone, and all with it
-            pickling.undo.pop()()
-
-
-def end_pickling(outer: Pickling | None) -> None:
-    """Go on with what ``begin_pickling`` interrupted."""
-    _this_thread.pickling = outer
+    """What is being pickled is about to be pickled in another way."""
+    pickling = _current()
+    if pickling is not None:
+        pickling.take_back()
 
 
 def _undo_by(step: Callable[[], None]) -> None:
     """Remember how a grant is taken back, if anybody is to ask."""
-    if _this_thread.pickling is not None:
-        _this_thread.pickling.undo.append(step)
+    pickling = _current()
+    if pickling is not None:
+        pickling.undo.append(step)
 
 
 def _grants() -> GrantSet | _SingleUse:
     """Where the handle that is being pickled gets its grant."""
-    if _this_thread.pickling is _ONE_USE:
-        _this_thread.pickling = Pickling()
-    elif _this_thread.pickling is _REUSABLE:
-        _this_thread.pickling = Pickling(GrantSet())
-    pickling = _this_thread.pickling
-    return _single_use if pickling is None or pickling.grants is None else pickling.grants
+    pickling = _current()
+    if pickling is None:
+        return _single_use
+    if pickling.reusable and pickling.grants is None:
+        pickling.grants = GrantSet()
+    return pickling.grants if pickling.grants is not None else _single_use
 
 
 @contextlib.contextmanager
@@ -310,15 +318,15 @@ def collecting_grants(*, reusable: bool = True) -> Iterator[GrantSet]:
 
     If the block raises, it is released.  Not ``reusable``: each works once.
     """
-    grants = GrantSet(reusable=reusable)
-    outer, _this_thread.pickling = _this_thread.pickling, Pickling(grants)
+    pickling = begin_pickling(reusable=reusable)
+    pickling.grants = grants = GrantSet(reusable=reusable)
     try:
         yield grants
     except BaseException:
         grants.release()
         raise
     finally:
-        end_pickling(outer)
+        pickling.done = True
 
 
 def _reduce_channel(end: Any) -> tuple[Any, ...]:
