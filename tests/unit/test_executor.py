@@ -397,6 +397,14 @@ def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
 # The end
 
 
+def test_a_worker_that_was_told_to_end_as_a_recall_was_on_its_way_is_told_again(rig: Rig) -> None:
+    rig.executor.close()
+    told = rig.ports[0].packets
+    assert told == [(0, work.STOP_MESSAGE)]
+    rig.handles[0].recalled([0])
+    assert told == [(0, work.STOP_MESSAGE)] * 2
+
+
 def test_after_close_what_is_there_is_done_and_the_workers_leave(rig: Rig) -> None:
     results = [rig.map(range(5)), rig.call()]
     rig.executor.close()
