@@ -123,6 +123,8 @@ class Receiver:
         """A worker will never see these batches."""
         if handle.worker is None:
             return
+        if 0 in seqs:  # no batch, but what told it to end: the recall was later by an agent's turn
+            handle.dismiss()
         for seq in seqs:
             self._sender.settled(seq)
             batch = self._ledger.batches.get(seq)
