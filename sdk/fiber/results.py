@@ -17,7 +17,7 @@ from multiprocessing import TimeoutError
 from typing import Any, Protocol
 
 from fiber._runtime.input_stream import InputStream
-from fiber._runtime.latch import Latch, Waiters, as_lock_timeout
+from fiber._runtime.latch import Latch, Waiters, acquire
 from fiber._runtime.outcome import Failure, Pickled, decode, is_failure
 
 __all__ = ["ApplyResult", "AsyncResult", "IMapIterator", "IMapUnorderedIterator", "MapResult"]
@@ -262,10 +262,9 @@ class _Buffer:
                 self._waiters.leave(waiter)
                 raise StopIteration
             left = None if deadline is None else deadline - time.monotonic()
-            if not waiter.acquire(True, as_lock_timeout(left)):
+            if not acquire(waiter, left):
                 self._waiters.leave(waiter)
-                if left is not None and left <= 0:
-                    raise _too_late(timeout)
+                raise _too_late(timeout)
 
 
 class _OrderedBuffer(_Buffer):

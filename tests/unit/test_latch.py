@@ -5,12 +5,13 @@ from __future__ import annotations
 import gc
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from fiber._runtime.latch import Latch, Waiters, as_lock_timeout
+from fiber._runtime.latch import Latch, Waiters, acquire
 
 PATIENCE = 15.0
 
@@ -188,9 +189,39 @@ def test_a_finalizer_at_any_allocation_may_set_it() -> None:
         gc.enable()
 
 
-@pytest.mark.parametrize(
-    ("seconds", "as_locks_want_it"),
-    [(None, -1), (-5.0, 0), (0.5, 0.5), (float("inf"), threading.TIMEOUT_MAX)],
-)
-def test_timeouts(seconds: float | None, as_locks_want_it: float) -> None:
-    assert as_lock_timeout(seconds) == as_locks_want_it
+@pytest.mark.parametrize("timeout", [None, float("inf"), 10**400])
+def test_no_limit_is_too_long(timeout: float | None) -> None:
+    lock = threading.Lock()
+    assert acquire(lock, timeout)
+
+
+@pytest.mark.parametrize("timeout", [-5.0, 0, 0.01])
+def test_a_limit_ends_the_wait(timeout: float) -> None:
+    lock = threading.Lock()
+    lock.acquire()
+    assert not acquire(lock, timeout)
+
+
+@pytest.mark.usefixtures("_signals_raise")
+def test_a_signal_that_did_not_wake_the_waiting_thread_is_not_slept_over() -> None:
+    latch = Latch()
+
+    def strike() -> None:
+        while not latch._waiters._locks or not asleep(threading.main_thread()):
+            assert not latch.is_set()
+        # It is noted here, and the main thread, which is to run the handler, sleeps on.
+        signal.pthread_kill(threading.get_ident(), signal.SIGUSR1)
+
+    striker = threading.Thread(target=strike)
+    begin = time.monotonic()
+    striker.start()
+    with pytest.raises(Stop):
+        latch.wait(PATIENCE)
+    striker.join()
+    assert time.monotonic() - begin < PATIENCE / 2
+
+
+def asleep(thread: threading.Thread) -> bool:
+    """Whether the kernel has put it to sleep."""
+    with open(f"/proc/self/task/{thread.native_id}/stat") as file:
+        return file.read().rpartition(") ")[2].startswith("S")

@@ -4,12 +4,21 @@
 raises while one is between taking and releasing it leaves it in a state that nobody can wait at any
 more, and one that itself waits or sets finds it taken, by its own thread.  Here each who waits has
 a lock of its own, which nobody else waits for.
+
+CPython notes a signal and runs its handler between two instructions.  One that strikes after the
+last of them and before the kernel has put the thread to sleep on a lock is noted, and then slept
+over: Ctrl-C seems to do nothing.  A busy machine makes that likely, since a thread that lets go of
+the interpreter is interrupted just there.  So nobody sleeps for longer than ``DOZE``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import threading
+import time
+
+DOZE = 0.2
+"""Seconds that a signal is slept over at most."""
 
 
 class Waiters:
@@ -66,11 +75,16 @@ class Latch:
         if self.is_set():
             return True
         lock = self._waiters.join()
-        if not self.is_set() and not lock.acquire(True, as_lock_timeout(timeout)):
+        if not self.is_set() and not acquire(lock, timeout):
             self._waiters.leave(lock)
         return self.is_set()
 
 
-def as_lock_timeout(timeout: float | None) -> float:
-    """Seconds as locks want them: -1 stands for no limit."""
-    return -1 if timeout is None else min(max(0, timeout), threading.TIMEOUT_MAX)
+def acquire(lock: threading.Lock, timeout: float | None) -> bool:
+    """Wait until ``lock`` is released; False if ``timeout`` seconds are over first."""
+    longest = threading.TIMEOUT_MAX
+    deadline = time.monotonic() + (longest if timeout is None else min(timeout, longest))
+    while not lock.acquire(True, max(0.0, min(DOZE, deadline - time.monotonic()))):
+        if time.monotonic() >= deadline:
+            return False
+    return True
