@@ -1,14 +1,42 @@
-"""Two hosts in one process, for the tests of what is used from another host."""
+"""What several modules test with: a loop, the ends of links, two hosts in one process."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
 
 import fiber
+from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.loop import Loop
 from fiber.connection import Connection
 from hosts import Far, Hosts, Wire
+
+if TYPE_CHECKING:
+    from unit.link_site import Site
+
+
+@pytest.fixture
+def loop() -> Iterator[Loop]:
+    running = Loop()
+    running.start_thread("loop under test")
+    yield running
+    running.stop()
+
+
+@pytest.fixture(scope="module")
+def credentials() -> MasterCredentials:
+    return make_credentials("test")
+
+
+@pytest.fixture
+def site(credentials: MasterCredentials) -> Iterator[Site]:
+    from unit.link_site import Site  # it starts nng, which is for the tests of links alone
+
+    site = Site(credentials)
+    yield site
+    site.end()
 
 
 @pytest.fixture

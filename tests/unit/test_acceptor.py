@@ -7,13 +7,12 @@ import os
 import socket
 import ssl
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from fiber._transport import acceptor, tls
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import make_credentials
 from fiber._transport.handshake import Hello, Identity
 from unit.link_site import DEADLINE, Notes, Site, complete, port_of
 
@@ -21,19 +20,9 @@ SOON = 0.3
 HELLO = Hello(Identity.of_this_process("stranger"), "0" * 32, 0, False).encode()
 
 
-@pytest.fixture(scope="module")
-def credentials() -> MasterCredentials:
-    return make_credentials("test")
-
-
-@pytest.fixture
-def site(credentials: MasterCredentials, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(acceptor, "_DEADLINE", SOON)
-    site = Site(credentials)
-    try:
-        yield site
-    finally:
-        site.end()
 
 
 class Visitor:

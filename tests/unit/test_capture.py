@@ -19,14 +19,6 @@ from fiber._transport.loop import Loop
 PATIENCE = 10
 
 
-@pytest.fixture
-def loop() -> Iterator[Loop]:
-    running = Loop()
-    running.start_thread("loop under test")
-    yield running
-    running.stop()
-
-
 class Captured:
     """A capture whose child is the test itself."""
 

@@ -27,13 +27,6 @@ from hosts import Hosts
 PATIENCE = 15.0
 
 
-@pytest.fixture
-def hosts() -> Iterator[Hosts]:
-    hosts = Hosts()
-    yield hosts
-    hosts.close()
-
-
 def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
     process = fiber.Process(target=target, args=args, daemon=True)
     process.start()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import pickle
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -243,13 +242,6 @@ def test_frames_for_a_tunnel_that_ended_are_ignored() -> None:
 
 
 # Across three hosts
-
-
-@pytest.fixture
-def hosts() -> Iterator[Hosts]:
-    hosts = Hosts()
-    yield hosts
-    hosts.close()
 
 
 @pytest.fixture

@@ -13,25 +13,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import MasterCredentials
 from fiber._transport.handshake import Identity
 from fiber._transport.link import Keepalive
 from fiber._transport.listener import MasterListener
 from unit.link_site import DEADLINE, SHORT, Site, break_connections, vanish
-
-
-@pytest.fixture(scope="module")
-def credentials() -> MasterCredentials:
-    return make_credentials("test")
-
-
-@pytest.fixture
-def site(credentials: MasterCredentials) -> Iterator[Site]:
-    site = Site(credentials)
-    try:
-        yield site
-    finally:
-        site.end()
 
 
 def test_frames_of_all_sizes_cross_both_ways(site: Site) -> None:

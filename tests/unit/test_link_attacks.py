@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from fiber._transport import tls
-from fiber._transport.credentials import MasterCredentials, make_credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, decode
 from fiber._transport.listener import MasterListener
 from fiber.errors import AuthenticationError, LinkError
@@ -24,20 +23,6 @@ from unit.link_site import DEADLINE, Notes, Site, port_of, say
 FRAMES = [b"%d " % number * 50 for number in range(30)]
 HOPS = 8 + 4
 """Where a message's sealed part begins: behind its length and nng's count of hops."""
-
-
-@pytest.fixture(scope="module")
-def credentials() -> MasterCredentials:
-    return make_credentials("test")
-
-
-@pytest.fixture
-def site(credentials: MasterCredentials) -> Iterator[Site]:
-    site = Site(credentials)
-    try:
-        yield site
-    finally:
-        site.end()
 
 
 class Once:

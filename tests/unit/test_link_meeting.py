@@ -11,25 +11,11 @@ from typing import Any
 import pytest
 
 from fiber._transport import dialer
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import make_credentials
 from fiber._transport.handshake import Hello, Identity
 from fiber._transport.link import Keepalive
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
 from unit.link_site import Site, free_port, port_of, say, vanish
-
-
-@pytest.fixture(scope="module")
-def credentials() -> MasterCredentials:
-    return make_credentials("test")
-
-
-@pytest.fixture
-def site(credentials: MasterCredentials) -> Iterator[Site]:
-    site = Site(credentials)
-    try:
-        yield site
-    finally:
-        site.end()
 
 
 def test_a_port_in_use_is_named(site: Site) -> None:

@@ -22,14 +22,6 @@ PATIENCE = 10
 
 
 @pytest.fixture
-def loop() -> Iterator[Loop]:
-    running = Loop()
-    running.start_thread("loop under test")
-    yield running
-    running.stop()
-
-
-@pytest.fixture
 def pipe() -> Iterator[tuple[int, int]]:
     ends = os.pipe()
     yield ends

@@ -24,14 +24,6 @@ FULL = bytes(60_000)
 
 
 @pytest.fixture
-def loop() -> Iterator[Loop]:
-    running = Loop()
-    running.start_thread("loop under test")
-    yield running
-    running.stop()
-
-
-@pytest.fixture
 def ends(loop: Loop) -> Iterator[tuple[Outbox, socket.socket]]:
     """An outbox and the socket at the other end of it."""
     ours, theirs = socketpair("a test")
