@@ -8,9 +8,10 @@ from typing import Any
 
 from fiber_api.names import LABEL_TEMPLATE_HASH
 from fiber_api.times import format_time
-from fiber_api.v1alpha1 import FiberPool
+from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
 from fiber_operator.planning.plans import Memory, Plan
 from fiber_operator.planning.pods import PodView, observe
+from fiber_operator.planning.reconcile import plan
 from fiber_operator.planning.revisions import template_hash
 
 NOW = 1_800_000_000.0
@@ -165,6 +166,16 @@ def views(pool: FiberPool, *documents: Json) -> list[PodView]:
         )
         for document in documents
     ]
+
+
+def plan_of(pool: FiberPool, *pods: Json, now: float = NOW, **memory: Any) -> Plan:
+    """What is planned for the pool with these pods; further arguments are the operator's memory."""
+    return plan(pool, views(pool, *pods), memory_of(pool, **memory), now)
+
+
+def status_of(pool: FiberPool, *pods: Json, **more: Any) -> FiberPoolStatus:
+    """The status that ``plan_of`` would have written."""
+    return with_plan(pool, plan_of(pool, *pods, **more)).status
 
 
 def _container(**state: Any) -> Json:

@@ -10,28 +10,20 @@ import pytest
 from fakes import virtual_time
 from fakes.store import Body
 from fakes.world import NAMESPACE, a_world
-from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.planning.plans import Plan
-from fiber_operator.planning.reconcile import plan
 from unit.operator_objects import (
     NOW,
     ended,
     make_pool,
-    memory_of,
     name_of,
     of_template,
+    plan_of,
     running,
     unschedulable,
-    views,
     waiting,
     with_plan,
 )
 
 Json = dict[str, Any]
-
-
-def plan_of(pool: FiberPool, *pods: Json, now: float = NOW, **memory: Any) -> Plan:
-    return plan(pool, views(pool, *pods), memory_of(pool, **memory), now)
 
 
 def pulling(numbers: range, *, age: float) -> list[Json]:

@@ -10,7 +10,6 @@ from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
 from fiber_operator.planning import plans, wording
 from fiber_operator.planning.plans import Obstacle, Refusal
-from fiber_operator.planning.reconcile import plan
 from fiber_operator.planning.revisions import spec_hash, template_hash
 from unit.operator_objects import (
     MASTER,
@@ -18,22 +17,15 @@ from unit.operator_objects import (
     condition,
     ended,
     make_pool,
-    memory_of,
     name_of,
     pod_document,
     running,
+    status_of,
     unschedulable,
-    views,
     waiting,
-    with_plan,
 )
 
 Json = dict[str, Any]
-
-
-def status_of(pool: FiberPool, *pods: Json, now: float = NOW, **memory: Any) -> FiberPoolStatus:
-    made = plan(pool, views(pool, *pods), memory_of(pool, **memory), now)
-    return with_plan(pool, made).status
 
 
 def problem(pool: FiberPool, *pods: Json, **more: Any) -> Problem:

@@ -28,6 +28,7 @@ from unit.operator_objects import (
     memory_of,
     name_of,
     of_template,
+    plan_of,
     pod_document,
     running,
     terminating,
@@ -50,10 +51,6 @@ def tried(**spec: Any) -> FiberPool:
     """A pool whose template is known to work."""
     pool = make_pool(**spec)
     return make_pool(proven(pool), **spec)
-
-
-def plan_of(pool: FiberPool, *pods: Json, now: float = NOW, **memory: Any) -> Plan:
-    return plan(pool, views(pool, *pods), memory_of(pool, **memory), now)
 
 
 def gone(made: Plan) -> list[str]:

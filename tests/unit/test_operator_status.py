@@ -9,7 +9,7 @@ import pytest
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
 from fiber_operator.planning import plans
 from fiber_operator.planning.pods import State
-from fiber_operator.planning.reconcile import plan, plan_unreadable
+from fiber_operator.planning.reconcile import plan_unreadable
 from fiber_operator.planning.revisions import template_hash
 from unit.operator_cluster_model import view
 from unit.operator_objects import (
@@ -18,25 +18,18 @@ from unit.operator_objects import (
     UID,
     ended,
     make_pool,
-    memory_of,
     of_template,
+    plan_of,
     pod_document,
     pool_document,
     running,
+    status_of,
     terminating,
     views,
     with_plan,
 )
 
 Json = dict[str, Any]
-
-
-def look(pool: FiberPool, *pods: Json, now: float = NOW, **memory: Any) -> plans.Plan:
-    return plan(pool, views(pool, *pods), memory_of(pool, **memory), now)
-
-
-def status_of(pool: FiberPool, *pods: Json, **more: Any) -> FiberPoolStatus:
-    return with_plan(pool, look(pool, *pods, **more)).status
 
 
 def told(status: FiberPoolStatus) -> dict[str, tuple[str, str]]:
@@ -169,8 +162,8 @@ def test_the_master_is_alive_if_its_lease_is(alive: bool | None, expected: tuple
 
 def test_a_condition_keeps_its_time_until_its_status_changes() -> None:
     pool = make_pool(replicas=1)
-    first = with_plan(pool, look(pool, pod_document(1)))
-    second = with_plan(first, look(first, running(1, age=1), now=NOW + 9))
+    first = with_plan(pool, plan_of(pool, pod_document(1)))
+    second = with_plan(first, plan_of(first, running(1, age=1), now=NOW + 9))
     times = {found.type: found.last_transition_time for found in second.status.conditions}
     assert times["Accepted"] == NOW
     assert times["Ready"] == NOW + 9
@@ -179,13 +172,13 @@ def test_a_condition_keeps_its_time_until_its_status_changes() -> None:
 def test_time_alone_changes_nothing() -> None:
     pool = make_pool(replicas=3)
     pods = [running(1), running(2), ended(3)]
-    pool = with_plan(pool, look(pool, *pods))
-    assert look(pool, *pods, now=NOW + 1.5).status is None
+    pool = with_plan(pool, plan_of(pool, *pods))
+    assert plan_of(pool, *pods, now=NOW + 1.5).status is None
 
 
 def test_the_secret_is_named_once_it_is_seen_to_be_the_pools() -> None:
     pool = make_pool()
-    seen = with_plan(pool, look(pool))
+    seen = with_plan(pool, plan_of(pool))
     assert seen.status.credentials_secret == "es-tls"
     assert status_of(pool, credentials=None).credentials_secret is None
     assert status_of(seen, credentials=None).credentials_secret == "es-tls"
@@ -194,21 +187,21 @@ def test_the_secret_is_named_once_it_is_seen_to_be_the_pools() -> None:
 
 def test_a_damaged_status_is_written_anew() -> None:
     document = pool_document(
-        with_plan(make_pool(), look(make_pool())).status.model_dump(mode="json", by_alias=True)
+        with_plan(make_pool(), plan_of(make_pool())).status.model_dump(mode="json", by_alias=True)
     )
-    assert look(FiberPool.read(document)).status is None
+    assert plan_of(FiberPool.read(document)).status is None
     document["status"]["failures"]["total"] = "many"
-    made = look(FiberPool.read(document))
+    made = plan_of(FiberPool.read(document))
     assert made.status is not None
     assert made.status["failures"]["total"] == 0
 
 
 def test_what_is_no_more_is_none_in_the_patch() -> None:
     pool = make_pool(replicas=1)
-    pool = with_plan(pool, look(pool, ended(1)))
+    pool = with_plan(pool, plan_of(pool, ended(1)))
     assert pool.status.failures.next_create_time
     document = {**pool_document(replicas=0), "status": pool.status.model_dump(by_alias=True)}
-    made = look(FiberPool.read(document), now=NOW + 100)
+    made = plan_of(FiberPool.read(document), now=NOW + 100)
     assert made.status is not None
     assert made.status["failures"]["nextCreateTime"] is None
     assert made.status["problems"] == []
@@ -217,7 +210,7 @@ def test_what_is_no_more_is_none_in_the_patch() -> None:
 def test_a_spec_that_cannot_be_read_is_told_and_counts_go_on() -> None:
     pool = make_pool(replicas=1, master=MASTER)
     document = pool_document(
-        with_plan(pool, look(pool, running(1))).status.model_dump(mode="json", by_alias=True)
+        with_plan(pool, plan_of(pool, running(1))).status.model_dump(mode="json", by_alias=True)
     )
     document["spec"]["replicas"] = "three"
     pods = [*views(pool, running(1)), view(2, State.PENDING)]

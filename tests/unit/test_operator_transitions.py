@@ -8,20 +8,18 @@ import pytest
 
 from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.planning.plans import Plan
-from fiber_operator.planning.reconcile import plan
 from unit.operator_objects import (
     MASTER,
     NOW,
     condition,
     ended,
     make_pool,
-    memory_of,
     name_of,
     of_template,
+    plan_of,
     running,
     terminating,
     unschedulable,
-    views,
     waiting,
     with_plan,
 )
@@ -30,7 +28,7 @@ Json = dict[str, Any]
 
 
 def look(pool: FiberPool, *pods: Json, now: float = NOW) -> tuple[Plan, FiberPool]:
-    made = plan(pool, views(pool, *pods), memory_of(pool), now)
+    made = plan_of(pool, *pods, now=now)
     return made, with_plan(pool, made)
 
 
