@@ -10,9 +10,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from typing import Any
 
+from fakes import virtual_time
 from fakes.kubelet import Kubelet
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Failure, Store
@@ -199,6 +200,18 @@ class World:
     def names(self, namespace: str = NAMESPACE) -> list[str]:
         return [pod["metadata"]["name"] for pod in self.pods(namespace)]
 
+    def created(self) -> list[str]:
+        """Every pod that was ever created."""
+        return self._changed("ADDED")
+
+    def deleted(self) -> list[str]:
+        """Every pod that was ever deleted."""
+        return self._changed("DELETED")
+
+    def _changed(self, how: str) -> list[str]:
+        changes = (change for change in self.store.changes if change.type == how)
+        return [change.place[2] for change in changes if change.place[0] == "pods"]
+
     def slow(self, verb: str, plural: str, seconds: float) -> Fault:
         """From now on such calls take so long."""
         fault = Fault(verb, plural, late=seconds, times=float("inf"))
@@ -272,3 +285,16 @@ async def a_world(
                 await world.kill()
             if world._nodes is not None:
                 world._nodes.cancel()
+
+
+Test = Callable[[World], Coroutine[Any, Any, None]]
+
+
+def played(test: Test) -> Callable[[], None]:
+    """The test as pytest calls it: in a world and a time of its own."""
+
+    async def main() -> None:
+        async with a_world() as world:
+            await test(world)
+
+    return lambda: virtual_time.run(main())

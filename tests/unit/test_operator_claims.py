@@ -5,22 +5,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Callable, Coroutine
-from typing import Any
+from collections.abc import AsyncIterator, Callable
 
 import pytest
 
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.store import Body
-from fakes.world import NAMESPACE, World, a_world
+from fakes.world import NAMESPACE, Test, World, a_world
 from fiber_operator.claims import LINGER, NAME, SECONDS
 from fiber_operator.program import Program
+from unit.operator_objects import MASTER
 
-MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
 OURS, OTHER = "fiber-system/fiber-operator", "other-system/other"
 EVERYWHERE: tuple[str, ...] = ()
-Test = Callable[[World], Coroutine[Any, Any, None]]
 
 
 def played(*namespaces: str) -> Callable[[Test], Callable[[], None]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -12,12 +12,9 @@ import pytest
 from fakes import virtual_time
 from fakes.kubernetes_api import Call
 from fakes.store import Body, Failure
-from fakes.world import NAMESPACE, TEMPLATE, World, a_world
+from fakes.world import NAMESPACE, TEMPLATE, Test, World, a_world
 from fiber_operator.turns import LULL
-
-MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
-
-Test = Callable[[World], Coroutine[Any, Any, None]]
+from unit.operator_objects import MASTER
 
 
 def played(**settings: Any) -> Callable[[Test], Callable[[], None]]:
@@ -29,10 +26,6 @@ def played(**settings: Any) -> Callable[[Test], Callable[[], None]]:
         return lambda: virtual_time.run(main())
 
     return decorate
-
-
-def created(world: World) -> list[str]:
-    return [c.place[2] for c in world.store.changes if c.type == "ADDED" and c.place[0] == "pods"]
 
 
 @played()
@@ -283,7 +276,7 @@ async def test_a_new_master_is_dialled_within_a_second(world: World) -> None:
             )
         )
         assert took < 1.0
-    assert len(created(world)) == 3
+    assert len(world.created()) == 3
 
 
 @played()
@@ -294,7 +287,7 @@ async def test_what_is_deleted_beside_the_pods_comes_back(world: World) -> None:
         name = world.store.list(plural)[0]["metadata"]["name"]
         world.store.delete(plural, NAMESPACE, name)
         await world.until(lambda p=plural: len(world.store.list(p)) == 1, within=125)  # type: ignore[misc]
-    assert len(created(world)) == 2
+    assert len(world.created()) == 2
 
 
 @played()
@@ -343,10 +336,10 @@ async def test_a_pool_made_anew_waits_for_what_the_old_one_left(world: World) ->
     await world.until(lambda: "NameTaken" in world.reasons())
     assert not world.status()["problems"][0]["terminal"]
     await world.settled(20)
-    assert len(created(world)) == 2
+    assert len(world.created()) == 2
     world.store.collect_garbage(old)
     await world.ready(2)
-    assert len(created(world)) == 4
+    assert len(world.created()) == 4
 
 
 @played()
@@ -409,7 +402,7 @@ def test_nonsense_in_the_status_is_written_over(status: Any) -> None:
             lambda: isinstance(world.status(), dict) and world.status().get("phase") == "Ready", 125
         )
         await world.ready(3)
-        assert len(created(world)) == 4
+        assert len(world.created()) == 4
 
     test()
 
@@ -425,7 +418,7 @@ def test_nonsense_in_a_pod_harms_nobody(status: Any) -> None:
         world.store.set_status("pods", NAMESPACE, world.names()[0], status)
         await world.settled(120)
         assert world.api.count("delete", "pods") == 0
-        assert len(created(world)) == 3
+        assert len(world.created()) == 3
 
     test()
 
@@ -438,7 +431,7 @@ async def test_what_no_event_tells_is_found_within_a_minute(world: World) -> Non
     world.kubelet.evict(NAMESPACE, world.names()[0])
     assert await world.until(lambda: world.status()["failures"]["disrupted"] == 1) < 65
     world.make_pool("second", replicas=2)
-    assert await world.until(lambda: len(created(world)) == 4 + 2) < 65
+    assert await world.until(lambda: len(world.created()) == 4 + 2) < 65
     assert await world.ready(2, "second") < 65
     world.store.delete("fiberpools", NAMESPACE, "second")
     await world.settled(65)
@@ -475,7 +468,7 @@ async def test_a_pool_that_is_being_deleted_gets_no_pods(world: World) -> None:
 async def test_other_namespaces_are_not_looked_at(world: World) -> None:
     for namespace in ("one", "two", "three"):
         world.make_pool(namespace=namespace, replicas=1)
-    await world.until(lambda: len(created(world)) == 2)
+    await world.until(lambda: len(world.created()) == 2)
     await world.settled(120)
     asked = {call.namespace for call in world.api.calls}
     assert asked == {"one", "two", "fiber-system"}
@@ -487,7 +480,7 @@ async def test_many_pools_are_served_side_by_side(world: World) -> None:
         world.make_pool(f"pool-{number}", replicas=3)
     for number in range(20):
         await world.ready(3, f"pool-{number}", within=30)
-    assert len(created(world)) == 60
+    assert len(world.created()) == 60
 
 
 @played()
@@ -513,7 +506,7 @@ async def test_people_see_what_the_operator_does(world: World) -> None:
     world.make_pool(replicas=3)
     await world.ready(3)
     world.kubelet.exit(NAMESPACE, world.names()[0], 3)
-    await world.until(lambda: len(created(world)) == 4)
+    await world.until(lambda: len(world.created()) == 4)
     found = {(event["type"], event["reason"]) for event in world.store.list("events")}
     assert ("Normal", "ScaledUp") in found
     assert ("Warning", "ContainerFailed") in found

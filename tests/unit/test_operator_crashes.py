@@ -15,8 +15,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Call
 from fakes.store import Store
 from fakes.world import NAMESPACE, World, a_world
-
-MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+from unit.operator_objects import MASTER
 
 ENDING_TAKES = 3.0
 """Seconds that a deleted pod is still there."""
@@ -30,7 +29,7 @@ async def make(world: World) -> None:
 
 async def is_made(world: World) -> None:
     await world.ready(5)
-    assert sorted(created(world)) == sorted(world.names())
+    assert sorted(world.created()) == sorted(world.names())
 
 
 async def release(world: World) -> None:
@@ -39,7 +38,7 @@ async def release(world: World) -> None:
 
 async def is_released(world: World) -> None:
     await world.ready(3)
-    assert len(created(world)) == 5
+    assert len(world.created()) == 5
 
 
 async def fail(world: World) -> None:
@@ -54,7 +53,7 @@ async def is_counted(world: World) -> None:
     await world.until(replaced)
     await world.settled()
     assert world.status()["failures"]["total"] == 1
-    assert len(created(world)) == 6
+    assert len(world.created()) == 6
 
 
 async def disrupt(world: World) -> None:
@@ -62,11 +61,11 @@ async def disrupt(world: World) -> None:
 
 
 async def is_replaced(world: World) -> None:
-    await world.until(lambda: len(created(world)) == 6)
+    await world.until(lambda: len(world.created()) == 6)
     await world.ready(5)
     assert world.status()["failures"]["disrupted"] == 1
     assert world.status()["failures"]["total"] == 0
-    assert len(created(world)) == 6
+    assert len(world.created()) == 6
 
 
 async def change_template(world: World) -> None:
@@ -81,7 +80,7 @@ async def is_changed(world: World) -> None:
 
     await world.until(all_new)
     await world.ready(5)
-    assert len(created(world)) == 10
+    assert len(world.created()) == 10
 
 
 async def suspend(world: World) -> None:
@@ -91,7 +90,7 @@ async def suspend(world: World) -> None:
 async def is_suspended(world: World) -> None:
     await world.ready(0)
     await world.until(lambda: world.names() == [])
-    assert len(created(world)) == 5
+    assert len(world.created()) == 5
 
 
 async def attach(world: World) -> None:
@@ -121,12 +120,6 @@ def disruptions(world: World) -> tuple[int, int]:
     """How many were counted, and how many events tell of one."""
     counted = sum(p["status"]["failures"]["disrupted"] for p in world.store.list("fiberpools"))
     return counted, sum(e["reason"] == "Disrupted" for e in world.store.list("events"))
-
-
-def created(world: World) -> list[str]:
-    """Every pod that was ever created."""
-    changes = world.store.changes
-    return [c.place[2] for c in changes if c.type == "ADDED" and c.place[0] == "pods"]
 
 
 def belongings(world: World) -> list[int]:

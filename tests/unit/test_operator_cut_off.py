@@ -2,30 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
-from typing import Any
-
 import pytest
 
-from fakes import virtual_time
 from fakes.store import Body, Failure
-from fakes.world import NAMESPACE, TEMPLATE, World, a_world
-
-MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
-
-Test = Callable[[World], Coroutine[Any, Any, None]]
-
-
-def played(test: Test) -> Callable[[], None]:
-    async def main() -> None:
-        async with a_world() as world:
-            await test(world)
-
-    return lambda: virtual_time.run(main())
-
-
-def created(world: World) -> list[str]:
-    return [c.place[2] for c in world.store.changes if c.type == "ADDED" and c.place[0] == "pods"]
+from fakes.world import NAMESPACE, TEMPLATE, World, played
+from unit.operator_objects import MASTER
 
 
 def taken(plural: str, body: Body) -> None:
@@ -53,7 +34,7 @@ async def test_a_service_that_was_deleted_comes_back_with_its_address(world: Wor
     await world.settled()
     assert world.status()["endpoint"] == endpoint
     assert f"tls+tcp://{world.store.list('services')[0]['spec']['clusterIP']}:7070" == endpoint
-    assert (world.reasons(), len(created(world))) == ([], 2)
+    assert (world.reasons(), len(world.created())) == ([], 2)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +114,7 @@ async def test_a_template_that_says_where_to_dial_is_taken_at_its_word(world: Wo
     world.make_pool(replicas=2, template={"spec": {"containers": [container]}})
     await world.ready(2)
     await world.settled(60)
-    assert (world.reasons(), len(created(world))) == ([], 2)
+    assert (world.reasons(), len(world.created())) == ([], 2)
 
 
 @played

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from fakes import strict, virtual_time
+from fakes import strict
 from fakes.kubernetes_api import Call, Fault
 from fakes.store import Body, Failure
-from fakes.world import NAMESPACE, TEMPLATE, World, a_world
+from fakes.world import NAMESPACE, TEMPLATE, World, played
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.planning.plans import Refusal
@@ -20,18 +19,8 @@ from fiber_operator.planning.podspec import pod
 from fiber_operator.planning.problems import refusal_reason
 from unit.operator_objects import MASTER, NOW, make_pool
 
-Test = Callable[[World], Coroutine[Any, Any, None]]
-
 WORKER = {"name": "worker", "image": "registry/worker:1"}
 CANNOT = 'Pod in version "v1" cannot be handled as a Pod'
-
-
-def played(test: Test) -> Callable[[], None]:
-    async def main() -> None:
-        async with a_world() as world:
-            await test(world)
-
-    return lambda: virtual_time.run(main())
 
 
 def template(container: Body | None = None, metadata: Body | None = None, **spec: Any) -> Body:

@@ -3,36 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
 
 from fakes import virtual_time
 from fakes.kubernetes_api import Call, Fault
-from fakes.world import NAMESPACE, World, a_world
+from fakes.world import NAMESPACE, World, a_world, played
 from fiber_operator import acting
-
-MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
-
-Test = Callable[[World], Coroutine[Any, Any, None]]
-
-
-def played(test: Test) -> Callable[[], None]:
-    async def main() -> None:
-        async with a_world() as world:
-            await test(world)
-
-    return lambda: virtual_time.run(main())
-
-
-def created(world: World) -> list[str]:
-    return [c.place[2] for c in world.store.changes if c.type == "ADDED" and c.place[0] == "pods"]
-
-
-def deleted(world: World) -> list[str]:
-    return [c.place[2] for c in world.store.changes if c.type == "DELETED" and c.place[0] == "pods"]
-
+from unit.operator_objects import MASTER
 
 CALLS = [
     ("get", "fiberpools"),
@@ -75,7 +54,7 @@ def test_a_pool_is_made_whatever_fails(way: str) -> None:
             await world.ready(5, within=3000)
             await world.settled(100)
             assert all(fault.times < 2 for fault in world.api.faults)
-            assert len(world.pods()) == len(created(world)) == 5
+            assert len(world.pods()) == len(world.created()) == 5
             assert [len(world.store.list(p)) for p in ("services", "secrets")] == [1, 1]
 
     virtual_time.run(main())
@@ -89,7 +68,7 @@ def test_no_pod_is_made_twice_because_an_answer_was_lost(way: str) -> None:
         world.make_pool(replicas=10)
         await world.ready(10)
         await world.settled(100)
-        assert len(created(world)) == 10
+        assert len(world.created()) == 10
         assert world.live_at_most == 10
 
     test()
@@ -108,8 +87,8 @@ async def test_a_minute_without_api_server_costs_no_worker(world: World) -> None
     world.api.down = False
     await world.settled(120)
     renewing.cancel()
-    assert deleted(world) == []
-    assert len(created(world)) == 5
+    assert world.deleted() == []
+    assert len(world.created()) == 5
     assert world.status()["phase"] == "Ready"
     world.edit(replicas=7)
     await world.ready(7)
@@ -176,8 +155,8 @@ def test_a_list_that_is_none_makes_no_pods(text: str) -> None:
         await world.settled(120)
         fault.times = 0
         await world.ready(6)
-        assert len(created(world)) == 6
-        assert deleted(world) == []
+        assert len(world.created()) == 6
+        assert world.deleted() == []
 
     test()
 
@@ -192,9 +171,9 @@ def test_an_answer_that_is_not_the_pool_changes_nothing(text: str) -> None:
         await world.ready(5)
         world.api.faults.append(Fault("get", "fiberpools", text=text, times=5))
         world.kubelet.evict(NAMESPACE, world.names()[0])
-        await world.until(lambda: len(created(world)) == 6)
+        await world.until(lambda: len(world.created()) == 6)
         await world.ready(5)
-        assert len(created(world)) == 6
+        assert len(world.created()) == 6
 
     test()
 
@@ -209,7 +188,7 @@ async def test_a_status_that_cannot_be_written_holds_back_what_it_must_tell(worl
     for name in world.names():
         world.kubelet.exit(NAMESPACE, name, 3)
     await world.settled(120)
-    assert deleted(world) == []
+    assert world.deleted() == []
     unwritable.times = 0
     await world.until(lambda: world.status()["failures"]["total"] == 8)
     await world.ready(8)
@@ -261,14 +240,14 @@ async def test_a_lost_lease_stops_a_scale_up_at_once(world: World) -> None:
     spec = {"holderIdentity": "another", "leaseDurationSeconds": 15, "renewTime": "now"}
     world.store.merge("leases", "fiber-system", "fiber-operator", {"spec": spec})
     await world.until(lambda: not world.program.guard.held)
-    at_loss = len(created(world))
+    at_loss = len(world.created())
     assert world.program.health.ready() != []
     await world.settled(12)
     under_way = world.program.queue.statistics().running
     assert under_way == 0
-    assert len(created(world)) - at_loss <= 32, "what was sent is carried out, and no more"
+    assert len(world.created()) - at_loss <= 32, "what was sent is carried out, and no more"
     await world.ready(300)
-    assert len(created(world)) == 300
+    assert len(world.created()) == 300
 
 
 def test_two_operators_do_the_work_of_one() -> None:
@@ -284,7 +263,7 @@ def test_two_operators_do_the_work_of_one() -> None:
             await world.until(lambda: len(world.pods()) > 20)
             await world.kill()
             await world.until_settled(60)
-            assert len(created(world)) == 60
+            assert len(world.created()) == 60
             assert second.guard.held
             stop.set()
             await task
@@ -301,9 +280,9 @@ async def test_sigterm_ends_a_scale_up_between_two_calls(world: World) -> None:
     began, calls = clock(), len(world.api.calls)
     await world.stop()
     assert clock() - began < 2
-    made = len(created(world))
+    made = len(world.created())
     await asyncio.sleep(10)
-    assert len(created(world)) == made, "nothing was cut off in the middle"
+    assert len(world.created()) == made, "nothing was cut off in the middle"
     late = [call for call in world.api.calls[calls:] if call.plural == "pods"]
     assert late == []
     lease = world.store.get("leases", "fiber-system", "fiber-operator")
@@ -311,7 +290,7 @@ async def test_sigterm_ends_a_scale_up_between_two_calls(world: World) -> None:
     world.api.faults.clear()
     world.start(identity="operator-2")
     await world.ready(300)
-    assert len(created(world)) == 300
+    assert len(world.created()) == 300
 
 
 @played
@@ -385,7 +364,7 @@ def test_no_worker_of_a_master_that_attaches_during_a_look_is_deleted(
         a_master_attaches_after(*call, world, **attachment)
         world.edit(**edit)
         await world.settled(60)
-        assert deleted(world) == []
+        assert world.deleted() == []
         assert len(world.pods()) == 40
         assert world.status()["master"] == "10.0.3.7:41337"
 
@@ -404,7 +383,7 @@ async def test_a_master_that_attaches_during_a_long_deletion_keeps_who_is_left(
     a_master_attaches_after("delete", "pods", world, replicas=200)
     world.edit(replicas=10)
     await world.settled(60)
-    assert 0 < len(deleted(world)) <= acting.DELETIONS
+    assert 0 < len(world.deleted()) <= acting.DELETIONS
 
 
 @played
@@ -421,9 +400,9 @@ async def test_what_is_released_goes_though_the_pool_changes_all_the_time(world:
     world.api.after = change
     world.edit(template=NEW_TEMPLATE, scaleDown={"release": [released]})
     await world.settled(5)
-    assert deleted(world) == [released]
+    assert world.deleted() == [released]
     world.api.after = lambda call: None
-    await world.until(lambda: len(deleted(world)) == 5)
+    await world.until(lambda: len(world.deleted()) == 5)
 
 
 @played
@@ -440,5 +419,5 @@ async def test_a_pool_that_is_gone_during_a_look_is_no_error(world: World) -> No
     world.api.after = remove
     world.edit(replicas=2)
     await world.settled(30)
-    assert deleted(world) == []
+    assert world.deleted() == []
     assert world.program.queue.known() == []

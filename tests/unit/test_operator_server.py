@@ -8,7 +8,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +20,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
-from fakes.world import NAMESPACE, World, a_world
+from fakes.world import NAMESPACE, Test, World, a_world
 from fiber_operator.health import Health
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.planning.pods import State
@@ -28,8 +28,6 @@ from fiber_operator.turns import Statistics
 from fiber_operator.watches import Watches
 
 ROOT = Path(__file__).resolve().parents[2]
-
-Test = Callable[[World], Coroutine[Any, Any, None]]
 
 
 def played(test: Test) -> Callable[[], None]:

@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.store import Body
-from fakes.world import NAMESPACE, World, a_world
+from fakes.world import NAMESPACE, World, played
 from fiber_operator.planning.situation import SECOND_LOOK
+from unit.operator_objects import MASTER
 
-MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
 LOST = {**MASTER, "leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5}
 FOR_EVER = 10**6
 RULES = (
     Path(__file__).parents[2] / "charts" / "fiber-operator" / "templates" / "_rules.tpl"
 ).read_text()
 
-Test = Callable[[World], Coroutine[Any, Any, None]]
 Right = tuple[str, str]
-
-
-def played(test: Test) -> Callable[[], None]:
-    async def main() -> None:
-        async with a_world() as world:
-            await test(world)
-
-    return lambda: virtual_time.run(main())
 
 
 def rights() -> list[Right]:
