@@ -143,14 +143,15 @@ def _rows(run: Run, case: Case, metric: Metric) -> list[tuple[str, ...]]:
                 contender.label,
                 in_words(found.median, metric.unit),
                 spread,
-                _ratio(to_baseline),
+                ratio_in_words(to_baseline),
                 *verdict,
             )
         )
     return rows
 
 
-def _ratio(found: Summary | None) -> str:
+def ratio_in_words(found: Summary | None) -> str:
+    """Its median, and from where to where it went."""
     if not found:
         return "—"
     if found.rounds == 1:

@@ -10,7 +10,7 @@ from benchmarks.operator_scale import picture, results
 from benchmarks.operator_scale.cases import CASES, FIBER, REPLICA_SET, SUBJECTS, Case
 from benchmarks.operator_scale.counters import STATUS_WRITES
 from benchmarks.operator_scale.results import MEGA, STEPS, OperatorUse, Result, Trial
-from benchmarks.report import table
+from benchmarks.report import ratio_in_words, table
 from benchmarks.samples import Summary, in_words, summary, times
 
 RESULTS = "operator.json"
@@ -142,20 +142,12 @@ def _steps(known: Mapping[str, Result]) -> Iterator[tuple[str, ...]]:
         for step, meaning in STEPS.items():
             both = [_seconds(result.step(subject.name, step)) for subject in SUBJECTS]
             ratio = result.ratio(FIBER.name, REPLICA_SET.name, step)
-            yield title, meaning, *both, _ratio(ratio)
+            yield title, meaning, *both, ratio_in_words(ratio)
             title = ""
 
 
 def _seconds(found: Summary | None) -> str:
     return f"{found.median:.1f} s" if found else "—"
-
-
-def _ratio(found: Summary | None) -> str:
-    if not found:
-        return "—"
-    if found.rounds == 1:
-        return times(found.median)
-    return f"{times(found.median)} ({times(found.least)} to {times(found.greatest)})"
 
 
 def _uses(known: Mapping[str, Result]) -> Iterator[tuple[str, ...]]:
