@@ -78,13 +78,6 @@ class Cluster:
         self._wait_until_ready(node)
 
     @contextlib.contextmanager
-    def without_kubelet(self, node: str) -> Iterator[None]:
-        """The node's kubelet does not run meanwhile, its containers do; then it is Ready again."""
-        with self._without_kubelet(node):
-            yield
-        self._wait_until_ready(node)
-
-    @contextlib.contextmanager
     def without_apiserver(self) -> Iterator[None]:
         """Nobody gets an answer from the API server meanwhile; then it is ready again."""
         with self._without_apiserver():
@@ -106,9 +99,6 @@ class Cluster:
 
     def _cut_off(self, node: str) -> AbstractContextManager[None]:
         self._skip(f"cut {node} off")
-
-    def _without_kubelet(self, node: str) -> AbstractContextManager[None]:
-        self._skip(f"stop the kubelet of {node}")
 
     def _without_apiserver(self) -> AbstractContextManager[None]:
         self._skip("stop the API server")
@@ -145,9 +135,6 @@ class Own(Cluster):
 
     def _cut_off(self, node: str) -> AbstractContextManager[None]:
         return faults.cut_off(node)
-
-    def _without_kubelet(self, node: str) -> AbstractContextManager[None]:
-        return faults.stopped(f"{node}-kubelet")
 
     def _kill(self, node: str, container_id: str) -> None:
         faults.kill_container(node, container_id)
@@ -207,14 +194,6 @@ class Kind(Cluster):
                 self._inside(node, "iptables", "--wait", "-I", *rule)
                 undo.callback(self._inside, node, "iptables", "--wait", "-D", *rule)
             yield
-
-    @contextlib.contextmanager
-    def _without_kubelet(self, node: str) -> Iterator[None]:
-        self._inside(node, "systemctl", "stop", "kubelet")
-        try:
-            yield
-        finally:
-            self._inside(node, "systemctl", "start", "kubelet")
 
     @contextlib.contextmanager
     def _without_apiserver(self) -> Iterator[None]:

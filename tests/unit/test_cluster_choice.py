@@ -107,10 +107,9 @@ def test_where_there_is_none_each_reason_is_given() -> None:
     "harm",
     [
         lambda cluster: cluster.cut_off("node-1"),
-        lambda cluster: cluster.without_kubelet("node-1"),
         lambda cluster: cluster.without_apiserver(),
     ],
-    ids=["cut off", "kubelet", "apiserver"],
+    ids=["cut off", "apiserver"],
 )
 def test_what_a_cluster_cannot_do_skips_the_test(
     harm: Callable[[Cluster], AbstractContextManager[None]],
