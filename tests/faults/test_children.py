@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from multiprocessing import connection
 from typing import Any
 
@@ -18,14 +18,6 @@ from faults.program import PATIENCE, alive, stop_and_wait, wait_for
 pytestmark = pytest.mark.usefixtures("backend")
 
 METHODS = ("fork", "spawn")
-
-
-@pytest.fixture
-def pipe() -> Iterator[tuple[Any, Any]]:
-    ends = fiber.Pipe()
-    yield ends
-    for end in ends:
-        end.close()
 
 
 def started(target: Callable[..., Any], *args: Any, method: str = "fork") -> Any:

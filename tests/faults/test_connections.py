@@ -20,14 +20,6 @@ pytestmark = pytest.mark.usefixtures("backend")
 
 
 @pytest.fixture
-def pipe() -> Iterator[tuple[Any, Any]]:
-    ends = fiber.Pipe()
-    yield ends
-    for end in ends:
-        end.close()
-
-
-@pytest.fixture
 def start() -> Iterator[Callable[..., Any]]:
     """Starts processes, and ends those that the test left."""
     children: list[Any] = []
