@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import fiber
+from census import wait_until
 from fiber.pool import Pool
 from unit import pool_tasks as tasks
 
@@ -339,10 +340,10 @@ def test_buffersize_bounds_what_is_read_and_not_consumed(pool: Pool, unordered: 
         next(iterator)
         assert read <= consumed + 7
     del iterator  # nobody consumes any more: nothing more is read
-    deadline = time.monotonic() + PATIENCE
-    while any(thread.name == "fiber-pool-feeder" for thread in threading.enumerate()):
-        assert time.monotonic() < deadline, "the infinite input is still read"
-        time.sleep(0.001)
+    assert wait_until(
+        lambda: all(thread.name != "fiber-pool-feeder" for thread in threading.enumerate()),
+        PATIENCE,
+    ), "the infinite input is still read"
 
 
 def test_a_slow_input_holds_nothing_up(pool: Pool) -> None:

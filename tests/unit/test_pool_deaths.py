@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import fiber
+from census import wait_until
 from fiber._engine import worker_set
 from fiber.errors import StartError, WorkerDied
 from fiber.pool import Pool
@@ -24,10 +25,7 @@ def pool() -> Iterator[Pool]:
     pool = fiber.Pool(2, retries=3)
     yield pool
     assert pool.map(tasks.square, range(10)) == [x * x for x in range(10)]
-    deadline = time.monotonic() + PATIENCE
-    while len(pool._pool) < 2:
-        assert time.monotonic() < deadline, "a worker is not replaced"
-        time.sleep(0.001)
+    assert wait_until(lambda: len(pool._pool) >= 2, PATIENCE), "a worker is not replaced"
     pool.close()
     pool.join()
 
@@ -65,10 +63,9 @@ def test_sys_exit_ends_the_worker_and_is_not_tried_again(
     with pytest.raises(SystemExit):
         pool.map(tasks.count_and_exit, [(tmp_path / "again", True)], chunksize)
     assert tasks.runs(tmp_path / "again") == 1
-    deadline = time.monotonic() + PATIENCE
-    while before <= {process.pid for process in pool._pool}:
-        assert time.monotonic() < deadline, "its worker goes on"
-        time.sleep(0.001)
+    assert wait_until(lambda: not before <= {process.pid for process in pool._pool}, PATIENCE), (
+        "its worker goes on"
+    )
 
 
 @pytest.mark.parametrize("chunksize", [None, 1, 2])
