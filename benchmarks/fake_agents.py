@@ -110,10 +110,6 @@ class FakeChild:
         """Die of it."""
         self._agent.loop.call_soon(self._end, ExitReport(-signum, "killed"))
 
-    def condemn(self, error: OSError) -> None:
-        """What its agent does with a child that cannot be written to; this one always can."""
-        raise error
-
     def send(self, payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
         """What its worker says goes to its observer: a worker's `Sender`."""
         self._observer.received(Message(memoryview(payload), list(buffers), []))

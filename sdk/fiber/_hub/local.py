@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast
 from fiber._transport.loop import LONGEST_POLL
 from fiber._transport.unix import UnixChannel, UnixCounter, socketpair
 from fiber._wire import packet
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.packet import BytesLike
 
 _Socket = TypeVar("_Socket", bound=socket.socket)
 
@@ -101,13 +101,6 @@ class LocalChannel(UnixChannel):
         except BlockingIOError:
             return False
         return True
-
-    def try_recv(self) -> Message | None:
-        """The next message if one is there; EOFError at the end."""
-        try:
-            return packet.receive(self._sock, wait=False)
-        except BlockingIOError:
-            return None
 
     def close(self) -> None:
         """Close this holder's descriptor."""

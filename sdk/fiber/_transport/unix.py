@@ -132,7 +132,7 @@ class UnixChannel:
         return message
 
     def try_recv(self) -> Message | None:
-        """The next message if one is there."""
+        """The next message if one is there; EOFError at the end."""
         try:
             return packet.receive(self._sock, wait=False)
         except BlockingIOError:
@@ -145,10 +145,6 @@ class UnixChannel:
     def fileno(self) -> int:
         """The socket's descriptor."""
         return self._sock.fileno()
-
-    def duplicate(self) -> int:
-        """A new descriptor of this end, for another holder."""
-        return os.dup(self._sock.fileno())
 
     def close(self) -> None:
         """Close this holder's descriptor."""
@@ -212,10 +208,6 @@ class UnixCounter:
     def fileno(self) -> int:
         """The eventfd: readable while the count is above zero."""
         return self._fd
-
-    def duplicate(self) -> int:
-        """A new descriptor of it, for another holder."""
-        return os.dup(self._fd)
 
     def close(self) -> None:
         """Close this holder's descriptor."""
