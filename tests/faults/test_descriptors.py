@@ -30,6 +30,14 @@ PRELUDE = """
             print(type(error).__name__, error.limit, error.errno)
             assert "ulimit -n" in str(error) and "resource.setrlimit()" in str(error), error
         return made
+
+    def fill():
+        made = []
+        try:
+            while True:
+                made.append(os.dup(1))
+        except OSError:
+            return made
 """
 
 PIPES = (
@@ -169,12 +177,7 @@ MESSAGES = (
         child = fiber.Process(target=targets.echo, args=(theirs,))
         child.start()
         limit(held() + 3)
-        fillers = []
-        try:
-            while True:
-                fillers.append(os.dup(1))
-        except OSError:
-            pass
+        fillers = fill()
         ours.send("small ones need none")
         print(ours.recv())
         try:
@@ -204,12 +207,7 @@ RECEIVES = (
         ours, theirs = fiber.Pipe()
         theirs.send(bytes(200_000))
         limit(held() + 3)
-        fillers = []
-        try:
-            while True:
-                fillers.append(os.dup(1))
-        except OSError:
-            pass
+        fillers = fill()
         try:
             print(len(ours.recv()))
         except TooManyOpenFiles as error:
@@ -290,6 +288,7 @@ AGENT_WITHOUT = (
     PRELUDE
     + """
     import subprocess
+    from fiber._engine import worker_set
 
     def agent():
         found = subprocess.run(
@@ -298,6 +297,7 @@ AGENT_WITHOUT = (
         return int(found.stdout)
 
     if __name__ == "__main__":
+        worker_set.KILLED_PATIENCE = 1.0  # the real one is half of what the test may take
         pool = fiber.Pool(2, retries=0)
         pool.map(abs, range(10))
         pid = agent()
