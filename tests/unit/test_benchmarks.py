@@ -1,11 +1,9 @@
-"""The benchmarks: their arithmetic, their pages, and one tiny run against multiprocessing alone."""
+"""The benchmarks: their arithmetic, their pages, a contender that fails."""
 
 from __future__ import annotations
 
 import json
 import os
-import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -232,55 +230,3 @@ def test_a_contender_that_dies_is_told(session: Session) -> None:
     case = Case("no_such_measure", "x", "", "map", {}, (), limit=20.0)
     with pytest.raises(Failed, match="exit status 1: ModuleNotFoundError"):
         session.run(case)
-
-
-def command(tmp_path: Path, *arguments: str) -> subprocess.Popen[str]:
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    return subprocess.Popen(
-        [
-            sys.executable,
-            str(ROOT / "benchmarks" / "run.py"),
-            *arguments,
-            "--output",
-            str(tmp_path),
-        ],
-        env={**os.environ, "TMPDIR": str(scratch)},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-@pytest.mark.timeout(90)  # starts every contender; the processors may be busy
-def test_a_tiny_run_of_everything(tmp_path: Path) -> None:
-    only = ["--contenders", "multiprocessing", "--size", "0.002", "--rounds", "1"]
-    with command(tmp_path, *only) as process:
-        _, said = process.communicate(timeout=60)
-    assert process.returncode == 0, said
-    assert "failed" not in said
-    assert "left a process behind" not in said
-    assert not list((tmp_path / "scratch").iterdir())
-    runs = report.load(tmp_path)
-    assert set(runs) == set(MEASURES)
-    offers = contenders.BY_NAME["multiprocessing"].offers
-    for name, measure in MEASURES.items():
-        cases = {case.name for case in measure.cases(0.002) if case.needs in offers}
-        assert set(runs[name].values) == cases
-        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
-        page = (tmp_path / f"{name}.md").read_text(encoding="utf-8")
-        assert bool(cases) == ("multiprocessing, fork" in page)
-
-
-def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
-    with command(tmp_path, "--contenders", "multiprocessing", "--measure", "overhead") as process:
-        assert process.stderr is not None
-        process.stderr.readline()
-        below = processes.descendants(process.pid)
-        process.send_signal(signal.SIGINT)
-        said = process.stderr.read()
-        assert process.wait(30) == 130
-    assert len(below) == 6
-    assert "nothing is written" in said
-    assert not any(os.path.exists(f"/proc/{pid}") for pid in below)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["scratch"]
-    assert not list((tmp_path / "scratch").iterdir())

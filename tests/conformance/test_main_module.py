@@ -13,11 +13,12 @@ from typing import IO, Any
 
 import pytest
 
-from unit.main_checks import CALL, DEFINITIONS, PATIENCE, PROGRAM, RESULT
+from conformance.main_checks import CALL, DEFINITIONS, PATIENCE, PROGRAM, RESULT
 
 TESTS = Path(__file__).parents[1]
 BACKENDS = ["local", "loopback"]
 LIMIT = 60
+pytestmark = pytest.mark.timeout(LIMIT)
 
 ONCE = "top level of __main__\n"
 """What a program prints whose children need not, or must not, import it."""
@@ -43,7 +44,7 @@ class Programs:
 
     def run(self, *arguments: str, **options: Any) -> str:
         """What the interpreter prints with these arguments."""
-        done = subprocess.run(
+        done: subprocess.CompletedProcess[str] = subprocess.run(
             [sys.executable, *arguments],
             cwd=self.folder,
             env=self.environment,

@@ -10,7 +10,7 @@ PATIENCE = 15
 
 DEFINITIONS = """\
 import os
-from unit import main_checks
+from conformance import main_checks
 
 print("top level of", __name__, flush=True)
 
