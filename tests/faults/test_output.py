@@ -123,6 +123,28 @@ def test_a_program_that_closes_its_standard_streams_itself(
     assert program.left() == []
 
 
+def test_in_development_mode_nothing_of_ours_is_warned_of(
+    launch_on: Callable[..., Program],
+) -> None:
+    program = launch_on(
+        """
+        import fiber
+        if __name__ == "__main__":
+            with fiber.Pool(1) as pool:
+                print(pool.apply(abs, (-3,)))
+            queue = fiber.SimpleQueue()
+            child = fiber.Process(target=queue.put, args=(4,))
+            child.start()
+            print(queue.get())
+            child.join()
+            queue.close()
+        """,
+        env={"PYTHONDEVMODE": "1"},
+    )
+    assert program.finish() == "3\n4\n"
+    assert program.stderr == ""
+
+
 WRITES_A_LOT = """
     import fiber, sys
     def shout():

@@ -318,6 +318,24 @@ def test_no_descriptor_left_is_a_clear_error_and_leaks_none(shared: Agent, spare
     assert observer.wait_for_exit().exitcode == 0
 
 
+def test_a_child_whose_start_was_interrupted_once_it_was_asked_for_is_killed(
+    own: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    call_soon = own.loop.call_soon
+    observer = Recorder()
+
+    def interrupted(*call: Any) -> None:
+        monkeypatch.undo()
+        call_soon(*call)
+        raise KeyboardInterrupt
+
+    spec = specification(run_forever)
+    monkeypatch.setattr(own.loop, "call_soon", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        own.start(spec, observer)
+    assert observer.wait_for_exit().exitcode == -signal.SIGKILL
+
+
 class few_descriptors:
     """Leaves this process exactly ``spare`` descriptors to open."""
 

@@ -7,6 +7,7 @@ import pickle
 import signal
 import weakref
 from collections.abc import Iterator
+from functools import partial
 from typing import NoReturn
 
 import pytest
@@ -16,6 +17,7 @@ from fiber._engine.ledger import PATIENCE
 from fiber._runtime.executor import KILL_AFTER
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.outcome import Failure, Pickled
+from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
 from fiber.errors import FiberError, WorkerDied
 from unit import pool_tasks as tasks
@@ -403,6 +405,34 @@ def test_a_worker_that_was_told_to_end_as_a_recall_was_on_its_way_is_told_again(
     assert told == [(0, work.STOP_MESSAGE)]
     rig.handles[0].recalled([0])
     assert told == [(0, work.STOP_MESSAGE)] * 2
+
+
+def test_a_call_that_a_recall_took_from_a_lent_worker_is_sent_again(rig: Rig) -> None:
+    class Recalled:
+        """The channel of a worker: what is sent on it meets a recall that was on its way."""
+
+        def __init__(self, handle: WorkerHandle) -> None:
+            self._handle = handle
+
+        def send(self, seq: int, payload: bytes, buffers: object = ()) -> None:
+            self._handle.recalled([seq])
+
+        def receive(self, timeout: float) -> None:
+            """The worker has nothing to answer."""
+
+        def close(self) -> None:
+            """It has no descriptor."""
+
+    class Awaited(Results):
+        def get(self) -> int:
+            rig.answer_all()
+            return self.done
+
+    for handle, port in zip(rig.handles, rig.ports, strict=True):
+        port.lend = partial(Recalled, handle)  # type: ignore[assignment,method-assign]
+    for _ in range(2):  # the first one's answer has its worker lent
+        assert rig.executor.call_and_wait(Awaited(), tasks.square, (3,), {}) == 1
+    assert len(list(rig.deliveries())) == 2, "the second call was not sent again"
 
 
 def test_after_close_what_is_there_is_done_and_the_workers_leave(rig: Rig) -> None:

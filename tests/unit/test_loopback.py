@@ -346,6 +346,24 @@ def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
     assert observer.report.exitcode == -signal.SIGKILL
 
 
+def test_a_child_whose_start_was_interrupted_once_it_was_asked_for_is_killed(
+    remote: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent, link, _ = remote
+    agent.join(link)
+    send = link.send
+
+    def interrupted(frame: Any) -> None:
+        monkeypatch.undo()
+        send(frame)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(link, "send", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        agent.start(ChildSpec("unknown", "fork", b"", b""), Recorder())
+    assert link.sent[-1] == messages.Signal(2, signal.SIGKILL)
+
+
 def test_what_was_asked_before_it_joined_is_sent_when_it_does(remote: Any) -> None:
     agent, link, observer = remote
     (child,) = agent._children.values()

@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 
 import fiber
+from fiber.process import PoolProcess
 from unit import pool_tasks as tasks
 from unit.pool_programs import ENVIRON, is_alive, run_program, wait_until
 
@@ -204,6 +205,27 @@ def test_a_result_keeps_its_pool() -> None:
         iterator = fiber.Pool(1).imap(tasks.nap_and_return, iter(range(100)))
         assert list(iterator) == list(range(100))
         gc.collect()
+
+
+@pytest.mark.parametrize("workers", [1, 2], ids=["the first", "one of several"])
+def test_a_pool_whose_making_is_interrupted_as_a_worker_was_started_leaves_none(
+    monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    started: list[PoolProcess] = []
+    start = PoolProcess.start
+
+    def interrupted(process: PoolProcess) -> None:
+        start(process)
+        started.append(process)
+        if len(started) == workers:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(PoolProcess, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fiber.Pool(workers)
+    for process in started:
+        process.join(PATIENCE)
+    assert [process.exitcode for process in started] == [-signal.SIGTERM] * workers
 
 
 def test_pools_do_not_pickle() -> None:

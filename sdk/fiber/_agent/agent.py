@@ -56,8 +56,12 @@ class Agent:
         child = LocalChild(self, next(self._ids), spec, observer)
         if self.loop.on_thread():
             self._start(child)  # what is asked of it next, in this very turn, finds it there
-        else:
+            return child
+        try:
             self.loop.call_soon(self._start, child)
+        except BaseException:  # Ctrl-C: it may be started, and nobody will know it
+            child.signal(signal.SIGKILL)
+            raise
         return child
 
     def _start(self, child: LocalChild) -> None:

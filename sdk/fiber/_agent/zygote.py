@@ -258,14 +258,14 @@ def main(control: int, agent: int) -> None:
     # What every child needs, while the program that started us early is busy with its own imports.
     import fiber._agent.worker  # noqa: F401
 
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control)
-    try:
-        message = packet.receive(sock, descriptors=True)
-    except (EOFError, ConnectionError):
-        return  # nothing was ever asked of it
-    (progress_table,), message.fds = message.fds, []
-    _, ancestors, preload, cleanup_directory = packet.loads(message)
-    _run_zygote(sock, progress_table, ancestors, cleanup_directory, preload=preload)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control) as sock:
+        try:
+            message = packet.receive(sock, descriptors=True)
+        except (EOFError, ConnectionError):
+            return  # nothing was ever asked of it
+        (progress_table,), message.fds = message.fds, []
+        _, ancestors, preload, cleanup_directory = packet.loads(message)
+        _run_zygote(sock, progress_table, ancestors, cleanup_directory, preload=preload)
 
 
 def _run_zygote(

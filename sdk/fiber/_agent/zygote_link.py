@@ -88,6 +88,9 @@ class ZygoteLink:
         if self._loop.running:
             # Its last words tell of its children.
             self._gone.wait(_QUIT_TIMEOUT)
+        else:
+            self._outbox.close()
+            self._sock.close()
 
     def _receive(self) -> None:
         try:

@@ -85,7 +85,12 @@ class RemoteAgent:
         if lost is not None:
             raise RuntimeError(f"agent {self.host} cannot start {spec.name}: {lost}")
         fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
-        self.send(messages.Start(child.number, pickle.dumps(fields, protocol=5)))
+        start = messages.Start(child.number, pickle.dumps(fields, protocol=5))
+        try:
+            self.send(start)
+        except BaseException:  # Ctrl-C: it may be started, and nobody will know it
+            child.signal(signal.SIGKILL)
+            raise
         return child
 
     def send(self, message: messages.Message) -> None:

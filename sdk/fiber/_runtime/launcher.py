@@ -38,13 +38,12 @@ class Launcher:
 
     def launch_now(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
         """Start some on the calling thread; raises what stands in the way of one."""
-        started = 0
         try:
             for handle in handles:
                 self._start(handle)
-                started += 1
-        except BaseException:
-            self._loop.call_soon(self._on_failed, handles[started:], None)
+        except BaseException:  # of those that have a port the end will be heard
+            unstarted = [handle for handle in handles if handle.port is None]
+            self._loop.call_soon(self._on_failed, unstarted, None)
             raise
         self._raise_start_error(handles, timeout)
 

@@ -50,6 +50,8 @@ class Receiver:
         self._on_ready = on_ready
         self._last_words: dict[WorkerHandle, tuple[Any, list[memoryview]]] = {}
         """Of workers that callers use, whose agents heard them first since they died."""
+        self._taken_back: dict[WorkerHandle, list[int]] = {}
+        """From workers that callers use: calls of theirs, which are no batches yet."""
 
     def take(self, handle: WorkerHandle, message: Message) -> None:
         """A packet from a worker."""
@@ -71,13 +73,16 @@ class Receiver:
             self._unreadable(kind, words[1], Pickled(work.ERROR, words[2], ()))
 
     def replay(self, handle: WorkerHandle) -> None:
-        """A worker is not lent any more: what it said meanwhile counts now."""
+        """A worker is not lent any more: what was heard of it meanwhile counts now."""
         if handle in self._last_words:
             self._answered(*self._last_words.pop(handle))
+        if handle in self._taken_back:
+            self.recalled(handle, self._taken_back.pop(handle))
 
     def forget(self, handle: WorkerHandle) -> None:
-        """What it said meanwhile is of no use."""
+        """What was heard of it meanwhile is of no use."""
         self._last_words.pop(handle, None)
+        self._taken_back.pop(handle, None)
 
     def _answered(self, words: tuple[Any, ...], buffers: list[memoryview]) -> None:
         seq, offset, kept, seconds, values, odd = words
@@ -125,6 +130,8 @@ class Receiver:
             return
         if 0 in seqs:  # no batch, but what told it to end: the recall was later by an agent's turn
             handle.dismiss()
+        if seqs and handle.worker.lent:  # a recall that was on its way as it was lent took them
+            self._taken_back.setdefault(handle, []).extend(seqs)
         for seq in seqs:
             self._sender.settled(seq)
             batch = self._ledger.batches.get(seq)
