@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -352,6 +353,7 @@ def test_what_was_asked_before_it_joined_is_sent_when_it_does(remote: Any) -> No
     for seq in (3, 4, 5):
         child.deliver(seq, b"work")
     agent.join(link)
+    agent.loop.run_for(0)
     assert [message.seq for message in link.sent[1:]] == [3, 4, 5]
     agent.on_lost("silence")
     assert not child.deliver(6, b"too late")
@@ -363,3 +365,26 @@ def test_a_lost_agent_starts_nothing_more(remote: Any) -> None:
     agent.on_lost("silence")
     with pytest.raises(RuntimeError, match="agent far cannot start child: silence"):
         agent.start(ChildSpec("child", "fork", b"", b""), Recorder())
+
+
+def test_an_agent_that_is_lost_while_a_child_is_on_its_way_there_tells_its_end(remote: Any) -> None:
+    agent, link, observer = remote
+    late = Recorder()
+    agent.start(ChildSpec("late", "fork", b"", b""), late)
+    assert agent.children == 2, "before the loop has looked at them"
+    agent.on_lost("silence")
+    agent.join(link)
+    agent.loop.run_for(0)
+    assert observer.events == late.events == ["exited"]
+    assert link.sent == []
+
+
+def test_a_start_that_a_signal_interrupts_leaves_nothing(remote: Any) -> None:
+    agent, _, _ = remote
+    before = agent.children
+    with (
+        mock.patch.object(agent.loop, "call_soon", side_effect=KeyboardInterrupt),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        agent.start(ChildSpec("never", "fork", b"", b""), Recorder())
+    assert agent.children == before
