@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import pynng
 import pytest
 
 from fiber._transport import dialer
@@ -123,6 +124,26 @@ def test_a_host_that_vanishes_before_the_welcome_is_dialled_anew(
             assert agent.link is not master.link
         else:
             master.wait(lambda: master.refusals)  # another master: it was reached, that is all
+
+
+def test_without_descriptors_for_a_moment_both_sides_go_on_to_try(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusals = [pynng.OutOfFiles("Out of files", 0), pynng.OutOfFiles("Out of files", 0)]
+
+    class Scarce(pynng.Pair1):  # type: ignore[misc]  # pynng has no types
+        @property
+        def recv_fd(self) -> int:
+            if refusals:
+                raise refusals.pop()
+            return int(super().recv_fd)
+
+    monkeypatch.setattr(pynng, "Pair1", Scarce)
+    listener, master = site.listener()
+    _, agent = site.dialer(listener.address)
+    agent.link.send(b"in after all")
+    master.wait(lambda: master.frames == [b"in after all"])
+    assert refusals == []
 
 
 @pytest.mark.parametrize("wrong", ["other run", "other name", "the agent's certificate"])
