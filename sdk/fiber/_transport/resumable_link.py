@@ -109,14 +109,13 @@ class ResumableLink:
         if self._wire is not None:
             self._unplug().close()
         try:
-            self._stream.connected(arrived, self._loop.now())
+            self._stream.connected(arrived)
         except ProtocolError as error:
             # A peer that forgot what it had acknowledged is not the one that this link was with.
             wire.close()
             self._lose(str(error))
             return
         self._wire = wire
-        self._heard()
         self._flush()
 
     def disconnect(self) -> None:
