@@ -115,6 +115,10 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         ),
         (Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, 0, 1, [], null, [], ""]', "text"),
         (Recall(1).encode()[:1] + b"\x08" + bytes(8) + b"7", "of kind exited .* is malformed"),
+        (
+            Recall(1).encode()[:1] + b"\x08" + bytes(8) + b"[" * 30_000,
+            "of kind exited .* is malformed",
+        ),
     ],
 )
 def test_an_error_names_what_is_wrong(frame: bytes, complaint: str) -> None:

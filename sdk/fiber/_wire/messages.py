@@ -265,7 +265,7 @@ def decode(frame: bytes | bytearray) -> Message:
         raise ProtocolError(f"a frame is of unknown kind {kind}")
     try:
         return reader(memoryview(frame))
-    except (struct.error, UnicodeDecodeError, ValueError, TypeError) as error:
+    except (struct.error, ValueError, TypeError, RecursionError) as error:
         # Each of them is what its reader raises for bytes that its writer cannot have written.
         name = reader.__name__.removeprefix("_read_")
         raise ProtocolError(
