@@ -116,14 +116,14 @@ class LoopbackBackend:
 
     # On the loop's thread
 
-    def _joined(self, link: Link) -> None:
+    def _joined(self, link: Link) -> str | None:
         for process in self._processes:
             if process.agent.host == link.peer.name and not process.agent.joined:
                 self._failures = ()
                 process.agent.join(link)
                 self._replace_lost()  # those that were given up: it can be done after all
-                return
-        link.close(f"the master expects no agent named {link.peer.name}")
+                return None
+        return f"the master expects no agent named {link.peer.name}"
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
         """Have a place for new children before the ends of its own make anybody ask for one."""
