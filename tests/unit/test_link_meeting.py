@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -69,6 +70,30 @@ def test_where_nobody_listens_the_dialer_gives_up(site: Site) -> None:
     assert f"no master answered at {address} within 0.3 s: connection refused" in str(
         agent.errors[0]
     )
+
+
+def test_a_name_that_is_none_is_given_up_in_time_and_named(site: Site) -> None:
+    _, agent = site.dialer(f"{'x' * 64}.example:80", timeout=0.3)
+    agent.wait(lambda: agent.errors)
+    assert "within 0.3 s: its name is none: " in str(agent.errors[0])
+
+
+def test_where_there_is_no_thread_for_a_moment_it_is_tried_again(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listener, master = site.listener()
+    refusals, start = [1, 2, 3], threading.Thread.start
+
+    def scarce(thread: threading.Thread) -> None:
+        if thread.name == "fiber-dial" and refusals:
+            refusals.pop()
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", scarce)
+    _, agent = site.dialer(listener.address)
+    assert agent.link is not master.link
+    assert refusals == []
 
 
 def test_what_takes_connections_and_says_nothing_is_given_up(site: Site) -> None:
