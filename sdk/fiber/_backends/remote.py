@@ -235,5 +235,5 @@ class RemoteChild:
         self._gone = True
         if self._channel is not None:
             self._channel.end()
-        missed = list(self._latest)[len(self._latest) - crossed :]
+        missed = list(self._latest)[max(0, len(self._latest) - crossed) :]
         self.observer.exited(report._replace(unread=(*report.unread, *missed)))
