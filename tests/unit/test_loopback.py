@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -291,6 +292,23 @@ def test_it_leaves_no_file(tmp_path: Any) -> None:
         stop(start())
         assert "key" not in " ".join(path.name for path in tmp_path.rglob("*"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_agents_that_do_not_answer_share_one_deadline_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, waits, wait = [0.0], [], agent_process.AgentProcess.wait
+
+    def stuck(process: agent_process.AgentProcess, timeout: float) -> None:
+        waits.append(timeout)
+        clock[0] += timeout
+        wait(process, PATIENCE)
+
+    monkeypatch.setattr(agent_process.AgentProcess, "wait", stuck)
+    monkeypatch.setattr(loopback, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    with running(agents=3):
+        pass
+    assert waits == [loopback._QUIT_TIMEOUT, 0.0, 0.0]
 
 
 def test_the_runtime_can_be_shut_down_and_made_again() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import os
 import threading
+import time
 
 from fiber._backends.agent_process import AgentProcess, Launcher
 from fiber._backends.output import Output
@@ -27,6 +28,7 @@ _PAUSE_MIN, _PAUSE_MAX = 0.1, 30.0
 """Seconds before another one is started after those, if there are others to work with."""
 
 _QUIT_TIMEOUT = 5.0
+"""Seconds for all agents together to end by themselves."""
 
 
 class LoopbackBackend:
@@ -84,8 +86,9 @@ class LoopbackBackend:
         self._launcher.close()
         for process in self._processes:
             process.agent.close()
+        deadline = time.monotonic() + _QUIT_TIMEOUT
         for process in self._processes:
-            process.process.wait(_QUIT_TIMEOUT)
+            process.process.wait(max(deadline - time.monotonic(), 0.0))
         done = threading.Event()
         self._listener.close("the master ended", then=done.set)
         done.wait(_QUIT_TIMEOUT)
