@@ -246,6 +246,27 @@ def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.Monke
         stop(start())
 
 
+def test_an_agent_that_cannot_be_watched_is_ended_before_the_next_attempt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    started: list[int] = []
+    watch = os.pidfd_open
+
+    def refuse_first(pid: int, flags: int = 0) -> int:
+        if threading.current_thread().name == "fiber-launch":
+            started.append(pid)
+            if len(started) == 1:
+                raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return watch(pid, flags)
+
+    monkeypatch.setattr(os, "pidfd_open", refuse_first)
+    with running() as backend:
+        stop(start())
+        first, second = started
+        assert census.read(first) is None
+        assert backend._processes[0].process.pid == second
+
+
 def test_an_agent_that_can_never_be_started_is_an_error_with_the_cause(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
