@@ -43,6 +43,8 @@ class ZygoteLink:
         *,
         preload: bool,
     ) -> None:
+        self.children = 0
+        """Those that are to live on in it."""
         self._observer = observer
         self._loop = loop
         self._gone = threading.Event()

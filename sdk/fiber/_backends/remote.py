@@ -62,6 +62,10 @@ class RemoteAgent:
         """How many children it has."""
         return len(self._children)
 
+    def can_take(self, limit: float) -> bool:
+        """Whether it may have one more child, of at most so many."""
+        return self._lost is None and len(self._children) < limit
+
     @property
     def joined(self) -> bool:
         """Whether it has its link."""
