@@ -13,10 +13,8 @@ from fiber._wire.messages import (
     PROTOCOL,
     Deliver,
     Exited,
-    Log,
     Message,
     Output,
-    Problem,
     ProtocolError,
     Recall,
     Recalled,
@@ -59,12 +57,10 @@ messages: st.SearchStrategy[Message] = st.one_of(
         any_text,
     ),
     st.builds(Output, ids, any_text),
-    st.builds(Log, ids, any_text, numbers, any_text, any_text),
     st.builds(TunnelOpen, ids, any_text),
     st.builds(TunnelData, ids, data, buffers),
     st.builds(TunnelClose, ids, any_text),
     st.builds(Shutdown, st.floats(allow_nan=False)),
-    st.builds(Problem, any_text),
 )
 
 
@@ -171,15 +167,9 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
             "log=<1 items>, host=<14 characters>)",
         ),
         (
-            Log(3, SECRET, 20, SECRET, SECRET),
-            "Log(child=3, logger=<14 characters>, level=20, process=<14 characters>, "
-            "text=<14 characters>)",
-        ),
-        (
             TunnelData(3, bytearray(SECRET.encode())),
             "TunnelData(tunnel=3, payload=<14 bytes>, buffers=())",
         ),
-        (Problem(SECRET), "Problem(text=<14 characters>)"),
         (Signal(3, 15), "Signal(child=3, signum=15)"),
     ],
 )

@@ -142,9 +142,6 @@ class RemoteAgent:
         if isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
             self._tunnels.on_frame(message)
             return
-        if isinstance(message, messages.Problem):
-            self._output.write(self.host, message.text)
-            return
         number = getattr(message, "child", None)
         child = None if number is None else self._children.get(number)
         if child is None:
