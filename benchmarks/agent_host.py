@@ -81,7 +81,7 @@ class AgentHost:
         agent: Any = FakeAgent(self._loop, "fake", self._runner)
         hub: Any = _NoHub()
         service = AgentService(
-            self._loop, link, agent, hub, lambda _: link.close("it ended", then=self._ended)
+            self._loop, link, agent, hub, lambda *_: link.close("it ended", then=self._ended)
         )
         self._services.append(service)
         link.attach(service)

@@ -134,8 +134,7 @@ class Main:
             return
         self._loop.stop()
 
-    def _ended(self, reason: str) -> None:
-        lost = reason.startswith("lost")
+    def _ended(self, reason: str, lost: bool) -> None:
         if lost:
             self._complain(reason)
         if self._lost_grace is not None and not self._told_to_end:

@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
-from fiber._transport import acceptor, admission, tls
+from fiber._transport import acceptor, admission, refusals, tls
+from fiber._transport.admission import Admission
 from fiber._transport.credentials import make_credentials
 from fiber._transport.handshake import Hello, Identity
-from unit.link_site import DEADLINE, Notes, Site, complete, port_of
+from unit.link_site import DEADLINE, Notes, Site, complete, port_of, say
 
 SOON = 0.3
 HELLO = Hello(Identity.of_this_process("stranger"), "0" * 32, 0, False).encode()
@@ -211,12 +212,53 @@ def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:
         assert not end.is_alive()
 
 
+def test_who_has_a_certificate_and_is_refused_is_told_once(site: Site) -> None:
+    listener, master = site.listener()
+    for _ in range(3):
+        say(listener.address, site.credentials.agent_half(), b"GET / HTTP/1.1")
+    master.wait(lambda: master.refusals)
+    site.on_loop(lambda: None)
+    (told,) = [told for told in master.refusals if "no agent of Fiber" in told]
+    assert "(127.0.0.1:" in told
+
+
+def test_an_agent_that_nobody_wants_hears_why_and_is_told_once(site: Site) -> None:
+    listener, master = site.listener()
+    listener._on_agent = lambda link: f"{link.peer.name} is not wanted"
+    for _ in range(2):
+        _, agent = site.dialer(listener.address)
+        agent.wait(lambda agent=agent: agent.events == ["lost: agent-1 is not wanted"])
+    master.wait(lambda: master.refusals)
+    (told,) = master.refusals
+    assert told.startswith("agent-1 is not wanted (127.0.0.1:")
+
+
+def test_a_crowd_is_told_of_once_from_wherever_it_comes(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(admission, "_FAIR_CHANCE", 60.0)
+    listener, master = site.listener()
+    acceptor, full = listener._acceptor, Admission(1, 1)
+    full.enter("somebody", "192.0.2.1", acceptor.loop.now())
+    acceptor._admission = full
+    ends = []
+    for number in range(3):
+        ours, theirs = socket.socketpair()
+        acceptor.loop.call_soon(acceptor._admit, theirs, f"10.0.0.{number}", f"10.0.0.{number}:1")
+        ends.append(ours)
+    for ours in ends:
+        assert ours.recv(1) == b""
+        ours.close()
+    site.on_loop(lambda: None)
+    assert master.refusals == ["10.0.0.0:1 was turned away: too many come at the same time"]
+
+
 def test_complaints_are_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(acceptor, "_TOLD", 3)
+    monkeypatch.setattr(refusals, "_MOST", 3)
     listener, master = site.listener()
     site.on_loop(lambda: None)
     for number in range(10):
-        listener._acceptor.complain(f"10.0.0.{number}", f"10.0.0.{number}:1", "nonsense")
+        listener._acceptor.report(f"10.0.0.{number}", f"10.0.0.{number}:1", "nonsense")
     notes: Notes = master
     notes.wait(lambda: len(notes.refusals) == 3)
     site.on_loop(lambda: None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import resource
 import signal
 import sys
 import threading
@@ -251,6 +252,23 @@ def test_the_death_of_the_zygote_is_the_death_of_its_children(own: Agent) -> Non
         assert census.wait_until(lambda pid=child.pid: census.read(pid) is None, PATIENCE)
     _, observer = begin(own, os._exit, 0)  # and a new one serves what comes next
     assert observer.wait_for_exit().exitcode == 0
+
+
+def test_a_zygote_without_descriptors_for_a_moment_costs_one_start(own: Agent) -> None:
+    child, observer = begin(own, run_forever)
+    observer.wait_for_start()
+    zygote = own._zygotes[0]._process.pid
+    limits = resource.prlimit(zygote, resource.RLIMIT_NOFILE)
+    resource.prlimit(zygote, resource.RLIMIT_NOFILE, (3, limits[1]))
+    _, unlucky = begin(own, run_forever)
+    report = unlucky.wait_for_exit()
+    assert (report.exitcode, report.reason[:22]) == (1, "could not be started: ")
+    assert "descriptor" in report.reason
+    resource.prlimit(zygote, resource.RLIMIT_NOFILE, limits)
+    _, lucky = begin(own, os._exit, 0)
+    assert lucky.wait_for_exit().exitcode == 0
+    assert observer.events == ["started"]
+    end(child, observer)
 
 
 def test_close_kills_and_reports_every_child_once(

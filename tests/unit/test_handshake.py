@@ -44,6 +44,8 @@ def test_a_hello_of_another_protocol_still_says_who_it_is() -> None:
         (Hello(OURS, "ab12", 7, True).encode().replace(b"arrived", b"arrival"), "'arrived'"),
         (Welcome(OURS, 0, 0.5, 1.0, 2.0).encode().replace(b"0.5", b'"x"'), "malformed"),
         (b"\x12\xff", "malformed"),
+        (b"\x10" + b"[" * 30_000, "RecursionError"),
+        (Welcome(OURS, 31, 1.0, 2.0, 3.0).encode().replace(b"31", b"Infinity"), "OverflowError"),
     ],
 )
 def test_what_is_no_greeting_is_named(datagram: bytes, complaint: str) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import pynng
 import pytest
 
 from fiber._transport import dialer
@@ -54,6 +56,30 @@ def test_where_nobody_listens_the_dialer_gives_up(site: Site) -> None:
     assert f"no master answered at {address} within 0.3 s: connection refused" in str(
         agent.errors[0]
     )
+
+
+def test_a_name_that_is_none_is_given_up_in_time_and_named(site: Site) -> None:
+    _, agent = site.dialer(f"{'x' * 64}.example:80", timeout=0.3)
+    agent.wait(lambda: agent.errors)
+    assert "within 0.3 s: its name is none: " in str(agent.errors[0])
+
+
+def test_where_there_is_no_thread_for_a_moment_it_is_tried_again(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listener, master = site.listener()
+    refusals, start = [1, 2, 3], threading.Thread.start
+
+    def scarce(thread: threading.Thread) -> None:
+        if thread.name == "fiber-dial" and refusals:
+            refusals.pop()
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", scarce)
+    _, agent = site.dialer(listener.address)
+    assert agent.link is not master.link
+    assert refusals == []
 
 
 def test_what_takes_connections_and_says_nothing_is_given_up(site: Site) -> None:
@@ -109,6 +135,26 @@ def test_a_host_that_vanishes_before_the_welcome_is_dialled_anew(
             assert agent.link is not master.link
         else:
             master.wait(lambda: master.refusals)  # another master: it was reached, that is all
+
+
+def test_without_descriptors_for_a_moment_both_sides_go_on_to_try(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusals = [pynng.OutOfFiles("Out of files", 0), pynng.OutOfFiles("Out of files", 0)]
+
+    class Scarce(pynng.Pair1):  # type: ignore[misc]  # pynng has no types
+        @property
+        def recv_fd(self) -> int:
+            if refusals:
+                raise refusals.pop()
+            return int(super().recv_fd)
+
+    monkeypatch.setattr(pynng, "Pair1", Scarce)
+    listener, master = site.listener()
+    _, agent = site.dialer(listener.address)
+    agent.link.send(b"in after all")
+    master.wait(lambda: master.frames == [b"in after all"])
+    assert refusals == []
 
 
 @pytest.mark.parametrize("wrong", ["other run", "other name", "the agent's certificate"])

@@ -12,7 +12,9 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -244,6 +246,27 @@ def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.Monke
         stop(start())
 
 
+def test_an_agent_that_cannot_be_watched_is_ended_before_the_next_attempt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    started: list[int] = []
+    watch = os.pidfd_open
+
+    def refuse_first(pid: int, flags: int = 0) -> int:
+        if threading.current_thread().name == "fiber-launch":
+            started.append(pid)
+            if len(started) == 1:
+                raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return watch(pid, flags)
+
+    monkeypatch.setattr(os, "pidfd_open", refuse_first)
+    with running() as backend:
+        stop(start())
+        first, second = started
+        assert census.read(first) is None
+        assert backend._processes[0].process.pid == second
+
+
 def test_an_agent_that_can_never_be_started_is_an_error_with_the_cause(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -290,6 +313,23 @@ def test_it_leaves_no_file(tmp_path: Any) -> None:
         stop(start())
         assert "key" not in " ".join(path.name for path in tmp_path.rglob("*"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_agents_that_do_not_answer_share_one_deadline_at_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, waits, wait = [0.0], [], agent_process.AgentProcess.wait
+
+    def stuck(process: agent_process.AgentProcess, timeout: float) -> None:
+        waits.append(timeout)
+        clock[0] += timeout
+        wait(process, PATIENCE)
+
+    monkeypatch.setattr(agent_process.AgentProcess, "wait", stuck)
+    monkeypatch.setattr(loopback, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    with running(agents=3):
+        pass
+    assert waits == [loopback._QUIT_TIMEOUT, 0.0, 0.0]
 
 
 def test_the_runtime_can_be_shut_down_and_made_again() -> None:
@@ -351,16 +391,17 @@ def test_a_child_whose_start_was_interrupted_once_it_was_asked_for_is_killed(
 ) -> None:
     agent, link, _ = remote
     agent.join(link)
-    send = link.send
+    call_soon = agent.loop.call_soon
 
-    def interrupted(frame: Any) -> None:
+    def interrupted(*call: Any) -> None:
         monkeypatch.undo()
-        send(frame)
+        call_soon(*call)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(link, "send", interrupted)
+    monkeypatch.setattr(agent.loop, "call_soon", interrupted)
     with pytest.raises(KeyboardInterrupt):
         agent.start(ChildSpec("unknown", "fork", b"", b""), Recorder())
+    agent.loop.run_for(0)
     assert link.sent[-1] == messages.Signal(2, signal.SIGKILL)
 
 
@@ -370,6 +411,7 @@ def test_what_was_asked_before_it_joined_is_sent_when_it_does(remote: Any) -> No
     for seq in (3, 4, 5):
         child.deliver(seq, b"work")
     agent.join(link)
+    agent.loop.run_for(0)
     assert [message.seq for message in link.sent[1:]] == [3, 4, 5]
     agent.on_lost("silence")
     assert not child.deliver(6, b"too late")
@@ -381,3 +423,26 @@ def test_a_lost_agent_starts_nothing_more(remote: Any) -> None:
     agent.on_lost("silence")
     with pytest.raises(RuntimeError, match="agent far cannot start child: silence"):
         agent.start(ChildSpec("child", "fork", b"", b""), Recorder())
+
+
+def test_an_agent_that_is_lost_while_a_child_is_on_its_way_there_tells_its_end(remote: Any) -> None:
+    agent, link, observer = remote
+    late = Recorder()
+    agent.start(ChildSpec("late", "fork", b"", b""), late)
+    assert agent.children == 2, "before the loop has looked at them"
+    agent.on_lost("silence")
+    agent.join(link)
+    agent.loop.run_for(0)
+    assert observer.events == late.events == ["exited"]
+    assert link.sent == []
+
+
+def test_a_start_that_a_signal_interrupts_leaves_nothing(remote: Any) -> None:
+    agent, _, _ = remote
+    before = agent.children
+    with (
+        mock.patch.object(agent.loop, "call_soon", side_effect=KeyboardInterrupt),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        agent.start(ChildSpec("never", "fork", b"", b""), Recorder())
+    assert agent.children == before

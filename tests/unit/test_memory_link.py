@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import random
+import sys
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -247,7 +251,38 @@ def test_what_is_sent_after_the_end_is_not_kept(loop: SimulatedLoop) -> None:
     cable.master.send(b"to nobody")
     loop.run_for(1)
     assert cable.master.statistics().queued_frames == 0
-    assert not cable.master._outbox
+
+
+def test_a_send_that_a_signal_interrupts_does_not_keep_later_ones_back(loop: SimulatedLoop) -> None:
+    cable = Cable(loop)
+    notes = Notes(cable.agent)
+    line = 0
+    while interrupted_in(line, cable.master.send, b"lost or sent"):
+        line += 1
+        cable.master.send(b"%d" % line)
+        loop.run_for(1)
+        assert notes.frames[-1] == b"%d" % line
+    assert line > 2
+
+
+def interrupted_in(line: int, call: Callable[[bytes], None], frame: bytes) -> bool:
+    """Whether a signal's handler could raise before so many lines of a call had run."""
+    lines = itertools.count()
+
+    def trace(*_: object) -> Any:
+        if next(lines) == line:
+            raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call(frame)
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(before)
+    return False
 
 
 def test_keepalive_is_configurable(loop: SimulatedLoop) -> None:

@@ -11,6 +11,7 @@ from unittest import mock
 import pytest
 
 from fiber._agent.interface import ChildSpec
+from fiber._backends import remote
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._transport.memory import SimulatedLoop
 from fiber._wire import messages
@@ -132,6 +133,18 @@ def test_what_met_the_end_on_its_way_is_named_unread(far: Far) -> None:
     with pytest.raises(EOFError):
         channel.receive(FOREVER)
     assert far.observer.report.unread == (7,)
+
+
+def test_of_more_than_is_remembered_all_that_is_remembered_is_named_unread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(remote, "_REMEMBERED", 4)
+    far = Far()
+    for seq in range(6):
+        far.child.deliver(seq, b"call")
+    far.ends(delivered=0)
+    assert far.observer.report is not None
+    assert far.observer.report.unread == (2, 3, 4, 5)
 
 
 def test_what_never_left_is_told_to_its_sender(far: Far) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 
 import pytest
 from hypothesis import given
@@ -105,3 +106,21 @@ def test_both_sides_derive_the_same_and_each_direction_has_its_own() -> None:
 
 def test_secrets_stay_out_of_logs() -> None:
     assert repr(derive(SECRET, SECRET, for_master=True)) == "Secrets(...)"
+
+
+def opened(size: int) -> memoryview:
+    """What a connection of its own brings."""
+    return Opener(SECRET).open(sealed(Sealer(SECRET), bytes(size)))
+
+
+def test_a_thousand_connections_take_the_memory_of_one() -> None:
+    largest = opened(1000)
+    assert {id(opened(size).obj) for size in range(1000)} == {id(largest.obj)}
+
+
+def test_what_one_thread_has_opened_is_not_overwritten_by_another() -> None:
+    mine, others = opened(1000), []
+    thread = threading.Thread(target=lambda: others.append(opened(1000)))
+    thread.start()
+    thread.join()
+    assert others[0].obj is not mine.obj

@@ -38,8 +38,8 @@ class Network:
 
     def connect(self) -> None:
         one, other = self.ends
-        one.connected(other.arrived, self.now)
-        other.connected(one.arrived, self.now)
+        one.connected(other.arrived)
+        other.connected(one.arrived)
 
     def reconnect(self) -> None:
         """Break the connection: what was under way is lost, or still arrives at first."""
@@ -168,8 +168,8 @@ def test_a_break_at_any_step_loses_nothing(sizes: list[int], cuts: set[int], see
 
 def pair(now: float = 0.0) -> tuple[ResumableStream, ResumableStream]:
     one, other = ResumableStream(now), ResumableStream(now)
-    one.connected(0, now)
-    other.connected(0, now)
+    one.connected(0)
+    other.connected(0)
     meet(one, other, now)
     return one, other
 
@@ -184,8 +184,8 @@ def meet(one: ResumableStream, other: ResumableStream, now: float) -> None:
 
 def test_both_speak_at_once_so_that_each_knows_that_the_connection_works() -> None:
     one, other = ResumableStream(0), ResumableStream(0)
-    one.connected(0, 0)
-    other.connected(0, 0)
+    one.connected(0)
+    other.connected(0)
     assert not other.heard
     (datagram,) = one.outgoing(0)
     assert other.received(datagram, 0) == []
@@ -302,8 +302,8 @@ def test_nothing_leaves_while_disconnected_and_all_of_it_afterwards() -> None:
     other.disconnected()
     one.send(b"queued")
     assert one.outgoing(50) == []
-    one.connected(other.arrived, 50)
-    other.connected(one.arrived, 50)
+    one.connected(other.arrived)
+    other.connected(one.arrived)
     frames = [frame for datagram in one.outgoing(50) for frame in other.received(datagram, 50)]
     assert frames == [b"under way", b"queued"]
     assert one.statistics().breaks == one.statistics().resent == 1
@@ -318,7 +318,7 @@ def test_a_peer_that_lost_its_place_cannot_resume(arrived: int) -> None:
     one.received(other.outgoing(ACK_DELAY)[0], 0)
     one.disconnected()
     with pytest.raises(ProtocolError, match=f"cannot resume after datagram {arrived}"):
-        one.connected(arrived, 0)
+        one.connected(arrived)
 
 
 def test_an_idle_stream_says_that_it_is_alive() -> None:

@@ -23,7 +23,7 @@ PATIENCE = tasks.PATIENCE
 
 
 class Channel:
-    """What the dispatcher would hear."""
+    """What the executor would hear."""
 
     def __init__(self) -> None:
         self.said: list[tuple[Any, ...]] = []

@@ -353,6 +353,41 @@ def test_a_refused_fork_is_told_and_leaks_nothing(
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()
 
 
+def test_a_request_for_which_it_has_no_descriptors_is_told_and_does_not_end_it(
+    inside: tuple[zygote.Zygote, socket.socket],
+) -> None:
+    made, ours = inside
+    request = (zygote.START, 1, tuple(_start()))
+    packet.send(ours, pickle.dumps(request), fds=[1, 2, 1, 2])
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+    try:
+        assert made._serve()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    kind, who, text = packet.loads(packet.receive(ours))
+    assert (kind, who) == (zygote.FAILED, None)
+    assert "descriptor" in text
+
+
+def test_a_child_out_of_reach_does_not_end_the_others(
+    inside: tuple[zygote.Zygote, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, ours = inside
+    child = subprocess.Popen(["sleep", "0"])
+    made._pids, made._children = {1: child.pid}, {child.pid: 1}
+
+    def refuse(pid: int, signum: int) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(os, "kill", refuse)
+    packet.send(ours, pickle.dumps((zygote.SIGNAL, 1, signal.SIGTERM)))
+    assert made._serve()
+    made._kill_children(0)
+    assert packet.loads(packet.receive(ours)) == (zygote.EXITED, 1, 0)
+    child.returncode = 0
+
+
 def test_what_came_ahead_of_a_start_that_never_came_is_closed(master: Master) -> None:
     reader, writer = os.pipe()
     packet.send(master.sock, pickle.dumps((zygote.DESCRIPTORS, 1)), fds=[writer])

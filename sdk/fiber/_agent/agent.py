@@ -164,12 +164,12 @@ class Agent:
         except Exception as error:
             self._child_exited(child, 1, f"could not be started: {error}")
             return
-        unused = all(other.zygote is not old for other in self._children.values())
-        if unused and old is not None:
+        if old is not None and not old.children:
             old.send(zygote.QUIT)
 
     def _child_exited(self, child: LocalChild, exitcode: int, reason: str) -> None:
         del self._children[child.id]
+        child.leave_zygote()
         unread, running = self._release(child)
         if child.fault is not None:
             reason = f"killed by its agent: {child.fault}"

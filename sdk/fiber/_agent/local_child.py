@@ -91,7 +91,9 @@ class LocalChild:
 
     def start(self, zygote: ZygoteLink, hub: HubAddress | None) -> None:
         """Have ``zygote`` start it; ``hub`` is what it is told of its host's hub."""
+        self.leave_zygote()
         self.zygote = zygote
+        zygote.children += 1
         spec = self._spec
         fds = self._descriptors()
         request = StartRequest(
@@ -106,6 +108,11 @@ class LocalChild:
             ancestors=lineage(),
         )
         zygote.start(self.id, request, fds)
+
+    def leave_zygote(self) -> None:
+        """It is gone, or goes elsewhere."""
+        if self.zygote is not None:
+            self.zygote.children -= 1
 
     def _descriptors(self) -> list[int]:
         """New descriptors for the child: stdout, stderr, task channel, and those of its handles."""

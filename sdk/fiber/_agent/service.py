@@ -22,10 +22,13 @@ _BACKLOG = 4 << 20
 
 
 class AgentService:
-    """Serves one master until the link ends; a ``LinkObserver``.  On the loop's thread."""
+    """Serves one master until the link ends; a ``LinkObserver``.  On the loop's thread.
+
+    ``on_end`` hears why it ended, and whether the master was lost.
+    """
 
     def __init__(
-        self, loop: Loop, link: Link, agent: Agent, hub: Hub, on_end: Callable[[str], None]
+        self, loop: Loop, link: Link, agent: Agent, hub: Hub, on_end: Callable[[str, bool], None]
     ) -> None:
         self._loop = loop
         self._hub = hub
@@ -36,6 +39,7 @@ class AgentService:
         self._children: dict[int, _Observed] = {}
         self._stopping = False
         self._reason = ""
+        self._lost = False
 
     def send(self, message: messages.Message) -> None:
         """Tell the master."""
@@ -70,6 +74,7 @@ class AgentService:
     def on_lost(self, reason: str) -> None:
         """The master is gone for good."""
         self._hub.unlink(None, reason)
+        self._lost = not self._stopping
         self.stop(f"lost the master: {reason}", 0)
 
     # Children
@@ -85,7 +90,7 @@ class AgentService:
         """That one is gone."""
         del self._children[child]
         if self._stopping and not self._children:
-            self._loop.call_soon(self._on_end, self._reason)
+            self._loop.call_soon(self._end)
 
     def stop(self, reason: str, grace: float) -> None:
         """End the children, by force after ``grace`` seconds, and then the agent."""
@@ -94,11 +99,14 @@ class AgentService:
         self._stopping = True
         self._reason = reason
         if not self._children:
-            self._on_end(reason)
+            self._end()
             return
         self._signal_all(signal.SIGTERM if grace else signal.SIGKILL)
         self._loop.call_later(grace, self._signal_all, signal.SIGKILL)
-        self._loop.call_later(grace + 5, self._on_end, reason)
+        self._loop.call_later(grace + 5, self._end)
+
+    def _end(self) -> None:
+        self._on_end(self._reason, self._lost)
 
     def _signal_all(self, signum: int) -> None:
         for child in self._children.values():

@@ -62,7 +62,7 @@ class Watchdog:
                 seen = batch.seq
                 try:
                     batch.return_unstarted()
-                except OSError:  # the dispatcher is gone, and this process will follow
+                except OSError:  # the executor is gone, and this process will follow
                     return
                 del batch  # its results must not live until the next batch
 

@@ -10,7 +10,7 @@ descriptor of the progress table; ``(START, child, start request)``, ``(SIGNAL, 
 ``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
 ``(FORK_UNSAFE, child, reason)``: this zygote's imports made forking unsafe, start that child
-elsewhere.
+elsewhere.  ``(FAILED, None, text)``: the next child of those asked for; its request is lost.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from fiber._agent import child as child_module
 from fiber._agent.child import StartRequest
 from fiber._agent.progress import ProgressTable
 from fiber._wire import packet
+from fiber.errors import TooManyOpenFiles
 
 SETUP, START, SIGNAL, DESCRIPTORS, QUIT = range(5)
 STARTED, FAILED, EXITED, FORK_UNSAFE = range(4)
@@ -106,7 +107,11 @@ class Zygote:
         signal.set_wakeup_fd(self._sigchld_in, warn_on_full_buffer=False)
 
     def _serve(self) -> bool:
-        message = packet.receive(self._control, descriptors=True)
+        try:
+            message = packet.receive(self._control, descriptors=True)
+        except TooManyOpenFiles as error:
+            self._reply(FAILED, None, str(error))
+            return True
         fds, message.fds = message.fds, []
         request: tuple[Any, ...] = packet.loads(message)
         if request[0] == DESCRIPTORS:
@@ -183,7 +188,7 @@ class Zygote:
     def _signal(self, child: int, signum: int) -> None:
         pid = self._pids.get(child)
         if pid is not None:
-            os.kill(pid, signum)
+            _kill(pid, signum)
 
     def _reap(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -213,7 +218,7 @@ class Zygote:
             waiter.poll(left * 1000)
             self._reap()
         for pid in self._children:
-            os.kill(pid, signal.SIGKILL)
+            _kill(pid, signal.SIGKILL)
         while self._children:
             pid, status = os.waitpid(-1, 0)
             child = self._children.pop(pid, None)
@@ -237,6 +242,12 @@ def _preload(preparation: bytes) -> str | None:
     gc.collect()
     gc.freeze()
     return None
+
+
+def _kill(pid: int, signum: int) -> None:
+    # A child that runs a set-user-ID program by now is out of our reach, but not the others.
+    with contextlib.suppress(PermissionError):
+        os.kill(pid, signum)
 
 
 def _close_all(fds: list[int]) -> None:

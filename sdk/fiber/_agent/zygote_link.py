@@ -6,6 +6,7 @@ import os
 import pickle
 import subprocess
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -42,10 +43,14 @@ class ZygoteLink:
         *,
         preload: bool,
     ) -> None:
+        self.children = 0
+        """Those that are to live on in it."""
         self._observer = observer
         self._loop = loop
         self._gone = threading.Event()
         self._has_replied = False
+        self._asked: deque[int] = deque()
+        """Children that it was asked for and has not answered; it answers in their order."""
         with naming_the_limit("starting the zygote"):
             own_table = os.dup(progress_table)  # what is sent is closed
             try:
@@ -62,6 +67,7 @@ class ZygoteLink:
 
     def start(self, child: int, request: StartRequest, fds: list[int]) -> None:
         """Ask for a child that gets ``fds``, which are this object's from now on."""
+        self._asked.append(child)
         while len(fds) > packet.MAX_DESCRIPTORS:
             some, fds = fds[: packet.MAX_DESCRIPTORS], fds[packet.MAX_DESCRIPTORS :]
             self._outbox.send(pickle.dumps((zygote.DESCRIPTORS, child)), fds=some)
@@ -106,7 +112,14 @@ class ZygoteLink:
             self._gone.set()
             return
         self._has_replied = True
-        self._observer.on_reply(self, reply)
+        self._observer.on_reply(self, self._completed(reply))
+
+    def _completed(self, reply: tuple[Any, ...]) -> tuple[Any, ...]:
+        """``reply`` with the child that it is about."""
+        kind, child, *rest = reply
+        if kind != zygote.EXITED and self._asked and child in (None, self._asked[0]):
+            child = self._asked.popleft()
+        return kind, child, *rest
 
 
 def dup_or_null(fd: int) -> int:

@@ -52,7 +52,7 @@ class AgentProcess:
                 return
             descriptor = credentials.to_descriptor()
             try:
-                self._process = subprocess.Popen(
+                process = subprocess.Popen(
                     interpreter_arguments(sys.executable, _STATEMENT),
                     env={**environment, "FIBER_AGENT_CREDENTIALS": f"fd:{descriptor}"},
                     stdin=subprocess.DEVNULL,
@@ -61,8 +61,14 @@ class AgentProcess:
                 )
             finally:
                 os.close(descriptor)
+            try:
+                self._watched = os.pidfd_open(process.pid)
+            except OSError:  # nobody would see its end, and the next attempt has its name
+                process.kill()
+                process.wait()
+                raise
+            self._process = process
             self.delayed = False
-            self._watched = os.pidfd_open(self._process.pid)
         self._loop.register(self._watched, self._ended)
 
     def fail(self, reason: str) -> None:

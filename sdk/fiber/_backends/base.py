@@ -15,7 +15,9 @@ class Backend(Protocol):
     """Whether its agents run on the program's own host, so that descriptors can be handed over."""
 
     def place(self) -> AgentHandle:
-        """The agent for the next child; waits until there is one, at most the start timeout."""
+        """The agent for the next child, at once, though it may not have joined yet; StartError if
+        none can take one more.
+        """
 
     def close(self) -> None:
         """End every agent and its children.  Not on the loop's thread."""

@@ -6,8 +6,11 @@ The whole remote path, encryption and authentication included, without a cluster
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import threading
+import time
+from typing import NamedTuple
 
 from fiber._backends.agent_process import AgentProcess, Launcher
 from fiber._backends.output import Output
@@ -27,6 +30,7 @@ _PAUSE_MIN, _PAUSE_MAX = 0.1, 30.0
 """Seconds before another one is started after those, if there are others to work with."""
 
 _QUIT_TIMEOUT = 5.0
+"""Seconds for all agents together to end by themselves."""
 
 
 class LoopbackBackend:
@@ -46,6 +50,10 @@ class LoopbackBackend:
         self._failures: tuple[str, ...] = ()
         self._closing = False
         self._numbers = itertools.count()
+        self._processes: list[_Slot] = []
+        self._by_name: dict[str, _Slot] = {}
+        self._vacant: list[_Slot] = []
+        """Those whose agents are lost and not yet replaced."""
         credentials = make_credentials("loopback")
         self._listener = MasterListener(
             loop,
@@ -60,49 +68,52 @@ class LoopbackBackend:
             config.start_timeout,
             lambda trouble: self._output.write("fiber", trouble),
         )
-        self._processes = tuple(self._launch() for _ in range(config.agents))
+        for index in range(config.agents):
+            self._launch(index)
 
     def place(self) -> RemoteAgent:
         """The agent with the fewest children; StartError if none can take one more."""
-        there = [process for process in self._processes if not process.agent.lost]
-        if not there:
-            reasons = "\n".join(self._failures)
-            raise StartError("the loopback agents", "none joined", reasons, _ATTEMPTS)
-        limit = self._config.processes_per_agent
-        free = [process for process in there if not limit or process.agent.children < limit]
-        if not free:
+        limit = self._config.processes_per_agent or math.inf
+        free = [slot for slot in self._processes if slot.agent.can_take(limit)]
+        if free:
+            return min(free, key=_Slot.preference).agent
+        there = sum(not slot.agent.lost for slot in self._processes)
+        if there:
             raise StartError(
                 "one more process",
-                f"all {len(there)} agents run {limit} processes already (processes_per_agent); "
+                f"all {there} agents run {limit} processes already (processes_per_agent); "
                 "raise FIBER_AGENTS or FIBER_PROCESSES_PER_AGENT",
             )
-        return min(free, key=_Placed.preference).agent
+        reasons = "\n".join(self._failures)
+        raise StartError("the loopback agents", "none joined", reasons, _ATTEMPTS)
 
     def close(self) -> None:
         """End the agents and wait for them."""
         self._closing = True
         self._launcher.close()
-        for process in self._processes:
-            process.agent.close()
-        for process in self._processes:
-            process.process.wait(_QUIT_TIMEOUT)
+        for slot in self._processes:
+            slot.agent.close()
+        deadline = time.monotonic() + _QUIT_TIMEOUT
+        for slot in self._processes:
+            slot.process.wait(max(deadline - time.monotonic(), 0.0))
         done = threading.Event()
         self._listener.close("the master ended", then=done.set)
         done.wait(_QUIT_TIMEOUT)
         self._output.close()
 
-    def _launch(self, pause: float = 0.0) -> _Placed:
+    def _launch(self, index: int, pause: float = 0.0) -> None:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
         agent = RemoteAgent(name, self._loop, self._hub, self._output, on_lost=self._lost)
         process = AgentProcess(self._loop, agent.lose)
+        slot = self._by_name[name] = _Slot(index, agent, process)
+        self._processes[index : index + 1] = [slot]
         launch = self._launcher.launch, process, name, self._environment(name)
         if pause:
             process.delayed = True
             self._loop.call_later(pause, *launch)
         else:
             launch[0](*launch[1:])
-        return _Placed(agent, process)
 
     def _environment(self, name: str) -> dict[str, str]:
         return {
@@ -116,48 +127,48 @@ class LoopbackBackend:
 
     # On the loop's thread
 
-    def _joined(self, link: Link) -> None:
-        for process in self._processes:
-            if process.agent.host == link.peer.name and not process.agent.joined:
-                self._failures = ()
-                process.agent.join(link)
-                self._replace_lost()  # those that were given up: it can be done after all
-                return
-        link.close(f"the master expects no agent named {link.peer.name}")
+    def _joined(self, link: Link) -> str | None:
+        slot = self._by_name.get(link.peer.name)
+        if slot is None or slot.agent.joined:
+            return f"the master expects no agent named {link.peer.name}"
+        self._failures = ()
+        slot.agent.join(link)
+        self._fill_vacant()  # those that were given up: it can be done after all
+        return None
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
         """Have a place for new children before the ends of its own make anybody ask for one."""
         if self._closing:
             return
-        for process in self._processes:
-            if process.agent is agent:
-                process.process.kill()
+        slot = self._by_name.pop(agent.host)
+        slot.process.kill()
+        self._vacant.append(slot)
         if not agent.joined:
             self._failures += (f"{agent.host}: {reason}",)
         in_a_row = len(self._failures)
         if in_a_row < _ATTEMPTS:
-            self._replace_lost()
-        elif any(process.agent.joined and not process.agent.lost for process in self._processes):
+            self._fill_vacant()
+        elif any(slot.agent.joined and not slot.agent.lost for slot in self._processes):
             pause = min(_PAUSE_MIN * 2 ** (in_a_row - _ATTEMPTS), _PAUSE_MAX)
             self._output.write(
                 "fiber",
                 f"agent {agent.host} was lost before it joined, as {in_a_row - 1} before it: "
                 f"{reason}. The others go on; the next attempt is in {pause:g} s",
             )
-            self._replace_lost(pause)
+            self._fill_vacant(pause)
 
-    def _replace_lost(self, pause: float = 0.0) -> None:
-        self._processes = tuple(
-            self._launch(pause) if process.agent.lost else process for process in self._processes
-        )
+    def _fill_vacant(self, pause: float = 0.0) -> None:
+        vacant, self._vacant = self._vacant, []
+        for slot in vacant:
+            self._launch(slot.position, pause)
 
 
-class _Placed:
-    """An agent, and the process that it is."""
+class _Slot(NamedTuple):
+    """The place of an agent among the others, the agent, and the process that it is."""
 
-    def __init__(self, agent: RemoteAgent, process: AgentProcess) -> None:
-        self.agent = agent
-        self.process = process
+    position: int
+    agent: RemoteAgent
+    process: AgentProcess
 
     def preference(self) -> tuple[bool, bool, int]:
         """Lower is better for one more child."""

@@ -7,26 +7,56 @@ import queue
 import sys
 import threading
 
+_ROOM = 4 << 20
+"""Characters that may wait for stderr.  Above that lines are left out, until half of it is free."""
+
 
 class Output:
-    """Lines on their way to stderr.  A slow or broken stderr holds up nobody but their writer."""
+    """Lines on their way to stderr.  One that is slow, stuck or broken holds up nobody: what it
+    has no room for is left out, and how much that was is said in its place.
+    """
 
     def __init__(self) -> None:
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._waiting = 0
+        """Characters in the queue, and those that are being written."""
+        self._left_out = 0
+        """Lines since the last that was taken."""
 
     def write(self, who: str, text: str) -> None:
         """Lines of ``who``; returns at once."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="fiber-output", daemon=True)
             self._thread.start()
-        self._lines.put("".join(f"[{who}] {line}\n" for line in text.split("\n")))
+        lines = "".join(f"[{who}] {line}\n" for line in text.split("\n"))
+        with self._lock:
+            if self._waiting > (_ROOM // 2 if self._left_out else _ROOM):
+                self._left_out += lines.count("\n")
+            else:
+                self._say_what_is_left_out()
+                self._put(lines)
 
     def close(self) -> None:
         """Write what is left."""
         if self._thread is not None:
+            with self._lock:
+                self._say_what_is_left_out()
             self._lines.put(None)
             self._thread.join(timeout=2)
+
+    def _say_what_is_left_out(self) -> None:
+        number, self._left_out = self._left_out, 0
+        if number:
+            self._put(
+                f"[fiber] {number} lines are left out here: stderr took them more slowly than they "
+                "came\n"
+            )
+
+    def _put(self, lines: str) -> None:
+        self._waiting += len(lines)
+        self._lines.put(lines)
 
     def _run(self) -> None:
         while (lines := self._lines.get()) is not None:
@@ -34,3 +64,7 @@ class Output:
             with contextlib.suppress(OSError, ValueError):
                 sys.stderr.write(lines)
                 sys.stderr.flush()
+            with self._lock:
+                self._waiting -= len(lines)
+                if not self._waiting:
+                    self._say_what_is_left_out()

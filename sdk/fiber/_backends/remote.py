@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import pickle
 import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -28,6 +27,9 @@ class RemoteAgent:
     """An ``AgentHandle``.
 
     It takes work before its link is there; what it cannot do it reports as exits.
+
+    ``start``, ``send`` and ``close``, and a child's ``recall`` and ``signal``, come from anywhere
+    and only put into the loop's queue; everything else happens on the loop's thread.
     """
 
     def __init__(
@@ -44,7 +46,6 @@ class RemoteAgent:
         self._tunnels = hub.link(host, self.send, dialer=False)
         self._output = output
         self._on_lost = on_lost
-        self._lock = threading.RLock()  # a finalizer may send, wherever the collector runs
         self._ids = itertools.count(1)
         self._children: dict[int, RemoteChild] = {}
         self._link: Link | None = None
@@ -61,6 +62,10 @@ class RemoteAgent:
         """How many children it has."""
         return len(self._children)
 
+    def can_take(self, limit: float) -> bool:
+        """Whether it may have one more child, of at most so many."""
+        return self._lost is None and len(self._children) < limit
+
     @property
     def joined(self) -> bool:
         """Whether it has its link."""
@@ -68,39 +73,31 @@ class RemoteAgent:
 
     def join(self, link: Link) -> None:
         """Its process dialled in.  On the loop's thread."""
-        with self._lock:
-            self._link = link
-            early, self._early = self._early, []
-            for frame in early:
-                link.send(frame)
+        self._link = link
+        early, self._early = self._early, []
+        for frame in early:
+            link.send(frame)
         link.attach(self)
 
     def start(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """Start a child there."""
-        child = RemoteChild(self, next(self._ids), spec.name, observer)
-        with self._lock:
-            lost = self._lost
-            if lost is None:
-                self._children[child.number] = child
-        if lost is not None:
-            raise RuntimeError(f"agent {self.host} cannot start {spec.name}: {lost}")
+        if self._lost is not None:
+            raise RuntimeError(f"agent {self.host} cannot start {spec.name}: {self._lost}")
         fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
-        start = messages.Start(child.number, pickle.dumps(fields, protocol=5))
+        child = RemoteChild(self, next(self._ids), spec.name, observer)
+        frame = messages.Start(child.number, pickle.dumps(fields, protocol=5)).encode()
+        self._children[child.number] = child  # it counts at once, wherever the next one is placed
         try:
-            self.send(start)
+            self.loop.call_soon(self._start, child, frame)
         except BaseException:  # Ctrl-C: it may be started, and nobody will know it
+            self._children.pop(child.number, None)
             child.signal(signal.SIGKILL)
             raise
         return child
 
     def send(self, message: messages.Message) -> None:
-        """Send a frame, now or when the link is there."""
-        frame = message.encode()
-        with self._lock:
-            if self._link is None:
-                self._early.append(frame)
-                return
-        self._link.send(frame)
+        """Send a frame as soon as there is a link."""
+        self.loop.call_soon(self._send, message.encode())
 
     def close(self) -> None:
         """End it and its children."""
@@ -108,22 +105,37 @@ class RemoteAgent:
 
     def lose(self, reason: str) -> None:
         """It is gone, and its children with it.  On the loop's thread."""
-        with self._lock:
-            if self._lost is not None:
-                return
-            self._lost = reason
-            children, self._children = self._children, {}
+        if self._lost is not None:
+            return
+        self._lost = reason
         self._hub.unlink(self.host, reason)
         try:
             self._on_lost(self, reason)
         finally:  # whatever becomes of it, nobody must wait for these
-            report = ExitReport(
-                -signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host
-            )
-            for child in children.values():
-                child.end(report)
+            for number in list(self._children):
+                self._lose_child(number)
 
-    # What comes over the link, on the loop's thread
+    # On the loop's thread
+
+    def _start(self, child: RemoteChild, frame: Frame) -> None:
+        if self._lost is None:
+            self._children[child.number] = child
+            self._send(frame)
+        else:
+            self._lose_child(child.number)
+
+    def _send(self, frame: Frame) -> None:
+        if self._link is None:
+            self._early.append(frame)
+        else:
+            self._link.send(frame)
+
+    def _lose_child(self, number: int) -> None:
+        if (child := self._children.pop(number, None)) is not None:
+            reason = f"agent {self.host} lost: {self._lost}"
+            child.end(ExitReport(-signal.SIGKILL, reason, host=self.host))
+
+    # What comes over the link
 
     def on_frame(self, frame: Frame) -> None:
         """What the agent tells of its children."""
@@ -131,16 +143,12 @@ class RemoteAgent:
         if isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
             self._tunnels.on_frame(message)
             return
-        if isinstance(message, messages.Problem):
-            self._output.write(self.host, message.text)
-            return
         number = getattr(message, "child", None)
         child = None if number is None else self._children.get(number)
         if child is None:
             return
         if isinstance(message, messages.Exited):
-            with self._lock:
-                self._children.pop(message.child, None)
+            self._children.pop(message.child, None)
         child.heard(message, self._output)
 
     def on_suspect(self) -> None:
@@ -229,5 +237,5 @@ class RemoteChild:
         self._gone = True
         if self._channel is not None:
             self._channel.end()
-        missed = list(self._latest)[len(self._latest) - crossed :]
+        missed = list(self._latest)[max(0, len(self._latest) - crossed) :]
         self.observer.exited(report._replace(unread=(*report.unread, *missed)))

@@ -21,6 +21,7 @@ from fiber._transport import address as addresses
 from fiber._transport import tls
 from fiber._transport.admission import Admission
 from fiber._transport.loop import Loop
+from fiber._transport.refusals import Refusals
 from fiber._transport.sealing import Secrets
 from fiber._wire.messages import ProtocolError
 from fiber.errors import LinkError, TooManyOpenFiles
@@ -41,9 +42,6 @@ _PAUSE = 0.2
 _LAST_WORD = 1.0
 """Seconds for the peer to read why it was turned away: closing at once might destroy that."""
 
-_TOLD = 256
-"""Different complaints that are told; who varies his address or fault must not fill the log."""
-
 _BACKLOG = 1024
 
 _SHORT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
@@ -53,7 +51,8 @@ class Acceptor:
     """Listens on ``address`` (port 0: a free one), which then says where it really does.
 
     ``on_hello`` is called on its thread with a newcomer that has proved itself, and its first
-    words; ``on_refused`` with why one was turned away, once for each address and reason.
+    words; ``on_refused`` with why one was turned away, once in some minutes for each address and
+    reason.
     """
 
     def __init__(
@@ -68,7 +67,7 @@ class Acceptor:
         self.on_hello = on_hello
         self.loop = Loop()
         self._on_refused = on_refused
-        self._told: set[tuple[str, str]] = set()
+        self._refusals = Refusals()
         descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         most = min(_MOST, max(descriptors // 4, 2))
         self._admission = Admission(most, most // 2)
@@ -93,11 +92,12 @@ class Acceptor:
 
     # On its own thread
 
-    def complain(self, host: str, origin: str, what: str) -> None:
-        """Somebody was turned away."""
-        if (host, what) not in self._told and len(self._told) < _TOLD:
-            self._told.add((host, what))
-            self._on_refused(f"{origin} was turned away: {what}")
+    def report(self, host: str, origin: str, reason: str, *, proven: bool = False) -> None:
+        """Somebody was turned away; ``proven``: one with the pool's credentials."""
+        if self._refusals.is_news(host, reason, self.loop.now()):
+            self._on_refused(
+                f"{reason} ({origin})" if proven else f"{origin} was turned away: {reason}"
+            )
 
     def forget(self, newcomer: Newcomer) -> None:
         """It is gone, or in."""
@@ -118,7 +118,7 @@ class Acceptor:
             self._admit(sock, host, f"{host}:{port}")
 
     def _pause(self, error: OSError) -> None:
-        self.complain("", "whoever comes now", f"{error.strerror}; it is tried again all the time")
+        self.report("", "whoever comes now", f"{error.strerror}; it is tried again all the time")
         self.loop.unregister(self._door.fileno())
         self.loop.call_later(_PAUSE, self._resume)
 
@@ -132,7 +132,7 @@ class Acceptor:
         if isinstance(leaves, Newcomer):
             leaves.refuse("it said nothing, and others want to come in")
         if not admitted:
-            self.complain(host, origin, "too many come at the same time")
+            self.report("", origin, "too many come at the same time")
             sock.close()
             return
         self._newcomers.add(newcomer)
@@ -173,9 +173,16 @@ class Newcomer:
         """
         self._loop.call_soon(self._answer, greeting, lambda end: then(*end))
 
-    def turn_away(self, greeting: bytes) -> None:
-        """Answer it and hang up.  Any thread."""
+    def turn_away(self, greeting: bytes, reason: str) -> None:
+        """Answer it, hang up and tell whom it concerns.  Any thread."""
+        self.report_proven(reason)
         self._loop.call_soon(self._answer, greeting, lambda end: os.close(end[0]))
+
+    def report_proven(self, reason: str) -> None:
+        """It has the pool's credentials, and is nobody who can be served.  Any thread."""
+        self._loop.call_soon(
+            lambda: self._acceptor.report(self._host, self.origin, reason, proven=True)
+        )
 
     def _answer(self, greeting: bytes, then: Callable[[tuple[int, Secrets]], None]) -> None:
         if self.gone:
@@ -196,7 +203,7 @@ class Newcomer:
 
     def refuse(self, what: str) -> None:
         """Hang up, and tell whom it concerns."""
-        self._acceptor.complain(self._host, self.origin, what)
+        self._acceptor.report(self._host, self.origin, what)
         self.hang_up()
 
     def hang_up(self) -> None:
@@ -219,7 +226,7 @@ class Newcomer:
                 self._unwatch()
                 then(finished.value)
             except (tls.Untrusted, tls.HungUp, ProtocolError) as error:
-                self._acceptor.complain(self._host, self.origin, str(error))
+                self._acceptor.report(self._host, self.origin, str(error))
                 self._part()
 
         step()

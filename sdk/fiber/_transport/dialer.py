@@ -91,7 +91,9 @@ class AgentDialer:
         """Give up dialling, or drop the link without a farewell.  Calls nobody back."""
         self._loop.call_soon(self._stop)
 
-    def _start(self, *, pause: float = 0.0) -> None:
+    def _start(self, pause: float = 0.0) -> None:
+        if self._over.is_set():
+            return
         link = self._link
         welcomed, arrived = (link.heard, link.arrived) if link else (False, 0)
         hello = Hello(self._identity, self._name, arrived, welcomed).encode()
@@ -99,7 +101,11 @@ class AgentDialer:
         dial = threading.Thread(
             target=self._dial, args=(hello, pause), name="fiber-dial", daemon=True
         )
-        dial.start()
+        try:
+            dial.start()
+        except RuntimeError as error:  # the system has no thread to give, which may pass
+            self._obstacle = str(error)
+            self._loop.call_later(_PAUSE_MAX, self._start)
 
     # On the thread that dials
 
@@ -201,7 +207,7 @@ class AgentDialer:
         except FiberError as error:
             # No descriptors, which may pass.
             self._obstacle = str(error)
-            self._start(pause=_PAUSE_MAX)
+            self._start(_PAUSE_MAX)
             return
         self.lost_grace = welcome.lost_grace
         link.connected(connection, welcome.arrived)
@@ -213,8 +219,7 @@ class AgentDialer:
     def _gone(self, wire: Wire) -> None:
         if self._link is not None:
             self._link.disconnected(wire)
-        if not self._over.is_set():
-            self._start(pause=_PAUSE_MIN)
+        self._start(_PAUSE_MIN)
 
     def _too_late(self) -> None:
         self._fail(
@@ -273,4 +278,6 @@ def _connect(address: str) -> socket.socket:
         raise Unreachable(f"no answer within {_CONNECT:g} s") from error
     except OSError as error:
         raise Unreachable(str(error.strerror or error).lower()) from error
+    except UnicodeError as error:
+        raise Unreachable(f"its name is none: {error}") from error
     return sock

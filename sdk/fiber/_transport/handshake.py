@@ -90,6 +90,15 @@ class Refusal(NamedTuple):
         return _encode(_REFUSAL, self)
 
 
+_UNREADABLE = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,  # an infinite number
+    RecursionError,  # brackets without end
+)
+
 Greeting: TypeAlias = Hello | Welcome | Refusal
 
 
@@ -101,7 +110,7 @@ def decode(datagram: bytes) -> Greeting:
     try:
         fields = json.loads(datagram[1:])
         return reader(_identity(fields["identity"]), fields)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except _UNREADABLE as error:
         # Whatever JSON holds instead of what belongs there.
         raise ProtocolError(
             f"its greeting is malformed ({type(error).__name__}: {error})"

@@ -22,9 +22,10 @@ class MasterListener:
     """The master's end of all its links: one address that agents dial.
 
     ``address`` is ``host:port``; port 0 takes a free one, and ``address`` then says which.  The
-    callbacks run on the loop's thread: ``on_agent`` must attach an observer to the new link,
-    ``on_refused`` hears who was turned away and why.  ``lost_grace`` is told to the agents: for so
-    many seconds they wait for another master if this one is lost.
+    callbacks run on the loop's thread: ``on_agent`` attaches an observer to the new link, or
+    returns why it does not want it; ``on_refused`` hears who was turned away and why.
+    ``lost_grace`` is told to the agents: for so many seconds they wait for another master if this
+    one is lost.
     """
 
     def __init__(
@@ -33,14 +34,13 @@ class MasterListener:
         address: str,
         credentials: Credentials,
         *,
-        on_agent: Callable[[Link], None],
+        on_agent: Callable[[Link], str | None],
         on_refused: Callable[[str], None],
         keepalive: Keepalive = DEFAULT_KEEPALIVE,
         lost_grace: float | None = None,
     ) -> None:
         self._loop = loop
         self._on_agent = on_agent
-        self._on_refused = on_refused
         self._keepalive = keepalive
         self._lost_grace = lost_grace
         self._identity = Identity.of_this_process("the master")
@@ -116,8 +116,7 @@ class MasterListener:
         return ""
 
     def _refuse(self, newcomer: Newcomer, reason: str) -> None:
-        newcomer.turn_away(Refusal(self._identity, reason).encode())
-        self._on_refused(f"{reason} ({newcomer.origin})")
+        newcomer.turn_away(Refusal(self._identity, reason).encode(), reason)
 
     def _welcome(self, newcomer: Newcomer, hello: Hello) -> None:
         link = self._links.get(hello.link)
@@ -130,11 +129,13 @@ class MasterListener:
         newcomer.welcome(
             welcome.encode(),
             lambda descriptor, secrets: self._loop.call_soon(
-                self._connect, hello, arrived, descriptor, secrets
+                self._connect, newcomer, hello, arrived, descriptor, secrets
             ),
         )
 
-    def _connect(self, hello: Hello, arrived: int, descriptor: int, secrets: Secrets) -> None:
+    def _connect(
+        self, newcomer: Newcomer, hello: Hello, arrived: int, descriptor: int, secrets: Secrets
+    ) -> None:
         """Go on without TLS."""
         link = self._links.get(hello.link)
         if self._closing is not None or (link.arrived if link else 0) != arrived:
@@ -154,12 +155,13 @@ class MasterListener:
                 on_gone=link.disconnected,
             )
         except FiberError as error:
-            self._on_refused(f"{hello.identity.name!r} cannot be served: {error}")
+            newcomer.report_proven(f"{hello.identity.name!r} cannot be served: {error}")
             return
         self._links[hello.link] = link
         link.connected(connection, hello.arrived)
-        if new:
-            self._on_agent(link)
+        if new and (unwanted := self._on_agent(link)):
+            link.close(unwanted)
+            newcomer.report_proven(unwanted)
 
     def _forget(self, link: str) -> None:
         self._links.pop(link, None)

@@ -77,13 +77,17 @@ class Connection:
         self._closed = False
         self._message = _ffi.new("nng_msg **")
         self._descriptor = descriptor
-        self._greeting: socket.socket | None = _duplicate(descriptor)
-        self._socket = _pair(
-            descriptor,
-            on_here=lambda: loop.call_soon(self._came),
-            on_gone=lambda: loop.call_soon(self._went),
-        )
-        self._fd: int = self._socket.recv_fd
+        greeting = _duplicate(descriptor)
+        try:
+            self._socket, self._fd = _pair(
+                descriptor,
+                on_here=lambda: loop.call_soon(self._came),
+                on_gone=lambda: loop.call_soon(self._went),
+            )
+        except BaseException:
+            greeting.close()
+            raise
+        self._greeting: socket.socket | None = greeting
         _live.add(self)
         loop.register(self._fd, self._readable)
 
@@ -177,12 +181,17 @@ def _duplicate(descriptor: int) -> socket.socket:
         raise
 
 
-def _pair(descriptor: int, on_here: Callable[[], None], on_gone: Callable[[], None]) -> Any:
-    """A Pair1 socket whose only pipe is the connection ``descriptor``."""
+def _pair(
+    descriptor: int, on_here: Callable[[], None], on_gone: Callable[[], None]
+) -> tuple[Any, int]:
+    """A Pair1 socket whose only pipe is the connection ``descriptor``, and what is readable
+    whenever a message is there.
+    """
     owned = True
     try:
         pair = pynng.Pair1(recv_max_size=_LARGEST, recv_buffer_size=_TURN, send_buffer_size=_QUEUE)
         try:
+            readable: int = pair.recv_fd  # made now: it takes descriptors of its own
             pair.add_post_pipe_connect_cb(lambda _: on_here())
             pair.add_post_pipe_remove_cb(lambda _: on_gone())
             listener = _ffi.new("nng_listener *")
@@ -200,7 +209,7 @@ def _pair(descriptor: int, on_here: Callable[[], None], on_gone: Callable[[], No
     finally:
         if owned:
             os.close(descriptor)
-    return pair
+    return pair, readable
 
 
 _live: weakref.WeakSet[Connection] = weakref.WeakSet()

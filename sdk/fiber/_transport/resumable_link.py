@@ -61,7 +61,6 @@ class ResumableLink:
         self._observer: LinkObserver | None = None
         self._inbox: deque[Frame] = deque()
         self._lost: str | None = None
-        self._outbox: deque[Frame] = deque()
         self._flush_due = False
         self._timer: Timer | None = None
         self._timer_due = 0.0
@@ -85,8 +84,7 @@ class ResumableLink:
 
     def send(self, frame: Frame) -> None:
         """Send a frame as soon as there is room; dropped if the link has ended."""
-        self._outbox.append(frame)
-        self._flush_soon()
+        self._loop.call_soon(self._send, frame)
 
     def close(
         self,
@@ -111,14 +109,13 @@ class ResumableLink:
         if self._wire is not None:
             self._unplug().close()
         try:
-            self._stream.connected(arrived, self._loop.now())
+            self._stream.connected(arrived)
         except ProtocolError as error:
             # A peer that forgot what it had acknowledged is not the one that this link was with.
             wire.close()
             self._lose(str(error))
             return
         self._wire = wire
-        self._heard()
         self._flush()
 
     def disconnect(self) -> None:
@@ -193,20 +190,21 @@ class ResumableLink:
             self._observer = None
             observer.on_lost(self._lost)
 
+    def _send(self, frame: Frame) -> None:
+        if self._state is not _State.ENDED:
+            self._stream.send(frame)
+            self._flush_soon()
+
     def _flush_soon(self) -> None:
+        """Flush once for all that is sent in this turn."""
         if not self._flush_due:
             self._flush_due = True
             self._loop.call_soon(self._flush)
 
     def _flush(self) -> None:
-        # The flag first: a frame that is appended while this runs is either taken or flushed again.
         self._flush_due = False
-        if self._state is _State.ENDED:
-            self._outbox.clear()
-            return
-        while self._outbox:
-            self._stream.send(self._outbox.popleft())
-        self._speak()
+        if self._state is not _State.ENDED:
+            self._speak()
 
     def _speak(self) -> None:
         now = self._loop.now()

@@ -138,7 +138,7 @@ class ResumableStream:
         self._queued_bytes += len(frame)
         self._counts["frames_sent"] += 1
 
-    def connected(self, arrived: int, now: float) -> None:
+    def connected(self, arrived: int) -> None:
         """There is a connection, and the peer has taken our datagrams up to ``arrived``."""
         if not self._acknowledged <= arrived <= self._sent:
             raise ProtocolError(
@@ -148,8 +148,7 @@ class ResumableStream:
         self._connected = True
         self._acknowledge(arrived)
         self._repeat = bool(self._unacknowledged)
-        self._speak_now = True  # so that both sides know soon that it works
-        self._heard(now)
+        self._speak_now = True  # a connection alone says nothing: what comes over it does
 
     def disconnected(self) -> None:
         """The connection broke; what was under way counts as not arrived."""
@@ -202,7 +201,8 @@ class ResumableStream:
             raise ProtocolError(
                 f"it acknowledges datagram {acknowledged}, but only {self._sent} were sent"
             )
-        self._heard(now)
+        self._silent = 0.0
+        self._ticked = now
         self._counts["datagrams_received"] += 1
         self._counts["bytes_received"] += len(datagram)
         self._acknowledge(acknowledged)
@@ -292,10 +292,6 @@ class ResumableStream:
         self._unacknowledged.append(datagram)
         self._unacknowledged_bytes += len(datagram)
         return datagram
-
-    def _heard(self, now: float) -> None:
-        self._silent = 0.0
-        self._ticked = now
 
     def _acknowledge(self, arrived: int) -> None:
         while self._acknowledged < arrived:

@@ -151,23 +151,6 @@ class Output(NamedTuple):
         return _redacted(self)
 
 
-class Log(NamedTuple):
-    """Agent to master: a log record of the child, or of the agent itself (child 0)."""
-
-    child: int
-    logger: str
-    level: int
-    process: str
-    text: str
-
-    def encode(self) -> bytes:
-        """The frame."""
-        return _NUMBER.pack(PROTOCOL, _LOG, self.child) + _json(self[1:])
-
-    def __repr__(self) -> str:
-        return _redacted(self)
-
-
 class TunnelOpen(NamedTuple):
     """Either way: connect a new tunnel to the hub at ``target``."""
 
@@ -216,19 +199,6 @@ class Shutdown(NamedTuple):
         return _GRACE.pack(PROTOCOL, _SHUTDOWN, self.grace)
 
 
-class Problem(NamedTuple):
-    """Agent to master: something is wrong that a person should know."""
-
-    text: str
-
-    def encode(self) -> bytes:
-        """The frame."""
-        return _HEAD.pack(PROTOCOL, _PROBLEM) + _utf8(self.text)
-
-    def __repr__(self) -> str:
-        return _redacted(self)
-
-
 Message: TypeAlias = (
     Start
     | Started
@@ -239,12 +209,10 @@ Message: TypeAlias = (
     | Recalled
     | Exited
     | Output
-    | Log
     | TunnelOpen
     | TunnelData
     | TunnelClose
     | Shutdown
-    | Problem
 )
 
 
@@ -265,7 +233,7 @@ def decode(frame: bytes | bytearray) -> Message:
         raise ProtocolError(f"a frame is of unknown kind {kind}")
     try:
         return reader(memoryview(frame))
-    except (struct.error, UnicodeDecodeError, ValueError, TypeError) as error:
+    except (struct.error, ValueError, TypeError, RecursionError) as error:
         # Each of them is what its reader raises for bytes that its writer cannot have written.
         name = reader.__name__.removeprefix("_read_")
         raise ProtocolError(
@@ -274,7 +242,7 @@ def decode(frame: bytes | bytearray) -> Message:
 
 
 _START, _STARTED, _SIGNAL, _DELIVER, _SAID, _RECALL, _RECALLED, _EXITED = range(1, 9)
-_OUTPUT, _LOG, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN, _PROBLEM = range(9, 16)
+_OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
 
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
@@ -383,12 +351,6 @@ def _read_output(view: memoryview) -> Output:
     return Output(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
 
 
-def _read_log(view: memoryview) -> Log:
-    child = _NUMBER.unpack_from(view)[2]
-    logger, level, process, text = json.loads(_text(view[_NUMBER.size :]))
-    return Log(child, _string(logger), _integer(level), _string(process), _string(text))
-
-
 def _read_tunnel_open(view: memoryview) -> TunnelOpen:
     return TunnelOpen(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
 
@@ -403,10 +365,6 @@ def _read_tunnel_close(view: memoryview) -> TunnelClose:
 
 def _read_shutdown(view: memoryview) -> Shutdown:
     return Shutdown(_GRACE.unpack(view)[2])
-
-
-def _read_problem(view: memoryview) -> Problem:
-    return Problem(_text(view[_HEAD.size :]))
 
 
 def _integer(value: Any) -> int:
@@ -431,12 +389,10 @@ _READERS: dict[int, Callable[[memoryview], Message]] = {
     _RECALLED: _read_recalled,
     _EXITED: _read_exited,
     _OUTPUT: _read_output,
-    _LOG: _read_log,
     _TUNNEL_OPEN: _read_tunnel_open,
     _TUNNEL_DATA: _read_tunnel_data,
     _TUNNEL_CLOSE: _read_tunnel_close,
     _SHUTDOWN: _read_shutdown,
-    _PROBLEM: _read_problem,
 }
 
 

@@ -1,4 +1,4 @@
-"""What the dispatcher and a pool worker say to each other.
+"""What the executor and a pool worker say to each other.
 
 To a worker (behind the sequence number that its agent put in front)::
 

@@ -1,0 +1,98 @@
+"""What remote children write, and a stderr that does not keep up with them."""
+
+from __future__ import annotations
+
+import io
+import re
+import threading
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import pytest
+
+from fiber._backends import output
+from fiber._backends.output import Output
+
+PATIENCE = 10
+SAID = re.compile(r"\[fiber\] (\d+) lines are left out here")
+
+
+class Stuck(io.StringIO):
+    """A terminal that takes nothing for as long as it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.goes_on = threading.Event()
+        self.changed = threading.Condition()
+
+    def write(self, text: str) -> int:
+        assert self.goes_on.wait(PATIENCE)
+        with self.changed:
+            written = super().write(text)
+            self.changed.notify_all()
+            return written
+
+    def wait_for(self, text: str) -> None:
+        with self.changed:
+            assert self.changed.wait_for(lambda: text in self.getvalue(), PATIENCE)
+
+
+@pytest.fixture
+def stderr(monkeypatch: pytest.MonkeyPatch) -> Stuck:
+    stuck = Stuck()
+    # pytest puts its own sys.stderr in place after the fixtures.
+    monkeypatch.setattr(output, "sys", SimpleNamespace(stderr=stuck))
+    monkeypatch.setattr(output, "_ROOM", 1000)
+    return stuck
+
+
+@pytest.fixture
+def lines(stderr: Stuck) -> Iterator[Output]:
+    lines = Output()
+    yield lines
+    stderr.goes_on.set()
+    lines.close()
+
+
+def numbers(stderr: Stuck) -> list[int]:
+    return [int(line.split()[-1]) for line in stderr.getvalue().splitlines() if "[w]" in line]
+
+
+def test_what_a_stuck_stderr_has_no_room_for_is_left_out_and_counted(
+    stderr: Stuck, lines: Output
+) -> None:
+    for number in range(1000):
+        lines.write("w", f"line {number}")
+    assert lines._waiting < 1100
+    stderr.goes_on.set()
+    stderr.wait_for("left out")
+    written = numbers(stderr)
+    assert written == list(range(len(written)))
+    assert SAID.findall(stderr.getvalue()) == [str(1000 - len(written))]
+
+
+def test_what_comes_after_a_gap_follows_what_is_said_of_it(stderr: Stuck, lines: Output) -> None:
+    for number in range(1000):
+        lines.write("w", f"line {number}")
+    stderr.goes_on.set()
+    stderr.wait_for("left out")
+    lines.write("w", "line 1000")
+    lines.close()
+    assert numbers(stderr)[-1] == 1000
+    assert "left out" in stderr.getvalue().splitlines()[-2]
+
+
+def test_what_is_left_out_at_the_end_is_said_too(stderr: Stuck, lines: Output) -> None:
+    for number in range(1000):
+        lines.write("w", f"line {number}")
+    threading.Timer(0.05, stderr.goes_on.set).start()
+    lines.close()
+    assert "left out" in stderr.getvalue().splitlines()[-1]
+
+
+def test_what_keeps_up_loses_nothing(stderr: Stuck, lines: Output) -> None:
+    stderr.goes_on.set()
+    for number in range(1000):
+        lines.write("w", f"line {number}")
+        stderr.wait_for(f"line {number}\n")
+    assert numbers(stderr) == list(range(1000))
