@@ -6,6 +6,7 @@ deadlock fails it.
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import sys
@@ -20,7 +21,7 @@ import fiber
 from fiber import queues, reduction
 from fiber._hub import feeder, handles, hub
 from fiber._hub.client import HubStream
-from fiber._hub.local import LocalChannel
+from fiber._hub.local import LocalChannel, QuietSocket
 from fiber._hub.protocol import ObjectKind
 from fiber._hub.registry import Registry
 from fiber._wire.arena import Arena, Block
@@ -252,6 +253,70 @@ def test_receiving_within_receiving_from_a_far_pipe(
     monkeypatch.setattr(HubStream, "ask", once(lambda: got.append(far.recv()), HubStream.ask))
     got.append(without_deadlock(far.recv))
     assert sorted(got) == [1, 2]
+
+
+# Descriptors
+
+
+MAKERS: dict[str, Callable[[], Any]] = {
+    "Pipe": fiber.Pipe,
+    "one-way Pipe": lambda: fiber.Pipe(duplex=False),
+    "Event": fiber.Event,
+    "Semaphore": lambda: fiber.Semaphore(3),
+    "SimpleQueue": fiber.SimpleQueue,
+    "Queue": lambda: fiber.Queue(1).put(1),
+    "memory for a large message": lambda: Block(1 << 16),
+}
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
+def test_whatever_interrupts_making_or_dropping_something_no_descriptor_is_left(
+    make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)  # what strikes in a finalizer
+    make()
+    gc.collect()
+    before = os.listdir("/proc/self/fd")
+    step = 0
+    while interrupted_at(step, make):
+        step += 1
+        if os.listdir("/proc/self/fd") != before:
+            gc.collect()
+            assert os.listdir("/proc/self/fd") == before, f"left at step {step}"
+    assert step > 10, "it was hardly interrupted"
+
+
+def interrupted_at(stop: int, function: Callable[[], Any]) -> bool:
+    """Call it, and raise KeyboardInterrupt at its instruction number ``stop``."""
+    step = -1
+
+    def trace(frame: FrameType, event: str, _arg: Any) -> Any:
+        nonlocal step
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            step += 1
+            if step == stop:
+                raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        function()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        sys.settrace(before)
+    return step >= stop
+
+
+def test_a_socket_whose_making_was_interrupted_ends_in_silence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    QuietSocket.__new__(QuietSocket)
+    assert told == []
 
 
 # Memory for large messages

@@ -85,9 +85,9 @@ def channel(handle: Handle) -> SharedChannel:
 def counter(handle: Handle) -> SharedCounter:
     """Where a handle was unpickled: the counter that it stands for."""
     if not isinstance(handle, HubHandle):
-        return LocalCounter(handle.detach())
+        return LocalCounter.from_fd(handle.detach())
     if handle.here():
-        return LocalCounter(handle.fetch())
+        return LocalCounter.from_fd(handle.fetch())
     return RemoteCounter(*handle)
 
 

@@ -167,7 +167,7 @@ class HostedCounter:
 
     def __init__(self, poller: Poller, fd: int) -> None:
         self._poller = poller
-        self._counter = LocalCounter(fd)
+        self._counter = LocalCounter.from_fd(fd)
         self._takers: deque[Waiter] = deque()
         self._waiters: deque[Waiter] = deque()
         self._changes: dict[Waiter, int] = {}
