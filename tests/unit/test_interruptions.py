@@ -21,7 +21,7 @@ import pytest
 
 import fiber
 from fiber import queues, reduction
-from fiber._hub import feeder, handles, hub, registry
+from fiber._hub import feeder, handles, hub, registry, remote
 from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.local import LocalChannel, QuietSocket
 from fiber._hub.protocol import ONE, Op
@@ -345,6 +345,18 @@ def test_receiving_within_receiving_from_a_far_pipe(
     assert sorted(got) == [1, 2]
 
 
+def test_a_far_pipe_is_there_whatever_interrupts_its_use(
+    pipe: tuple[Connection, Connection],
+) -> None:
+    here, far = pipe
+    step = 0
+    while without_deadlock(lambda: [interrupted_at(step, far.poll, {remote.__file__})])[0]:  # noqa: B023 - it ends before the next
+        here.send(step)
+        assert far.recv() == step
+        step += 1
+    assert step > 10, "it was hardly interrupted"
+
+
 # Descriptors
 
 
@@ -376,13 +388,13 @@ def test_whatever_interrupts_making_or_dropping_something_no_descriptor_is_left(
     assert step > 10, "it was hardly interrupted"
 
 
-def interrupted_at(stop: int, function: Callable[[], Any]) -> bool:
-    """Call it, and raise KeyboardInterrupt at its instruction number ``stop``."""
+def interrupted_at(stop: int, function: Callable[[], Any], files: set[str] | None = None) -> bool:
+    """Call it, and raise KeyboardInterrupt at its instruction number ``stop`` in ``files``."""
     step = -1
 
     def trace(frame: FrameType, event: str, _arg: Any) -> Any:
         nonlocal step
-        frame.f_trace_opcodes = True
+        frame.f_trace_opcodes = files is None or frame.f_code.co_filename in files
         if event == "opcode":
             step += 1
             if step == stop:
