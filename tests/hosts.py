@@ -104,6 +104,14 @@ class Hosts:
 PATIENCE = 15.0
 
 
+def objects_kept(hub: Hub) -> int:
+    """How many objects it keeps, once it has done what it was asked for until now."""
+    done = threading.Event()
+    hub._loop.call_soon(done.set)
+    assert done.wait(PATIENCE)
+    return len(hub.registry._objects)
+
+
 class Far:
     """Brings what lives on host a to this process on host b."""
 

@@ -16,7 +16,6 @@ import math
 import os
 import pickle
 import re
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
@@ -146,21 +145,21 @@ def _not_in_use() -> bool:
     return False
 
 
-_lock = threading.Lock()
-_current: Config | None = None
+# One configuration, or none yet.  No lock: a signal handler that makes a pipe while its own thread
+# reads the sources would wait for it for ever.  Of several that read them, the first counts.
+_current: dict[str, Config] = {}
 _in_use: Callable[[], bool] = _not_in_use
 _used = False  # something that is no part of the runtime was built on it, such as a pipe
 
 
 def current() -> Config:
     """The configuration in force: at the first call read from its sources, or a parent's."""
-    global _current
-    if _current is None:
-        with _lock:
-            if _current is None:
-                pickled = inherited.configuration()
-                _current = pickle.loads(pickled) if pickled is not None else load()
-    return _current
+    config = _current.get("config")
+    if config is None:
+        pickled = inherited.configuration()
+        read = pickle.loads(pickled) if pickled is not None else load()
+        config = _current.setdefault("config", read)
+    return config
 
 
 def use() -> Config:
@@ -179,26 +178,21 @@ def init(**settings: object) -> Config:
     that the running program was built on.
     """
     global _current
-    with _lock:
-        config = load(settings)
-        if _current is not None and (_used or _in_use()):
-            _refuse_late_change(_current, config)
-        _current = config
+    config = load(settings)
+    if _current and (_used or _in_use()):
+        _refuse_late_change(current(), config)
+    _current = {"config": config}
     return config
 
 
 def install(config: Config) -> None:
     """Put a configuration in force as it is."""
     global _current, _used
-    with _lock:
-        _current, _used = config, False
+    _current, _used = {"config": config}, False
 
 
 def guard(in_use: Callable[[], bool]) -> None:
-    """Let the runtime say whether it has been built on `current()`, which `init()` respects.
-
-    `in_use` is called with the module's lock held and must not take one itself.
-    """
+    """Let the runtime say whether it has been built on `current()`, which `init()` respects."""
     global _in_use
     _in_use = in_use
 
@@ -213,15 +207,6 @@ def _refuse_late_change(running: Config, wanted: Config) -> None:
                 f"Call fiber.init() before that, or set {_variable(name)} or {name} in "
                 "[tool.fiber] of pyproject.toml."
             )
-
-
-def _unlock_in_forked_child() -> None:
-    # Another thread may have held it at the fork; that thread does not exist here.
-    global _lock
-    _lock = threading.Lock()
-
-
-os.register_at_fork(after_in_child=_unlock_in_forked_child)
 
 
 # ---- reading the sources --------------------------------------------------------------------

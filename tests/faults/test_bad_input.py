@@ -164,7 +164,7 @@ def test_bad_environment_is_named_at_the_first_use(
 def test_bad_environment_is_named_where_no_process_is_made(
     monkeypatch: pytest.MonkeyPatch, statement: str
 ) -> None:
-    monkeypatch.setattr(config, "_current", None)
+    monkeypatch.setattr(config, "_current", {})
     monkeypatch.setenv("FIBER_BACKEND", "typo")
     with pytest.raises(fiber.ConfigError, match="'typo' for 'backend'"):
         eval(f"fiber.{statement}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._agent.interface import ChildObserver, ExitReport
 from fiber._transport.link import Keepalive
-from fiber._transport.memory import SimulatedLoop
+from memory_link import SimulatedLoop
 from simulation import schedule
 from simulation.workers import Worker
 

@@ -14,8 +14,8 @@ from unittest import mock
 from fiber._agent import service
 from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._backends.remote import RemoteAgent, RemoteChild
-from fiber._transport.memory import Cable
 from fiber._wire.packet import Message
+from memory_link import Cable
 from simulation import schedule
 from simulation.agents import SAME_HOST, Agent, Child
 from simulation.workers import Worker

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from fiber._agent.interface import ChildObserver
 from fiber._transport.loop import Timer
-from fiber._transport.memory import SimulatedLoop
+from memory_link import SimulatedLoop
 from simulation import schedule
 from simulation.agents import LOST_AFTER, Agent, Child
 from simulation.oracle import Oracle, Violation

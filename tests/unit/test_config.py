@@ -22,7 +22,7 @@ from fiber.errors import ConfigError, FiberError
 @pytest.fixture(autouse=True)
 def _bare_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """No configuration in force, none in the environment, none above the directory."""
-    monkeypatch.setattr(config, "_current", None)
+    monkeypatch.setattr(config, "_current", {})
     monkeypatch.setattr(config, "_in_use", config._not_in_use)
     monkeypatch.setattr(config, "_used", False)
     for name in [name for name in os.environ if name.startswith("FIBER_")]:
@@ -271,23 +271,36 @@ class TestCurrent:
         monkeypatch.setenv("FIBER_AGENTS", "9")
         assert config.current() is first
 
-    def test_is_read_once_by_many_threads(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        loads = []
+    def test_is_one_for_many_threads(self, monkeypatch: pytest.MonkeyPatch) -> None:
         all_there = threading.Barrier(4, timeout=10)
 
-        def slow_load() -> Config:
-            loads.append(1)
+        def load_at_the_same_time() -> Config:
+            all_there.wait()
             return load()
 
-        def ask(_: int) -> Config:
-            all_there.wait()
-            return config.current()
-
-        monkeypatch.setattr(config, "load", slow_load)
+        monkeypatch.setattr(config, "load", load_at_the_same_time)
         with ThreadPoolExecutor(4) as threads:
-            found = list(threads.map(ask, range(4)))
-        assert len(loads) == 1
+            found = list(threads.map(lambda _: config.current(), range(4)))
         assert all(one is found[0] for one in found)
+        assert config.current() is found[0]
+
+    def test_a_handler_may_ask_while_its_thread_reads(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        inner = []
+
+        def interrupted_load() -> Config:
+            monkeypatch.setattr(config, "load", load)
+            inner.append(config.current())
+            return load()
+
+        monkeypatch.setattr(config, "load", interrupted_load)
+        found: list[Config] = []
+        thread = threading.Thread(target=lambda: found.append(config.current()), daemon=True)
+        thread.start()
+        thread.join(10)
+        assert not thread.is_alive(), "deadlock"
+        assert found[0] is inner[0] is config.current()
 
     def test_a_bad_source_is_reported_again_at_the_next_use(
         self, monkeypatch: pytest.MonkeyPatch
@@ -297,13 +310,27 @@ class TestCurrent:
             with pytest.raises(ConfigError, match="typo"):
                 config.current()
 
-    def test_a_fork_while_another_thread_reads_does_not_block_the_child(self) -> None:
-        with config._lock:
-            pid = os.fork()
-            if pid == 0:
-                signal.alarm(10)
-                config.install(Config(agents=5))
-                os._exit(config.current().agents)
+    def test_a_fork_while_another_thread_reads_does_not_block_the_child(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        reading, forked = threading.Event(), threading.Event()
+
+        def slow_load() -> Config:
+            reading.set()
+            assert forked.wait(10)
+            return load()
+
+        monkeypatch.setattr(config, "load", slow_load)
+        thread = threading.Thread(target=config.current)
+        thread.start()
+        assert reading.wait(10)
+        pid = os.fork()
+        if pid == 0:
+            signal.alarm(10)
+            config.install(Config(agents=5))
+            os._exit(config.current().agents)
+        forked.set()
+        thread.join()
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 5
 
     def test_install_hands_over_a_parents_configuration(self) -> None:

@@ -23,7 +23,7 @@ from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.remote import RemoteChannel, RemoteCounter
 from fiber.connection import Connection
 from fiber.errors import ConnectionClosed
-from hosts import PATIENCE, Far, Hosts, background
+from hosts import PATIENCE, Far, Hosts, background, objects_kept
 
 # Channels
 
@@ -165,7 +165,7 @@ def test_it_comes_home_as_what_it_was(hosts: Hosts, far: Far) -> None:
         home = pickle.loads(data)
     assert isinstance(home._channel, LocalChannel)
     assert os.fstat(home.fileno()).st_ino == os.fstat(there.fileno()).st_ino
-    assert wait_until(lambda: len(hosts["a"].registry) == 0, PATIENCE)
+    assert wait_until(lambda: objects_kept(hosts["a"]) == 0, PATIENCE)
 
 
 def test_collected_handles_of_far_objects_outlive_them(hosts: Hosts, far: Far) -> None:
@@ -191,7 +191,7 @@ def test_an_unused_handle_that_is_forgotten_holds_nothing(hosts: Hosts, far: Far
     _, there = fiber.Pipe()
     remote = far(there)
     del remote
-    assert wait_until(lambda: len(hosts["a"].registry) == 0, PATIENCE)
+    assert wait_until(lambda: objects_kept(hosts["a"]) == 0, PATIENCE)
 
 
 def test_a_handle_used_twice_says_so(hosts: Hosts, far: Far) -> None:
@@ -199,7 +199,7 @@ def test_a_handle_used_twice_says_so(hosts: Hosts, far: Far) -> None:
     with hosts.at("a"):
         data = pickle.dumps(there)
     pickle.loads(data).close()
-    assert wait_until(lambda: len(hosts["a"].registry) == 0, PATIENCE)
+    assert wait_until(lambda: objects_kept(hosts["a"]) == 0, PATIENCE)
     late = pickle.loads(data)
     with pytest.raises(Unreachable, match="used once already"):
         late.poll()

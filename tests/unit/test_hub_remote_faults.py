@@ -22,7 +22,7 @@ from fiber._hub.client import Unreachable
 from fiber._hub.local import LocalCounter
 from fiber._hub.protocol import HubAddress
 from fiber.connection import Connection
-from hosts import PATIENCE, Far, Hosts, Wire, background
+from hosts import PATIENCE, Far, Hosts, Wire, background, objects_kept
 
 # Processes that die, links that break
 
@@ -69,7 +69,7 @@ def test_a_far_receiver_killed_while_waiting_takes_nothing(
     process, _ = lost_soul(there)
     os.kill(process.pid, signal.SIGKILL)
     process.join(PATIENCE)
-    assert wait_until(lambda: len(hosts["a"].registry) == 0, PATIENCE)
+    assert wait_until(lambda: objects_kept(hosts["a"]) == 0, PATIENCE)
     here.send("still here")
     assert there.recv() == "still here"
 
@@ -126,7 +126,7 @@ def test_a_lost_link_ends_every_wait_with_its_reason(hosts: Hosts, far: Far) -> 
     assert all("no heartbeat" in error for error in errors)
     with pytest.raises(BrokenPipeError, match=r"no heartbeat|cannot be reached"):
         remote.send(1)
-    assert wait_until(lambda: len(hosts["a"].registry) == 0, PATIENCE)
+    assert wait_until(lambda: objects_kept(hosts["a"]) == 0, PATIENCE)
     remote.close()
 
 

@@ -6,8 +6,11 @@ deadlock fails it.
 
 from __future__ import annotations
 
+import gc
+import itertools
 import os
 import pickle
+import socket
 import sys
 import threading
 from collections.abc import Callable
@@ -18,14 +21,13 @@ import pytest
 
 import fiber
 from fiber import queues, reduction
-from fiber._hub import feeder, handles, hub
-from fiber._hub.client import HubStream
-from fiber._hub.local import LocalChannel
-from fiber._hub.protocol import ObjectKind
-from fiber._hub.registry import Registry
+from fiber._hub import feeder, handles, hub, registry, remote
+from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.local import LocalChannel, QuietSocket
+from fiber._hub.protocol import ONE, Op
 from fiber._wire.arena import Arena, Block
 from fiber.connection import Connection, wait
-from hosts import PATIENCE, Hosts
+from hosts import PATIENCE, Hosts, objects_kept
 
 MORE_THAN_FITS = 2000
 
@@ -116,48 +118,111 @@ def interrupted_put(queue: Any, stop: int, files: set[str]) -> bool:
 
 # Handles
 
-
-def test_sharing_within_sharing_in_the_hubs_own_process() -> None:
-    fds = [os.eventfd(0), os.eventfd(0)]
-    closed: list[Any] = []
-
-    class Hosted:
-        def __init__(self, fd: int) -> None:
-            self.fd = fd
-
-        def fileno(self) -> int:
-            return self.fd
-
-    inner: list[tuple[int, int]] = []
-
-    def share_again() -> None:
-        inner.extend(registry.register(ObjectKind.COUNTER, fd, reusable=True) for fd in fds)
-
-    make: Any = once(share_again, lambda _kind, fd: Hosted(fd))
-    registry = Registry(make, closed.append, lambda function, *args: function(*args))
-    outer = without_deadlock(lambda: registry.register(ObjectKind.COUNTER, fds[0], reusable=True))
-    for number, grant in [outer, *inner]:
-        os.close(registry.fetch(number, grant))
-        registry.release(grant)
-    assert len(registry) == 0
-    assert len(closed) == 3
-    for fd in [*fds, *(hosted.fd for hosted in closed)]:
-        os.close(fd)
+SHARING = {registry.__file__, hub.__file__, handles.__file__}
 
 
-def test_the_last_holder_lets_go_while_another_takes_hold() -> None:
-    fd = os.eventfd(0)
-    registry = Registry(lambda _kind, fd: fd, os.close, lambda function, *args: function(*args))  # type: ignore[arg-type,return-value]
-    number, grant = registry.register(ObjectKind.COUNTER, fd, reusable=True)
-    hold: Any = once(lambda: registry.release(grant), registry._hold)
-    registry._hold = hold  # type: ignore[method-assign]
-    again, other = without_deadlock(
-        lambda: registry.register(ObjectKind.COUNTER, fd, reusable=True)
-    )
-    assert again != number
-    registry.release(other)
-    assert len(registry) == 0
-    os.close(fd)
+def test_sharing_at_any_line_of_sharing(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        here, there = fiber.Pipe()
+        inner: list[bytes] = []
+
+        def share() -> bytes:
+            return pickle.dumps(there)
+
+        outer = at_each_line(lambda: inner.append(share()), share, SHARING)
+        assert objects_kept(hub) == 1
+        for data in (outer, *inner):
+            pickle.loads(data).close()
+        assert objects_kept(hub) == 0
+        here.close()
+
+
+def test_a_handler_at_any_line_of_sharing_may_wait_for_the_hub(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        here, there = fiber.Pipe()
+        stream = HubStream(hub.address)
+
+        def ask() -> None:
+            stream.say(Op.RELEASE, 0, form=ONE)
+            stream.ask(Op.SYNC)
+
+        def share() -> None:
+            with handles.collecting_grants() as grants:
+                data = pickle.dumps(there)
+            pickle.loads(data).close()
+            grants.release()
+
+        without_deadlock(lambda: at_each_line(ask, share, SHARING) or True)
+        assert objects_kept(hub) == 0
+        for end in (stream, here, there):
+            end.close()
+
+
+def test_a_finalizer_at_any_line_of_the_hub_may_share(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        here, there = fiber.Pipe()
+        first = pickle.dumps(there)
+        inner: list[bytes] = []
+        loop_trace = striking(lambda: inner.append(pickle.dumps(there)), SHARING)
+        hosts.on_loop(sys.settrace, loop_trace)
+        pickle.loads(first).close()
+        hosts.on_loop(sys.settrace, None)
+        assert objects_kept(hub) == 1
+        assert len(inner) > 10
+        for data in inner:
+            pickle.loads(data).close()
+        assert objects_kept(hub) == 0
+        here.close()
+
+
+def test_who_waits_for_a_hub_that_ends_is_told(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hosts.at("a") as hub_a:
+        here, there = fiber.Pipe()
+        data = pickle.dumps(there)
+        call_soon = hosts.loop.call_soon
+
+        def ends_first(*_: Any) -> None:
+            monkeypatch.undo()
+            call_soon(hub_a.close)
+
+        monkeypatch.setattr(hosts.loop, "call_soon", ends_first)
+        with pytest.raises(Unreachable, match="has ended"):
+            pickle.loads(data)
+        here.close()
+
+
+def striking(action: Callable[[], Any], files: set[str]) -> Callable[..., Any]:
+    """For ``sys.settrace``: do something once at each line of the code in ``files``."""
+    struck: set[tuple[Any, int]] = set()
+
+    def trace(frame: FrameType, event: str, _arg: Any) -> Any:
+        line = (frame.f_code, frame.f_lineno)
+        if event == "line" and frame.f_code.co_filename in files and line not in struck:
+            struck.add(line)
+            action()
+        return trace
+
+    return trace
+
+
+def at_each_line(action: Callable[[], Any], function: Callable[[], Any], files: set[str]) -> Any:
+    """Call ``function``, and ``action`` at its lines in ``files``."""
+    lines: list[None] = []
+
+    def strike() -> None:
+        lines.append(None)
+        action()
+
+    before = sys.gettrace()
+    sys.settrace(striking(strike, files))
+    try:
+        result = function()
+    finally:
+        sys.settrace(before)
+    assert len(lines) > 10, "it was hardly interrupted"
+    return result
 
 
 def test_opening_the_hub_within_opening_it(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,6 +238,32 @@ def test_opening_the_hub_within_opening_it(hosts: Hosts, monkeypatch: pytest.Mon
     monkeypatch.setattr(hub.tempfile, "mkdtemp", open_again)
     assert without_deadlock(lambda: hosts["a"].address) == inner[0]
     assert [path for path in made if os.path.exists(path)] == [hosts["a"].directory]
+
+
+def test_a_handler_at_any_line_of_opening_the_hub_may_wait_for_the_loop(hosts: Hosts) -> None:
+    def opened_twice(line: int) -> bool:
+        """Whether opening a hub was interrupted, at its line number ``line``."""
+        opening, lines = hosts[f"host {line}"], itertools.count()
+        seen: list[Any] = []
+        known = threading.Event()
+
+        def ask() -> None:
+            if next(lines) == line:
+                hosts.on_loop(lambda: (seen.append(opening.address), known.set()))
+                assert known.wait(PATIENCE)
+
+        sys.settrace(striking(ask, {hub.__file__}))
+        address = opening.address
+        sys.settrace(None)
+        assert seen in ([], [address])
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as caller:
+            caller.connect(address.path)
+        return bool(seen)
+
+    line = 0
+    while without_deadlock(lambda: [opened_twice(line)])[0]:  # noqa: B023 - it ends before the next
+        line += 1
+    assert line > 10, "it was hardly interrupted"
 
 
 def test_sharing_within_sharing_in_a_child(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,6 +343,82 @@ def test_receiving_within_receiving_from_a_far_pipe(
     monkeypatch.setattr(HubStream, "ask", once(lambda: got.append(far.recv()), HubStream.ask))
     got.append(without_deadlock(far.recv))
     assert sorted(got) == [1, 2]
+
+
+def test_a_far_pipe_is_there_whatever_interrupts_its_use(
+    pipe: tuple[Connection, Connection],
+) -> None:
+    here, far = pipe
+    step = 0
+    while without_deadlock(lambda: [interrupted_at(step, far.poll, {remote.__file__})])[0]:  # noqa: B023 - it ends before the next
+        here.send(step)
+        assert far.recv() == step
+        step += 1
+    assert step > 10, "it was hardly interrupted"
+
+
+# Descriptors
+
+
+MAKERS: dict[str, Callable[[], Any]] = {
+    "Pipe": fiber.Pipe,
+    "one-way Pipe": lambda: fiber.Pipe(duplex=False),
+    "Event": fiber.Event,
+    "Semaphore": lambda: fiber.Semaphore(3),
+    "SimpleQueue": fiber.SimpleQueue,
+    "Queue": lambda: fiber.Queue(1).put(1),
+    "memory for a large message": lambda: Block(1 << 16),
+}
+
+
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
+def test_whatever_interrupts_making_or_dropping_something_no_descriptor_is_left(
+    make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)  # what strikes in a finalizer
+    make()
+    gc.collect()
+    before = os.listdir("/proc/self/fd")
+    step = 0
+    while interrupted_at(step, make):
+        step += 1
+        if os.listdir("/proc/self/fd") != before:
+            gc.collect()
+            assert os.listdir("/proc/self/fd") == before, f"left at step {step}"
+    assert step > 10, "it was hardly interrupted"
+
+
+def interrupted_at(stop: int, function: Callable[[], Any], files: set[str] | None = None) -> bool:
+    """Call it, and raise KeyboardInterrupt at its instruction number ``stop`` in ``files``."""
+    step = -1
+
+    def trace(frame: FrameType, event: str, _arg: Any) -> Any:
+        nonlocal step
+        frame.f_trace_opcodes = files is None or frame.f_code.co_filename in files
+        if event == "opcode":
+            step += 1
+            if step == stop:
+                raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        function()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        sys.settrace(before)
+    return step >= stop
+
+
+def test_a_socket_whose_making_was_interrupted_ends_in_silence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    QuietSocket.__new__(QuietSocket)
+    assert told == []
 
 
 # Memory for large messages

@@ -27,9 +27,9 @@ from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._hub.protocol import HubAddress
 from fiber._runtime import state
-from fiber._transport.memory import SimulatedLoop
 from fiber._wire import messages
 from fiber.errors import LinkError, StartError
+from memory_link import SimulatedLoop
 from unit.agent_children import Recorder, run_forever
 
 PATIENCE = 15

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from fiber._transport.link import Keepalive
-from fiber._transport.memory import Cable, SimulatedLoop
 from fiber._transport.resumable_link import ResumableLink
 from fiber._transport.stream import Frame
+from memory_link import Cable, SimulatedLoop
 
 
 class Notes:

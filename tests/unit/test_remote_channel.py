@@ -13,9 +13,9 @@ import pytest
 from fiber._agent.interface import ChildSpec
 from fiber._backends import remote
 from fiber._backends.remote import RemoteAgent, RemoteChild
-from fiber._transport.memory import SimulatedLoop
 from fiber._wire import messages
 from fiber._wire.packet import Message
+from memory_link import SimulatedLoop
 from unit.agent_children import Recorder
 
 FOREVER = 60.0

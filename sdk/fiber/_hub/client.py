@@ -19,6 +19,7 @@ from fiber._hub.protocol import HEAD, ONE, TWO, HubAddress, Op, Status
 from fiber._hub.registry import Registry
 from fiber._transport.unix import naming_the_limit, wait_readable
 from fiber._wire import packet
+from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import ConnectionClosed, FiberError
 
@@ -58,6 +59,9 @@ class LocalHub(Protocol):
 
     def dial(self) -> socket.socket:
         """A stream to it."""
+
+    def fetch(self, number: int, grant: int) -> Descriptor:
+        """A descriptor of an object that it keeps."""
 
     def on_loop(self) -> bool:
         """Whether the caller is the thread that serves it."""

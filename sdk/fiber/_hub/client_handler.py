@@ -103,8 +103,7 @@ class ClientHandler:
             if isinstance(entry.hosted, HostedChannel):
                 entry.hosted.forget(self)
             self._home.registry.detach(entry)
-        for grant in self._bound:
-            self._home.registry.release(grant)
+        self._home.registry.take_back(self._bound)
         self._bound.clear()
         self._home.ended(self)
 
@@ -170,7 +169,7 @@ class ClientHandler:
 
     def release(self, message: Message) -> None:
         """Take a grant back."""
-        self._home.registry.release(ONE.unpack(message.payload)[2])
+        self._home.registry.take_back([ONE.unpack(message.payload)[2]])
 
     def fetch(self, message: Message) -> None:
         """Hand over a descriptor."""

@@ -30,6 +30,7 @@ from fiber._hub.registry import NoSuchObject, Registry
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
 from fiber._transport.base import SharedChannel, SharedCounter
 from fiber._transport.unix import UnixChannel, UnixCounter
+from fiber._wire.descriptor import Descriptor, own
 
 
 class InheritedDescriptor(Protocol):
@@ -50,19 +51,19 @@ class HubHandle(NamedTuple):
         """Whether the hub is on this host."""
         return self.home.host == client.host()
 
-    def fetch(self) -> int:
+    def fetch(self) -> Descriptor:
         """On the hub's host: a descriptor."""
         hub = client.local_hub()
         if hub is not None and hub.key == self.home.key:
             try:
-                return hub.registry.fetch(self.number, self.grant)
+                return hub.fetch(self.number, self.grant)
             except NoSuchObject as error:
                 raise Unreachable(hub.host, str(error)) from None
         stream = HubStream(self.home)
         try:
             reply = stream.ask(Op.FETCH, self.number, self.grant, form=TWO)
             (fd,) = reply.fds
-            return fd
+            return own(fd)
         finally:
             stream.close()
 
@@ -78,14 +79,14 @@ def channel(handle: Handle) -> SharedChannel:
     if not isinstance(handle, HubHandle):
         return LocalChannel.from_fd(handle.detach())
     if handle.here():
-        return LocalChannel.from_fd(handle.fetch())
+        return LocalChannel(handle.fetch())
     return RemoteChannel(*handle)
 
 
 def counter(handle: Handle) -> SharedCounter:
     """Where a handle was unpickled: the counter that it stands for."""
     if not isinstance(handle, HubHandle):
-        return LocalCounter(handle.detach())
+        return LocalCounter.from_fd(handle.detach())
     if handle.here():
         return LocalCounter(handle.fetch())
     return RemoteCounter(*handle)
@@ -118,7 +119,7 @@ class GrantSet:
 
     def __init__(self, *, reusable: bool = True) -> None:
         self._reusable = reusable
-        self._direct: list[tuple[Registry, int]] = []
+        self._direct: dict[Registry, list[int]] = {}
         self._streams: dict[HubAddress, HubStream] = {}
 
     def __bool__(self) -> bool:
@@ -131,7 +132,7 @@ class GrantSet:
         hub = client.local_hub()
         if hub is not None:
             number, grant = hub.registry.register(kind, fd, reusable=self._reusable)
-            self._direct.append((hub.registry, grant))
+            self._direct.setdefault(hub.registry, []).append(grant)
             return HubHandle(home, number, grant)
         return _register(self._stream(home), home, kind, fd, self._flags())
 
@@ -143,19 +144,15 @@ class GrantSet:
 
     def release(self) -> None:
         """Nobody unpickles the handles any more."""
-        direct, self._direct = self._direct, []
+        direct, self._direct = self._direct, {}
         streams, self._streams = self._streams, {}
-        for registry, grant in direct:
-            registry.release(grant)
+        for registry, grants in direct.items():
+            registry.release(grants)
         for stream in streams.values():
             stream.close()  # a hub takes back what was granted on a stream when it ends
 
     def __del__(self) -> None:
-        # Whoever lets go of it, or the collector, may be in the middle of anything.
-        for registry, grant in self._direct:
-            registry.release_soon(grant)
-        for stream in self._streams.values():
-            stream.close()
+        self.release()
 
     def _flags(self) -> GrantFlags:
         flags = GrantFlags.ENDS_WITH_STREAM
@@ -190,7 +187,7 @@ class _SingleUse:
             return handle
         registry = hub.registry
         number, grant = registry.register(kind, fd, reusable=False)
-        _undo_by(lambda: registry.release(grant))
+        _undo_by(lambda: registry.release([grant]))
         return HubHandle(home, number, grant)
 
     def for_remote(self, end: RemoteObject) -> HubHandle:

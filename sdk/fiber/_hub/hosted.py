@@ -12,7 +12,7 @@ from typing import Protocol, TypeAlias
 
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.poller import EDGE, IN, OUT, Poller
-from fiber._hub.protocol import ObjectKind, Status
+from fiber._hub.protocol import Status
 from fiber._wire.packet import INLINE_LIMIT, Message
 
 
@@ -32,8 +32,6 @@ class Watcher(Protocol):
 
 class HostedChannel:
     """One end of a channel."""
-
-    kind = ObjectKind.CHANNEL
 
     def __init__(self, poller: Poller, fd: int) -> None:
         self._poller = poller
@@ -163,11 +161,9 @@ class HostedChannel:
 class HostedCounter:
     """A counter."""
 
-    kind = ObjectKind.COUNTER
-
     def __init__(self, poller: Poller, fd: int) -> None:
         self._poller = poller
-        self._counter = LocalCounter(fd)
+        self._counter = LocalCounter.from_fd(fd)
         self._takers: deque[Waiter] = deque()
         self._waiters: deque[Waiter] = deque()
         self._changes: dict[Waiter, int] = {}

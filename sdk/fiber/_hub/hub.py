@@ -15,11 +15,12 @@ import shutil
 import socket
 import struct
 import tempfile
-import threading
 import weakref
+from functools import partial
+from queue import Empty, SimpleQueue
 
 from fiber._hub import protocol
-from fiber._hub.client import NoHub
+from fiber._hub.client import NoHub, Unreachable
 from fiber._hub.client_handler import ClientHandler
 from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter
 from fiber._hub.local import QuietSocket, without_timeout
@@ -30,6 +31,7 @@ from fiber._hub.streams import SocketStream, Stream
 from fiber._hub.tunnel import Router, Send, Tunnels
 from fiber._transport.loop import Loop
 from fiber._transport.unix import naming_the_limit, socketpair
+from fiber._wire.descriptor import Descriptor, own
 from fiber.errors import TooManyOpenFiles
 
 _PEER = struct.Struct("iII")  # pid, uid, gid
@@ -37,9 +39,14 @@ _PEER = struct.Struct("iII")  # pid, uid, gid
 _ACCEPT_AGAIN = 0.1
 """Seconds until the next try when no descriptor is free to accept a stream with."""
 
+_DOZE = 0.2
+"""Seconds after which whoever waits for the loop looks whether it is still there; it is also as
+long as a signal may be slept over that comes just before the sleep.
+"""
+
 
 class Hub:
-    """``register``, ``fetch`` and the like may be called on any thread; the rest on the loop's."""
+    """On the loop's thread, but for what says that any thread may call it."""
 
     def __init__(self, loop: Loop, host: str, directory: str | None = None) -> None:
         self.host = host
@@ -47,19 +54,20 @@ class Hub:
         self._loop = loop
         self._parent = directory
         self._poller = Poller(loop)
-        self.registry = Registry(self._host_object, self._discard, loop.call_soon)
+        self.registry = Registry(self._host_object, loop.call_soon)
         self._router = Router(host, self._accept)
         self._handlers: set[ClientHandler] = set()
         self._streams: weakref.WeakSet[SocketStream] = weakref.WeakSet()
-        # A finalizer that shares something may come while this thread holds it.
-        self._lock = threading.RLock()
-        self._listener: socket.socket | None = None
-        self._address: HubAddress | None = None
+        # Of several that open it at the same time, the first here counts.
+        self._opened: list[tuple[HubAddress, socket.socket | None]] = []
         self._closed = False
 
     @property
     def address(self) -> HubAddress:
-        """Where other processes of this host find the hub; NoHub if there can be no socket."""
+        """Where other processes of this host find the hub; NoHub if there can be no socket.
+
+        Any thread.
+        """
         address = self.address_or_problem
         if address.problem:
             raise NoHub(address.problem)
@@ -70,23 +78,22 @@ class Hub:
         """What the processes of this host are told at birth.  The first call opens the socket.
 
         If that fails it is not tried again: those who clean up after us know the directory, or that
-        there is none, from the first child on.
+        there is none, from the first child on.  Any thread.
         """
-        with self._lock:
-            if self._address is None:
-                self._open_socket()
-            assert self._address is not None
-            return self._address
+        if not self._opened:
+            self._open_socket()
+        return self._opened[0][0]
 
     @property
     def known_address(self) -> HubAddress | None:
         """The same, if anybody was told yet."""
-        return self._address
+        return self._opened[0][0] if self._opened else None
 
     @property
     def directory(self) -> str | None:
         """The socket's directory, once it is there."""
-        return os.path.dirname(self._address.path) or None if self._address else None
+        address = self.known_address
+        return os.path.dirname(address.path) or None if address else None
 
     def on_loop(self) -> bool:
         """Whether the caller is the thread that serves this hub."""
@@ -97,6 +104,30 @@ class Hub:
         ours, theirs = socketpair("using a pipe or queue of another host")
         self._loop.call_soon(self._admit, theirs)
         return without_timeout(QuietSocket(fileno=ours.detach()))
+
+    def fetch(self, number: int, grant: int) -> Descriptor:
+        """A descriptor of an object, for this very process.  Any thread: it waits for the loop."""
+        if self._loop.on_thread():
+            return own(self.registry.fetch(number, grant))
+        answers: SimpleQueue[Descriptor | Exception] = SimpleQueue()
+        self._loop.call_soon(self._answer, number, grant, answers)
+        while not self._closed and not self._loop.broken:
+            try:
+                answer = answers.get(timeout=_DOZE)
+            except Empty:
+                continue
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+        raise Unreachable(self.host, "the program that keeps it has ended")
+
+    def _answer(
+        self, number: int, grant: int, answers: SimpleQueue[Descriptor | Exception]
+    ) -> None:
+        try:
+            answers.put(own(self.registry.fetch(number, grant)))
+        except Exception as error:
+            answers.put(error)
 
     def link(self, host: str | None, send: Send, *, dialer: bool) -> Tunnels:
         """The hub of ``host`` can be reached by tunnels whose frames go out by ``send``.
@@ -127,10 +158,10 @@ class Hub:
         for stream in list(self._streams):
             stream.finish("the program has ended")
         self.registry.close()
-        with self._lock:
-            if self._listener is not None:
-                self._loop.unregister(self._listener.fileno())
-                self._listener.close()
+        for _, listener in self._opened[:1]:
+            if listener is not None:
+                self._loop.unregister(listener.fileno())
+                listener.close()
         self._poller.close()
         if self.directory is not None:
             remove_directory(self.directory)
@@ -139,32 +170,34 @@ class Hub:
 
     def _open_socket(self) -> None:
         try:
-            sock, path = _listen(self._parent)
+            listener, path = _listen(self._parent)
         except TooManyOpenFiles:
             raise
         except OSError as error:
-            self._address = HubAddress(self.host, "", self.key, _problem(error))
+            self._opened.append((HubAddress(self.host, "", self.key, _problem(error)), None))
             return
-        address = HubAddress(self.host, path, self.key)
-        if self._address is not None:  # a finalizer that came meanwhile has opened one
-            sock.close()
-            remove_directory(os.path.dirname(path))
-            return
-        self._listener, self._address = sock, address
-        self._loop.register(sock.fileno(), self._accept_socket)
-
-    def _accept_socket(self) -> None:
-        assert self._listener is not None
+        opened = HubAddress(self.host, path, self.key), listener
         try:
-            sock, _ = self._listener.accept()
+            self._loop.register(listener.fileno(), partial(self._accept_socket, listener))
+            self._opened.append(opened)
+        finally:
+            if not self._opened or self._opened[0] is not opened:
+                # Another thread was faster, or whoever interrupted this one.
+                self._loop.unregister(listener.fileno())
+                listener.close()
+                remove_directory(os.path.dirname(path))
+
+    def _accept_socket(self, listener: socket.socket) -> None:
+        try:
+            sock, _ = listener.accept()
         except BlockingIOError:
             return
         except OSError as error:
             if error.errno not in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
                 raise
             # Who knocked waits; without this pause the loop would do nothing else.
-            self._loop.unregister(self._listener.fileno())
-            self._loop.call_later(_ACCEPT_AGAIN, self._listen_again)
+            self._loop.unregister(listener.fileno())
+            self._loop.call_later(_ACCEPT_AGAIN, self._listen_again, listener)
             return
         _, uid, _ = _PEER.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
         if uid in (os.geteuid(), 0):
@@ -172,9 +205,9 @@ class Hub:
         else:
             sock.close()
 
-    def _listen_again(self) -> None:
-        if self._listener is not None and self._listener.fileno() >= 0:
-            self._loop.register(self._listener.fileno(), self._accept_socket)
+    def _listen_again(self, listener: socket.socket) -> None:
+        if listener.fileno() >= 0:
+            self._loop.register(listener.fileno(), partial(self._accept_socket, listener))
 
     def _admit(self, sock: socket.socket) -> None:
         stream = SocketStream(self._poller, sock)
@@ -190,12 +223,6 @@ class Hub:
         if kind is ObjectKind.CHANNEL:
             return HostedChannel(self._poller, fd)
         return HostedCounter(self._poller, fd)
-
-    def _discard(self, hosted: Hosted) -> None:
-        if self._closed or self._loop.on_thread():
-            hosted.close()
-        else:
-            self._loop.call_soon(hosted.close)
 
 
 def remove_directory(path: str) -> None:

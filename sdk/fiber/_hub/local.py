@@ -6,11 +6,12 @@ import select
 import socket
 import time
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from fiber._transport.loop import LONGEST_POLL
-from fiber._transport.unix import UnixChannel, UnixCounter, socketpair
+from fiber._transport.unix import BorrowedSocket, UnixChannel, UnixCounter
 from fiber._wire import packet
+from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike
 
 _Socket = TypeVar("_Socket", bound=socket.socket)
@@ -28,11 +29,11 @@ class QuietSocket(socket.socket):
     __slots__ = ()
 
     def __del__(self) -> None:
-        self.close()
+        self._real_close()  # type: ignore[attr-defined]  # ``close`` needs a finished ``__init__``
 
 
-class NonWaitingSocket(socket.socket):
-    """Another's socket, whose sends never wait.
+class NonWaitingSocket(BorrowedSocket):
+    """One whose sends never wait.
 
     The descriptor's own mode will not do: O_NONBLOCK is shared by all that hold the socket.
     """
@@ -54,9 +55,6 @@ class NonWaitingSocket(socket.socket):
         """Send or raise BlockingIOError."""
         return super().sendmsg(buffers, ancdata, flags | _DONTWAIT)
 
-    def __del__(self) -> None:
-        self.detach()
-
 
 def without_timeout(sock: _Socket) -> _Socket:
     """Free ``sock`` of the program's default timeout, which is for the user's own sockets."""
@@ -72,20 +70,9 @@ class LocalChannel(UnixChannel):
 
     can_try_send = True
 
-    def __init__(self, sock: socket.socket) -> None:
-        super().__init__(sock)
+    def __init__(self, owner: Descriptor) -> None:
+        super().__init__(owner)
         self._non_waiting: NonWaitingSocket | None = None
-
-    @classmethod
-    def pair(cls) -> tuple[LocalChannel, LocalChannel]:
-        """Two connected ends."""
-        one, other = socketpair("opening a pipe")
-        return cls.from_fd(one.detach()), cls.from_fd(other.detach())
-
-    @classmethod
-    def from_fd(cls, fd: int) -> LocalChannel:
-        """Take over a descriptor."""
-        return cls(without_timeout(QuietSocket(fileno=fd)))
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room but not, as ``send``, until a bulky one is read."""
@@ -95,7 +82,7 @@ class LocalChannel(UnixChannel):
         """Send one message if there is room for it now."""
         sock = self._non_waiting
         if sock is None:
-            sock = self._non_waiting = without_timeout(NonWaitingSocket(fileno=self._sock.fileno()))
+            sock = self._non_waiting = NonWaitingSocket(self._owner)
         try:
             packet.send(sock, payload, buffers, ballast=True)
         except BlockingIOError:
@@ -109,19 +96,11 @@ class LocalChannel(UnixChannel):
             non_waiting.detach()  # the same descriptor
         super().close()
 
-    def __del__(self) -> None:
-        self.close()
-
 
 class LocalCounter(UnixCounter):
     """A counter whose every change can be waited for."""
 
     __slots__ = ()
-
-    @classmethod
-    def create(cls, value: int = 0) -> LocalCounter:
-        """A counter that starts at ``value``."""
-        return cast(LocalCounter, super().create(value))
 
     def changed(self, since: int, timeout: float | None) -> bool:
         """Wait until the count is not ``since``; False when ``timeout`` is over."""
@@ -135,6 +114,3 @@ class LocalCounter(UnixCounter):
                     return False
                 poller.poll(None if left is None else min(left, LONGEST_POLL))
         return True
-
-    def __del__(self) -> None:
-        self.close()

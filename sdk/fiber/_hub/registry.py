@@ -1,4 +1,4 @@
-"""Which objects a hub hosts, and what keeps each of them there.
+"""Which objects of its host a hub keeps for others, and what keeps each of them there.
 
 An object stays as long as someone on another host is attached to it or a grant for it is out.  A
 grant is the permission that travels inside a pickled handle.  A plain one is used up by whoever
@@ -10,88 +10,118 @@ from __future__ import annotations
 import itertools
 import os
 import stat
-import threading
-from collections.abc import Callable
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterable
 
 from fiber._hub.hosted import Hosted
 from fiber._hub.protocol import ObjectKind
 from fiber._transport.unix import naming_the_limit
+from fiber._wire.descriptor import Descriptor, opened
 
 
 class NoSuchObject(LookupError):
     """The grant was used up or released, or nobody holds the object any more."""
 
 
+class SharedObject:
+    """A channel or counter of this host, while others may ask for it."""
+
+    __slots__ = ("__weakref__", "attached", "descriptor", "hosted", "kind")
+
+    def __init__(self, kind: ObjectKind, descriptor: Descriptor) -> None:
+        self.kind = kind
+        self.descriptor = descriptor
+        self.attached = 0
+        self.hosted: Hosted | None = None
+        """What serves those who are attached."""
+
+    def end_service(self) -> None:
+        """Nobody is attached any more."""
+        hosted, self.hosted = self.hosted, None
+        if hosted is not None:
+            hosted.close()
+
+
 class Entry:
-    """A hosted object and its holders."""
+    """An object as it was registered once, and its holders."""
 
-    __slots__ = ("attached", "grants", "hosted", "identity", "number")
+    __slots__ = ("attached", "grants", "number", "shared")
 
-    def __init__(self, number: int, hosted: Hosted, identity: tuple[int, int]) -> None:
+    def __init__(self, number: int, shared: SharedObject) -> None:
         self.number = number
-        self.hosted = hosted
-        self.identity = identity
+        self.shared = shared
         self.attached = 0
         self.grants: set[int] = set()
 
+    @property
+    def hosted(self) -> Hosted:
+        """The object, for those who are attached."""
+        assert self.shared.hosted is not None
+        return self.shared.hosted
+
 
 class Registry:
-    """The objects of one hub.  Any thread.
+    """The objects of one hub.  On the loop's thread, but for ``register`` and ``release``.
 
-    A finalizer or signal handler that shares something may interrupt a thread that holds the lock,
-    and takes it again.  So between any two lines everything is in order, and ``register`` makes
-    sure that what it found is still there once it holds it.
-
-    ``call_soon`` has something done in a moment, and takes no lock for it.
+    Those two take no lock and wait for nothing, so that a finalizer or signal handler may come at
+    any line of them: they leave a note for the loop.  Nobody can come with a grant before the loop
+    has seen the note of it, since each method looks for notes first.
     """
 
     def __init__(
-        self,
-        host: Callable[[ObjectKind, int], Hosted],
-        discard: Callable[[Hosted], None],
-        call_soon: Callable[..., None],
+        self, host: Callable[[ObjectKind, int], Hosted], call_soon: Callable[..., None]
     ) -> None:
         self._host = host
-        self._discard = discard
         self._call_soon = call_soon
-        self._lock = threading.RLock()
         # Ids are unguessable only in so far as nobody without the hub's key gets to ask for one.
         self._numbers = itertools.count(1)
+        self._registered: deque[tuple[Entry, int, bool]] = deque()
+        # So that one descriptor does for an object, however often it is registered.  Of two threads
+        # that share it for the first time each may keep one: as good, but one too many.
+        self._objects: weakref.WeakValueDictionary[tuple[int, int], SharedObject] = (
+            weakref.WeakValueDictionary()
+        )
         self._entries: dict[int, Entry] = {}
-        self._by_identity: dict[tuple[int, int], Entry] = {}
         self._grants: dict[int, Entry] = {}
         self._reusable: set[int] = set()
 
     def register(self, kind: ObjectKind, fd: int, *, reusable: bool) -> tuple[int, int]:
-        """Host what ``fd`` refers to, which stays the caller's; its number and a grant."""
+        """Keep what ``fd`` refers to, which stays the caller's; a number for it and a grant."""
         identity = _identity(kind, fd)
-        with self._lock:
-            grant = next(self._numbers)
-            entry = self._by_identity.get(identity)
-            if entry is None or not self._hold(entry, grant):
-                with naming_the_limit("sharing a pipe or queue with another process"):
-                    hosted = self._host(kind, os.dup(fd))
-                entry = Entry(next(self._numbers), hosted, identity)
-                entry.grants.add(grant)
-                self._entries[entry.number] = self._by_identity[identity] = entry
-            self._note(entry, grant, reusable)
-            return entry.number, grant
+        shared = self._objects.get(identity)
+        if shared is None:
+            with naming_the_limit("sharing a pipe or queue with another process"):
+                shared = SharedObject(kind, opened(os.dup, fd))
+            self._objects[identity] = shared
+        number, grant = next(self._numbers), next(self._numbers)
+        self._registered.append((Entry(number, shared), grant, reusable))
+        return number, grant
+
+    def release(self, grants: Iterable[int]) -> None:
+        """Nobody will use them any more.  It is done in a moment."""
+        self._call_soon(self.take_back, grants)
+
+    def take_back(self, grants: Iterable[int]) -> None:
+        """The same, now."""
+        self._settle()
+        for grant in grants:
+            self._end(grant)
 
     def grant(self, number: int, *, reusable: bool) -> int:
         """One more grant for an object."""
-        with self._lock:
-            entry, grant = self._find(number), next(self._numbers)
-            self._hold(entry, grant)
-            self._note(entry, grant, reusable)
-            return grant
+        self._settle()
+        entry, grant = self._find(number), next(self._numbers)
+        self._note(entry, grant, reusable)
+        return grant
 
     def fetch(self, number: int, grant: int) -> int:
         """A descriptor for someone on this host; uses up a plain grant."""
-        with self._lock:
-            entry = self._find(number, grant)
-            with naming_the_limit("receiving a pipe or queue from another process"):
-                fd = os.dup(entry.hosted.fileno())
-            self._use(entry, grant)
+        self._settle()
+        entry = self._find(number, grant)
+        with naming_the_limit("receiving a pipe or queue from another process"):
+            fd = os.dup(entry.shared.descriptor.fileno())
+        self._use(grant)
         return fd
 
     def attach(self, number: int, grant: int) -> Entry:
@@ -99,41 +129,40 @@ class Registry:
 
         Who is attached already may attach again with grant 0.
         """
-        with self._lock:
-            entry = self._find(number, grant)
-            entry.attached += 1
-            self._use(entry, grant)
+        self._settle()
+        entry = self._find(number, grant)
+        shared = entry.shared
+        if shared.hosted is None:
+            with naming_the_limit("serving a pipe or queue to another host"):
+                shared.hosted = self._host(shared.kind, os.dup(shared.descriptor.fileno()))
+        shared.attached += 1
+        entry.attached += 1
+        self._use(grant)
         return entry
 
     def detach(self, entry: Entry) -> None:
         """One user less."""
-        with self._lock:
-            entry.attached -= 1
-            self._drop_if_unused(entry)
-
-    def release(self, grant: int) -> None:
-        """Nobody will use the grant any more."""
-        with self._lock:
-            entry = self._grants.get(grant)
-            if entry is not None:
-                self._end(entry, grant)
-
-    def release_soon(self, grant: int) -> None:
-        """The same for finalizers, which run anywhere, even where this thread holds a lock."""
-        self._call_soon(self.release, grant)
+        entry.attached -= 1
+        entry.shared.attached -= 1
+        if not entry.shared.attached:
+            entry.shared.end_service()
+        self._drop_if_unused(entry)
 
     def close(self) -> None:
         """Let go of everything."""
-        with self._lock:
-            for entry in list(self._entries.values()):
-                self._discard(entry.hosted)
-            self._entries.clear()
-            self._by_identity.clear()
-            self._grants.clear()
-            self._reusable.clear()
+        self._registered.clear()
+        for entry in self._entries.values():
+            entry.shared.end_service()
+        self._entries.clear()
+        self._grants.clear()
+        self._reusable.clear()
 
-    def __len__(self) -> int:
-        return len(self._entries)
+    def _settle(self) -> None:
+        """Enter what was registered meanwhile."""
+        while self._registered:
+            entry, grant, reusable = self._registered.popleft()
+            self._note(entry, grant, reusable)
+            self._entries[entry.number] = entry
 
     def _find(self, number: int, grant: int = 0) -> Entry:
         entry = self._entries.get(number)
@@ -144,33 +173,26 @@ class Registry:
             )
         return entry
 
-    def _hold(self, entry: Entry, grant: int) -> bool:
-        """Keep the object; False if its last holder has just let go of it."""
-        entry.grants.add(grant)
-        return entry.number in self._entries
-
     def _note(self, entry: Entry, grant: int, reusable: bool) -> None:
         if reusable:
             self._reusable.add(grant)
+        entry.grants.add(grant)
         self._grants[grant] = entry
 
-    def _use(self, entry: Entry, grant: int) -> None:
-        if grant and grant not in self._reusable:
-            self._end(entry, grant)
+    def _use(self, grant: int) -> None:
+        if grant not in self._reusable:
+            self._end(grant)
 
-    def _end(self, entry: Entry, grant: int) -> None:
-        self._grants.pop(grant, None)
-        self._reusable.discard(grant)
-        entry.grants.discard(grant)
-        self._drop_if_unused(entry)
+    def _end(self, grant: int) -> None:
+        entry = self._grants.pop(grant, None)
+        if entry is not None:
+            self._reusable.discard(grant)
+            entry.grants.discard(grant)
+            self._drop_if_unused(entry)
 
     def _drop_if_unused(self, entry: Entry) -> None:
-        if entry.attached or entry.grants:
-            return
-        if self._entries.pop(entry.number, None) is not None:
-            if self._by_identity.get(entry.identity) is entry:
-                del self._by_identity[entry.identity]
-            self._discard(entry.hosted)
+        if not entry.attached and not entry.grants:
+            self._entries.pop(entry.number, None)
 
 
 def _identity(kind: ObjectKind, fd: int) -> tuple[int, int]:

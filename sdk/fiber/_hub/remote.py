@@ -24,7 +24,9 @@ class RemoteObject:
     """An object that lives elsewhere, and stays there as long as this is open.
 
     No lock: whatever interrupts a thread here, a finalizer or a signal's handler, may use the same
-    object.  A stream is for whoever has taken it out of the idle ones.
+    object.  A stream is for whoever has taken it out of the idle ones.  The object holds them all:
+    who is interrupted with one in hand loses the use of that one, and not the last hold on what the
+    hub keeps for us.
     """
 
     def __init__(self, home: HubAddress, number: int, grant: int) -> None:
@@ -32,6 +34,7 @@ class RemoteObject:
         self.number = number
         self._pid = os.getpid()
         self._closed = False
+        self._streams: list[HubStream] = []
         # Opened at once, so that the grant is used up, but without waiting: whoever unpickles this
         # may be the very thread that carries the answer.  An error shows at the first request.
         self._idle = deque([self._open(grant)])
@@ -49,13 +52,16 @@ class RemoteObject:
         """Let go of the object."""
         self._closed = True
         _close_all(self._idle)
+        self._streams.clear()
 
     def __del__(self) -> None:
         if hasattr(self, "_idle"):  # otherwise its first stream could not be opened
             self.close()
 
     def _open(self, grant: int = 0) -> HubStream:
-        return HubStream(self.home, [TWO.pack(Op.ATTACH, 0, self.number, grant)])
+        stream = HubStream(self.home, [TWO.pack(Op.ATTACH, 0, self.number, grant)])
+        self._streams.append(stream)
+        return stream
 
     @contextmanager
     def _take(self, idle: deque[HubStream]) -> Iterator[HubStream]:
@@ -70,6 +76,7 @@ class RemoteObject:
             idle.append(stream)
             if self._closed:  # in the meantime
                 _close_all(idle)
+                self._streams.clear()
 
     def _check(self) -> None:
         if self._closed:
@@ -81,6 +88,7 @@ class RemoteObject:
         """Someone else forked us: the streams are our parent's, which keeps the object there."""
         self._pid = os.getpid()
         self._idle.clear()
+        self._streams.clear()
 
     def _settled(self, operation: Op, reply: Reply) -> None:
         """A request that was given up (Ctrl-C) had been granted by then."""

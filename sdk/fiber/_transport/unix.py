@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import _socket
 import errno
 import os
 import select
 import socket
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 from fiber._transport.loop import LONGEST_POLL
 from fiber._wire import packet
+from fiber._wire.descriptor import Descriptor, opened, opened_pair, own
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import TooManyOpenFiles
 
@@ -49,6 +51,19 @@ def _block(sock: socket.socket) -> None:
         sock.settimeout(None)
 
 
+class BorrowedSocket(socket.socket):
+    """A packet socket that blocks, over a descriptor of which somebody else is the owner."""
+
+    __slots__ = ()
+
+    def __init__(self, owner: Descriptor) -> None:
+        super().__init__(socket.AF_UNIX, socket.SOCK_SEQPACKET, 0, owner.fileno())
+        _block(self)
+
+    def __del__(self) -> None:
+        self.detach()
+
+
 # How a receiver looks for an answer before it sleeps (decision 16)
 
 _LOOK = 50e-6
@@ -70,25 +85,26 @@ _last_asked = 0
 class UnixChannel:
     """A ``SOCK_SEQPACKET`` socket whose messages are packets."""
 
-    __slots__ = ("_sleeps", "_sock", "_tries")
+    __slots__ = ("_owner", "_sleeps", "_sock", "_tries")
 
-    def __init__(self, sock: socket.socket) -> None:
-        self._sock = sock
+    def __init__(self, owner: Descriptor) -> None:
+        self._owner = owner
+        self._sock = BorrowedSocket(owner)
         self._tries = _TRIES
         self._sleeps = 0
 
     @classmethod
-    def pair(cls) -> tuple[UnixChannel, UnixChannel]:
+    def pair(cls) -> tuple[Self, Self]:
         """Two connected ends."""
-        one, other = socketpair("opening a pipe")
+        with naming_the_limit("opening a pipe"):
+            # socket.socketpair() is several steps, with the descriptors in between as numbers.
+            one, other = opened_pair(_socket.socketpair, socket.AF_UNIX, socket.SOCK_SEQPACKET)
         return cls(one), cls(other)
 
     @classmethod
-    def from_fd(cls, fd: int) -> UnixChannel:
+    def from_fd(cls, fd: int) -> Self:
         """Take over a descriptor."""
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd)
-        _block(sock)
-        return cls(sock)
+        return cls(own(fd))
 
     @property
     def sock(self) -> socket.socket:
@@ -148,26 +164,32 @@ class UnixChannel:
 
     def close(self) -> None:
         """Close this holder's descriptor."""
-        self._sock.close()
+        self._sock.detach()
+        self._owner.close()
+
+
+_COUNTER = os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE
 
 
 class UnixCounter:
     """An eventfd in semaphore mode."""
 
-    __slots__ = ("_fd",)
+    __slots__ = ("_fd", "_owner")
 
-    def __init__(self, fd: int) -> None:
-        self._fd = fd
+    def __init__(self, owner: Descriptor) -> None:
+        self._owner = owner
+        self._fd = owner.fileno()
 
     @classmethod
-    def create(cls, value: int = 0) -> UnixCounter:
+    def create(cls, value: int = 0) -> Self:
         """A counter that starts at ``value``."""
         with naming_the_limit("making a counter"):
-            fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
-        counter = cls(fd)
-        if value:
-            counter.add(value)
-        return counter
+            return cls(opened(os.eventfd, value, _COUNTER))
+
+    @classmethod
+    def from_fd(cls, fd: int) -> Self:
+        """Take over a descriptor."""
+        return cls(own(fd))
 
     def add(self, n: int = 1) -> None:
         """Raise the count."""
@@ -211,9 +233,8 @@ class UnixCounter:
 
     def close(self) -> None:
         """Close this holder's descriptor."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
+        self._fd = -1
+        self._owner.close()
 
 
 def wait_readable(fd: int, timeout: float | None) -> bool:

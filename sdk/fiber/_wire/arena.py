@@ -14,6 +14,8 @@ import os
 from collections import deque
 from collections.abc import Iterable
 
+from fiber._wire.descriptor import opened
+
 RETAINED_LIMIT = 1 << 25
 """Bytes of memory kept for later messages, per process.
 
@@ -34,23 +36,20 @@ _GRAIN = 1 << 16
 class Block:
     """One memfd and the mapped page that holds its flag."""
 
-    __slots__ = ("capacity", "fd", "flag")
+    __slots__ = ("_owner", "capacity", "fd", "flag")
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self.fd = os.memfd_create("fiber-message", os.MFD_CLOEXEC)
-        try:
-            os.ftruncate(self.fd, mmap.PAGESIZE)
-            self.flag = mmap.mmap(self.fd, mmap.PAGESIZE)
-        except BaseException:
-            os.close(self.fd)
-            raise
+        self._owner = opened(os.memfd_create, "fiber-message", os.MFD_CLOEXEC)
+        self.fd = self._owner.fileno()
+        os.ftruncate(self.fd, mmap.PAGESIZE)
+        self.flag = mmap.mmap(self.fd, mmap.PAGESIZE)
         self.flag[0] = _BUSY
 
     def close(self) -> None:
         """Let go of it; a reader that has the descriptor keeps the content."""
         self.flag.close()
-        os.close(self.fd)
+        self._owner.close()
 
 
 class Arena:

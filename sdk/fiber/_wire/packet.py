@@ -26,6 +26,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, release
+from fiber._wire.descriptor import Descriptor, own
 from fiber.errors import ConnectionClosed, TooManyOpenFiles
 
 BytesLike: TypeAlias = bytes | bytearray | memoryview
@@ -64,7 +65,8 @@ _DONTWAIT = int(socket.MSG_DONTWAIT) | _CLOEXEC
 _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
-_Received: TypeAlias = tuple[int, list[tuple[int, int, bytes]], int, Any]
+_Ancillary: TypeAlias = list[tuple[int, int, bytes]]
+_Received: TypeAlias = tuple[int, _Ancillary, int, Descriptor | None]
 
 
 class _FreeBuffers(threading.local):
@@ -238,14 +240,14 @@ def receive_object(sock: socket.socket) -> Any:
     buffer = free.pop() if free else bytearray(_RECEIVE)
     ours = True
     try:
-        size, ancillary, flags, _ = _recvmsg(sock, buffer, _ANCILLARY_ONE, _CLOEXEC)
+        size, ancillary, flags, memory = _recvmsg(sock, buffer, _ANCILLARY_ONE, _CLOEXEC)
         if size and not buffer[0]:
             return pickle.loads(memoryview(buffer)[1:size])
         ours = False
     finally:
         if ours:
             free.append(buffer)
-    return loads(_receive_parts(memoryview(buffer), buffer, size, ancillary, flags))
+    return loads(_receive_parts(memoryview(buffer), buffer, size, ancillary, flags, memory))
 
 
 def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True) -> Message:
@@ -259,31 +261,39 @@ def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True
     free = _buffers.free
     buffer = free.pop() if free else bytearray(_RECEIVE)
     try:
-        size, ancillary, flags, _ = _recvmsg(sock, buffer, space, _CLOEXEC if wait else _DONTWAIT)
+        size, ancillary, flags, memory = _recvmsg(
+            sock, buffer, space, _CLOEXEC if wait else _DONTWAIT
+        )
     except BaseException:
         free.append(buffer)
         raise
     view = memoryview(buffer)
     if size and not buffer[0]:
         return Message(view[1:size], [], [], buffer)
-    return _receive_parts(view, buffer, size, ancillary, flags)
+    return _receive_parts(view, buffer, size, ancillary, flags, memory)
 
 
 def _recvmsg(sock: socket.socket, buffer: bytearray, space: int, flags: int) -> _Received:
     try:
-        return sock.recvmsg_into((buffer,), space, flags)
+        size, ancillary, flags_there, _ = sock.recvmsg_into((buffer,), space, flags)
     except ConnectionResetError:
         # The peer closed with packets of ours unread.  The kernel says so once, ahead of what the
         # peer sent before; the next call delivers that, or the end.
-        return sock.recvmsg_into((buffer,), space, flags)
+        size, ancillary, flags_there, _ = sock.recvmsg_into((buffer,), space, flags)
+    memory = None
+    if ancillary and buffer[0] == PARTS_IN_MEMFD:
+        # Here and now: until then the descriptor is a number, which an exception would lose.
+        memory = own(*_FD.unpack_from(ancillary[0][2]))
+    return size, ancillary, flags_there, memory
 
 
 def _receive_parts(
     view: memoryview,
     buffer: bytearray,
     size: int,
-    ancillary: list[tuple[int, int, bytes]],
+    ancillary: _Ancillary,
     flags: int,
+    memory: Descriptor | None,
 ) -> Message:
     fds = [
         fd
@@ -291,6 +301,8 @@ def _receive_parts(
         if kind == socket.SCM_RIGHTS and level == socket.SOL_SOCKET
         for (fd,) in _FD.iter_unpack(data[: len(data) // _FD.size * _FD.size])
     ]
+    if memory is not None:
+        del fds[0]
     lent = Message(view[:0], [], fds, buffer)
     try:
         if not size:
@@ -303,7 +315,9 @@ def _receive_parts(
         sizes = [length, *(n for (n,) in _SIZE.iter_unpack(view[_PARTS.size : offset]))]
         if kind == PARTS:
             return _inline_parts(view[offset:size], sizes, lent)
-        return _memory_parts(sizes, lent)
+        if memory is None:
+            raise ValueError("a large message without its memory")
+        return _memory_parts(sizes, lent, memory.fileno())
     except BaseException:
         lent.close_descriptors()
         lent.release()
@@ -319,21 +333,17 @@ def _inline_parts(body: memoryview, sizes: list[int], lent: Message) -> Message:
     return lent
 
 
-def _memory_parts(sizes: list[int], lent: Message) -> Message:
+def _memory_parts(sizes: list[int], lent: Message, memory: int) -> Message:
     """Take the parts out of the sender's block: by a copy that frees it, or for good if it is
     large.
     """
-    memory = lent.fds.pop(0)
-    try:
-        offsets, total = _offsets(sizes)
-        if total > RETAINED_LIMIT:
-            mapped = memoryview(mmap.mmap(memory, total))
-            views = [mapped[at : at + size] for at, size in zip(offsets, sizes, strict=True)]
-        else:
-            views = [_copy_out(memory, at, size) for at, size in zip(offsets, sizes, strict=True)]
-            release(memory)
-    finally:
-        os.close(memory)
+    offsets, total = _offsets(sizes)
+    if total > RETAINED_LIMIT:
+        mapped = memoryview(mmap.mmap(memory, total))
+        views = [mapped[at : at + size] for at, size in zip(offsets, sizes, strict=True)]
+    else:
+        views = [_copy_out(memory, at, size) for at, size in zip(offsets, sizes, strict=True)]
+        release(memory)
     lent.release()
     return Message(views[0], views[1:], lent.fds)
 
