@@ -83,8 +83,12 @@ class ApplyResult:
         self._mixed = mixed
         return False
 
+    def has_room(self) -> bool:
+        """Always: whoever wants it wants all of it."""
+        return True
+
     def lift_bound(self) -> None:
-        """There is none: whoever wants it wants all of it."""
+        """There is none."""
 
     def set_done(self) -> None:
         """All outcomes are there: call back, then let those go on who wait."""
@@ -196,9 +200,10 @@ class _Buffer:
         """What reads no more than is consumed, if that was asked for."""
         self.pool: Owner | None = pool
         self.resume: Callable[[], None] | None = None
-        """Asks for more results, after ``add_results`` has asked for no more."""
+        """Has the executor look whether there is room, after ``add_results`` asked for no more."""
         self._waiters = Waiters()
         self._bounded = True
+        self._passed = 0  # results that were put into ``items``
         self._came = 0  # bytes, since it was looked last how many are held
         self._resume_at = -1  # results that are left then; -1: nothing is held back
 
@@ -209,7 +214,15 @@ class _Buffer:
         return self._is_full(outcomes) if mixed else False
 
     def _keep(self, start: int, outcomes: list[Any]) -> None:
+        self._pass_on(outcomes)
+
+    def _pass_on(self, outcomes: list[Any]) -> None:
         self.items.extend(outcomes)
+        self._passed += len(outcomes)
+
+    def consumed(self) -> int:
+        """How many the user took; on the loop's thread."""
+        return self._passed - len(self.items)
 
     def _early_results(self) -> list[Any]:
         return []
@@ -225,17 +238,28 @@ class _Buffer:
             self._resume_at = -1
         return self._came >= HELD
 
+    def has_room(self) -> bool:
+        """Whether half of what was held back for is read."""
+        if self._resume_at < len(self.items):
+            return False
+        self._resume_at = -1
+        return True
+
     def lift_bound(self) -> None:
         """Take all that comes."""
         self._bounded = False
 
-    def taken(self) -> None:
-        """The user took one."""
+    def ask(self) -> None:
+        """Have the executor go on, if it waits until results are read.
+
+        Changes nothing here, and is called after each result and before each wait: whoever is
+        interrupted after the one makes up for it before the other.
+        """
         if self.stream is not None:
-            self.stream.consume()
-        if self._resume_at >= len(self.items) and self.resume is not None:
-            self._resume_at = -1
-            self.resume()
+            self.stream.ask()
+        resume = self.resume
+        if resume is not None and self._resume_at >= len(self.items):
+            resume()
 
     def set_done(self) -> None:
         """All outcomes are there."""
@@ -261,6 +285,7 @@ class _Buffer:
             if finished:
                 self._waiters.leave(waiter)
                 raise StopIteration
+            self.ask()
             left = None if deadline is None else deadline - time.monotonic()
             if not acquire(waiter, left):
                 self._waiters.leave(waiter)
@@ -270,15 +295,13 @@ class _Buffer:
 class _OrderedBuffer(_Buffer):
     def __init__(self, pool: Owner) -> None:
         super().__init__(pool)
-        self._next = 0
         self._early: dict[int, list[Any]] = {}
 
     def _keep(self, start: int, outcomes: list[Any]) -> None:
         """Pass on what is next in order."""
         self._early[start] = outcomes
-        while (ready := self._early.pop(self._next, None)) is not None:
-            self.items.extend(ready)
-            self._next += len(ready)
+        while (ready := self._early.pop(self._passed, None)) is not None:
+            self._pass_on(ready)
 
     def _early_results(self) -> list[Any]:
         return list(itertools.chain.from_iterable(self._early.values()))
@@ -303,7 +326,7 @@ class IMapIterator:
             outcome = buffer.items.popleft()
         except IndexError:
             outcome = buffer.wait(timeout)
-        buffer.taken()
+        buffer.ask()
         if type(outcome) is Pickled:
             outcome = outcome.decode()
         if type(outcome) is Failure:

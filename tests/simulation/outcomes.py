@@ -59,6 +59,10 @@ class Outcomes:
                 self._master.consume_soon(self)
         return self.item is not None and self._master.holds_back(self.item)
 
+    def has_room(self) -> bool:
+        """The user has read enough of them."""
+        return True
+
     def lift_bound(self) -> None:
         """Whoever would read the results waits for the rest."""
         self._master.waits_for_all(self.account)

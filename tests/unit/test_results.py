@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import threading
 from multiprocessing import TimeoutError
 from typing import Any
 
 import pytest
 
+from fiber import results
+from fiber._engine.chunks import TARGET
+from fiber._runtime import input_stream
+from fiber._runtime.input_stream import InputStream
 from fiber._runtime.outcome import Failure, Pickled
 from fiber._wire import work
 from fiber.results import ApplyResult, IMapIterator
+from unit.interrupting import is_interrupted
+from unit.ledger_steps import known
 
 
 class Stop(BaseException):
@@ -142,6 +150,38 @@ def test_an_interrupted_wait_for_an_iterator_loses_no_result(
     monkeypatch.undo()
     found._buffer.set_done()
     assert list(found) == [3]
+
+
+def test_whoever_is_interrupted_at_any_step_asks_for_more_the_next_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(results, "HELD", 1)
+    files = {results.__file__, input_stream.__file__}
+
+    def take_two(stop: int) -> bool:
+        """Whether it was interrupted, at step ``stop`` of taking the first."""
+        asked: set[str] = set()
+        found = iterator()
+        buffer = found._buffer
+        stream = InputStream(1, lambda: asked.add("input"), 1, buffer.consumed)
+        buffer.stream, buffer.resume = stream, lambda: asked.add("results")
+        stream.grant(0, 1, known(1.0, 1), TARGET)
+        assert buffer.add_results(0, [Pickled(work.VALUE, b"I3\n.", [])], True), "it is full"
+        stream._taken = 1
+        stream.grant(0, 1, known(1.0, 1), TARGET)
+        assert stream._granted == 1
+        interrupted = is_interrupted(lambda: next(found), stop, files)
+        with contextlib.suppress(TimeoutError):
+            while True:
+                found.next(0)
+        assert asked == {"input", "results"}, f"interrupted at step {stop}"
+        stream.grant(0, 1, known(1.0, 1), TARGET)
+        assert stream._granted == 2
+        assert buffer.has_room()
+        return interrupted
+
+    steps = next(stop for stop in itertools.count() if not take_two(stop))
+    assert steps > 10, "it was hardly interrupted"
 
 
 def test_what_unpickles_to_an_error_is_raised_and_the_next_is_there() -> None:

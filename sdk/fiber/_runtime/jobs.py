@@ -85,7 +85,7 @@ class Jobs:
 
     def resume(self, item: WorkItem) -> None:
         """Its results are being read again."""
-        if item.job is not None:
+        if item.job is not None and item.future is not None and item.future.has_room():
             self._ledger.pause(item.job, False)
 
     def lift_limits(self) -> None:

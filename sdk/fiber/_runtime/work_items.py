@@ -29,6 +29,9 @@ class Future(Protocol):
         nobody reads them: until it says otherwise, by what it was given for that.
         """
 
+    def has_room(self) -> bool:
+        """Whether it takes more again, after it has asked for no more."""
+
     def lift_bound(self) -> None:
         """Take all that comes: whoever would read them waits for the rest."""
 
