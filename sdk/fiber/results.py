@@ -7,7 +7,6 @@ terminated or cannot go on raises an error instead of waiting for ever.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import threading
 import time
 import types
@@ -77,7 +76,7 @@ class ApplyResult:
 
     # What the executor says
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take the outcome."""
         self._outcome = outcomes[0]
         self._mixed = mixed
@@ -157,7 +156,7 @@ class MapResult(ApplyResult):
         self._outcome = []
         self._first: Any = None
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take outcomes."""
         values = self._outcome
         if start > len(values):
@@ -186,8 +185,8 @@ class MapResult(ApplyResult):
 
 
 HELD = 64 << 20
-"""Bytes of results that an iterator holds for somebody who does not read them.  Then no more tasks
-are begun until half of them are read."""
+"""Bytes of results, as workers sent them, that an iterator holds for somebody who does not read
+them.  Then no more tasks are begun until half of the results are read."""
 
 
 class _Buffer:
@@ -204,39 +203,46 @@ class _Buffer:
         self._waiters = Waiters()
         self._bounded = True
         self._passed = 0  # results that were put into ``items``
-        self._came = 0  # bytes, since it was looked last how many are held
+        self._held = 0  # bytes, of which some may have been taken since it was last looked
+        self._sizes: deque[tuple[int, int]] = deque()
+        """How many results were passed on up to some point, and bytes of those since the last."""
         self._resume_at = -1  # results that are left then; -1: nothing is held back
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take outcomes."""
-        self._keep(start, outcomes)
+        self._held += size
+        self._keep(start, outcomes, size)
         self._waiters.wake()
-        return self._is_full(outcomes) if mixed else False
+        return self._is_full()
 
-    def _keep(self, start: int, outcomes: list[Any]) -> None:
-        self._pass_on(outcomes)
+    def _keep(self, start: int, outcomes: list[Any], size: int) -> None:
+        self._pass_on(outcomes, size)
 
-    def _pass_on(self, outcomes: list[Any]) -> None:
+    def _pass_on(self, outcomes: list[Any], size: int) -> None:
         self.items.extend(outcomes)
         self._passed += len(outcomes)
+        if self._sizes and self._sizes[-1][1] < HELD >> 10:  # else they take more than the results
+            size += self._sizes.pop()[1]
+        self._sizes.append((self._passed, size))
 
     def consumed(self) -> int:
         """How many the user took; on the loop's thread."""
         return self._passed - len(self.items)
 
-    def _early_results(self) -> list[Any]:
-        return []
-
-    def _is_full(self, outcomes: list[Any]) -> bool:
-        self._came += sum(map(_size, outcomes))
-        if self._came < HELD or not self._bounded or self.resume is None:
+    def _is_full(self) -> bool:
+        if self._held < HELD or not self._bounded:
             return False
+        held_back = self._resume_at >= 0
         # Noted first: whoever takes results while they are counted asks for more.
-        self._resume_at = len(self.items) // 2
-        self._came = sum(map(_size, [*self.items, *self._early_results()]))
-        if self._came < HELD:
+        self._resume_at = max(self._resume_at, len(self.items) // 2)
+        if held_back:
+            return True  # until half of them are read, and not before
+        consumed = self.consumed()
+        while self._sizes and self._sizes[0][0] <= consumed:
+            self._held -= self._sizes.popleft()[1]
+        if self._held < HELD:
             self._resume_at = -1
-        return self._came >= HELD
+        return self._held >= HELD
 
     def has_room(self) -> bool:
         """Whether half of what was held back for is read."""
@@ -248,6 +254,7 @@ class _Buffer:
     def lift_bound(self) -> None:
         """Take all that comes."""
         self._bounded = False
+        self._resume_at = -1
 
     def ask(self) -> None:
         """Have the executor go on, if it waits until results are read.
@@ -295,16 +302,13 @@ class _Buffer:
 class _OrderedBuffer(_Buffer):
     def __init__(self, pool: Owner) -> None:
         super().__init__(pool)
-        self._early: dict[int, list[Any]] = {}
+        self._early: dict[int, tuple[list[Any], int]] = {}
 
-    def _keep(self, start: int, outcomes: list[Any]) -> None:
+    def _keep(self, start: int, outcomes: list[Any], size: int) -> None:
         """Pass on what is next in order."""
-        self._early[start] = outcomes
+        self._early[start] = outcomes, size
         while (ready := self._early.pop(self._passed, None)) is not None:
-            self._pass_on(ready)
-
-    def _early_results(self) -> list[Any]:
-        return list(itertools.chain.from_iterable(self._early.values()))
+            self._pass_on(*ready)
 
 
 class IMapIterator:
@@ -345,10 +349,3 @@ class IMapUnorderedIterator(IMapIterator):
     """Iterator over the results of ``imap_unordered``, as they come."""
 
     _buffer_type = _Buffer
-
-
-def _size(outcome: Any) -> int:
-    """Bytes that a result holds, if that is worth counting."""
-    if type(outcome) is not Pickled:
-        return 0
-    return len(outcome.data) + sum(buffer.nbytes for buffer in outcome.buffers)

@@ -48,7 +48,7 @@ class Outcomes:
         """Who waits for it."""
         self._ended = False
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Outcomes of tasks from ``start`` on; sometimes nobody reads them for a while."""
         if not mixed and any(type(outcome) in (Failure, Pickled) for outcome in outcomes):
             raise Violation(f"job {self.account.number} has results that are not plain")

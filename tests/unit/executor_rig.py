@@ -149,7 +149,7 @@ class Results:
         self.done = 0
         self.error: BaseException | None = None
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> None:
         assert not self.outcomes.keys() & range(start, start + len(outcomes)), "twice"
         self.outcomes.update(enumerate(outcomes, start))
 

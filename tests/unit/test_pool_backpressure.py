@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -17,6 +18,11 @@ HELD = 16 * RESULT
 MANY = 400
 
 Imap = Callable[..., Iterator[bytearray]]
+
+
+def row_of(kind: Callable[[int], Any], size: int) -> tuple[Any]:
+    """Something plain that holds much."""
+    return (kind(size),)
 
 
 @pytest.fixture
@@ -46,6 +52,17 @@ def test_an_iterator_that_nobody_reads_holds_back_its_tasks(
     # What the workers had already comes, and no more.
     assert _unread(iterator) < MANY // 2
     assert sum(map(len, iterator)) == MANY * RESULT
+
+
+@pytest.mark.parametrize("chunksize", [1, 7])
+@pytest.mark.parametrize("function", [bytes, partial(row_of, bytes), " ".__mul__])
+def test_plain_results_count_as_well(
+    pool: Pool, function: Callable[[int], Any], chunksize: int
+) -> None:
+    iterator = pool.imap(function, [RESULT] * MANY, chunksize)
+    wait_until(lambda: _is_held_back(pool), "it is held back")
+    assert _unread(iterator) < MANY // 2
+    assert list(iterator) == [function(RESULT)] * MANY
 
 
 def test_other_calls_go_on_meanwhile(pool: Pool) -> None:

@@ -112,22 +112,24 @@ class Jobs:
 
     # Outcomes
 
-    def put(self, receipt: Receipt, results: list[Any], *, mixed: bool = True) -> None:
-        """Hand results on, but for those whose tasks get another try."""
+    def put(
+        self, receipt: Receipt, results: list[Any], *, mixed: bool = True, size: int = 0
+    ) -> None:
+        """Hand results on, ``size`` bytes, but for those whose tasks get another try."""
         if mixed and self._retry:
             for at, result in enumerate(results):
                 again = type(result) is Pickled and result.kind == work.AGAIN
                 index = receipt.start + at
                 if not (again and self._ledger.retry(receipt, index)):
-                    self._put(receipt._replace(start=index), [result], True)
+                    self._put(receipt._replace(start=index), [result], True, size // len(results))
         else:
-            self._put(receipt, results, mixed)
+            self._put(receipt, results, mixed, size)
         self.check_finished(receipt.job)
 
-    def _put(self, receipt: Receipt, results: list[Any], mixed: bool) -> None:
+    def _put(self, receipt: Receipt, results: list[Any], mixed: bool, size: int) -> None:
         item: WorkItem = receipt.job.owner
         if item.future is not None:
-            if item.future.add_results(receipt.start, results, mixed):
+            if item.future.add_results(receipt.start, results, mixed, size):
                 self._ledger.pause(receipt.job, True)
             return
         for task, outcome in enumerate(results, receipt.start):

@@ -22,11 +22,12 @@ from fiber._wire import work
 class Future(Protocol):
     """Where the outcomes of a work item, or of one call, go.  Called on the loop's thread."""
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Outcomes of the tasks from ``start`` on.  Each task's comes once, in any order.
 
-        Unless ``mixed`` they are all plain values.  True asks for no more than must be, since
-        nobody reads them: until it says otherwise, by what it was given for that.
+        Unless ``mixed`` they are all plain values.  They came in ``size`` bytes.  True asks for no
+        more than must be, since nobody reads them: until it says otherwise, by what it was given
+        for that.
         """
 
     def has_room(self) -> bool:
