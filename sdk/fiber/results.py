@@ -171,17 +171,23 @@ class MapResult(ApplyResult):
     def _settle(self) -> None:
         if not self._mixed:
             return
+        # In this order: whoever is interrupted at any line begins again here, with what is left.
+        if self._first is None:
+            self._first = _unpickle(self._outcome)
         if self._first is not None:
             self._outcome = decode(self._first)
-        else:
-            values = self._outcome
-            for at, value in enumerate(values):
-                if type(value) is Pickled:
-                    values[at] = value.decode()
-                    if type(values[at]) is Failure:
-                        self._outcome = values[at]
-                        break
         self._mixed = False
+
+
+def _unpickle(outcomes: list[Any]) -> Failure | None:
+    """Unpickle in place what is pickled, up to the first failure, which stays pickled there."""
+    for at, outcome in enumerate(outcomes):
+        if type(outcome) is Pickled:
+            value = outcome.decode()
+            if type(value) is Failure:
+                return value
+            outcomes[at] = value
+    return None
 
 
 HELD = 64 << 20

@@ -18,7 +18,8 @@ from fiber._runtime import input_stream
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.outcome import Failure, Pickled
 from fiber._wire import work
-from fiber.results import ApplyResult, IMapIterator, IMapUnorderedIterator
+from fiber.pool import MaybeEncodingError
+from fiber.results import ApplyResult, IMapIterator, IMapUnorderedIterator, MapResult
 from unit.interrupting import is_interrupted
 from unit.ledger_steps import known
 
@@ -218,6 +219,33 @@ def test_what_is_unread_is_held_back_and_costs_the_same_however_much_it_is(
     assert read(51) == 50 * [False] + [True]
     assert add(203, 253) == 49 * [False] + [True]
     assert looked_at == 0
+
+
+@pytest.mark.parametrize(
+    "outcome", [Pickled(work.VALUE, b"garbage", []), Pickled(work.ERROR, b"garbage", [])]
+)
+def test_a_map_whose_getting_is_interrupted_at_any_step_raises_its_error_the_next_time(
+    outcome: Pickled,
+) -> None:
+    pool: Any = None
+
+    def get_twice(stop: int) -> bool:
+        """Whether the first was interrupted, at step ``stop``."""
+        found = MapResult(pool)
+        found.add_results(0, [1, outcome, 3], True)
+        found.set_done()
+
+        def get() -> None:
+            with contextlib.suppress(MaybeEncodingError):
+                found.get()
+
+        interrupted = is_interrupted(get, stop, {results.__file__})
+        with pytest.raises(MaybeEncodingError):
+            found.get()
+        return interrupted
+
+    steps = next(stop for stop in itertools.count() if not get_twice(stop))
+    assert steps > 10, "it was hardly interrupted"
 
 
 def test_what_unpickles_to_an_error_is_raised_and_the_next_is_there() -> None:
