@@ -268,16 +268,17 @@ class _Buffer:
         Changes nothing here, and is called after each result and before each wait: whoever is
         interrupted after the one makes up for it before the other.
         """
-        if self.stream is not None:
-            self.stream.ask()
-        resume = self.resume
-        if resume is not None and self._resume_at >= len(self.items):
-            resume()
+        stream = self.stream
+        if stream is not None:
+            stream.ask()
+        if self._resume_at >= len(self.items) and self.resume is not None:
+            self.resume()
 
     def set_done(self) -> None:
         """All outcomes are there."""
         self.finished = True
         self.pool = None
+        self.stream = None  # which knows this, too
         self._waiters.wake()
 
     def set_exception(self, error: BaseException) -> None:
@@ -349,6 +350,7 @@ class IMapIterator:
         # Nobody can make room any more for what was not read yet.
         if self._cancel is not None and not self._buffer.finished:
             self._cancel()
+            self._buffer.stream = None
 
 
 class IMapUnorderedIterator(IMapIterator):

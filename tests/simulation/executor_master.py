@@ -326,10 +326,10 @@ class ExecutorMaster:
 
     def _consume(self, future: Outcomes) -> None:
         assert future.item is not None
-        assert future.item.stream is not None
         if not self._pool.joined:
             future.consumed += 1
-            future.item.stream.ask()
+            if future.item.stream is not None:
+                future.item.stream.ask()
 
     def holds_back(self, item: WorkItem) -> bool:
         """Whether the user has more results than it reads; until a little later."""

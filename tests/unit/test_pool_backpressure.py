@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -78,6 +80,27 @@ def test_whoever_joins_the_pool_first_gets_all_later(pool: Pool) -> None:
     pool.close()
     pool.join()
     assert len(list(iterator)) == MANY
+
+
+@pytest.mark.parametrize("bounds", [{}, {"buffersize": 5}], ids=["no bound", "buffersize"])
+@pytest.mark.parametrize("dropped", ["when done", "before"])
+def test_results_are_freed_when_their_iterator_is_dropped(
+    bounds: dict[str, int], dropped: str
+) -> None:
+    with fiber.Pool(1) as pool:
+        gc.collect()
+        gc.disable()
+        try:
+            iterator: Any = pool.imap(bytearray, iter([10, 20, 30]), **bounds)
+            buffer = weakref.ref(iterator._buffer)
+            if dropped == "when done":
+                assert len(next(iterator)) == 10
+                wait_until(lambda: iterator._buffer.finished, "all results are there")
+            iterator = None
+            wait_until(lambda: buffer() is None, "it is freed, by no collector")
+        finally:
+            gc.enable()
+    pool.join()
 
 
 def test_small_results_are_never_held_back(pool: Pool) -> None:

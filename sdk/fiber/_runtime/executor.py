@@ -356,8 +356,9 @@ class Executor:
         """On that thread."""
         error = None
         try:
-            if item.stream is not None:
-                item.stream.read(iterable)
+            stream = item.stream
+            if stream is not None:
+                stream.read(iterable)
         except BaseException as raised:
             error = raised
         self.finish(item, error)

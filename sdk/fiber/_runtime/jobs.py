@@ -177,9 +177,10 @@ class Jobs:
         """If all is done, say so."""
         item: WorkItem | None = job.owner
         if job.finished and item is not None:
+            future = item.future
             self._over(item)
-            if item.future is not None:
-                item.future.set_done()
+            if future is not None:
+                future.set_done()
 
     def fail(self, job: Job, error: BaseException) -> None:
         """Nothing that is not done of a job will be."""
@@ -209,4 +210,5 @@ class Jobs:
             item.stream.end()
         if item.job is not None:
             item.job.owner = None
+        item.future = item.stream = None
         item.grants.clear()

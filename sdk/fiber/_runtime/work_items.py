@@ -78,8 +78,8 @@ class WorkItem:
     """A job of the ledger, and all that the ledger need not know of it.
 
     Without a ``future`` each of its tasks is a Call with its own.  A job and its work item know
-    each other; ``Executor._over`` parts them, so that results are freed when the user lets go of
-    them, not when the collector comes.
+    each other, its future and its stream; ``Jobs`` parts them once it is over, so that results are
+    freed when the user lets go of them, not when the collector comes.
     """
 
     __slots__ = (
