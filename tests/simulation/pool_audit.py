@@ -210,7 +210,10 @@ class PoolAudit:
         workers = self._workers
         if self._scheduler.terminated or workers.error is not None or workers.starting:
             return False
-        tasks = sum(job.fed - job.done for job in self._ledger.jobs)
+        # Nor does anybody come for what waits until results are read.
+        tasks = sum(
+            (job.reached if job.paused else job.fed) - job.done for job in self._ledger.jobs
+        )
         # A worker that still runs what was cancelled is not there for the others.
         held_up = [it for it in self._ledger.workers if it.queue and not it.leaving]
         lost = sum(worker.queue[0].job is None for worker in held_up)
