@@ -106,6 +106,7 @@ class Ledger:
         worker.pinned.append((job, span))
         self._pins[worker] = None
         job.pins[worker] = None
+        self._load.sort_pinned(worker)
 
     def close(self, job: Job) -> bool:
         """No more tasks will be fed; True if the job is finished by that."""
@@ -140,6 +141,7 @@ class Ledger:
             worker.pinned = deque(pinned for pinned in worker.pinned if pinned[0] is not job)
             if not worker.pinned:
                 self._pins.pop(worker, None)
+                self._load.sort_pinned(worker)
         job.pins.clear()
         if self._homeless:
             self._homeless = [pinned for pinned in self._homeless if pinned[0] is not job]
@@ -244,8 +246,8 @@ class Ledger:
 
         Idle workers come first; jobs take turns.
         """
-        if self._pins and (batch := self._assign_pinned(now)):
-            return batch
+        if self._load.idle_pinned:
+            return self._assign_pinned(now)
         turns = self._turns
         if not turns or not self.hungry():
             return None
@@ -266,11 +268,8 @@ class Ledger:
                 return batch
         return None
 
-    def _assign_pinned(self, now: float) -> Batch | None:
-        fewer, more = sorted((self._pins, self._load.idle), key=len)
-        worker = next((worker for worker in fewer if worker in more), None)
-        if worker is None:
-            return None
+    def _assign_pinned(self, now: float) -> Batch:
+        worker = next(iter(self._load.idle_pinned))
         job, span = worker.pinned.popleft()
         if not worker.pinned:
             del self._pins[worker]
