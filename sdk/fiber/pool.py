@@ -322,7 +322,7 @@ class Pool:
             self._submit(item, iterable, chunksize)
             return iterator
         try:
-            stream = executor.open_stream(item, buffersize)
+            stream = executor.open_stream(item, buffersize, buffer.consumed)
             if buffersize is not None:
                 buffer.stream = stream
                 iterator._cancel = partial(executor.cancel, item)

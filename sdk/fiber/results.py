@@ -7,7 +7,6 @@ terminated or cannot go on raises an error instead of waiting for ever.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import threading
 import time
 import types
@@ -77,14 +76,18 @@ class ApplyResult:
 
     # What the executor says
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take the outcome."""
         self._outcome = outcomes[0]
         self._mixed = mixed
         return False
 
+    def has_room(self) -> bool:
+        """Always: whoever wants it wants all of it."""
+        return True
+
     def lift_bound(self) -> None:
-        """There is none: whoever wants it wants all of it."""
+        """There is none."""
 
     def set_done(self) -> None:
         """All outcomes are there: call back, then let those go on who wait."""
@@ -153,7 +156,7 @@ class MapResult(ApplyResult):
         self._outcome = []
         self._first: Any = None
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take outcomes."""
         values = self._outcome
         if start > len(values):
@@ -168,22 +171,28 @@ class MapResult(ApplyResult):
     def _settle(self) -> None:
         if not self._mixed:
             return
+        # In this order: whoever is interrupted at any line begins again here, with what is left.
+        if self._first is None:
+            self._first = _unpickle(self._outcome)
         if self._first is not None:
             self._outcome = decode(self._first)
-        else:
-            values = self._outcome
-            for at, value in enumerate(values):
-                if type(value) is Pickled:
-                    values[at] = value.decode()
-                    if type(values[at]) is Failure:
-                        self._outcome = values[at]
-                        break
         self._mixed = False
 
 
+def _unpickle(outcomes: list[Any]) -> Failure | None:
+    """Unpickle in place what is pickled, up to the first failure, which stays pickled there."""
+    for at, outcome in enumerate(outcomes):
+        if type(outcome) is Pickled:
+            value = outcome.decode()
+            if type(value) is Failure:
+                return value
+            outcomes[at] = value
+    return None
+
+
 HELD = 64 << 20
-"""Bytes of results that an iterator holds for somebody who does not read them.  Then no more tasks
-are begun until half of them are read."""
+"""Bytes of results, as workers sent them, that an iterator holds for somebody who does not read
+them.  Then no more tasks are begun until half of the results are read."""
 
 
 class _Buffer:
@@ -196,51 +205,80 @@ class _Buffer:
         """What reads no more than is consumed, if that was asked for."""
         self.pool: Owner | None = pool
         self.resume: Callable[[], None] | None = None
-        """Asks for more results, after ``add_results`` has asked for no more."""
+        """Has the executor look whether there is room, after ``add_results`` asked for no more."""
         self._waiters = Waiters()
         self._bounded = True
-        self._came = 0  # bytes, since it was looked last how many are held
+        self._passed = 0  # results that were put into ``items``
+        self._held = 0  # bytes, of which some may have been taken since it was last looked
+        self._sizes: deque[tuple[int, int]] = deque()
+        """How many results were passed on up to some point, and bytes of those since the last."""
         self._resume_at = -1  # results that are left then; -1: nothing is held back
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take outcomes."""
-        self._keep(start, outcomes)
+        self._held += size
+        self._keep(start, outcomes, size)
         self._waiters.wake()
-        return self._is_full(outcomes) if mixed else False
+        return self._is_full()
 
-    def _keep(self, start: int, outcomes: list[Any]) -> None:
+    def _keep(self, start: int, outcomes: list[Any], size: int) -> None:
+        self._pass_on(outcomes, size)
+
+    def _pass_on(self, outcomes: list[Any], size: int) -> None:
         self.items.extend(outcomes)
+        self._passed += len(outcomes)
+        if self._sizes and self._sizes[-1][1] < HELD >> 10:  # else they take more than the results
+            size += self._sizes.pop()[1]
+        self._sizes.append((self._passed, size))
 
-    def _early_results(self) -> list[Any]:
-        return []
+    def consumed(self) -> int:
+        """How many the user took; on the loop's thread."""
+        return self._passed - len(self.items)
 
-    def _is_full(self, outcomes: list[Any]) -> bool:
-        self._came += sum(map(_size, outcomes))
-        if self._came < HELD or not self._bounded or self.resume is None:
+    def _is_full(self) -> bool:
+        if self._held < HELD or not self._bounded:
             return False
+        held_back = self._resume_at >= 0
         # Noted first: whoever takes results while they are counted asks for more.
-        self._resume_at = len(self.items) // 2
-        self._came = sum(map(_size, [*self.items, *self._early_results()]))
-        if self._came < HELD:
+        self._resume_at = max(self._resume_at, len(self.items) // 2)
+        if held_back:
+            return True  # until half of them are read, and not before
+        consumed = self.consumed()
+        while self._sizes and self._sizes[0][0] <= consumed:
+            self._held -= self._sizes.popleft()[1]
+        if self._held < HELD:
             self._resume_at = -1
-        return self._came >= HELD
+        return self._held >= HELD
+
+    def has_room(self) -> bool:
+        """Whether half of what was held back for is read."""
+        if self._resume_at < len(self.items):
+            return False
+        self._resume_at = -1
+        return True
 
     def lift_bound(self) -> None:
         """Take all that comes."""
         self._bounded = False
+        self._resume_at = -1
 
-    def taken(self) -> None:
-        """The user took one."""
-        if self.stream is not None:
-            self.stream.consume()
+    def ask(self) -> None:
+        """Have the executor go on, if it waits until results are read.
+
+        Changes nothing here, and is called after each result and before each wait: whoever is
+        interrupted after the one makes up for it before the other.
+        """
+        stream = self.stream
+        if stream is not None:
+            stream.ask()
         if self._resume_at >= len(self.items) and self.resume is not None:
-            self._resume_at = -1
             self.resume()
 
     def set_done(self) -> None:
         """All outcomes are there."""
         self.finished = True
         self.pool = None
+        self.stream = None  # which knows this, too
         self._waiters.wake()
 
     def set_exception(self, error: BaseException) -> None:
@@ -261,6 +299,7 @@ class _Buffer:
             if finished:
                 self._waiters.leave(waiter)
                 raise StopIteration
+            self.ask()
             left = None if deadline is None else deadline - time.monotonic()
             if not acquire(waiter, left):
                 self._waiters.leave(waiter)
@@ -270,18 +309,13 @@ class _Buffer:
 class _OrderedBuffer(_Buffer):
     def __init__(self, pool: Owner) -> None:
         super().__init__(pool)
-        self._next = 0
-        self._early: dict[int, list[Any]] = {}
+        self._early: dict[int, tuple[list[Any], int]] = {}
 
-    def _keep(self, start: int, outcomes: list[Any]) -> None:
+    def _keep(self, start: int, outcomes: list[Any], size: int) -> None:
         """Pass on what is next in order."""
-        self._early[start] = outcomes
-        while (ready := self._early.pop(self._next, None)) is not None:
-            self.items.extend(ready)
-            self._next += len(ready)
-
-    def _early_results(self) -> list[Any]:
-        return list(itertools.chain.from_iterable(self._early.values()))
+        self._early[start] = outcomes, size
+        while (ready := self._early.pop(self._passed, None)) is not None:
+            self._pass_on(*ready)
 
 
 class IMapIterator:
@@ -303,7 +337,7 @@ class IMapIterator:
             outcome = buffer.items.popleft()
         except IndexError:
             outcome = buffer.wait(timeout)
-        buffer.taken()
+        buffer.ask()
         if type(outcome) is Pickled:
             outcome = outcome.decode()
         if type(outcome) is Failure:
@@ -316,16 +350,10 @@ class IMapIterator:
         # Nobody can make room any more for what was not read yet.
         if self._cancel is not None and not self._buffer.finished:
             self._cancel()
+            self._buffer.stream = None
 
 
 class IMapUnorderedIterator(IMapIterator):
     """Iterator over the results of ``imap_unordered``, as they come."""
 
     _buffer_type = _Buffer
-
-
-def _size(outcome: Any) -> int:
-    """Bytes that a result holds, if that is worth counting."""
-    if type(outcome) is not Pickled:
-        return 0
-    return len(outcome.data) + sum(buffer.nbytes for buffer in outcome.buffers)

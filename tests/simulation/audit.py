@@ -285,7 +285,12 @@ class Audit:
         self._check_idle()
 
     def _check_demand(self, places: dict[Job, list[tuple[str, int, int]]]) -> None:
-        wanted = sum(size for where in places.values() for _, _, size in where)
+        wanted = sum(
+            size
+            for job, where in places.items()
+            for place, first, size in where
+            if not (job.paused and place == "waiting" and first >= job.reached)
+        )
         # Whoever runs a task that was cancelled is not there for others.
         unwanted = sum(
             len(batch.items) - batch.received

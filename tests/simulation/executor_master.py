@@ -281,7 +281,7 @@ class ExecutorMaster:
     def _stream(self, account: Account, future: Outcomes) -> None:
         future.limit = self._rng.choice((None, None, 1, 5))
         item = self._item(account, future)
-        stream = self._executor.open_stream(item, future.limit)
+        stream = self._executor.open_stream(item, future.limit, lambda: future.consumed)
         reader = f"the reader of job {account.number}"
         self.world.loop.comes_after(reader, _user(account))
         actor = self._stage.act(reader, partial(self._read, account, item, stream))
@@ -326,10 +326,10 @@ class ExecutorMaster:
 
     def _consume(self, future: Outcomes) -> None:
         assert future.item is not None
-        assert future.item.stream is not None
         if not self._pool.joined:
             future.consumed += 1
-            future.item.stream.consume()
+            if future.item.stream is not None:
+                future.item.stream.ask()
 
     def holds_back(self, item: WorkItem) -> bool:
         """Whether the user has more results than it reads; until a little later."""

@@ -48,7 +48,7 @@ class Outcomes:
         """Who waits for it."""
         self._ended = False
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Outcomes of tasks from ``start`` on; sometimes nobody reads them for a while."""
         if not mixed and any(type(outcome) in (Failure, Pickled) for outcome in outcomes):
             raise Violation(f"job {self.account.number} has results that are not plain")
@@ -58,6 +58,10 @@ class Outcomes:
             for _ in outcomes:
                 self._master.consume_soon(self)
         return self.item is not None and self._master.holds_back(self.item)
+
+    def has_room(self) -> bool:
+        """The user has read enough of them."""
+        return True
 
     def lift_bound(self) -> None:
         """Whoever would read the results waits for the rest."""

@@ -65,6 +65,7 @@ class PoolAudit:
         """The user waits for the pool's end, and takes no results."""
         self._moved = False
         self._failures: list[tuple[float, bool]] = []
+        self._alone_since = 0.0
         self._told = False
         self._since: dict[Any, float] = {}
         self._readings: list[Reading] = []
@@ -101,20 +102,28 @@ class PoolAudit:
     ) -> list[Loss]:
         require(member in self._workers.members, "an unknown worker is gone")
         counts = member.worker is None and not member.leaving and failure is not None
+        gives_up = False
         if failure is not None and counts:
             self._failures.append((now, failure.killed))
-            patience = KILLED_PATIENCE if failure.killed else RAISED_PATIENCE
-            lasts = now - self._failures[0][0]
-            self.starved |= len(self._failures) >= TRIES and lasts >= patience
+            self.starved |= self._fails_for_long(now, failure.killed, 0.0)
+            gives_up = self._fails_for_long(now, failure.killed, self._alone_since)
         had = self._workers.error
         losses: list[Loss] = self._real.gone(member, now, failure=failure, **rest)
         at_work = any(member.worker is not None for member in self._workers.staying())
+        if member.worker is not None and not at_work:
+            self._alone_since = now
         if self._workers.error is not had:
-            require(self.starved, "the pool gives up too early")
+            require(gives_up, "the pool gives up too early")
             require(not at_work, "the pool gives up though workers are at work")
-        elif counts and self.starved and not had:
+        elif gives_up and not had:
             require(at_work, "the pool does not give up")
         return losses
+
+    def _fails_for_long(self, now: float, killed: bool, alone_since: float) -> bool:
+        """Whether workers have failed like the last one for as long as a pool bears it alone."""
+        times = [time for time, other in self._failures if killed or not other]
+        patience = KILLED_PATIENCE if killed else RAISED_PATIENCE
+        return len(times) >= TRIES and now - max(times[0], alone_since) >= patience
 
     def _news(self, failure: StartFailure, now: float) -> str:
         news: str = self._real.news(failure, now)
@@ -201,7 +210,10 @@ class PoolAudit:
         workers = self._workers
         if self._scheduler.terminated or workers.error is not None or workers.starting:
             return False
-        tasks = sum(job.fed - job.done for job in self._ledger.jobs)
+        # Nor does anybody come for what waits until results are read.
+        tasks = sum(
+            (job.reached if job.paused else job.fed) - job.done for job in self._ledger.jobs
+        )
         # A worker that still runs what was cancelled is not there for the others.
         held_up = [it for it in self._ledger.workers if it.queue and not it.leaving]
         lost = sum(worker.queue[0].job is None for worker in held_up)

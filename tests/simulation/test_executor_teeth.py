@@ -145,8 +145,8 @@ def tells_twice(patch: Patch) -> None:
 
 
 def tells_others(patch: Patch) -> None:
-    def _put(self: Jobs, receipt: Receipt, results: list[Any], mixed: bool) -> None:
-        real(self, receipt, results[::-1], mixed)
+    def _put(self: Jobs, receipt: Receipt, results: list[Any], *rest: Any) -> None:
+        real(self, receipt, results[::-1], *rest)
 
     real = Jobs._put
     patch.setattr(Jobs, "_put", _put)
@@ -194,10 +194,7 @@ def reads_everything(patch: Patch) -> None:
 
 
 def forgets_who_waits_for_room(patch: Patch) -> None:
-    def consume(self: InputStream) -> None:
-        self._consumptions.append(None)
-
-    patch.setattr(InputStream, "consume", consume)
+    patch.setattr(InputStream, "ask", lambda _: None)
 
 
 def forgets_who_waits_for_input(patch: Patch) -> None:

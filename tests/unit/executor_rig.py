@@ -149,9 +149,12 @@ class Results:
         self.done = 0
         self.error: BaseException | None = None
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> None:
         assert not self.outcomes.keys() & range(start, start + len(outcomes)), "twice"
         self.outcomes.update(enumerate(outcomes, start))
+
+    def has_room(self) -> bool:
+        return True
 
     def lift_bound(self) -> None:
         """There is none."""

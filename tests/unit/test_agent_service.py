@@ -8,8 +8,8 @@ from unittest import mock
 import pytest
 
 from fiber._agent.service import AgentService
-from fiber._transport.memory import SimulatedLoop
 from fiber._wire import messages
+from memory_link import SimulatedLoop
 
 
 @pytest.fixture

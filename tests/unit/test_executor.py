@@ -466,12 +466,10 @@ def test_what_was_asked_for_at_the_moment_of_the_end_hears_of_it(rig: Rig) -> No
 
 def test_terminate_fails_what_is_not_done(rig: Rig) -> None:
     error = RuntimeError("terminated")
-    found = [rig.map(range(100)), rig.call(), rig.call(timeout=60.0)]
-    item = rig.item(Results())
-    stream = rig.executor.open_stream(item)
+    found = [rig.map(range(100)), rig.call(), rig.call(timeout=60.0), Results()]
+    stream = rig.executor.open_stream(rig.item(found[-1]))
     rig.executor.terminate(error)
-    assert [results.error for results in found] == [error] * 3
-    assert item.future is not None
+    assert [results.error for results in found] == [error] * 4
     assert stream.ended
     assert [port.signals for port in rig.ports] == [[signal.SIGTERM]] * 2
     rig.loop.pass_time(KILL_AFTER)

@@ -23,11 +23,17 @@ class Reading:
         self.notified = 0
         self.read: list[Any] = []
         self.error: BaseException | None = None
-        self.stream = InputStream(unit, limit, self._notify)
+        self.consumed = 0
+        self.stream = InputStream(unit, self._notify, limit, lambda: self.consumed)
         self._thread: threading.Thread | None = None
 
     def _notify(self) -> None:
         self.notified += 1
+
+    def consume(self) -> None:
+        """The user takes a result."""
+        self.consumed += 1
+        self.stream.ask()
 
     def grant(self, waiting: int = 0, workers: int = 1, pace: Pace = SLOW_TASKS) -> None:
         self.stream.grant(waiting, workers, pace, TARGET)
@@ -211,9 +217,9 @@ def test_no_more_is_read_than_the_limit_allows_until_it_is_consumed() -> None:
     reading.grant(workers=100)
     assert reading.stream._granted == 2
     assert reading.notified == 1
-    reading.stream.consume()
+    reading.consume()
     assert reading.notified == 2, "there is room"
-    reading.stream.consume()
+    reading.consume()
     assert reading.notified == 2, "as was said already"
     reading.grant(workers=100)
     assert reading.stream._granted == 4
@@ -221,9 +227,9 @@ def test_no_more_is_read_than_the_limit_allows_until_it_is_consumed() -> None:
 
 def test_consuming_is_not_told_to_who_does_not_wait_for_it() -> None:
     reading = Reading(limit=2)
-    reading.stream.consume()
+    reading.consume()
     reading.grant()
-    reading.stream.consume()
+    reading.consume()
     assert reading.notified == 0
 
 
@@ -238,10 +244,10 @@ def test_what_is_consumed_while_room_is_counted_is_counted_or_told(
 
     def consumed_meanwhile(stream: InputStream, limit: int) -> int:
         if counted:
-            stream.consume()
+            reading.consume()
             return room(stream, limit)
         found = room(stream, limit)
-        stream.consume()
+        reading.consume()
         return found
 
     monkeypatch.setattr(InputStream, "_room", consumed_meanwhile)

@@ -28,6 +28,7 @@ from fiber._hub.protocol import ONE, Op
 from fiber._wire.arena import Arena, Block
 from fiber.connection import Connection, wait
 from hosts import PATIENCE, Hosts, objects_kept
+from unit.interrupting import is_interrupted
 
 MORE_THAN_FITS = 2000
 
@@ -76,7 +77,7 @@ def test_ctrl_c_at_any_line_of_a_put_leaves_a_queue_that_works(before: int) -> N
         queue: Any = fiber.Queue()
         for number in range(before):
             queue.put(number)
-        interrupted = interrupted_put(queue, stop, files)
+        interrupted = is_interrupted(lambda: queue.put("interrupted"), stop, files)
         queue.put("after")
         items = list(iter(queue.get, "after"))
         assert items[:before] == list(range(before))
@@ -89,31 +90,6 @@ def test_ctrl_c_at_any_line_of_a_put_leaves_a_queue_that_works(before: int) -> N
     while without_deadlock(lambda: put_and_drain(steps)):  # noqa: B023 - it ends before the next
         steps += 1
     assert steps > 10, "it was hardly interrupted"
-
-
-def interrupted_put(queue: Any, stop: int, files: set[str]) -> bool:
-    """Put, and raise KeyboardInterrupt at step ``stop`` of the code in ``files``."""
-    step = -1
-
-    def trace(frame: FrameType, event: str, _arg: Any) -> Any:
-        nonlocal step
-        if frame.f_code.co_filename not in files and frame.f_globals is not vars(threading):
-            return None
-        if event in ("line", "return"):
-            step += 1
-            if step == stop:
-                raise KeyboardInterrupt
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        queue.put("interrupted")
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.settrace(before)
-    return False
 
 
 # Handles

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -172,6 +174,44 @@ def test_a_pinned_task_waits_until_its_worker_is_idle() -> None:
     assert not assign_all(ledger)
     answer(ledger, second)
     assert assign_all(ledger)[0].pin
+
+
+@pytest.mark.parametrize("others_idle", [True, False])
+def test_to_look_for_a_pinned_task_takes_the_same_however_many_workers_there_are(
+    others_idle: bool,
+) -> None:
+    def steps(workers: int) -> int:
+        ledger, busy = ledger_with(workers)
+        job_of(ledger, range(workers), alone=True)
+        assert len(assign_all(ledger)) == workers
+        for worker in busy:
+            ledger.pin(ledger.open(), worker, "x")
+        for number in range(workers if others_idle else 0):
+            ledger.add(f"idle {number}", 0.0)
+        taken: list[str] = []
+
+        def trace(frame: FrameType, event: str, _arg: Any) -> Any:
+            frame.f_trace_opcodes = True
+            taken.append(event)
+            return trace
+
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            assert ledger.assign(0.0) is None
+        finally:
+            sys.settrace(before)
+        return len(taken)
+
+    assert steps(100) == steps(3) > 0
+
+
+def test_a_pinned_task_that_is_cancelled_is_not_looked_for() -> None:
+    ledger, (worker,) = ledger_with(1)
+    job = ledger.open()
+    ledger.pin(job, worker, "x")
+    ledger.cancel(job)
+    assert assign_all(ledger) == []
 
 
 def test_the_next_worker_takes_the_place_of_a_lost_one() -> None:

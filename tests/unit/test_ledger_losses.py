@@ -271,3 +271,23 @@ def test_demand_counts_what_waits_and_what_runs() -> None:
     ledger.pin(job, worker, "x")
     assert ledger.demand() == 11
     assert ledger.hungry() is False
+
+
+def test_demand_counts_no_tasks_that_wait_until_results_are_read() -> None:
+    ledger, _ = ledger_with(2)
+    job = job_of(ledger, range(10), pace=known(2 * SLOW))
+    first, second = assign_all(ledger)
+    ledger.pause(job, True)
+    assert ledger.demand() == 2
+    ledger.lose(first.worker, [first.seq], None)
+    assert ledger.demand() == 2, "a task that comes back does not wait for that"
+    answer(ledger, second)
+    (again,) = assign_all(ledger)
+    assert again.start == first.start
+    answer(ledger, again)
+    assert ledger.demand() == 0
+    ledger.pause(job, False)
+    assert ledger.demand() == 8
+    ledger.pause(job, True)
+    ledger.cancel(job)
+    assert ledger.demand() == 0

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -17,6 +20,11 @@ HELD = 16 * RESULT
 MANY = 400
 
 Imap = Callable[..., Iterator[bytearray]]
+
+
+def row_of(kind: Callable[[int], Any], size: int) -> tuple[Any]:
+    """Something plain that holds much."""
+    return (kind(size),)
 
 
 @pytest.fixture
@@ -48,6 +56,17 @@ def test_an_iterator_that_nobody_reads_holds_back_its_tasks(
     assert sum(map(len, iterator)) == MANY * RESULT
 
 
+@pytest.mark.parametrize("chunksize", [1, 7])
+@pytest.mark.parametrize("function", [bytes, partial(row_of, bytes), " ".__mul__])
+def test_plain_results_count_as_well(
+    pool: Pool, function: Callable[[int], Any], chunksize: int
+) -> None:
+    iterator = pool.imap(function, [RESULT] * MANY, chunksize)
+    wait_until(lambda: _is_held_back(pool), "it is held back")
+    assert _unread(iterator) < MANY // 2
+    assert list(iterator) == [function(RESULT)] * MANY
+
+
 def test_other_calls_go_on_meanwhile(pool: Pool) -> None:
     iterator = pool.imap(bytearray, [RESULT] * MANY)
     wait_until(lambda: _is_held_back(pool), "it is held back")
@@ -61,6 +80,27 @@ def test_whoever_joins_the_pool_first_gets_all_later(pool: Pool) -> None:
     pool.close()
     pool.join()
     assert len(list(iterator)) == MANY
+
+
+@pytest.mark.parametrize("bounds", [{}, {"buffersize": 5}], ids=["no bound", "buffersize"])
+@pytest.mark.parametrize("dropped", ["when done", "before"])
+def test_results_are_freed_when_their_iterator_is_dropped(
+    bounds: dict[str, int], dropped: str
+) -> None:
+    with fiber.Pool(1) as pool:
+        gc.collect()
+        gc.disable()
+        try:
+            iterator: Any = pool.imap(bytearray, iter([10, 20, 30]), **bounds)
+            buffer = weakref.ref(iterator._buffer)
+            if dropped == "when done":
+                assert len(next(iterator)) == 10
+                wait_until(lambda: iterator._buffer.finished, "all results are there")
+            iterator = None
+            wait_until(lambda: buffer() is None, "it is freed, by no collector")
+        finally:
+            gc.enable()
+    pool.join()
 
 
 def test_small_results_are_never_held_back(pool: Pool) -> None:

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import threading
+from collections import deque
+from collections.abc import Iterator
 from multiprocessing import TimeoutError
 from typing import Any
 
 import pytest
 
+from fiber import results
+from fiber._engine.chunks import TARGET
+from fiber._runtime import input_stream
+from fiber._runtime.input_stream import InputStream
 from fiber._runtime.outcome import Failure, Pickled
 from fiber._wire import work
-from fiber.results import ApplyResult, IMapIterator
+from fiber.pool import MaybeEncodingError
+from fiber.results import ApplyResult, IMapIterator, IMapUnorderedIterator, MapResult
+from unit.interrupting import is_interrupted
+from unit.ledger_steps import known
 
 
 class Stop(BaseException):
@@ -142,6 +153,99 @@ def test_an_interrupted_wait_for_an_iterator_loses_no_result(
     monkeypatch.undo()
     found._buffer.set_done()
     assert list(found) == [3]
+
+
+def test_whoever_is_interrupted_at_any_step_asks_for_more_the_next_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(results, "HELD", 1)
+    files = {results.__file__, input_stream.__file__}
+
+    def take_two(stop: int) -> bool:
+        """Whether it was interrupted, at step ``stop`` of taking the first."""
+        asked: set[str] = set()
+        found = iterator()
+        buffer = found._buffer
+        stream = InputStream(1, lambda: asked.add("input"), 1, buffer.consumed)
+        buffer.stream, buffer.resume = stream, lambda: asked.add("results")
+        stream.grant(0, 1, known(1.0, 1), TARGET)
+        assert buffer.add_results(0, [3], False, 1), "it is full"
+        stream._taken = 1
+        stream.grant(0, 1, known(1.0, 1), TARGET)
+        assert stream._granted == 1
+        interrupted = is_interrupted(lambda: next(found), stop, files)
+        with contextlib.suppress(TimeoutError):
+            while True:
+                found.next(0)
+        assert asked == {"input", "results"}, f"interrupted at step {stop}"
+        stream.grant(0, 1, known(1.0, 1), TARGET)
+        assert stream._granted == 2
+        assert buffer.has_room()
+        return interrupted
+
+    steps = next(stop for stop in itertools.count() if not take_two(stop))
+    assert steps > 10, "it was hardly interrupted"
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_what_is_unread_is_held_back_and_costs_the_same_however_much_it_is(
+    ordered: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(results, "HELD", 1000)
+    pool: Any = None
+    found = IMapIterator(pool) if ordered else IMapUnorderedIterator(pool)
+    buffer, looked_at = found._buffer, 0
+    buffer.resume = lambda: None
+
+    class Counted(deque[Any]):
+        def __iter__(self) -> Iterator[Any]:
+            nonlocal looked_at
+            looked_at += len(self)
+            return super().__iter__()
+
+    buffer.items = Counted()
+
+    def add(start: int, stop: int) -> list[bool]:
+        return [buffer.add_results(index, [index], False, 10) for index in range(start, stop)]
+
+    def read(count: int) -> list[bool]:
+        return [found.next(0) == -1 or buffer.has_room() for _ in range(count)]
+
+    assert add(0, 200) == 99 * [False] + 101 * [True]
+    assert read(99) == 99 * [False]
+    assert add(200, 202) == [True, True], "half of all must be read"
+    assert read(3) == [False, False, True]
+    assert add(202, 203) == [True], "and yet there is more than may be"
+    assert read(51) == 50 * [False] + [True]
+    assert add(203, 253) == 49 * [False] + [True]
+    assert looked_at == 0
+
+
+@pytest.mark.parametrize(
+    "outcome", [Pickled(work.VALUE, b"garbage", []), Pickled(work.ERROR, b"garbage", [])]
+)
+def test_a_map_whose_getting_is_interrupted_at_any_step_raises_its_error_the_next_time(
+    outcome: Pickled,
+) -> None:
+    pool: Any = None
+
+    def get_twice(stop: int) -> bool:
+        """Whether the first was interrupted, at step ``stop``."""
+        found = MapResult(pool)
+        found.add_results(0, [1, outcome, 3], True)
+        found.set_done()
+
+        def get() -> None:
+            with contextlib.suppress(MaybeEncodingError):
+                found.get()
+
+        interrupted = is_interrupted(get, stop, {results.__file__})
+        with pytest.raises(MaybeEncodingError):
+            found.get()
+        return interrupted
+
+    steps = next(stop for stop in itertools.count() if not get_twice(stop))
+    assert steps > 10, "it was hardly interrupted"
 
 
 def test_what_unpickles_to_an_error_is_raised_and_the_next_is_there() -> None:

@@ -173,6 +173,20 @@ def test_workers_above_the_minimum_leave_when_they_have_been_idle_for_long() -> 
     assert nothing(scheduler.decide(1000.0)), "the minimum stays"
 
 
+def test_a_pool_whose_tasks_wait_until_results_are_read_shrinks_and_grows_again() -> None:
+    scheduler, _ = pool(1, 3, idle_timeout=10.0)
+    job = job_of(scheduler, 9, pace=known(1.0))
+    start(scheduler, scheduler.decide(0.0))
+    scheduler.decide(0.0)
+    scheduler.ledger.pause(job, True)
+    for batch in list(scheduler.ledger.batches.values()):
+        answer(scheduler.ledger, batch, 1.0)
+    decisions = scheduler.decide(11.0)
+    assert (decisions.assign, decisions.start, len(decisions.dismiss)) == ([], 0, 2)
+    scheduler.ledger.pause(job, False)
+    assert scheduler.decide(12.0).start == 2
+
+
 def test_without_an_idle_timeout_all_stay() -> None:
     scheduler, _ = pool(0, 2)
     job_of(scheduler, 2)

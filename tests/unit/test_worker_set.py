@@ -143,6 +143,33 @@ def test_one_that_was_killed_after_some_that_raised_may_have_done_nothing_wrong(
     assert workers.error is None
 
 
+def test_one_that_raises_after_some_that_were_killed_has_its_tries(workers: WorkerSet) -> None:
+    fail_until(workers, KILLED_PATIENCE / 2, KILLED)
+    fail(workers, KILLED_PATIENCE / 2, RAISED)
+    assert workers.error is None, "it may be the first of its kind"
+    fail(workers, KILLED_PATIENCE / 2 + RAISED_PATIENCE / 2, RAISED)
+    fail(workers, KILLED_PATIENCE / 2 + RAISED_PATIENCE, RAISED)
+    assert workers.error is not None
+
+
+@pytest.mark.parametrize(
+    ("failure", "patience"), [(RAISED, RAISED_PATIENCE), (KILLED, KILLED_PATIENCE)]
+)
+@pytest.mark.parametrize("told_to_go", [False, True])
+def test_patience_begins_when_the_last_at_work_is_lost(
+    workers: WorkerSet, failure: StartFailure, patience: float, told_to_go: bool
+) -> None:
+    at_work = start(workers, ready=True)
+    fail_until(workers, 300.0, failure)
+    if told_to_go:
+        workers.let_go(at_work)
+    workers.gone(at_work, 300.0, None)
+    fail(workers, 300.0 + patience / 2, failure)
+    assert workers.error is None
+    fail(workers, 300.0 + patience, failure)
+    assert workers.error is not None
+
+
 def test_a_lost_host_says_nothing_of_its_workers(workers: WorkerSet) -> None:
     for at in range(100):
         workers.gone(start(workers), float(at), None)

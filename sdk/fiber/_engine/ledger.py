@@ -50,6 +50,7 @@ class Ledger:
         self._open_tasks = 0  # fed and not done, of jobs that count
         self._seq = itertools.count(1)
         self._turns: deque[Job] = deque()
+        self._paused: set[Job] = set()
         self._load = WorkersByLoad()
         self._pins: dict[Worker, None] = {}
         self._homeless: list[tuple[Job, Span]] = []
@@ -105,6 +106,7 @@ class Ledger:
         worker.pinned.append((job, span))
         self._pins[worker] = None
         job.pins[worker] = None
+        self._load.sort_pinned(worker)
 
     def close(self, job: Job) -> bool:
         """No more tasks will be fed; True if the job is finished by that."""
@@ -126,6 +128,7 @@ class Ledger:
         job.waiting = Waiting()
         if job in self.jobs:
             self.jobs.discard(job)
+            self._paused.discard(job)
             self._open_tasks -= job.fed - job.done
         holders = []
         for batch in job.batches:
@@ -138,6 +141,7 @@ class Ledger:
             worker.pinned = deque(pinned for pinned in worker.pinned if pinned[0] is not job)
             if not worker.pinned:
                 self._pins.pop(worker, None)
+                self._load.sort_pinned(worker)
         job.pins.clear()
         if self._homeless:
             self._homeless = [pinned for pinned in self._homeless if pinned[0] is not job]
@@ -146,8 +150,12 @@ class Ledger:
     def pause(self, job: Job, paused: bool) -> None:
         """Give out none of its tasks but those that come back, or go on with all."""
         job.paused = paused
-        if not paused and job.waiting:
-            self._list(job)
+        if not paused:
+            self._paused.discard(job)
+            if job.waiting:
+                self._list(job)
+        elif job in self.jobs:
+            self._paused.add(job)
 
     # Workers
 
@@ -220,8 +228,12 @@ class Ledger:
         return bool(self._load.idle or self._load.single)
 
     def demand(self) -> int:
-        """Tasks that wait or run; of cancelled ones, the batches that still hold up a worker."""
-        return self._open_tasks + len(self._cancelled)
+        """Tasks that run, or wait for a worker and not for somebody who takes results of their job.
+
+        Of cancelled ones, the batches that still hold up a worker.
+        """
+        held_back = sum([job.never_given for job in self._paused]) if self._paused else 0
+        return self._open_tasks - held_back + len(self._cancelled)
 
     def waits(self) -> bool:
         """Whether there are tasks that some worker could be given."""
@@ -234,8 +246,8 @@ class Ledger:
 
         Idle workers come first; jobs take turns.
         """
-        if self._pins and (batch := self._assign_pinned(now)):
-            return batch
+        if self._load.idle_pinned:
+            return self._assign_pinned(now)
         turns = self._turns
         if not turns or not self.hungry():
             return None
@@ -256,11 +268,8 @@ class Ledger:
                 return batch
         return None
 
-    def _assign_pinned(self, now: float) -> Batch | None:
-        fewer, more = sorted((self._pins, self._load.idle), key=len)
-        worker = next((worker for worker in fewer if worker in more), None)
-        if worker is None:
-            return None
+    def _assign_pinned(self, now: float) -> Batch:
+        worker = next(iter(self._load.idle_pinned))
         job, span = worker.pinned.popleft()
         if not worker.pinned:
             del self._pins[worker]
@@ -499,7 +508,7 @@ class Ledger:
         tasks that had their tries; they are done by that.
         """
         self.workers.discard(worker)
-        guilty = _in_progress(worker, set(unread), running)
+        guilty = worker.in_progress(set(unread), running)
         losses: list[Loss] = []
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):
             self._drop(batch)
@@ -513,7 +522,7 @@ class Ledger:
 
     def _lose_batch(self, job: Job, rest: Span, suspects: range) -> list[Loss]:
         losses = []
-        for span in reversed(_around(rest, suspects)):
+        for span in reversed(rest.around(suspects)):
             if span.start in suspects and not self._charge(job, span.start):
                 losses.append(Loss(job, span.start, job.attempts.pop(span.start), span.items[0]))
                 self._did(job, 1)
@@ -557,28 +566,9 @@ class Ledger:
     def _finish(self, job: Job) -> bool:
         if job.finished:
             self.jobs.discard(job)
+            self._paused.discard(job)
         return job.finished
 
 
 def _by_seq(batch: Batch) -> int:
     return batch.seq
-
-
-def _in_progress(worker: Worker, unread: set[int], running: tuple[int, int] | None) -> Batch | None:
-    """The batch that a worker was in when it died: it reads one at a time."""
-    read = [batch for batch in worker.queue if batch.seq not in unread]
-    named = [batch for batch in read if running is not None and batch.seq == running[0]]
-    return next(iter(named or read), None)
-
-
-def _around(span: Span, suspects: range) -> list[Span]:
-    """``span`` in pieces: what lies before the suspects, each of them alone, what lies behind."""
-    if not suspects:
-        return [span] if len(span.items) else []
-    pieces = []
-    if span.start < suspects.start:
-        pieces.append(span.part(span.start, suspects.start))
-    pieces += span.part(suspects.start, suspects.stop).singly()
-    if suspects.stop < span.start + len(span.items):
-        pieces.append(span.part(suspects.stop, span.start + len(span.items)))
-    return pieces

@@ -13,13 +13,15 @@ PATIENCE = 2e-3
 class WorkersByLoad:
     """The ready workers.  Dicts serve as sets that remember the order of insertion.
 
-    ``idle`` hold nothing, ``single`` one batch, and could be given another.  ``deep`` hold two, of
-    which the second could be recalled, and is in those of ``recalled``.  ``spent`` did all that
-    they may do.  Who is lent or leaves is in none of them.
+    ``idle`` hold nothing, ``idle_pinned`` are those of them that have pinned tasks to run.
+    ``single`` hold one batch, and could be given another.  ``deep`` hold two, of which the second
+    could be recalled, and is in those of ``recalled``.  ``spent`` did all that they may do.  Who is
+    lent or leaves is in none of them.
     """
 
     def __init__(self) -> None:
         self.idle: dict[Worker, None] = {}
+        self.idle_pinned: dict[Worker, None] = {}
         self.single: dict[Worker, None] = {}
         self.deep: dict[Worker, None] = {}
         self.recalled: dict[Worker, None] = {}
@@ -28,6 +30,7 @@ class WorkersByLoad:
     def sort(self, worker: Worker) -> None:
         """Put ``worker`` where one that holds as much as it does belongs."""
         self.idle.pop(worker, None)
+        self.idle_pinned.pop(worker, None)
         self.single.pop(worker, None)
         queue = worker.queue
         if len(queue) < 2:
@@ -47,8 +50,16 @@ class WorkersByLoad:
             return
         if not queue:
             self.idle[worker] = None
+            self.sort_pinned(worker)
         elif len(queue) == 1 and not queue[0].alone and not worker.pinned:
             self.single[worker] = None
+
+    def sort_pinned(self, worker: Worker) -> None:
+        """The same when its pinned tasks have changed, and nothing else."""
+        if worker.pinned and worker in self.idle:
+            self.idle_pinned[worker] = None
+        else:
+            self.idle_pinned.pop(worker, None)
 
     def last_idle(self) -> Worker | None:
         """The worker that became idle last: its memory is warm, and the others may leave."""

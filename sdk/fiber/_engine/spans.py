@@ -36,6 +36,18 @@ class Span:
         first = self.start
         return [self.part(at, at + 1, alone=True) for at in range(first, first + len(self.items))]
 
+    def around(self, suspects: range) -> list[Span]:
+        """In pieces: what lies before the suspects, each of them alone, what lies behind."""
+        if not suspects:
+            return [self] if len(self.items) else []
+        pieces, stop = [], self.start + len(self.items)
+        if self.start < suspects.start:
+            pieces.append(self.part(self.start, suspects.start))
+        pieces += self.part(suspects.start, suspects.stop).singly()
+        if suspects.stop < stop:
+            pieces.append(self.part(suspects.stop, stop))
+        return pieces
+
 
 class _Stock:
     """A span being given out from its front, and growing at its end while tasks come in."""

@@ -63,6 +63,11 @@ class Job:
         return bool(waiting) and not (self.paused and waiting.first() >= self.reached)
 
     @property
+    def never_given(self) -> int:
+        """How many of its tasks nobody was given yet."""
+        return self.fed - self.reached
+
+    @property
     def finished(self) -> bool:
         """No task will come any more, and all that came are done."""
         return self.closed and self.done == self.fed
@@ -141,6 +146,12 @@ class Worker:
         self.recalled = False
         self.leaving = False
         self.lent = False  # a caller uses it directly
+
+    def in_progress(self, unread: set[int], running: tuple[int, int] | None) -> Batch | None:
+        """The batch that it was in when it died: it reads one at a time."""
+        read = [batch for batch in self.queue if batch.seq not in unread]
+        named = [batch for batch in read if running is not None and batch.seq == running[0]]
+        return next(iter(named or read), None)
 
 
 class Receipt(NamedTuple):

@@ -83,6 +83,9 @@ class WorkerSet:
         self.trouble: StartError | None = None
         self.error: FiberError | None = None
         self._failing_since = 0.0
+        self._raises = 0  # those of the failures that were the workers' own doing
+        self._raising_since = 0.0
+        self._alone_since = 0.0  # when the last one at work was lost
         self._said = False
         self._pause = 0.0
         self._wave_at = 0.0
@@ -161,9 +164,11 @@ class WorkerSet:
         if member not in self.members:
             return
         del self.members[member]
+        self._uncount(member)
+        if member.worker is not None and not self._at_work():
+            self._alone_since = now
         if member.leaving:
             return
-        self._uncount(member)
         if member.worker is not None:
             if not member.worker.queue:
                 self._died_idle(now)
@@ -179,14 +184,21 @@ class WorkerSet:
     def _failed(self, failure: StartFailure, now: float) -> None:
         if not self.failures:
             self._failing_since = now
+            self._raises = 0
         self.failures += 1
+        if not failure.killed:
+            self._raising_since = self._raising_since if self._raises else now
+            self._raises += 1
         if not self._pause or now >= self._try_at():  # else it is of the same wave
             self._pause = min(max(2 * self._pause, FIRST_PAUSE), LAST_PAUSE_AT_WORK)
             self._wave_at = now
-        patience = KILLED_PATIENCE if failure.killed else RAISED_PATIENCE
-        if self.failures >= TRIES and now - self._failing_since >= patience:
+        if failure.killed:
+            tries, since, patience = self.failures, self._failing_since, KILLED_PATIENCE
+        else:
+            tries, since, patience = self._raises, self._raising_since, RAISED_PATIENCE
+        if tries >= TRIES and now - since >= patience:
             self.trouble = failure.error(self.failures)
-            if not self._at_work():
+            if not self._at_work() and now - max(since, self._alone_since) >= patience:
                 self.error = self.trouble
 
     def news(self, failure: StartFailure, now: float) -> str:

@@ -216,14 +216,16 @@ class Executor:
         self._check()
         self._loop.call_soon(self._take, item, tasks)
 
-    def open_stream(self, item: WorkItem, limit: int | None = None) -> InputStream:
+    def open_stream(
+        self, item: WorkItem, limit: int | None = None, consumed: Callable[[], int] = lambda: 0
+    ) -> InputStream:
         """Run what the stream will read; to be ended by ``finish`` or ``cancel``.
 
-        ``limit``: tasks read and not consumed, at most.
+        ``limit``: tasks read and not ``consumed``, at most.
         """
         self._check()
         loop = self._loop
-        stream = InputStream(item.unit, limit, lambda: loop.call_soon(self._refill, item))
+        stream = InputStream(item.unit, lambda: loop.call_soon(self._refill, item), limit, consumed)
         item.stream = stream
         loop.call_soon(self._take, item, None)
         return stream
@@ -354,8 +356,9 @@ class Executor:
         """On that thread."""
         error = None
         try:
-            if item.stream is not None:
-                item.stream.read(iterable)
+            stream = item.stream
+            if stream is not None:
+                stream.read(iterable)
         except BaseException as raised:
             error = raised
         self.finish(item, error)

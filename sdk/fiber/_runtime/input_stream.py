@@ -22,24 +22,30 @@ AHEAD = 3
 class InputStream:
     """The input of one job.  ``limit``: tasks that may be read and not yet consumed by the user.
 
-    ``notify`` is called, on the reading thread or the user's, when there is something that the
-    executor waits for: input, or room below the limit.
+    ``consumed`` says how many were.  ``notify`` is called, on the reading thread or the user's,
+    when there is something that the executor waits for: input, or room below the limit.
     """
 
-    def __init__(self, unit: int, limit: int | None, notify: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        unit: int,
+        notify: Callable[[], None],
+        limit: int | None = None,
+        consumed: Callable[[], int] = lambda: 0,
+    ) -> None:
         self.ended = False
         """Nothing is read any more."""
         self._unit = unit
         self._limit = None if limit is None else max(limit, unit)
+        self._consumed = consumed
         self._notify = notify
         self._items: deque[Any] = deque()
         self._credit: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._granted = 0
         self._taken = 0
-        self._consumed = 0
-        self._consumptions: deque[None] = deque()
         self._awaited = True
-        self._limited = False
+        self._refused = 0  # how often the executor has looked for room
+        self._asked = 0  # of these, the last time that it found some or was asked to look again
 
     # The reading thread
 
@@ -67,12 +73,15 @@ class InputStream:
 
     # The user's thread
 
-    def consume(self) -> None:
-        """The user took one result."""
-        self._consumptions.append(None)
-        if self._limited:
-            self._limited = False
+    def ask(self) -> None:
+        """The user took results: notify, if there was no room before.
+
+        Only notes that it has, when it has: whoever is interrupted asks again the next time.
+        """
+        refused = self._refused
+        if self._asked < refused:
             self._notify()
+            self._asked = refused
 
     # The executor
 
@@ -95,18 +104,15 @@ class InputStream:
             return
         units = -(-(bound - ahead) // self._unit)
         if self._limit is not None:
-            self._limited = True  # first: who consumes after the count sees it
+            self._refused += 1  # first: who consumes after the count asks
             units = min(units, self._room(self._limit) // self._unit)
-            self._limited = not units
         if units:
+            self._asked = self._refused
             self._granted += units * self._unit
             self._credit.put(units * self._unit)
 
     def _room(self, limit: int) -> int:
-        while self._consumptions:
-            self._consumptions.popleft()
-            self._consumed += 1
-        return limit - (self._granted - self._consumed)
+        return limit - (self._granted - self._consumed())
 
     def lift_limit(self) -> None:
         """Whoever waits for all to be done cannot consume."""

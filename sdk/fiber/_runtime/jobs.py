@@ -85,7 +85,7 @@ class Jobs:
 
     def resume(self, item: WorkItem) -> None:
         """Its results are being read again."""
-        if item.job is not None:
+        if item.job is not None and item.future is not None and item.future.has_room():
             self._ledger.pause(item.job, False)
 
     def lift_limits(self) -> None:
@@ -112,22 +112,24 @@ class Jobs:
 
     # Outcomes
 
-    def put(self, receipt: Receipt, results: list[Any], *, mixed: bool = True) -> None:
-        """Hand results on, but for those whose tasks get another try."""
+    def put(
+        self, receipt: Receipt, results: list[Any], *, mixed: bool = True, size: int = 0
+    ) -> None:
+        """Hand results on, ``size`` bytes, but for those whose tasks get another try."""
         if mixed and self._retry:
             for at, result in enumerate(results):
                 again = type(result) is Pickled and result.kind == work.AGAIN
                 index = receipt.start + at
                 if not (again and self._ledger.retry(receipt, index)):
-                    self._put(receipt._replace(start=index), [result], True)
+                    self._put(receipt._replace(start=index), [result], True, size // len(results))
         else:
-            self._put(receipt, results, mixed)
+            self._put(receipt, results, mixed, size)
         self.check_finished(receipt.job)
 
-    def _put(self, receipt: Receipt, results: list[Any], mixed: bool) -> None:
+    def _put(self, receipt: Receipt, results: list[Any], mixed: bool, size: int) -> None:
         item: WorkItem = receipt.job.owner
         if item.future is not None:
-            if item.future.add_results(receipt.start, results, mixed):
+            if item.future.add_results(receipt.start, results, mixed, size):
                 self._ledger.pause(receipt.job, True)
             return
         for task, outcome in enumerate(results, receipt.start):
@@ -175,9 +177,10 @@ class Jobs:
         """If all is done, say so."""
         item: WorkItem | None = job.owner
         if job.finished and item is not None:
+            future = item.future
             self._over(item)
-            if item.future is not None:
-                item.future.set_done()
+            if future is not None:
+                future.set_done()
 
     def fail(self, job: Job, error: BaseException) -> None:
         """Nothing that is not done of a job will be."""
@@ -207,4 +210,5 @@ class Jobs:
             item.stream.end()
         if item.job is not None:
             item.job.owner = None
+        item.future = item.stream = None
         item.grants.clear()

@@ -48,7 +48,7 @@ class Receiver:
         self._leases = leases
         self._advance = advance
         self._on_ready = on_ready
-        self._last_words: dict[WorkerHandle, tuple[Any, list[memoryview]]] = {}
+        self._last_words: dict[WorkerHandle, tuple[Any, list[memoryview], int]] = {}
         """Of workers that callers use, whose agents heard them first since they died."""
         self._taken_back: dict[WorkerHandle, list[int]] = {}
         """From workers that callers use: calls of theirs, which are no batches yet."""
@@ -57,12 +57,13 @@ class Receiver:
         """A packet from a worker."""
         words = pickle.loads(message.payload)
         buffers = message.buffers
+        size = len(message.payload) + sum([buffer.nbytes for buffer in buffers])
         message.release()
         kind = words[0]
         if type(kind) is int and handle.worker is not None and handle.worker.lent:
-            self._last_words[handle] = words, buffers
+            self._last_words[handle] = words, buffers, size
         elif type(kind) is int:
-            self._answered(words, buffers)
+            self._answered(words, buffers, size)
         elif kind == work.READY:
             self._on_ready(handle)
         elif kind == work.BIRTH:
@@ -84,7 +85,7 @@ class Receiver:
         self._last_words.pop(handle, None)
         self._taken_back.pop(handle, None)
 
-    def _answered(self, words: tuple[Any, ...], buffers: list[memoryview]) -> None:
+    def _answered(self, words: tuple[Any, ...], buffers: list[memoryview], size: int) -> None:
         seq, offset, kept, seconds, values, odd = words
         results = outcomes(values, odd, buffers) if odd else values
         receipt = self._ledger.receive(
@@ -97,7 +98,7 @@ class Receiver:
             if item.future is None and receipt.size and receipt.item(receipt.start).blocking:
                 # First: who waited for it may call again at once.
                 self._leases.offer(receipt.batch.worker.key)
-            self._jobs.put(receipt, results, mixed=bool(odd))
+            self._jobs.put(receipt, results, mixed=bool(odd), size=size)
         self._advance()
 
     def _unreadable(self, kind: str, seq: int, error: Pickled) -> None:

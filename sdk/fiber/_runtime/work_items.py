@@ -22,12 +22,16 @@ from fiber._wire import work
 class Future(Protocol):
     """Where the outcomes of a work item, or of one call, go.  Called on the loop's thread."""
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool) -> bool:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Outcomes of the tasks from ``start`` on.  Each task's comes once, in any order.
 
-        Unless ``mixed`` they are all plain values.  True asks for no more than must be, since
-        nobody reads them: until it says otherwise, by what it was given for that.
+        Unless ``mixed`` they are all plain values.  They came in ``size`` bytes.  True asks for no
+        more than must be, since nobody reads them: until it says otherwise, by what it was given
+        for that.
         """
+
+    def has_room(self) -> bool:
+        """Whether it takes more again, after it has asked for no more."""
 
     def lift_bound(self) -> None:
         """Take all that comes: whoever would read them waits for the rest."""
@@ -74,8 +78,8 @@ class WorkItem:
     """A job of the ledger, and all that the ledger need not know of it.
 
     Without a ``future`` each of its tasks is a Call with its own.  A job and its work item know
-    each other; ``Executor._over`` parts them, so that results are freed when the user lets go of
-    them, not when the collector comes.
+    each other, its future and its stream; ``Jobs`` parts them once it is over, so that results are
+    freed when the user lets go of them, not when the collector comes.
     """
 
     __slots__ = (
