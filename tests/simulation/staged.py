@@ -20,7 +20,7 @@ from unittest import mock
 from fiber._agent import service
 from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
 from fiber._backends import remote
-from fiber._backends.remote_channel import RemoteChannel
+from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._runtime import executor, launcher
 from fiber._wire.packet import Message
 from simulation.agents import Child
@@ -58,8 +58,8 @@ class Stage:
     def enter(self) -> None:
         """Take the places of what cannot be handed over."""
         self._stack.enter_context(mock.patch.object(service, "Capture", NoCapture))
-        channel = partial(StagedRemoteChannel, self)
-        self._stack.enter_context(mock.patch.object(remote, "RemoteChannel", channel))
+        channel = partial(StagedTaskChannel, self)
+        self._stack.enter_context(mock.patch.object(remote, "RemoteTaskChannel", channel))
         self._stack.enter_context(mock.patch.object(executor, "_say", self._say))
         self._stack.enter_context(mock.patch.object(launcher, "Latch", partial(StagedLatch, self)))
         self._stack.enter_context(mock.patch.object(PlannedError, "unpickled", self.run_user_code))
@@ -391,7 +391,7 @@ class StagedChannel:
             self._reader.wake()
 
 
-class StagedRemoteChannel(RemoteChannel):
+class StagedTaskChannel(RemoteTaskChannel):
     """The channel of a worker on another host: the real one, but for how its callers wait."""
 
     def __init__(self, stage: Stage, loop: Any, deliver: Callable[..., bool]) -> None:

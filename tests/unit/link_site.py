@@ -181,20 +181,20 @@ def vanish(listener: MasterListener) -> None:
 def say(address: str, credentials: Credentials, words: bytes) -> bytes:
     """What a master answers to the first words of somebody with the right credentials."""
     sock = socket.create_connection(("127.0.0.1", port_of(address)))
-    exchange = tls.Exchange(
+    handshake = tls.Handshake(
         sock, tls.context_of(credentials, listens=False), credentials.server_name
     )
     try:
-        return complete(exchange, exchange.ask(words))
+        return complete(handshake, handshake.ask(words))
     finally:
-        exchange.close()
+        handshake.close()
 
 
-def complete(exchange: tls.Exchange, steps: Generator[int, None, T]) -> T:
+def complete(handshake: tls.Handshake, steps: Generator[int, None, T]) -> T:
     poller = select.poll()
     while True:
         try:
-            poller.register(exchange.sock, next(steps))
+            poller.register(handshake.sock, next(steps))
         except StopIteration as finished:
             value: T = finished.value
             return value

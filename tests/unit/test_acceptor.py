@@ -1,4 +1,4 @@
-"""The door: who is turned away there, when, and what is said of it."""
+"""The acceptor: who is turned away there, when, and what is said of it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Visitor:
     def __init__(self, site: Site, address: str) -> None:
         half = site.credentials.agent_half()
         self.sock = socket.create_connection(("127.0.0.1", port_of(address)), DEADLINE)
-        self.exchange = tls.Exchange(
+        self.handshake = tls.Handshake(
             self.sock, tls.context_of(half, listens=False), half.server_name
         )
 
@@ -41,18 +41,18 @@ class Visitor:
         if state == "connected":
             return
         if state == "hello of TLS sent":
-            next(self.exchange.ask(HELLO))
+            next(self.handshake.ask(HELLO))
             return
-        complete(self.exchange, self.exchange._when_ready(self.exchange.sock.do_handshake))
+        complete(self.handshake, self.handshake._when_ready(self.handshake.sock.do_handshake))
         if state == "half of its first words":
-            self.exchange.sock.send(self.exchange._ours + (100).to_bytes(4, "big") + b"half")
+            self.handshake.sock.send(self.handshake._ours + (100).to_bytes(4, "big") + b"half")
         elif state == "welcome":
-            complete(self.exchange, self.exchange._write(HELLO))
-            complete(self.exchange, self.exchange._read())
+            complete(self.handshake, self.handshake._write(HELLO))
+            complete(self.handshake, self.handshake._read())
 
     def rest(self) -> bytes:
         """All that still comes, up to the end."""
-        sock = self.exchange.sock
+        sock = self.handshake.sock
         raw = socket.socket(fileno=os.dup(sock.fileno()))
         raw.settimeout(DEADLINE)
         data = b""
@@ -67,7 +67,7 @@ class Visitor:
         return data
 
     def close(self) -> None:
-        self.exchange.close()
+        self.handshake.close()
 
 
 STATES = (
@@ -104,7 +104,7 @@ def test_garbage_in_every_state_is_turned_away_and_told_once(site: Site, state: 
     for _ in range(3):
         visitor = Visitor(site, listener.address)
         visitor.go(state)
-        os.write(visitor.exchange.sock.fileno(), b"GET / HTTP/1.1\r\n\r\n" * 10)
+        os.write(visitor.handshake.sock.fileno(), b"GET / HTTP/1.1\r\n\r\n" * 10)
         visitor.rest()
     master.wait(lambda: master.refusals)
     (told,) = master.refusals
@@ -117,7 +117,7 @@ def test_a_greeting_without_end_is_turned_away(site: Site) -> None:
     listener, master = site.listener()
     visitor = Visitor(site, listener.address)
     visitor.go("TLS proved")
-    visitor.exchange.sock.send(bytes(32) + b"\xff\xff\xff\xff")
+    visitor.handshake.sock.send(bytes(32) + b"\xff\xff\xff\xff")
     visitor.rest()
     master.wait(lambda: master.refusals)
     assert "its greeting of 4294967295 bytes is too long" in master.refusals[0]
@@ -157,21 +157,21 @@ def test_a_crowd_from_one_address_is_bounded_and_keeps_nobody_out(
     assert any("too many come at the same time" in told for told in master.refusals)
 
 
-class Door:
+class ScarceListener:
     """A listening socket for which the process has no descriptor left, for a while."""
 
-    def __init__(self, door: socket.socket, times: int) -> None:
-        self._door = door
+    def __init__(self, listener: socket.socket, times: int) -> None:
+        self._listener = listener
         self.refusals = times
 
     def accept(self) -> Any:
         if self.refusals:
             self.refusals -= 1
             raise OSError(errno.EMFILE, "Too many open files")
-        return self._door.accept()
+        return self._listener.accept()
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._door, name)
+        return getattr(self._listener, name)
 
 
 def test_without_descriptors_it_goes_on_later_and_says_so_once(
@@ -179,11 +179,11 @@ def test_without_descriptors_it_goes_on_later_and_says_so_once(
 ) -> None:
     monkeypatch.setattr(acceptor, "_PAUSE", 0.05)
     listener, master = site.listener()
-    door = Door(listener._acceptor._door, times=4)
-    monkeypatch.setattr(listener._acceptor, "_door", door)
+    scarce = ScarceListener(listener._acceptor._listener, times=4)
+    monkeypatch.setattr(listener._acceptor, "_listener", scarce)
     _, agent = site.dialer(listener.address)
     assert agent.link is not master.link
-    assert door.refusals == 0
+    assert scarce.refusals == 0
     assert [told for told in master.refusals if "Too many open files" in told] == master.refusals
     assert len(master.refusals) == 1
 

@@ -384,7 +384,7 @@ def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
     results = rig.call()
     for _ in range(60):
         handle = rig.handles[-1]
-        rig.say(handle, work.BIRTH, "no such device")
+        rig.say(handle, work.INIT_FAILED, "no such device")
         handle.exited(ExitReport(1, "exit status 1"))
         rig.loop.pass_time(1.0)
         rig.background.run()

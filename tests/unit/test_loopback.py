@@ -376,9 +376,9 @@ def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
     agent, link, observer = remote
     agent.join(link)
     agent.on_frame(messages.Started(1, 77).encode())
-    agent.on_frame(messages.Said(1, pickle.dumps("in time"), ()).encode())
+    agent.on_frame(messages.FromChild(1, pickle.dumps("in time"), ()).encode())
     agent.on_lost("silence")
-    agent.on_frame(messages.Said(1, pickle.dumps("late"), ()).encode())
+    agent.on_frame(messages.FromChild(1, pickle.dumps("late"), ()).encode())
     agent.on_frame(messages.Exited(1, 0, 0, "exit status 0").encode())
     assert observer.words == ["in time"]
     assert observer.events == ["started", "received", "exited"]

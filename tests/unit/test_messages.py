@@ -13,12 +13,12 @@ from fiber._wire.messages import (
     PROTOCOL,
     Deliver,
     Exited,
+    FromChild,
     Message,
     Output,
     ProtocolError,
     Recall,
     Recalled,
-    Said,
     Shutdown,
     Signal,
     Start,
@@ -42,7 +42,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Started, ids, numbers),
     st.builds(Signal, ids, numbers),
     st.builds(Deliver, ids, ids, data, buffers),
-    st.builds(Said, ids, data, buffers),
+    st.builds(FromChild, ids, data, buffers),
     st.builds(Recall, ids),
     st.builds(Recalled, ids, st.lists(ids).map(tuple)),
     st.builds(
@@ -101,7 +101,7 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         (Signal(1, 15).encode()[:-1], "of kind signal and 17 bytes is malformed"),
         (Recall(1).encode() + b"!", "of kind recall and 11 bytes is malformed"),
         (Recalled(1, (5,)).encode()[:-1], "sequence numbers is cut short"),
-        (Said(1, b"", [b"12"]).encode()[:-1], "announces buffers of 2 bytes"),
+        (FromChild(1, b"", [b"12"]).encode()[:-1], "announces buffers of 2 bytes"),
         (bytes([PROTOCOL, 5]) + bytes(8) + b"\xff\xff\xff\xff", "announces 4294967295 buffers"),
         (Output(1, "x").encode() + b"\xff", "of kind output .* is malformed"),
         (Exited(1, 0, 0, "").encode()[:-1], "of kind exited .* is malformed"),
@@ -128,8 +128,8 @@ def test_a_pickle_is_only_bytes() -> None:
             return pytest.fail, ("it was unpickled",)
 
     packet = pickle.dumps(Bomb())
-    received = decode(Said(1, packet, [packet]).encode())
-    assert isinstance(received, Said)
+    received = decode(FromChild(1, packet, [packet]).encode())
+    assert isinstance(received, FromChild)
     assert received.payload == packet
 
 
@@ -145,8 +145,8 @@ def test_a_packet_is_not_copied_and_writable_where_the_frame_is() -> None:
 
 def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
     floats = memoryview(struct.pack("<2d", 1.5, 2.5)).cast("d")
-    message = decode(Said(1, b"", [floats]).encode())
-    assert isinstance(message, Said)
+    message = decode(FromChild(1, b"", [floats]).encode())
+    assert isinstance(message, FromChild)
     assert bytes(message.buffers[0]) == floats.tobytes()
 
 
@@ -158,7 +158,10 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
             Deliver(3, 4, SECRET.encode(), [SECRET.encode()]),
             "Deliver(child=3, seq=4, payload=<14 bytes>, buffers=<1 items>)",
         ),
-        (Said(3, memoryview(SECRET.encode())), "Said(child=3, payload=<14 bytes>, buffers=())"),
+        (
+            FromChild(3, memoryview(SECRET.encode())),
+            "FromChild(child=3, payload=<14 bytes>, buffers=())",
+        ),
         (Output(3, SECRET), "Output(child=3, text=<14 characters>)"),
         (
             Exited(3, 2, -9, SECRET, (1, 2), (1, 0), (SECRET,), SECRET),

@@ -43,7 +43,7 @@ class Far:
 
     def says(self, word: object) -> None:
         """The worker sends a packet."""
-        self.agent.on_frame(bytearray(messages.Said(1, pickle.dumps(word)).encode()))
+        self.agent.on_frame(bytearray(messages.FromChild(1, pickle.dumps(word)).encode()))
 
     def ends(self, delivered: int) -> None:
         """The worker is gone, after so many packets came in time."""

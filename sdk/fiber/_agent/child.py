@@ -134,7 +134,7 @@ def _load_and_run(start: StartRequest, agent: int) -> int:
         import traceback  # rarely needed, and long to import
 
         traceback.print_exc()
-        _report_birth_failure()
+        _report_init_failure()
         return 1
     return int(process._bootstrap(parent_sentinel=agent))
 
@@ -217,12 +217,14 @@ def _adopt_stdio(fds: list[int], *, captured: bool) -> None:
             )
 
 
-def _report_birth_failure() -> None:
+def _report_init_failure() -> None:
     if _task_channel is not None:
         import traceback
 
+        from fiber._wire import work
+
         with contextlib.suppress(OSError):
-            _task_channel.send(pickle.dumps(("birth", traceback.format_exc())))
+            _task_channel.send(pickle.dumps((work.INIT_FAILED, traceback.format_exc())))
 
 
 def _exec(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> None:

@@ -244,7 +244,7 @@ class Channel:
 
     def __init__(self, sock: socket.socket, abort: Callable[[Exception], None]) -> None:
         self._sock = sock
-        self._condemn = abort
+        self._abort = abort
         self._poller = select.poll()
         self._poller.register(sock, select.POLLIN)
 
@@ -261,7 +261,7 @@ class Channel:
         except BlockingIOError:  # its agent took it, which is burying the child
             return None
         except TooManyOpenFiles as error:
-            self._condemn(error)
+            self._abort(error)
             raise
 
     def close(self) -> None:

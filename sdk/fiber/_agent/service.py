@@ -63,7 +63,7 @@ class AgentService:
         elif isinstance(message, messages.Deliver | messages.Signal | messages.Recall):
             child = self._children.get(message.child)
             if child is not None:  # otherwise its end and this crossed
-                child.obey(message)
+                child.handle(message)
 
     def on_suspect(self) -> None:
         """The master is silent; work goes on."""
@@ -110,7 +110,7 @@ class AgentService:
 
     def _signal_all(self, signum: int) -> None:
         for child in self._children.values():
-            child.obey(messages.Signal(0, signum))
+            child.handle(messages.Signal(0, signum))
 
 
 class _Observed:
@@ -132,7 +132,7 @@ class _Observed:
             # Whatever keeps a child from starting here, the one who asked is the master.
             self.exited(ExitReport(1, f"could not be started: {error}", host=agent.host))
 
-    def obey(self, message: messages.Deliver | messages.Signal | messages.Recall) -> None:
+    def handle(self, message: messages.Deliver | messages.Signal | messages.Recall) -> None:
         """What the master wants of it."""
         child = self._child
         if child is None:
@@ -157,7 +157,7 @@ class _Observed:
 
     def received(self, message: packet.Message) -> None:
         """Pass a packet on."""
-        self._service.send(messages.Said(self._number, message.payload, message.buffers))
+        self._service.send(messages.FromChild(self._number, message.payload, message.buffers))
         message.release()
 
     def recalled(self, seqs: list[int]) -> None:

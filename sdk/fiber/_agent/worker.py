@@ -50,7 +50,7 @@ def run(
             import traceback  # rarely needed, and long to import
 
             with contextlib.suppress(OSError):  # the agent is gone
-                channel.send(pickle.dumps((work.BIRTH, traceback.format_exc())))
+                channel.send(pickle.dumps((work.INIT_FAILED, traceback.format_exc())))
             raise SystemExit(1) from None
     worker = Worker(channel, child.progress(), retryable)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:

@@ -104,7 +104,7 @@ class AgentProcess:
         self._on_end(f"its process ended with status {status}")
 
 
-class Launcher:
+class AgentLauncher:
     """A thread that starts agents, one after the other.
 
     Starting a process takes milliseconds and may fail, so the loop does not do it; nor would a

@@ -12,7 +12,7 @@ import threading
 import time
 from typing import NamedTuple
 
-from fiber._backends.agent_process import AgentProcess, Launcher
+from fiber._backends.agent_process import AgentLauncher, AgentProcess
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent
 from fiber._hub.hub import Hub
@@ -63,7 +63,7 @@ class LoopbackBackend:
             on_refused=lambda reason: self._output.write("fiber", f"refused an agent: {reason}"),
             keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
         )
-        self._launcher = Launcher(
+        self._launcher = AgentLauncher(
             credentials.agent_half(),
             config.start_timeout,
             lambda trouble: self._output.write("fiber", trouble),

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
-from fiber._backends.remote_channel import RemoteChannel
+from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._hub.hub import Hub
 from fiber._transport.link import EventLoop, Link
 from fiber._transport.stream import Frame
@@ -179,7 +179,7 @@ class RemoteChild:
         self._agent = agent
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
-        self._channel: RemoteChannel | None = None
+        self._channel: RemoteTaskChannel | None = None
         self._gone = False
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
@@ -191,11 +191,11 @@ class RemoteChild:
         self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
         return True
 
-    def lend(self) -> RemoteChannel | None:
+    def lend(self) -> RemoteTaskChannel | None:
         """Its task channel, for direct use; None if it is gone."""
         if self._gone:
             return None
-        self._channel = RemoteChannel(self._agent.loop, self.deliver)
+        self._channel = RemoteTaskChannel(self._agent.loop, self.deliver)
         return self._channel
 
     def reclaim(self) -> None:
@@ -215,7 +215,7 @@ class RemoteChild:
 
     def heard(self, message: messages.Message, output: Output) -> None:
         """Something about this child."""
-        if isinstance(message, messages.Said):
+        if isinstance(message, messages.FromChild):
             buffers = [memoryview(buffer) for buffer in message.buffers]
             said = packet.Message(memoryview(message.payload), buffers, [])
             if self._channel is None:

@@ -10,7 +10,7 @@ from fiber._transport.link import EventLoop
 from fiber._wire.packet import BytesLike, Message
 
 
-class RemoteChannel:
+class RemoteTaskChannel:
     """A ``DirectChannel``.  What it sends and receives passes the loop, and nothing above it.
 
     ``deliver`` is the port's own.  Each wait has a lock of its own, which the loop releases: an

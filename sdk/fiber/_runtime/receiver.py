@@ -66,7 +66,7 @@ class Receiver:
             self._answered(words, buffers, size)
         elif kind == work.READY:
             self._on_ready(handle)
-        elif kind == work.BIRTH:
+        elif kind == work.INIT_FAILED:
             handle.complaint = words[1]
         elif kind == work.UNKNOWN:
             self.recalled(handle, [words[1]])

@@ -1,4 +1,4 @@
-"""The door: takes connections, and lets pass who proves in time to have the pool's credentials.
+"""Takes connections, and lets pass who proves in time to have the pool's credentials.
 
 It has a thread and a loop of its own.  TLS costs milliseconds of processor time for each who comes,
 be it a thousand agents or strangers without end, and the program's own loop must not wait for that;
@@ -27,11 +27,11 @@ from fiber._wire.messages import ProtocolError
 from fiber.errors import LinkError, TooManyOpenFiles
 
 _DEADLINE = 10.0
-"""Seconds for a newcomer to prove itself, all in all."""
+"""Seconds for a connection to prove itself, all in all."""
 
 _MOST = 512
-"""Newcomers at the same time; half of them from one address, as a relay or a NAT has one for all.
-Never more than a quarter of the descriptors that this process may have."""
+"""Pending connections at the same time; half of them from one address, as a relay or a NAT has one
+for all.  Never more than a quarter of the descriptors that this process may have."""
 
 _TURN = 16
 """Connections taken in one turn, so that those under way have theirs."""
@@ -50,7 +50,7 @@ _SHORT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM
 class Acceptor:
     """Listens on ``address`` (port 0: a free one), which then says where it really does.
 
-    ``on_hello`` is called on its thread with a newcomer that has proved itself, and its first
+    ``on_hello`` is called on its thread with a connection that has proved itself, and its first
     words; ``on_refused`` with why one was turned away, once in some minutes for each address and
     reason.
     """
@@ -60,7 +60,7 @@ class Acceptor:
         address: str,
         context: ssl.SSLContext,
         *,
-        on_hello: Callable[[Newcomer, bytes], None],
+        on_hello: Callable[[PendingConnection, bytes], None],
         on_refused: Callable[[str], None],
     ) -> None:
         self.context = context
@@ -72,13 +72,13 @@ class Acceptor:
         most = min(_MOST, max(descriptors // 4, 2))
         self._admission = Admission(most, most // 2)
         try:
-            self._door = _listen(address)
+            self._listener = _listen(address)
         except BaseException:
             self.loop.stop()
             raise
-        self.address = f"{address.rpartition(':')[0]}:{self._door.getsockname()[1]}"
-        self.loop.register(self._door.fileno(), self._accept)
-        self._newcomers: set[Newcomer] = set()
+        self.address = f"{address.rpartition(':')[0]}:{self._listener.getsockname()[1]}"
+        self.loop.register(self._listener.fileno(), self._accept)
+        self._pending: set[PendingConnection] = set()
         self.loop.start_thread("fiber-accept")
 
     def take(self, sock: socket.socket, origin: str) -> None:
@@ -99,15 +99,15 @@ class Acceptor:
                 f"{reason} ({origin})" if proven else f"{origin} was turned away: {reason}"
             )
 
-    def forget(self, newcomer: Newcomer) -> None:
+    def forget(self, connection: PendingConnection) -> None:
         """It is gone, or in."""
-        self._admission.leave(newcomer)
-        self._newcomers.discard(newcomer)
+        self._admission.leave(connection)
+        self._pending.discard(connection)
 
     def _accept(self) -> None:
         for _ in range(_TURN):
             try:
-                sock, (host, port, *_) = self._door.accept()
+                sock, (host, port, *_) = self._listener.accept()
             except BlockingIOError:
                 return
             except OSError as error:
@@ -119,37 +119,37 @@ class Acceptor:
 
     def _pause(self, error: OSError) -> None:
         self.report("", "whoever comes now", f"{error.strerror}; it is tried again all the time")
-        self.loop.unregister(self._door.fileno())
+        self.loop.unregister(self._listener.fileno())
         self.loop.call_later(_PAUSE, self._resume)
 
     def _resume(self) -> None:
-        if self._door.fileno() >= 0:
-            self.loop.register(self._door.fileno(), self._accept)
+        if self._listener.fileno() >= 0:
+            self.loop.register(self._listener.fileno(), self._accept)
 
     def _admit(self, sock: socket.socket, host: str, origin: str) -> None:
-        newcomer = Newcomer(self, host, origin)
-        admitted, leaves = self._admission.enter(newcomer, host, self.loop.now())
-        if isinstance(leaves, Newcomer):
+        connection = PendingConnection(self, host, origin)
+        admitted, leaves = self._admission.enter(connection, host, self.loop.now())
+        if isinstance(leaves, PendingConnection):
             leaves.refuse("it said nothing, and others want to come in")
         if not admitted:
             self.report("", origin, "too many come at the same time")
             sock.close()
             return
-        self._newcomers.add(newcomer)
+        self._pending.add(connection)
         try:
-            newcomer.start(sock)
+            connection.start(sock)
         except tls.HungUp:
-            self.forget(newcomer)
+            self.forget(connection)
 
     def _close(self) -> None:
-        if self._door.fileno() >= 0:
-            self.loop.unregister(self._door.fileno())
-            self._door.close()
-        for newcomer in list(self._newcomers):
-            newcomer.hang_up()
+        if self._listener.fileno() >= 0:
+            self.loop.unregister(self._listener.fileno())
+            self._listener.close()
+        for connection in list(self._pending):
+            connection.hang_up()
 
 
-class Newcomer:
+class PendingConnection:
     """A connection from its first byte to its last in TLS."""
 
     def __init__(self, acceptor: Acceptor, host: str, origin: str) -> None:
@@ -163,9 +163,9 @@ class Newcomer:
         """Prove each other and hear its first words; HungUp if it has gone already."""
         with contextlib.suppress(OSError):  # no TCP, or broken already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._exchange = tls.Exchange(sock, self._acceptor.context)
+        self._handshake = tls.Handshake(sock, self._acceptor.context)
         self._timer = self._loop.call_later(_DEADLINE, self._too_late)
-        self._run(self._exchange.listen(), lambda hello: self._acceptor.on_hello(self, hello))
+        self._run(self._handshake.listen(), lambda hello: self._acceptor.on_hello(self, hello))
 
     def welcome(self, greeting: bytes, then: Callable[[int, Secrets], None]) -> None:
         """Answer it and end TLS; ``then`` gets the connection, on the acceptor's thread.  Any
@@ -193,13 +193,13 @@ class Newcomer:
             then(end)
 
         self._run(
-            self._exchange.answer(greeting), lambda _: self._run(self._exchange.end(), passed)
+            self._handshake.answer(greeting), lambda _: self._run(self._handshake.end(), passed)
         )
 
     @property
     def gone(self) -> bool:
         """Whether it hung up or was hung up on."""
-        return self._exchange.sock.fileno() < 0
+        return self._handshake.sock.fileno() < 0
 
     def refuse(self, what: str) -> None:
         """Hang up, and tell whom it concerns."""
@@ -209,7 +209,7 @@ class Newcomer:
     def hang_up(self) -> None:
         """Let go of it."""
         self._unwatch()
-        self._exchange.close()
+        self._handshake.close()
         self._leave()
 
     def _leave(self) -> None:
@@ -232,7 +232,7 @@ class Newcomer:
         step()
 
     def _watch(self, event: int, step: Callable[[], None]) -> None:
-        fd = self._exchange.sock.fileno()
+        fd = self._handshake.sock.fileno()
         if self._watched is None:
             self._watched = fd
             self._loop.register(fd, step)
@@ -246,7 +246,7 @@ class Newcomer:
     def _part(self) -> None:
         """Let it read the alert that says why, then hang up."""
         self._unwatch()
-        sock = self._exchange.sock
+        sock = self._handshake.sock
         try:
             socket.socket.shutdown(sock, socket.SHUT_WR)
         except OSError:  # it has hung up itself
@@ -259,7 +259,7 @@ class Newcomer:
 
     def _drain(self) -> None:
         try:
-            rest = os.read(self._exchange.sock.fileno(), 1 << 16)
+            rest = os.read(self._handshake.sock.fileno(), 1 << 16)
         except BlockingIOError:
             return
         except OSError:
@@ -275,7 +275,7 @@ def _listen(address: str) -> socket.socket:
     host, port = addresses.parse(address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        door = socket.create_server((host, port), family=family, backlog=_BACKLOG)
+        listener = socket.create_server((host, port), family=family, backlog=_BACKLOG)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise LinkError(
@@ -288,5 +288,5 @@ def _listen(address: str) -> socket.socket:
             f"cannot listen on {address}: {str(error.strerror or error).lower()}. Use an address "
             "of this host and a port that this user may bind."
         ) from error
-    door.setblocking(False)
-    return door
+    listener.setblocking(False)
+    return listener

@@ -139,24 +139,26 @@ class AgentDialer:
     def _meet(self, hello: bytes) -> tuple[bytes, int, Secrets]:
         """The master's answer, and the connection without TLS."""
         sock = self._connect(self._address)
-        exchange = tls.Exchange(sock, self._context, self._credentials.server_name)
+        tls_handshake = tls.Handshake(sock, self._context, self._credentials.server_name)
         try:
             with self._lock:
-                self._sock = exchange.sock
+                self._sock = tls_handshake.sock
             deadline = time.monotonic() + _GREET
-            answer = self._finish(exchange, exchange.ask(hello), deadline)
-            return answer, *self._finish(exchange, exchange.end(), deadline)
+            answer = self._finish(tls_handshake, tls_handshake.ask(hello), deadline)
+            return answer, *self._finish(tls_handshake, tls_handshake.end(), deadline)
         finally:
             with self._lock:
                 self._sock = None
-            exchange.close()
+            tls_handshake.close()
 
-    def _finish(self, exchange: tls.Exchange, steps: tls.Steps[tls._T], deadline: float) -> tls._T:
+    def _finish(
+        self, tls_handshake: tls.Handshake, steps: tls.Steps[tls._T], deadline: float
+    ) -> tls._T:
         """Take the steps, waiting before each until it can be taken."""
         poller = select.poll()
         try:
             while not self._over.is_set():
-                poller.register(exchange.sock, next(steps))
+                poller.register(tls_handshake.sock, next(steps))
                 if not poller.poll(max(deadline - time.monotonic(), 0.0) * 1000):
                     raise Unreachable("it took the connection and said nothing")
         except StopIteration as finished:

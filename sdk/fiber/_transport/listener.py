@@ -7,7 +7,7 @@ import socket
 from collections.abc import Callable
 
 from fiber._transport import handshake, tls
-from fiber._transport.acceptor import Acceptor, Newcomer
+from fiber._transport.acceptor import Acceptor, PendingConnection
 from fiber._transport.credentials import Credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
 from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, Link, SelectorEventLoop
@@ -49,7 +49,7 @@ class MasterListener:
         self._acceptor = Acceptor(
             address,
             tls.context_of(credentials, listens=True),
-            on_hello=lambda newcomer, words: loop.call_soon(self._greet, newcomer, words),
+            on_hello=lambda pending, words: loop.call_soon(self._greet, pending, words),
             on_refused=lambda reason: loop.call_soon(on_refused, reason),
         )
         self.address = self._acceptor.address
@@ -65,7 +65,7 @@ class MasterListener:
         linger: float = 1.0,
         then: Callable[[], None] | None = None,
     ) -> None:
-        """Close every link as ``Link.close`` does, then the door, then call ``then``.
+        """Close every link as ``Link.close`` does, then the listening socket, then call ``then``.
 
         Who comes meanwhile is refused.
         """
@@ -86,21 +86,21 @@ class MasterListener:
             for then in finished:
                 then()
 
-    def _greet(self, newcomer: Newcomer, words: bytes) -> None:
+    def _greet(self, pending: PendingConnection, words: bytes) -> None:
         """Somebody with the right credentials has said its first words."""
         try:
             hello = handshake.decode(words)
         except ProtocolError as error:
-            self._refuse(newcomer, f"someone connected who is no agent of Fiber: {error}")
+            self._refuse(pending, f"someone connected who is no agent of Fiber: {error}")
             return
         if not isinstance(hello, Hello):
-            self._refuse(newcomer, f"{hello.identity.name!r} connected and is no agent")
+            self._refuse(pending, f"{hello.identity.name!r} connected and is no agent")
             return
         reason = self._objection(hello)
         if reason:
-            self._refuse(newcomer, reason)
+            self._refuse(pending, reason)
         else:
-            self._welcome(newcomer, hello)
+            self._welcome(pending, hello)
 
     def _objection(self, hello: Hello) -> str:
         error = handshake.mismatch(self._identity, hello.identity)
@@ -115,10 +115,10 @@ class MasterListener:
             )
         return ""
 
-    def _refuse(self, newcomer: Newcomer, reason: str) -> None:
-        newcomer.turn_away(Refusal(self._identity, reason).encode(), reason)
+    def _refuse(self, pending: PendingConnection, reason: str) -> None:
+        pending.turn_away(Refusal(self._identity, reason).encode(), reason)
 
-    def _welcome(self, newcomer: Newcomer, hello: Hello) -> None:
+    def _welcome(self, pending: PendingConnection, hello: Hello) -> None:
         link = self._links.get(hello.link)
         if link is not None:
             # What its last connection might still bring is not to arrive: the agent is told now how
@@ -126,15 +126,20 @@ class MasterListener:
             link.disconnect()
         arrived = link.arrived if link else 0
         welcome = Welcome(self._identity, arrived, *self._keepalive, self._lost_grace)
-        newcomer.welcome(
+        pending.welcome(
             welcome.encode(),
             lambda descriptor, secrets: self._loop.call_soon(
-                self._connect, newcomer, hello, arrived, descriptor, secrets
+                self._connect, pending, hello, arrived, descriptor, secrets
             ),
         )
 
     def _connect(
-        self, newcomer: Newcomer, hello: Hello, arrived: int, descriptor: int, secrets: Secrets
+        self,
+        pending: PendingConnection,
+        hello: Hello,
+        arrived: int,
+        descriptor: int,
+        secrets: Secrets,
     ) -> None:
         """Go on without TLS."""
         link = self._links.get(hello.link)
@@ -155,13 +160,13 @@ class MasterListener:
                 on_gone=link.disconnected,
             )
         except FiberError as error:
-            newcomer.report_proven(f"{hello.identity.name!r} cannot be served: {error}")
+            pending.report_proven(f"{hello.identity.name!r} cannot be served: {error}")
             return
         self._links[hello.link] = link
         link.connected(connection, hello.arrived)
         if new and (unwanted := self._on_agent(link)):
             link.close(unwanted)
-            newcomer.report_proven(unwanted)
+            pending.report_proven(unwanted)
 
     def _forget(self, link: str) -> None:
         self._links.pop(link, None)

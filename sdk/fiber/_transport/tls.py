@@ -77,7 +77,7 @@ def _load_own(context: ssl.SSLContext, credentials: Credentials) -> None:
         os.close(file)
 
 
-class Exchange:
+class Handshake:
     """One side's part on ``sock``, which it makes non-blocking and takes over; HungUp if that is
     broken already.
     """

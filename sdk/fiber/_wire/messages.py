@@ -79,7 +79,7 @@ class Deliver(NamedTuple):
         return _redacted(self)
 
 
-class Said(NamedTuple):
+class FromChild(NamedTuple):
     """Agent to master: a packet from the child's task channel."""
 
     child: int
@@ -88,7 +88,7 @@ class Said(NamedTuple):
 
     def encode(self) -> bytes:
         """The frame."""
-        return _packet(_NUMBER.pack(PROTOCOL, _SAID, self.child), self.payload, self.buffers)
+        return _packet(_NUMBER.pack(PROTOCOL, _FROM_CHILD, self.child), self.payload, self.buffers)
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -204,7 +204,7 @@ Message: TypeAlias = (
     | Started
     | Signal
     | Deliver
-    | Said
+    | FromChild
     | Recall
     | Recalled
     | Exited
@@ -241,7 +241,7 @@ def decode(frame: bytes | bytearray) -> Message:
         ) from error
 
 
-_START, _STARTED, _SIGNAL, _DELIVER, _SAID, _RECALL, _RECALLED, _EXITED = range(1, 9)
+_START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
 
 _HEAD = struct.Struct("<BB")
@@ -311,8 +311,8 @@ def _read_deliver(view: memoryview) -> Deliver:
     return Deliver(child, seq, *_read_packet(view, _DELIVERY.size))
 
 
-def _read_said(view: memoryview) -> Said:
-    return Said(_NUMBER.unpack_from(view)[2], *_read_packet(view, _NUMBER.size))
+def _read_from_child(view: memoryview) -> FromChild:
+    return FromChild(_NUMBER.unpack_from(view)[2], *_read_packet(view, _NUMBER.size))
 
 
 def _read_recall(view: memoryview) -> Recall:
@@ -384,7 +384,7 @@ _READERS: dict[int, Callable[[memoryview], Message]] = {
     _STARTED: _read_started,
     _SIGNAL: _read_signal,
     _DELIVER: _read_deliver,
-    _SAID: _read_said,
+    _FROM_CHILD: _read_from_child,
     _RECALL: _read_recall,
     _RECALLED: _read_recalled,
     _EXITED: _read_exited,

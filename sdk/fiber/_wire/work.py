@@ -12,7 +12,7 @@ From a worker, pickled tuples of plain values, so that reading one never runs th
     (UNREADABLE, seq, error)                    its message does not unpickle
     (UNKNOWN, seq)                              its function was forgotten, or never seen
     (BROKEN, seq, error)                        its function does not unpickle
-    (READY,)  (BIRTH, text)                     initialized; failed before that
+    (READY,)  (INIT_FAILED, text)               initialized; failed before that
 
 ``kept`` is how many tasks of the batch the worker keeps, None for all: it gives the others back.
 ``values`` holds plain values; what is not plain is None there and stands in ``odd`` as (position
@@ -30,7 +30,8 @@ from typing import Any, NamedTuple
 from fiber._wire.packet import BytesLike
 
 MAP, STAR, CALLS, STOP = range(4)
-UNREADABLE, UNKNOWN, BROKEN, READY, BIRTH = "unreadable", "unknown", "broken", "ready", "birth"
+UNREADABLE, UNKNOWN, BROKEN, READY = "unreadable", "unknown", "broken", "ready"
+INIT_FAILED = "init failed"
 VALUE, ERROR, AGAIN = range(3)
 
 SEQ = struct.Struct("<Q")
