@@ -28,6 +28,7 @@ from fiber._hub.protocol import ONE, Op
 from fiber._wire.arena import Arena, Block
 from fiber.connection import Connection, wait
 from hosts import PATIENCE, Hosts, objects_kept
+from unit.pool_programs import run_program
 
 MORE_THAN_FITS = 2000
 
@@ -114,6 +115,25 @@ def interrupted_put(queue: Any, stop: int, files: set[str]) -> bool:
     finally:
         sys.settrace(before)
     return False
+
+
+# The runtime
+
+
+def test_a_runtime_made_within_making_one_keeps_its_hub() -> None:
+    done = run_program("""
+        import fiber
+        from fiber._runtime import state
+        real = state._make_backend
+        def interrupted(runtime):
+            state._make_backend = real
+            state.runtime()
+            return real(runtime)
+        state._make_backend = interrupted
+        with fiber.Pool(1) as pool:
+            print(pool.apply(type, (fiber.Queue(),)).__name__)
+    """)
+    assert (done.stdout, done.stderr) == ("Queue\n", "")
 
 
 # Handles
