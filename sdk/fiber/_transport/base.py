@@ -1,7 +1,8 @@
 """The two primitives under every connection, queue, event and semaphore.
 
 Both have two implementations: kernel objects for holders on the host where the object lives
-(``unix.py``) and a request to that host's hub for all others (``fiber._hub.remote``).
+(``fiber._hub.local``, over ``unix.py``) and a request to that host's hub for all others
+(``fiber._hub.remote``).
 """
 
 from __future__ import annotations
