@@ -1,7 +1,7 @@
 """The two primitives under every connection, queue, event and semaphore.
 
 Both have two implementations: kernel objects for holders on the host where the object lives
-(``fiber._hub.local``, over ``unix.py``) and a request to that host's hub for all others
+(``unix.py``, ``fiber._hub.local``) and a request to that host's hub for all others
 (``fiber._hub.remote``).
 """
 
