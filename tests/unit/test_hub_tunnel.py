@@ -176,7 +176,7 @@ def test_the_end_comes_after_what_was_sent_and_with_its_reason(reason: str) -> N
     pair.run()
     assert [len(payload) for payload, _ in listener.messages] == [3 * WINDOW, 4]
     assert listener.ends == [reason]
-    assert len(pair.agent) == len(pair.master) == 0
+    assert len(pair.agent._streams) == len(pair.master._streams) == 0
 
 
 def test_what_came_before_the_end_is_heard_although_paused() -> None:

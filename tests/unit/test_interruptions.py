@@ -29,6 +29,7 @@ from fiber._wire.arena import Arena, Block
 from fiber.connection import Connection, wait
 from hosts import PATIENCE, Hosts, objects_kept
 from unit.interrupting import is_interrupted
+from unit.pool_programs import run_program
 
 MORE_THAN_FITS = 2000
 
@@ -90,6 +91,25 @@ def test_ctrl_c_at_any_line_of_a_put_leaves_a_queue_that_works(before: int) -> N
     while without_deadlock(lambda: put_and_drain(steps)):  # noqa: B023 - it ends before the next
         steps += 1
     assert steps > 10, "it was hardly interrupted"
+
+
+# The runtime
+
+
+def test_a_runtime_made_within_making_one_keeps_its_hub() -> None:
+    done = run_program("""
+        import fiber
+        from fiber._runtime import state
+        real = state._make_backend
+        def interrupted(runtime):
+            state._make_backend = real
+            state.runtime()
+            return real(runtime)
+        state._make_backend = interrupted
+        with fiber.Pool(1) as pool:
+            print(pool.apply(type, (fiber.Queue(),)).__name__)
+    """)
+    assert (done.stdout, done.stderr) == ("Queue\n", "")
 
 
 # Handles

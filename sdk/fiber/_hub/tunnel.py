@@ -230,9 +230,6 @@ class Tunnels:
     def _forget(self, number: int) -> None:
         self._streams.pop(number, None)
 
-    def __len__(self) -> int:
-        return len(self._streams)
-
 
 class Router:
     """Knows over which link each host is reached."""

@@ -49,7 +49,6 @@ class Runtime:
             raise
         reduction.readers_are_remote(not self.backend.same_host)
         self.loop.start_thread("fiber-io")
-        hub_client.set_local_hub(self.hub)
 
     def _make_hub(self) -> Hub | None:
         # One hub a host: a process that Fiber started uses the one that its agent has.
@@ -58,7 +57,8 @@ class Runtime:
         return Hub(self.loop, self.host, self.config.runtime_directory)
 
     def _close_hub(self) -> None:
-        hub_client.set_local_hub(None)
+        if _runtime is None:  # otherwise the hub of this process is that of another runtime
+            hub_client.set_local_hub(None)
         if self.hub is not None:
             self.hub.close()
 
@@ -186,6 +186,7 @@ def _adopt(made: Runtime) -> None:
     if _runtime is not None:  # a finalizer was faster
         made.close()
         return
+    hub_client.set_local_hub(made.hub)
     _runtime = made
     util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
 
