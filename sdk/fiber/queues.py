@@ -8,6 +8,9 @@
 There is no lock between processes: an item is one message, which the kernel gives to exactly one
 reader.  A process that dies while it waits takes nothing; one that dies later takes its own item.
 
+Ctrl-C in ``put`` leaves the item either put or not, and its place taken or free as it should be;
+but for the moment in which the kernel takes the item: then it is there, and counts as not put.
+
 Differs from multiprocessing in that an item is pickled when it is put, not some time later.
 """
 
@@ -72,21 +75,21 @@ class Queue:
         """
         if self._closed:
             raise ValueError(f"Queue {self!r} is closed")
-        if not self._slots.take(timeout if block else 0):
-            raise Full
+        taken: list[Any] = []
         try:
-            payload, buffers = reduction.encode(obj)
-        except Exception as error:
-            self._slots.give_back()
-            self._on_queue_feeder_error(reduction.blame({"the item": obj}, error), obj)
-        except BaseException:
-            self._slots.give_back()
-            raise
-        else:
-            self._send(payload, buffers)
+            if not self._slots.take(timeout if block else 0, taken):
+                raise Full
+            message = _encode(obj)
+            if isinstance(message, tuple):
+                self._send(*message, taken)
+        finally:
+            if taken:  # it was not sent
+                self._slots.give_back()
+        if isinstance(message, Exception):
+            self._on_queue_feeder_error(message, obj)
 
-    def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
-        self._feeder.put(payload, buffers)
+    def _send(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
+        self._feeder.put(payload, buffers, taken)
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """The next item; Empty if there is none, nor within ``timeout`` seconds."""
@@ -94,8 +97,12 @@ class Queue:
             raise ValueError(f"Queue {self!r} is closed")
         if not block:
             timeout = 0
-        message = self._inbox.recv() if timeout is None else self._receive_within(timeout)
-        self._slots.free()
+        message = None
+        try:
+            message = self._inbox.recv() if timeout is None else self._receive_within(timeout)
+        finally:
+            if message is not None:
+                self._slots.free()
         return packet.loads(message)
 
     def _receive_within(self, timeout: float) -> Message:
@@ -155,6 +162,14 @@ class Queue:
         return types.GenericAlias(cls, item)
 
 
+def _encode(obj: Any) -> tuple[bytes, list[memoryview]] | Exception:
+    """An item, pickled, or why it does not pickle."""
+    try:
+        return reduction.encode(obj)
+    except Exception as error:
+        return reduction.blame({"the item": obj}, error)
+
+
 class JoinableQueue(Queue):
     """A queue that counts items until ``task_done`` was called for each."""
 
@@ -171,13 +186,13 @@ class JoinableQueue(Queue):
         queue, self._unfinished, self._bell = state
         super().__setstate__(queue)
 
-    def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
-        self._unfinished.add(1)
+    def _send(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
         try:
-            super()._send(payload, buffers)
-        except BaseException:
-            self._unfinished.take(0)
-            raise
+            self._unfinished.add(1)
+            super()._send(payload, buffers, taken)
+        finally:
+            if taken:  # it was not sent
+                self._unfinished.take(0)
 
     def task_done(self) -> None:
         """One item is dealt with; ValueError if all were before."""

@@ -59,7 +59,13 @@ class Semaphore:
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
         """Lower the count; False if it is zero and stays so for ``timeout`` seconds."""
-        return self._counter.take(timeout if block else 0)
+        taken: list[Any] = []
+        try:
+            return self._counter.take(timeout if block else 0, taken)
+        except BaseException:
+            if taken:  # interrupted on the way back
+                self._counter.add(1)
+            raise
 
     def release(self) -> None:
         """Raise the count, and wake one who waits."""

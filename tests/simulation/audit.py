@@ -275,7 +275,7 @@ class Audit:
                 first = batch.start + batch.received
                 places.setdefault(batch.job, []).append(("in a batch", first, batch.stop - first))
         pinned = [entry for worker in self._ledger.workers for entry in worker.pinned]
-        for job, span in (*pinned, *self._ledger._homeless):
+        for job, span in (*pinned, *self._ledger._unassigned_pins):
             places.setdefault(job, []).append(("pinned", span.start, len(span.items)))
         for job, where in places.items():
             account = self._names.account(job)

@@ -25,6 +25,7 @@ from fiber._hub import feeder, handles, hub, registry, remote
 from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.local import LocalChannel, QuietSocket
 from fiber._hub.protocol import ONE, Op
+from fiber._transport import unix
 from fiber._wire.arena import Arena, Block
 from fiber.connection import Connection, wait
 from hosts import PATIENCE, Hosts, objects_kept
@@ -91,6 +92,46 @@ def test_ctrl_c_at_any_line_of_a_put_leaves_a_queue_that_works(before: int) -> N
     while without_deadlock(lambda: put_and_drain(steps)):  # noqa: B023 - it ends before the next
         steps += 1
     assert steps > 10, "it was hardly interrupted"
+
+
+@pytest.mark.parametrize("fed", [False, True], ids=["direct", "fed"])
+@pytest.mark.parametrize("make", [fiber.Queue, fiber.JoinableQueue])
+def test_ctrl_c_at_any_step_of_a_put_costs_no_place_and_no_join(
+    make: Callable[[int], Any], fed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if fed:
+        monkeypatch.setattr(LocalChannel, "can_try_send", False)
+        monkeypatch.setattr(feeder.Feeder, "_start_thread", lambda _: None)
+    files = {queues.__file__, feeder.__file__, unix.__file__}
+
+    def put(stop: int) -> bool:
+        """Whether the put was interrupted, at its step number ``stop``."""
+        queue = make(1)
+        interrupted = is_interrupted(lambda: queue.put("interrupted"), stop, files)
+        there = len(queue._feeder._unsent) + queue._inbox.poll(0)
+        unfinished = queue._unfinished.value() if make is fiber.JoinableQueue else there
+        assert there or not queue.full(), f"its place is lost at step {stop}"
+        assert unfinished <= there, f"nobody can join after step {stop}"
+        if fed:
+            assert (unfinished, queue.full()) == (there, bool(there)), f"at step {stop}"
+        queue._feeder._unsent.clear()
+        return interrupted
+
+    steps = 0
+    while without_deadlock(lambda: (put(steps),))[0]:  # noqa: B023 - it ends before the next
+        steps += 1
+    assert steps > 10, "it was hardly interrupted"
+
+
+def test_ctrl_c_at_any_step_of_acquire_costs_nobody_a_semaphore() -> None:
+    steps = 0
+    while True:
+        semaphore = fiber.Semaphore(1)
+        if not is_interrupted(semaphore.acquire, steps, {unix.__file__}):
+            break
+        assert semaphore.get_value() == 1, f"interrupted at step {steps}"
+        steps += 1
+    assert steps > 3, "it was hardly interrupted"
 
 
 # The runtime

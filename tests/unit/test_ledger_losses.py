@@ -270,7 +270,7 @@ def test_demand_counts_what_waits_and_what_runs() -> None:
     assign_all(ledger)
     ledger.pin(job, worker, "x")
     assert ledger.demand() == 11
-    assert ledger.hungry() is False
+    assert ledger.has_capacity() is False
 
 
 def test_demand_counts_no_tasks_that_wait_until_results_are_read() -> None:

@@ -15,7 +15,7 @@
 * A **worker** has at most one batch that it runs and one that it has not read yet.
 
 No clock and no I/O: ``now`` is an argument, the caller sends what ``assign`` returns.  Not
-thread-safe: one lock around it.
+thread-safe: the executor calls it on its loop's thread.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Ledger:
         self._paused: set[Job] = set()
         self._load = WorkersByLoad()
         self._pins: dict[Worker, None] = {}
-        self._homeless: list[tuple[Job, Span]] = []
+        self._unassigned_pins: list[tuple[Job, Span]] = []
         self._cancelled: set[Batch] = set()
 
     # Jobs
@@ -98,7 +98,7 @@ class Ledger:
         span = Span(job.fed, [item], alone=True, pin=True)
         self._fed(job, 1)
         if worker is None:
-            self._homeless.append((job, span))
+            self._unassigned_pins.append((job, span))
         else:
             self._pin(job, worker, span)
 
@@ -116,7 +116,7 @@ class Ledger:
     def unfinished(self, job: Job) -> list[Any]:
         """The items of its tasks that are not done."""
         spans = [batch.rest() for batch in job.batches]
-        pinned = itertools.chain(self._homeless, *(worker.pinned for worker in job.pins))
+        pinned = itertools.chain(self._unassigned_pins, *(worker.pinned for worker in job.pins))
         spans += [span for owner, span in pinned if owner is job]
         return [*job.waiting.items(), *itertools.chain.from_iterable(s.items for s in spans)]
 
@@ -143,8 +143,8 @@ class Ledger:
                 self._pins.pop(worker, None)
                 self._load.sort_pinned(worker)
         job.pins.clear()
-        if self._homeless:
-            self._homeless = [pinned for pinned in self._homeless if pinned[0] is not job]
+        if self._unassigned_pins:
+            self._unassigned_pins = [pin for pin in self._unassigned_pins if pin[0] is not job]
         return holders
 
     def pause(self, job: Job, paused: bool) -> None:
@@ -171,18 +171,18 @@ class Ledger:
     def _adopt(self, worker: Worker) -> None:
         """Give it the pinned tasks of a lost worker: one of each job, as every worker has."""
         left = []
-        for job, span in self._homeless:
+        for job, span in self._unassigned_pins:
             if any(job is pinned[0] for pinned in worker.pinned):
                 left.append((job, span))
             else:
                 self._pin(job, worker, span)
-        self._homeless = left
+        self._unassigned_pins = left
 
     def leave(self, worker: Worker) -> bool:
         """Give ``worker`` nothing more.  False, and nothing changed, if it is busy."""
         if worker.queue or worker.pinned:
             return False
-        self._fence(worker)
+        self._retire(worker)
         self._load.spent.pop(worker, None)
         return True
 
@@ -192,24 +192,24 @@ class Ledger:
             return []
         spent, self._load.spent = list(self._load.spent), {}
         for worker in spent:
-            self._fence(worker)
+            self._retire(worker)
         return spent
 
-    def _fence(self, worker: Worker) -> None:
+    def _retire(self, worker: Worker) -> None:
         """It is about to go: what only it was to run is for one that comes after it."""
         worker.leaving = True
-        self._homeless += worker.pinned
+        self._unassigned_pins += worker.pinned
         worker.pinned.clear()
         self._pins.pop(worker, None)
         self._load.sort(worker)
 
     def newcomers_wanted(self) -> int:
         """How many tasks only a new worker may run."""
-        return len(self._homeless)
+        return len(self._unassigned_pins)
 
     def jobs_for_newcomers(self) -> set[Job]:
         """The jobs that have such tasks."""
-        return {job for job, _ in self._homeless}
+        return {job for job, _ in self._unassigned_pins}
 
     def idle(self) -> list[Worker]:
         """Workers with nothing to do, the one that has been so for longest first."""
@@ -223,9 +223,9 @@ class Ledger:
         """The first of them."""
         return next(iter(self._load.idle), None)
 
-    def hungry(self) -> bool:
+    def has_capacity(self) -> bool:
         """Whether somebody could be given something."""
-        return bool(self._load.idle or self._load.single)
+        return bool(self._load.idle or self._load.queueable)
 
     def demand(self) -> int:
         """Tasks that run, or wait for a worker and not for somebody who takes results of their job.
@@ -249,10 +249,10 @@ class Ledger:
         if self._load.idle_pinned:
             return self._assign_pinned(now)
         turns = self._turns
-        if not turns or not self.hungry():
+        if not turns or not self.has_capacity():
             return None
         passed = 0
-        while passed < len(turns) and passed <= min(len(self._load.single), LOOKAHEAD):
+        while passed < len(turns) and passed <= min(len(self._load.queueable), LOOKAHEAD):
             job = turns[passed]
             waits = job.has_next
             worker = self._worker_for(job, passed) if waits else None
@@ -289,7 +289,7 @@ class Ledger:
         # What a worker that is about to start can run should not queue behind something else.
         if self.starting and len(job.waiting) <= self.starting:
             return None
-        return self._load.single_after(passed)
+        return self._load.queueable_after(passed)
 
     def _cut(self, job: Job, worker: Worker, now: float) -> Batch:
         waiting = len(job.waiting)
@@ -473,7 +473,7 @@ class Ledger:
         batch = self.batches.get(seq)
         if batch is None:
             return None
-        self._fence(batch.worker)
+        self._retire(batch.worker)
         job, batch.job = batch.job, None
         if job is None:
             return None
@@ -482,9 +482,9 @@ class Ledger:
         self._finish(job)
         return Receipt(job, batch.start, 1, batch)
 
-    def uneven(self) -> bool:
+    def imbalanced(self) -> bool:
         """Whether somebody has nothing to do while others have more than they can do at once."""
-        return bool(self._load.idle and self._load.deep)
+        return bool(self._load.idle and self._load.recallable)
 
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for the batch that they have not read, since others have nothing to do."""
@@ -516,7 +516,7 @@ class Ledger:
                 suspects = batch.suspects(running) if batch is guilty else range(0)
                 losses += self._lose_batch(batch.job, batch.rest(), suspects)
         worker.queue.clear()
-        self._fence(worker)
+        self._retire(worker)
         self._load.spent.pop(worker, None)
         return losses[::-1]
 
@@ -527,7 +527,7 @@ class Ledger:
                 losses.append(Loss(job, span.start, job.attempts.pop(span.start), span.items[0]))
                 self._did(job, 1)
             elif span.pin:
-                self._homeless.append((job, span))
+                self._unassigned_pins.append((job, span))
             else:
                 self._return(job, span)
         self._finish(job)

@@ -14,16 +14,16 @@ class WorkersByLoad:
     """The ready workers.  Dicts serve as sets that remember the order of insertion.
 
     ``idle`` hold nothing, ``idle_pinned`` are those of them that have pinned tasks to run.
-    ``single`` hold one batch, and could be given another.  ``deep`` hold two, of which the second
-    could be recalled, and is in those of ``recalled``.  ``spent`` did all that they may do.  Who is
-    lent or leaves is in none of them.
+    ``queueable`` hold one batch, and could be given another.  ``recallable`` hold two, of which the
+    second could be recalled, and is in those of ``recalled``.  ``spent`` did all that they may do.
+    Who is lent or leaves is in none of them.
     """
 
     def __init__(self) -> None:
         self.idle: dict[Worker, None] = {}
         self.idle_pinned: dict[Worker, None] = {}
-        self.single: dict[Worker, None] = {}
-        self.deep: dict[Worker, None] = {}
+        self.queueable: dict[Worker, None] = {}
+        self.recallable: dict[Worker, None] = {}
         self.recalled: dict[Worker, None] = {}
         self.spent: dict[Worker, None] = {}
 
@@ -31,17 +31,17 @@ class WorkersByLoad:
         """Put ``worker`` where one that holds as much as it does belongs."""
         self.idle.pop(worker, None)
         self.idle_pinned.pop(worker, None)
-        self.single.pop(worker, None)
+        self.queueable.pop(worker, None)
         queue = worker.queue
         if len(queue) < 2:
-            self.deep.pop(worker, None)
+            self.recallable.pop(worker, None)
             self.recalled.pop(worker, None)
         elif worker.recalled:
-            self.deep.pop(worker, None)
+            self.recallable.pop(worker, None)
             self.recalled[worker] = None
-        elif worker not in self.deep:
+        elif worker not in self.recallable:
             self.recalled.pop(worker, None)
-            self.deep[worker] = None
+            self.recallable[worker] = None
         if worker.leaving or worker.left == 0:
             if not queue and not worker.leaving:
                 self.spent[worker] = None
@@ -52,7 +52,7 @@ class WorkersByLoad:
             self.idle[worker] = None
             self.sort_pinned(worker)
         elif len(queue) == 1 and not queue[0].alone and not worker.pinned:
-            self.single[worker] = None
+            self.queueable[worker] = None
 
     def sort_pinned(self, worker: Worker) -> None:
         """The same when its pinned tasks have changed, and nothing else."""
@@ -65,9 +65,9 @@ class WorkersByLoad:
         """The worker that became idle last: its memory is warm, and the others may leave."""
         return next(reversed(self.idle), None)
 
-    def single_after(self, spared: int) -> Worker | None:
+    def queueable_after(self, spared: int) -> Worker | None:
         """The worker that will need something to do first, sparing some that will before it."""
-        return next(itertools.islice(self.single, spared, None), None)
+        return next(itertools.islice(self.queueable, spared, None), None)
 
     def recall(self, now: float) -> list[Worker]:
         """Workers to ask for what they have not read, one for each idle one; marks them."""
@@ -82,4 +82,4 @@ class WorkersByLoad:
         return min((worker.since + PATIENCE for worker in self._candidates()), default=None)
 
     def _candidates(self) -> list[Worker]:
-        return list(itertools.islice(self.deep, len(self.idle)))
+        return list(itertools.islice(self.recallable, len(self.idle)))

@@ -160,7 +160,7 @@ class Scheduler:
             assign.append(batch)
         wake_at = math.inf
         recall: list[Worker] = []
-        if ledger.uneven():
+        if ledger.imbalanced():
             recall = ledger.recall(now)
             wake_at = ledger.next_recall() or wake_at
         dismiss: list[Member] = [worker.key for worker in ledger.spent()]

@@ -25,9 +25,9 @@ class Slots:
         self._maximum = maximum
         self._free: SharedCounter = LocalCounter.create(maximum)
 
-    def take(self, timeout: float | None) -> bool:
-        """Take a place for an item; False if none gets free in time."""
-        return self._free.take(timeout)
+    def take(self, timeout: float | None, taken: list[Any]) -> bool:
+        """Take a place for an item, and note it in ``taken``; False if none gets free in time."""
+        return self._free.take(timeout, taken)
 
     def give_back(self) -> None:
         """The item is not sent after all."""
@@ -45,7 +45,7 @@ class Slots:
 
     def used(self, waiting: int) -> int:
         """How many items there are; so many of them wait in this process."""
-        return self._maximum - self._free.value()
+        return max(0, self._maximum - self._free.value())
 
     def full(self) -> bool:
         """Whether there is no place."""
@@ -62,8 +62,9 @@ class ItemCount:
     def __init__(self) -> None:
         self._sent: SharedCounter = LocalCounter.create()
 
-    def take(self, timeout: float | None) -> bool:
+    def take(self, timeout: float | None, taken: list[Any]) -> bool:
         """There is always a place."""
+        taken.append(1)
         return True
 
     def give_back(self) -> None:
@@ -126,14 +127,19 @@ class Feeder:
         self._joins: list[util.Finalize] = []
         self._join_cancelled = False
 
-    def put(self, payload: bytes, buffers: list[memoryview]) -> None:
-        """Send a message now if it is its turn and there is room, otherwise later."""
+    def put(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
+        """Send a message now if it is its turn and there is room, otherwise later.
+
+        ``taken`` notes its place, and is emptied once that is ours to give back.
+        """
         # In this order: what the feeder has taken out, it had said before that it is sending.
         nothing_to_overtake = not self._unsent and not self._sending
         if nothing_to_overtake and self._outbox.can_try_send and self._send_now(payload, buffers):
+            taken.clear()
             return
         # The arrays behind the buffers are their owner's to change once ``put`` has returned.
-        self._unsent.append((payload, [memoryview(bytearray(view)) for view in buffers]))
+        taken[:] = None, (payload, [memoryview(bytearray(view)) for view in buffers])
+        self._unsent.extend(iter(taken.pop, None))  # from there to here, with no handler in between
         self._wake.put(True)
         if self._vacancy:
             self._start_thread()
@@ -155,7 +161,6 @@ class Feeder:
                 return True
         except OSError:
             self._slots.not_sent()
-            self._slots.give_back()
             raise
         self._slots.not_sent()
         return False

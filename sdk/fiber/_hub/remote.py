@@ -196,10 +196,14 @@ class RemoteCounter(RemoteObject):
         with self.stream() as stream:
             stream.ask(Op.ADD, n, form=ONE)
 
-    def take(self, timeout: float | None) -> bool:
+    def take(self, timeout: float | None, taken: list[Any] | None = None) -> bool:
         """Lower the count by one once it is above zero; False when ``timeout`` is over."""
         with self.stream() as stream:
-            return stream.ask(Op.TAKE, timeout=timeout).status is Status.OK
+            if stream.ask(Op.TAKE, timeout=timeout).status is not Status.OK:
+                return False
+            if taken is not None:
+                taken.append(1)
+            return True
 
     def clear(self) -> int:
         """Set the count to zero and say what it was."""

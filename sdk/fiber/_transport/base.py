@@ -47,8 +47,11 @@ class Counter(Protocol):
     def add(self, n: int = 1) -> None:
         """Raise the count and wake who waits."""
 
-    def take(self, timeout: float | None) -> bool:
-        """Lower the count by one once it is above zero; False when ``timeout`` is over."""
+    def take(self, timeout: float | None, taken: list[Any] | None = None) -> bool:
+        """Lower the count by one once it is above zero; False when ``timeout`` is over.
+
+        ``taken`` gets an entry when it is: whoever is interrupted sees there what to give back.
+        """
 
     def clear(self) -> int:
         """Set the count to zero and say what it was."""

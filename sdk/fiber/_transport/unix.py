@@ -195,12 +195,13 @@ class UnixCounter:
         """Raise the count."""
         os.eventfd_write(self._fd, n)
 
-    def take(self, timeout: float | None) -> bool:
+    def take(self, timeout: float | None, taken: list[Any] | None = None) -> bool:
         """Lower the count by one once it is above zero; False when ``timeout`` is over."""
+        noted = [] if taken is None else taken
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             try:
-                os.eventfd_read(self._fd)
+                noted.extend(map(os.eventfd_read, (self._fd,)))  # no handler runs in between
                 return True
             except BlockingIOError:
                 left = None if deadline is None else deadline - time.monotonic()
