@@ -340,14 +340,14 @@ class Pool:
         chunksize: int | None,
         timeout: float | None,
     ) -> WorkItem | None:
-        """A map to come; None if its function does not pickle, which the future is told."""
+        """A map to come; None if its function does not pickle, which the future will be told."""
         self._check_running()
         unit = 1 if chunksize is None else options.chunksize(chunksize)
         limit = self._limit(timeout)
         try:
             function = self._executor.function(func)
         except Exception as error:
-            future.set_exception(error)
+            self._executor.reject(future, error)
             return None
         return WorkItem(
             kind,
@@ -365,7 +365,7 @@ class Pool:
             if not hasattr(iterable, "__len__") or item.future is None:
                 raise
             # multiprocessing reads what has a length in the background.
-            item.future.set_exception(error)
+            self._executor.reject(item.future, error)
             return
         if chunksize is None and self._maxtasksperchild is not None:
             item.unit = default_chunksize(len(tasks), self._processes)

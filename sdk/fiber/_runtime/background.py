@@ -13,8 +13,8 @@ class BackgroundThread:
     """Does one thing after the other on a thread of its own, which starts when first needed.
 
     As ``ThreadPoolExecutor(1)``, with two differences: the thread is a daemon, so that what hangs
-    in it cannot keep the program from ending, and ``stop`` does not wait.  Only the loop's thread
-    submits, so nothing here needs a lock.
+    in it cannot keep the program from ending, and ``stop`` does not wait.  ``submit`` and ``stop``
+    are for the loop's thread only, so nothing here needs a lock.
     """
 
     def __init__(self, name: str) -> None:

@@ -22,9 +22,9 @@ from __future__ import annotations
 
 import math
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
@@ -159,7 +159,7 @@ class Executor:
         timeout: float | None = None,
     ) -> None:
         """One call of a function."""
-        call = pickle_call(future, function, args, kwargs)
+        call = pickle_call(future, function, args, kwargs, self.reject)
         if call is None:
             return
         self._check()
@@ -175,7 +175,7 @@ class Executor:
         timeout: float | None = None,
     ) -> Any:
         """The result of one call, which this thread waits for, or its exception."""
-        call = pickle_call(future, function, args, kwargs)
+        call = pickle_call(future, function, args, kwargs, self.reject)
         if call is None:
             return future.get()
         self._check()
@@ -202,10 +202,15 @@ class Executor:
 
     def broadcast(self, future: Future, function: Callable[..., Any], args: Sequence[Any]) -> None:
         """The same call on every worker, present or starting; an outcome of each."""
-        call = pickle_call(future, function, args, {})
+        call = pickle_call(future, function, args, {}, self.reject)
         if call is not None:
             self._check()
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
+
+    def reject(self, future: Future, error: BaseException) -> None:
+        """What was asked for cannot even begin, which its future is told, as all, on the loop."""
+        self._check()
+        self._loop.call_soon(future.set_exception, error)
 
     def function(self, function: Callable[..., Any]) -> Function:
         """``function``, pickled; one that pickles as an earlier one did is the same."""
@@ -342,23 +347,8 @@ class Executor:
 
     def _start_reading(self, item: WorkItem, iterable: Iterable[Any]) -> None:
         # Here, since a signal that strikes in Thread.start() leaves an error of its own.
-        reader = threading.Thread(
-            target=self._read, args=(item, iterable), name="fiber-pool-feeder", daemon=True
-        )
-        try:
-            reader.start()
-        except RuntimeError as error:  # the system has no room for it
-            self._finish(item, error)
-
-    def _read(self, item: WorkItem, iterable: Iterable[Any]) -> None:
-        """On that thread."""
-        error = None
-        try:
-            if item.stream is not None:
-                item.stream.read(iterable)
-        except BaseException as raised:
-            error = raised
-        self.finish(item, error)
+        if item.stream is not None:
+            item.stream.read_on_thread(iterable, partial(self.finish, item))
 
     def _finish(self, item: WorkItem, error: BaseException | None) -> None:
         self._jobs.end_stream(item, error)

@@ -74,7 +74,7 @@ class WorkItem:
     """A job of the ledger, and all that the ledger need not know of it.
 
     Without a ``future`` each of its tasks is a Call with its own.  A job and its work item know
-    each other; ``Executor._over`` parts them, so that results are freed when the user lets go of
+    each other; ``Jobs._over`` parts them, so that results are freed when the user lets go of
     them, not when the collector comes.
     """
 
@@ -121,15 +121,19 @@ class WorkItem:
 
 
 def pickle_call(
-    future: Future, function: Callable[..., Any], args: Iterable[Any], kwargs: Mapping[str, Any]
+    future: Future,
+    function: Callable[..., Any],
+    args: Iterable[Any],
+    kwargs: Mapping[str, Any],
+    reject: Callable[[Future, BaseException], None],
 ) -> Call | None:
-    """A call, pickled; None if it does not pickle, which the future is told."""
+    """A call, pickled; None if it does not pickle, and ``reject`` has told its future."""
     try:
         data, buffers, grants = reduction.encode_reusable((function, args, kwargs))
         if len(buffers) > work.BUFFERS:
             data, buffers = reduction.dumps((function, args, kwargs), 5), []
     except Exception as error:
-        future.set_exception(_blame_call(function, args, kwargs, error))
+        reject(future, _blame_call(function, args, kwargs, error))
         return None
     return Call(name_of(function), data, buffers, grants, future)
 
