@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -376,8 +377,12 @@ class Pool:
         return self._task_timeout if timeout is None else options.seconds("timeout", timeout)
 
     def _call_back(self, action: Callable[[], None]) -> bool:
-        """Have a callback run; False if the pool was terminated and none runs any more."""
-        return self._executor.callbacks.submit(action)
+        """Have a callback run; False if none runs any more, or the system has no thread for it."""
+        try:
+            return self._executor.callbacks.submit(action)
+        except RuntimeError:
+            sys.excepthook(*sys.exc_info())  # nobody else would hear of it
+            return False
 
     # The pool itself
 

@@ -88,8 +88,12 @@ class ManualThread:
     def __init__(self, name: str) -> None:
         self.submitted: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
         self.stopped = False
+        self.refusal: RuntimeError | None = None
+        """What stands in the way of the thread."""
 
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
+        if self.refusal is not None:
+            raise self.refusal
         if not self.stopped:
             self.submitted.append((action, args))
         return not self.stopped
@@ -173,7 +177,7 @@ class Rig:
         self.loop = ManualLoop()
         self.ports: list[Port] = []
         self.handles: list[WorkerHandle] = []
-        self.refusal: Exception | None = None
+        self.refusal: BaseException | None = None
         """What stands in the way of another worker."""
         host: Any = SimpleNamespace(
             loop=self.loop, start=self._start, config=SimpleNamespace(start_timeout=1.0)

@@ -245,6 +245,12 @@ def test_a_function_that_does_not_unpickle(pool: Pool, call: str) -> None:
         run(pool, call, tasks.UnreadableInWorker())
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_error_of_a_function_may_raise_anything_when_it_is_unpickled(pool: Pool) -> None:
+    with pytest.raises(SystemExit):
+        pool.map_async(tasks.ExitingInMaster(), [1]).get(PATIENCE)
+
+
 def run(pool: Pool, call: str, function: Any) -> Any:
     if call == "apply":
         return pool.apply(function, (1,))

@@ -25,13 +25,17 @@ class BackgroundThread:
         self._stopped = False
 
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
-        """Have it done, after what came before; False: it has been stopped, and drops it."""
+        """Have it done, after what came before; False: it has been stopped, and drops it.
+
+        RuntimeError if the system has no room for the thread; the next call tries again.
+        """
         if self._stopped:
             return False
-        self._queue.put((action, args))
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-            self._thread.start()
+            thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+            thread.start()
+            self._thread = thread
+        self._queue.put((action, args))
         return True
 
     def stop(self) -> None:

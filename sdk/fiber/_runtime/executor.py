@@ -20,6 +20,7 @@ thread, values whose unpickling could stay ``Pickled``.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
 from collections import deque
@@ -478,7 +479,7 @@ class Executor:
         for handle in handles:
             self._scheduler.starting(handle)
 
-    def _never_started(self, handles: Iterable[WorkerHandle], error: Exception | None) -> None:
+    def _never_started(self, handles: Iterable[WorkerHandle], error: BaseException | None) -> None:
         """Workers whose processes there never were; ``error``: not for want of trying."""
         failure = None
         if error is not None:
@@ -528,7 +529,8 @@ class Executor:
         if report is not None:
             self._jobs.put_losses(losses, handle.name, handle.pid, report)
         if failure is not None and (news := self._scheduler.workers.news(failure, now)):
-            self._background.submit(_say, news)
+            with contextlib.suppress(RuntimeError):  # the system has no room for its thread
+                self._background.submit(_say, news)
 
     # The end
 

@@ -27,7 +27,7 @@ class Launcher:
         loop: Loop,
         background: BackgroundThread,
         *,
-        on_failed: Callable[[Sequence[WorkerHandle], Exception | None], None],
+        on_failed: Callable[[Sequence[WorkerHandle], BaseException | None], None],
         on_late: Callable[[WorkerHandle], None],
     ) -> None:
         self._options = options
@@ -77,7 +77,10 @@ class Launcher:
     def launch_soon(self, handles: Sequence[WorkerHandle]) -> None:
         """Start some on the background thread; called on the loop's."""
         for handle in handles:
-            self._background.submit(self._launch, handle)
+            try:
+                self._background.submit(self._launch, handle)
+            except RuntimeError as error:  # the system has no room for its thread
+                self._loop.call_soon(self._on_failed, (handle,), error)
 
     def _launch(self, handle: WorkerHandle) -> None:
         error = None
@@ -85,6 +88,6 @@ class Launcher:
             try:
                 self._start(handle)
                 return
-            except Exception as raised:  # want of descriptors or memory, mostly
+            except BaseException as raised:  # want of descriptors; or the user's pickler's own
                 error = raised
         self._loop.call_soon(self._on_failed, (handle,), error)
