@@ -123,6 +123,9 @@ class Port:
         self.signals: list[int] = []
         self.gone = False
 
+    def start(self) -> None:
+        """It does what the test says."""
+
     def deliver(self, seq: int, payload: bytes, buffers: Sequence[memoryview] = ()) -> bool:
         if not self.gone:
             self.packets.append((seq, payload))
@@ -198,11 +201,12 @@ class Rig:
         self.threads[name] = ManualThread(name)
         return self.threads[name]
 
-    def _start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> Port:
+    def _start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> Port:
         if self.refusal is not None:
             raise self.refusal
         self.ports.append(Port(process.name))
-        self.handles.append(observer)
+        self.handles.append(owner)
+        self.loop.call_soon(owner.begin, self.ports[-1])
         return self.ports[-1]
 
     @property

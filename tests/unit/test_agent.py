@@ -89,7 +89,8 @@ def specification(target: Callable[..., Any], *args: Any, **options: Any) -> Chi
 def begin(agent: Agent, target: Callable[..., Any], *args: Any, **options: Any) -> Any:
     """A child, once its agent has looked at it."""
     observer = Recorder()
-    child = agent.start(specification(target, *args, **options), observer)
+    child = agent.child(specification(target, *args, **options), observer)
+    agent.loop.call_soon(child.start)
     settled(agent.loop)
     if child.start_error is not None:
         raise child.start_error

@@ -328,7 +328,7 @@ def remote() -> tuple[RemoteAgent, Silent, Recorder]:
     link = Silent()
     agent = RemoteAgent("far", SimulatedLoop(), link, Output(), on_lost=lambda *_: None)  # type: ignore[arg-type]
     observer = Recorder()
-    agent.start(ChildSpec("child", "fork", b"", b"", tasks=True), observer)
+    agent.child(ChildSpec("child", "fork", b"", b"", tasks=True), observer).start()
     return agent, link, observer
 
 
@@ -362,4 +362,25 @@ def test_a_lost_agent_starts_nothing_more(remote: Any) -> None:
     agent, _, _ = remote
     agent.on_lost("silence")
     with pytest.raises(RuntimeError, match="agent far cannot start child: silence"):
-        agent.start(ChildSpec("child", "fork", b"", b""), Recorder())
+        agent.child(ChildSpec("child", "fork", b"", b""), Recorder())
+
+
+def test_a_child_whose_agent_is_lost_before_it_starts_is_lost_with_it(remote: Any) -> None:
+    agent, link, _ = remote
+    agent.join(link)
+    observer = Recorder()
+    child = agent.child(ChildSpec("child", "fork", b"", b""), observer)
+    agent.on_lost("silence")
+    sent = len(link.sent)
+    child.start()
+    assert observer.events == ["exited"]
+    assert observer.wait_for_exit().reason == "agent far lost: silence"
+    assert len(link.sent) == sent
+
+
+def test_a_child_that_is_to_start_counts_until_it_is_dropped(remote: Any) -> None:
+    agent, _, _ = remote
+    child = agent.child(ChildSpec("child", "fork", b"", b""), Recorder())
+    assert agent.children == 2
+    del child
+    assert agent.children == 1

@@ -6,6 +6,7 @@ import itertools
 import pickle
 import signal
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -47,6 +48,7 @@ class RemoteAgent:
         self._lock = threading.RLock()  # a finalizer may send, wherever the collector runs
         self._ids = itertools.count(1)
         self._children: dict[int, RemoteChild] = {}
+        self._to_start: weakref.WeakSet[RemoteChild] = weakref.WeakSet()
         self._link: Link | None = None
         self._early: list[Frame] = []
         self._lost: str | None = None
@@ -58,8 +60,8 @@ class RemoteAgent:
 
     @property
     def children(self) -> int:
-        """How many children it has."""
-        return len(self._children)
+        """How many children it has, or is about to have."""
+        return len(self._children) + len(self._to_start)
 
     @property
     def joined(self) -> bool:
@@ -75,18 +77,22 @@ class RemoteAgent:
                 link.send(frame)
         link.attach(self)
 
-    def start(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
-        """Start a child there."""
-        child = RemoteChild(self, next(self._ids), spec.name, observer)
-        with self._lock:
-            lost = self._lost
-            if lost is None:
-                self._children[child.number] = child
-        if lost is not None:
-            raise RuntimeError(f"agent {self.host} cannot start {spec.name}: {lost}")
-        fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
-        self.send(messages.Start(child.number, pickle.dumps(fields, protocol=5)))
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
+        """A child to be started there."""
+        if self._lost is not None:
+            raise RuntimeError(f"agent {self.host} cannot start {spec.name}: {self._lost}")
+        child = RemoteChild(self, next(self._ids), spec, observer)
+        self._to_start.add(child)
         return child
+
+    def start(self, child: RemoteChild, message: messages.Start) -> None:
+        """Start it.  On the loop's thread."""
+        self._to_start.discard(child)
+        if self._lost is not None:
+            child.end(self._report_of_loss(self._lost))
+            return
+        self._children[child.number] = child
+        self.send(message)
 
     def send(self, message: messages.Message) -> None:
         """Send a frame, now or when the link is there."""
@@ -112,11 +118,11 @@ class RemoteAgent:
         try:
             self._on_lost(self, reason)
         finally:  # whatever becomes of it, nobody must wait for these
-            report = ExitReport(
-                -signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host
-            )
             for child in children.values():
-                child.end(report)
+                child.end(self._report_of_loss(reason))
+
+    def _report_of_loss(self, reason: str) -> ExitReport:
+        return ExitReport(-signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host)
 
     # What comes over the link, on the loop's thread
 
@@ -156,9 +162,11 @@ class RemoteAgent:
 class RemoteChild:
     """A ``ChildHandle`` whose child is on another host."""
 
-    def __init__(self, agent: RemoteAgent, number: int, name: str, observer: ChildObserver) -> None:
+    def __init__(
+        self, agent: RemoteAgent, number: int, spec: ChildSpec, observer: ChildObserver
+    ) -> None:
         self.number = number
-        self.name = name
+        self.name = spec.name
         self.host = agent.host
         self.pid: int | None = None
         self.start_error: Exception | None = None
@@ -168,6 +176,16 @@ class RemoteChild:
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteChannel | None = None
         self._gone = False
+        fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
+        self._start: messages.Start | None = messages.Start(
+            number, pickle.dumps(fields, protocol=5)
+        )
+
+    def start(self) -> None:
+        """Have it started."""
+        message, self._start = self._start, None
+        assert message is not None
+        self._agent.start(self, message)
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to its task channel; False if its end is known."""

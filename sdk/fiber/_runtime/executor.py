@@ -104,7 +104,6 @@ class Executor:
             self._loop,
             self._background,
             on_failed=self._never_started,
-            on_late=self._ready,
         )
         self._leases = Leases(
             self._scheduler, self._loop, on_adopted=self._adopt, on_back=self._back
@@ -490,9 +489,6 @@ class Executor:
 
     def _ready(self, handle: WorkerHandle) -> None:
         """A worker is initialized."""
-        handle.is_ready = True
-        if handle.port is None:  # whoever started it is about to note how to reach it, and calls
-            return
         self._scheduler.ready(handle, self._loop.now())
         self._advance()
 
