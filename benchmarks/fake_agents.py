@@ -59,11 +59,9 @@ class FakeAgent:
         self.on_ready = on_ready
         self._numbers = itertools.count(1)
 
-    def start(self, spec: ChildSpec, observer: ChildObserver) -> FakeChild:
-        """Start a child, which is ready soon."""
-        child = FakeChild(self, spec.name, next(self._numbers), observer)
-        self.loop.call_later(_BIRTH, child.begin)
-        return child
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> FakeChild:
+        """A child, which is ready soon after it is started."""
+        return FakeChild(self, spec.name, next(self._numbers), observer)
 
     def close(self) -> None:
         """Nothing is left behind by objects."""
@@ -81,6 +79,10 @@ class FakeChild:
         self._agent = agent
         self._observer = observer
         self._gone = False
+
+    def start(self) -> None:
+        """It will be there."""
+        self._agent.loop.call_later(_BIRTH, self.begin)
 
     def begin(self) -> None:
         """It is there, and ready, if it lives. On the loop's thread, as all that follows of it."""

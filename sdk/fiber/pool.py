@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -340,14 +341,14 @@ class Pool:
         chunksize: int | None,
         timeout: float | None,
     ) -> WorkItem | None:
-        """A map to come; None if its function does not pickle, which the future is told."""
+        """A map to come; None if its function does not pickle, which the future will be told."""
         self._check_running()
         unit = 1 if chunksize is None else options.chunksize(chunksize)
         limit = self._limit(timeout)
         try:
             function = self._executor.function(func)
         except Exception as error:
-            future.set_exception(error)
+            self._executor.reject(future, error)
             return None
         return WorkItem(
             kind,
@@ -365,7 +366,7 @@ class Pool:
             if not hasattr(iterable, "__len__") or item.future is None:
                 raise
             # multiprocessing reads what has a length in the background.
-            item.future.set_exception(error)
+            self._executor.reject(item.future, error)
             return
         if chunksize is None and self._maxtasksperchild is not None:
             item.unit = default_chunksize(len(tasks), self._processes)
@@ -376,8 +377,12 @@ class Pool:
         return self._task_timeout if timeout is None else options.seconds("timeout", timeout)
 
     def _call_back(self, action: Callable[[], None]) -> bool:
-        """Have a callback run; False if the pool was terminated and none runs any more."""
-        return self._executor.callbacks.submit(action)
+        """Have a callback run; False if none runs any more, or the system has no thread for it."""
+        try:
+            return self._executor.callbacks.submit(action)
+        except RuntimeError:
+            sys.excepthook(*sys.exc_info())  # nobody else would hear of it
+            return False
 
     # The pool itself
 

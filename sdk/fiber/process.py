@@ -73,11 +73,17 @@ class Process(BaseProcess):
         if getattr(current_process(), "_inheriting", False):
             raise RuntimeError(UNGUARDED_MAIN)
         _drop_ended()
-        self._popen: Any = self._Popen()
-        self._sentinel = self._popen.sentinel
-        # The child has them now; here they would keep the target's arguments alive.
-        del self._target, self._args, self._kwargs  # type: ignore[attr-defined]
-        _mp._children.add(self)  # type: ignore[attr-defined]
+        popen: Any = None
+        try:
+            self._popen = popen = self._Popen()
+            self._sentinel = popen.sentinel
+            # The child has them now; here they would keep the target's arguments alive.
+            del self._target, self._args, self._kwargs  # type: ignore[attr-defined]
+            _mp._children.add(self)  # type: ignore[attr-defined]
+        except BaseException:
+            if popen is not None:
+                popen.kill()  # an interruption: nobody has been told of it
+            raise
         if self._popen.returncode is not None:  # its end came first, and found nothing to drop
             _mp._children.discard(self)  # type: ignore[attr-defined]
 

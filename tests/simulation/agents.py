@@ -79,12 +79,13 @@ class Agent:
         self._cut_number = 0
         self._children: list[Child] = []
 
-    def start(self, observer: ChildObserver) -> Child:
+    def start(self, child: Child) -> None:
         """Start a worker."""
-        child = Child(self, self.world.next_worker(), observer)
+        if self.lost:
+            child.give_up()
+            return
         self._children.append(child)
         self.down.send(child.be_born)
-        return child
 
     def cut(self, seconds: float) -> None:
         """Let nothing through for a while."""
@@ -165,6 +166,10 @@ class Child:
         self._channel: Channel | None = None
         self._observer = observer
         self._unread: dict[int, None] = {}
+
+    def start(self) -> None:
+        """Start it."""
+        self.agent.start(self)
 
     def deliver(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to it; False if it is known to be gone."""

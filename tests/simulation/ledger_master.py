@@ -380,7 +380,8 @@ class LedgerMaster:
     def _start(self) -> None:
         member = Member(self)
         agents = [agent for agent in self.world.agents if not agent.lost]
-        member.child = self.world.start(self._rng.choice(agents), member)
+        member.child = self.world.child(self._rng.choice(agents), member)
+        member.child.start()
         self._members[member.child] = member
         self.ledger.starting += 1
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from fiber._runtime.outcome import Failure, Pickled
 from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
-from fiber.errors import StartError, TimeoutError, WorkerDied
+from fiber.errors import StartError, TimeoutError, UnpicklableError, WorkerDied
 from simulation.oracle import Account, Violation
 from simulation.schedule import Act
 from simulation.wire import value_of
@@ -105,9 +105,11 @@ class Outcomes:
     def set_exception(self, error: BaseException) -> None:
         """There will be no more."""
         account, number = self.account, self.account.number
+        if not self._master.world.loop.on_thread():
+            raise Violation(f"job {number} hears on another thread than the loop's that it is over")
         self._end()
-        if self.call is not None and not self._master.world.loop.on_thread():
-            self._refuse(Ref(number, self.call), error)
+        if self.call is not None and isinstance(error, UnpicklableError):
+            self._reject(Ref(number, self.call), error)
             return
         late = isinstance(error, ValueError) and str(error) == "Pool not running"
         if late and not self._master.is_closing:
@@ -125,9 +127,10 @@ class Outcomes:
             self._master.world.note("job %d is aborted: %s", number, type(error).__name__)
             account.cancelled = True
 
-    def _refuse(self, ref: Ref, error: BaseException) -> None:
-        """A call does not pickle, as its caller hears at once."""
-        self._put(ref, Failure(error))
+    def _reject(self, ref: Ref, error: BaseException) -> None:
+        """A call does not pickle."""
+        if ref.task < self.account.fed:  # else one before it came too late, and so did this one
+            self._put(ref, Failure(error))
         if self._master.ended_call(self.account):
             self._oracle.finished(self.account.number)
 

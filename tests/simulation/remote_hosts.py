@@ -61,11 +61,11 @@ class RemoteHost(Agent):
         """Whether nothing gets through."""
         return self._cable.is_cut
 
-    def start_for_master(self, name: str, observer: ChildObserver) -> RemoteChild:
-        """Start a worker as the master does."""
+    def child_of_master(self, name: str, observer: ChildObserver) -> RemoteChild:
+        """A worker as the master has it, to be started."""
         seen = self._seen[name] = Seen(self, name, observer)
         spec = ChildSpec(name, "fork", b"", b"", tasks=True)
-        return self._remote.start(spec, seen)
+        return self._remote.child(spec, seen)
 
     def seen(self, name: str) -> Seen:
         """What the master knows of a worker."""
@@ -113,11 +113,11 @@ class LocalPort:
         self.host = host.host
         self._host = host
 
-    def start(self, spec: ChildSpec, observer: ChildObserver) -> Child:
-        """Start a worker here."""
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> Child:
+        """A worker here, to be started."""
         if self._host.is_gone:
             raise RuntimeError("nobody is there")
-        child = self._host.world.start(self._host, observer)
+        child = self._host.world.child(self._host, observer)
         self._host.seen(spec.name).child = child
         return child
 

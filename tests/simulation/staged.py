@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 from fiber._agent import service
-from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
+from fiber._agent.interface import UNKNOWN, ExitReport
 from fiber._backends import remote
 from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._runtime import executor, launcher
 from fiber._wire.packet import Message
-from simulation.agents import Child
+from simulation.agents import Agent, Child
 from simulation.remote_hosts import NoCapture, RemoteHost
 from simulation.schedule import Famine, Refusal
 from simulation.wire import PlannedError
@@ -83,7 +83,7 @@ class Stage:
         self._actors.append(actor)
         return actor
 
-    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildHandle:
+    def start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> None:
         """Start a worker on some agent."""
         if self.running is not None:
             # What comes of it comes after all that this thread has asked for.
@@ -92,27 +92,32 @@ class Stage:
         famine = self.world.famine()
         if self._started in self._refusals or famine is Famine.REFUSED:
             self.world.note("the start of a worker is refused")
-            return self._refuse(observer)
+            self._refuse(owner)
+            return
         agent = self.rng.choice([agent for agent in self.world.agents if not agent.lost])
         if isinstance(agent, RemoteHost):
-            port: ChildHandle = agent.start_for_master(f"start {self._started}", observer)
+            child = agent.child_of_master(f"start {self._started}", owner)
+            self.loop.call_soon(owner.begin, child)
         else:
-            port = self.world.start(agent, observer)
+            self.loop.call_soon(self._begin, agent, owner)
         self.pause()
-        return port
 
-    def _refuse(self, observer: Any) -> ChildHandle:
+    def _begin(self, agent: Agent, owner: Any) -> None:
+        owner.begin(self.world.child(agent, owner))
+
+    def _refuse(self, owner: Any) -> None:
         """The system has no room for it, as is seen at once, or by its agent."""
         error = OSError("too many open files")
         if self.rng.random() < 0.5:
             raise error
-        port = mock.Mock(spec_set=("start_error", "name", "deliver", "signal"), start_error=None)
-        self.loop.call_soon(self._tell_refusal, port, observer, error)
-        return port
+        attributes = "start", "start_error", "name", "deliver", "signal"
+        port = mock.Mock(spec_set=attributes, start_error=None)
+        self.loop.call_soon(owner.begin, port)
+        self.loop.call_soon(self._tell_refusal, port, owner, error)
 
-    def _tell_refusal(self, port: Any, observer: Any, error: OSError) -> None:
+    def _tell_refusal(self, port: Any, owner: Any, error: OSError) -> None:
         port.start_error = error
-        observer.exited(ExitReport(UNKNOWN, f"could not be started: {error}"))
+        owner.exited(ExitReport(UNKNOWN, f"could not be started: {error}"))
 
     def run_user_code(self) -> None:
         """What every piece of the user's code does."""

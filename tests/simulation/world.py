@@ -232,9 +232,9 @@ class World:
         if self._calls > CALLS:
             raise Violation("it goes round in circles")
 
-    def start(self, agent: Agent, observer: ChildObserver) -> Child:
-        """Start a worker on ``agent``."""
-        child = agent.start(observer)
+    def child(self, agent: Agent, observer: ChildObserver) -> Child:
+        """A worker on ``agent``, to be started."""
+        child = Child(agent, self.next_worker(), observer)
         self.workers.append(child.worker)
         self.note("%s is started on %s", child.name, agent.host)
         return child

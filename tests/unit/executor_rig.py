@@ -88,8 +88,12 @@ class ManualThread:
     def __init__(self, name: str) -> None:
         self.submitted: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
         self.stopped = False
+        self.refusal: RuntimeError | None = None
+        """What stands in the way of the thread."""
 
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
+        if self.refusal is not None:
+            raise self.refusal
         if not self.stopped:
             self.submitted.append((action, args))
         return not self.stopped
@@ -118,6 +122,9 @@ class Port:
         self.recalls = 0
         self.signals: list[int] = []
         self.gone = False
+
+    def start(self) -> None:
+        """It does what the test says."""
 
     def deliver(self, seq: int, payload: bytes, buffers: Sequence[memoryview] = ()) -> bool:
         if not self.gone:
@@ -176,7 +183,7 @@ class Rig:
         self.loop = ManualLoop()
         self.ports: list[Port] = []
         self.handles: list[WorkerHandle] = []
-        self.refusal: Exception | None = None
+        self.refusal: BaseException | None = None
         """What stands in the way of another worker."""
         host: Any = SimpleNamespace(
             loop=self.loop, start=self._start, config=SimpleNamespace(start_timeout=1.0)
@@ -197,11 +204,12 @@ class Rig:
         self.threads[name] = ManualThread(name)
         return self.threads[name]
 
-    def _start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> Port:
+    def _start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> Port:
         if self.refusal is not None:
             raise self.refusal
         self.ports.append(Port(process.name))
-        self.handles.append(observer)
+        self.handles.append(owner)
+        self.loop.call_soon(owner.begin, self.ports[-1])
         return self.ports[-1]
 
     @property

@@ -238,6 +238,38 @@ class Unpicklable:
         return "<Unpicklable>"
 
 
+class Exiting:
+    """Does not pickle, and wants to end the process once it has said so ``refusals`` times."""
+
+    def __init__(self, refusals: int = 0) -> None:
+        self.refusals = refusals
+
+    def __reduce__(self) -> NoReturn:
+        self.refusals -= 1
+        raise SystemExit("no") if self.refusals < 0 else TypeError("cannot be pickled")
+
+
+class ExitingInMaster:
+    """A function that unpickles nowhere, with an error that unpickles in workers only."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _raise_exiting, (os.getpid(),)
+
+    def __call__(self, value: object) -> object:
+        return value
+
+
+class _ExitsIn(Exception):
+    def __init__(self, pid: int) -> None:
+        super().__init__(pid)
+        if os.getpid() == pid:
+            raise SystemExit("no")
+
+
+def _raise_exiting(pid: int) -> NoReturn:
+    raise _ExitsIn(pid)
+
+
 class Unreprable(Unpicklable):
     def __repr__(self) -> str:
         raise RuntimeError("cannot be shown")

@@ -90,7 +90,8 @@ def specification(target: Callable[..., Any], *args: Any, **options: Any) -> Chi
 def begin(agent: Agent, target: Callable[..., Any], *args: Any, **options: Any) -> Any:
     """A child, once its agent has looked at it."""
     observer = Recorder()
-    child = agent.start(specification(target, *args, **options), observer)
+    child = agent.child(specification(target, *args, **options), observer)
+    agent.loop.call_soon(child.start)
     settled(agent.loop)
     if child.start_error is not None:
         raise child.start_error
@@ -334,24 +335,6 @@ def test_no_descriptor_left_is_a_clear_error_and_leaks_none(shared: Agent, spare
     assert len(shared.progress_table._free) >= slots
     _, observer = begin(shared, os._exit, 0)
     assert observer.wait_for_exit().exitcode == 0
-
-
-def test_a_child_whose_start_was_interrupted_once_it_was_asked_for_is_killed(
-    own: Agent, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    call_soon = own.loop.call_soon
-    observer = Recorder()
-
-    def interrupted(*call: Any) -> None:
-        monkeypatch.undo()
-        call_soon(*call)
-        raise KeyboardInterrupt
-
-    spec = specification(run_forever)
-    monkeypatch.setattr(own.loop, "call_soon", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        own.start(spec, observer)
-    assert observer.wait_for_exit().exitcode == -signal.SIGKILL
 
 
 class few_descriptors:

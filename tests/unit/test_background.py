@@ -45,6 +45,24 @@ def test_the_thread_starts_when_it_is_needed(thread: BackgroundThread) -> None:
     assert "test-background" in names()
 
 
+def test_a_thread_that_the_system_has_no_room_for_is_started_when_there_is(
+    thread: BackgroundThread, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(thread: threading.Thread) -> NoReturn:
+        raise RuntimeError("can't start new thread")
+
+    seen: list[int] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        for n in range(2):
+            with pytest.raises(RuntimeError, match="can't start new thread"):
+                thread.submit(seen.append, n)
+    thread.submit(seen.append, 2)
+    thread.stop()
+    thread.join()
+    assert seen == [2]
+
+
 def test_one_that_was_never_needed_ends_at_once() -> None:
     thread = BackgroundThread("test-background")
     thread.stop()

@@ -208,7 +208,8 @@ SPEC = ChildSpec("worker-1", "fork", b"", b"", tasks=True)
 def fake_child() -> tuple[Turns, Heard, Any]:
     loop, heard = Turns(), Heard()
     agent = FakeAgent(loop, "host-1", TaskRunner())  # type: ignore[arg-type]  # all that it uses
-    child = agent.start(SPEC, heard)
+    child = agent.child(SPEC, heard)
+    child.start()
     loop.run()
     return loop, heard, child
 
@@ -239,7 +240,8 @@ def test_a_fake_child_ends_once_when_told_to_or_killed() -> None:
 def test_a_fake_child_that_was_killed_before_it_was_there_never_is() -> None:
     loop, heard = Turns(), Heard()
     agent = FakeAgent(loop, "host-1", TaskRunner())  # type: ignore[arg-type]  # all that it uses
-    child = agent.start(SPEC, heard)
+    child = agent.child(SPEC, heard)
+    child.start()
     child.signal(signal.SIGKILL)
     loop.calls.reverse()
     loop.run()

@@ -13,6 +13,7 @@ from typing import NoReturn
 import pytest
 
 from fiber._agent.interface import ExitReport
+from fiber._engine import worker_set
 from fiber._engine.ledger import PATIENCE
 from fiber._runtime.executor import KILL_AFTER
 from fiber._runtime.input_stream import InputStream
@@ -143,6 +144,16 @@ def test_an_item_that_does_not_pickle_concerns_its_task_alone(rig: Rig) -> None:
     assert type(failure) is Failure
     assert "cannot be pickled" in str(failure.error)
     assert [results.outcomes[0], results.outcomes[2]] == [None, None]
+
+
+@pytest.mark.parametrize("tries", [0, 2], ids=["to pickle it", "to find out why it does not"])
+def test_a_pickler_may_raise_anything(rig: Rig, tries: int) -> None:
+    results = rig.map([tasks.Exiting(tries)])
+    rig.answer_all()
+    assert results.done == 1
+    failure = results.outcomes[0]
+    assert type(failure) is Failure
+    assert type(failure.error) is SystemExit
 
 
 def test_broadcast(rig: Rig) -> None:
@@ -368,6 +379,65 @@ def test_a_worker_that_cannot_be_started_is_tried_again(rig: Rig) -> None:
         rig.background.run()
     rig.all_ready()
     assert len(rig.members) == 2
+
+
+@pytest.fixture
+def no_thread(rig: Rig) -> RuntimeError:
+    """What is raised as the background thread cannot be started."""
+    rig.background.refusal = RuntimeError("can't start new thread")
+    return rig.background.refusal
+
+
+def test_without_a_thread_to_pickle_them_tasks_fail(rig: Rig, no_thread: RuntimeError) -> None:
+    results = rig.map([tasks.Tattling(n) for n in range(6)])
+    assert results.done == 1
+    failures = [results.outcomes[n] for n in range(6)]
+    assert [failure.error for failure in failures] == [no_thread] * 6
+    others = rig.map(range(4))
+    rig.answer_all()
+    assert others.done == 1
+
+
+def test_without_a_thread_to_look_at_it_a_function_is_still_unusable(
+    rig: Rig, no_thread: RuntimeError
+) -> None:
+    results = rig.map([1])
+    (handle,) = rig.busy
+    error = pickle.dumps(ValueError("it does not unpickle"))
+    rig.say(handle, work.BROKEN, rig.port(handle).packets[0][0], error)
+    assert results.error is no_thread
+    assert not rig.busy
+
+
+@pytest.mark.usefixtures("no_thread")
+def test_without_a_thread_to_start_them_workers_are_tried_again(rig: Rig) -> None:
+    rig.lose(rig.handles[0])
+    assert len(rig.members) == 1
+    rig.background.refusal = None
+    for _ in range(3):
+        rig.loop.pass_time(60.0)
+        rig.background.run()
+    rig.all_ready()
+    assert len(rig.members) == 2
+
+
+@pytest.mark.usefixtures("no_thread")
+def test_without_a_thread_to_say_it_bad_news_stop_nothing(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_set, "SAID_AFTER", -1.0)
+    for handle in rig.members:
+        rig.lose(handle)
+    assert not rig.members
+
+
+def test_an_initializers_pickler_may_raise_anything() -> None:
+    rig = Rig(0, maximum=1, ready=False)
+    rig.refusal = SystemExit("no")
+    rig.map([1])
+    rig.background.run()
+    assert not rig.members
+    rig.close()
 
 
 def test_a_worker_that_is_not_ready_when_the_pool_is_closed_is_told_to_end() -> None:

@@ -14,7 +14,6 @@ import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
-from unittest import mock
 
 import pytest
 
@@ -368,7 +367,7 @@ def remote() -> tuple[RemoteAgent, Silent, Recorder]:
     link = Silent()
     agent = RemoteAgent("far", SimulatedLoop(), link, Output(), on_lost=lambda *_: None)  # type: ignore[arg-type]
     observer = Recorder()
-    agent.start(ChildSpec("child", "fork", b"", b"", tasks=True), observer)
+    agent.child(ChildSpec("child", "fork", b"", b"", tasks=True), observer).start()
     return agent, link, observer
 
 
@@ -384,25 +383,6 @@ def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
     assert observer.events == ["started", "received", "exited"]
     assert observer.report.reason == "agent far lost: silence"
     assert observer.report.exitcode == -signal.SIGKILL
-
-
-def test_a_child_whose_start_was_interrupted_once_it_was_asked_for_is_killed(
-    remote: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    agent, link, _ = remote
-    agent.join(link)
-    call_soon = agent.loop.call_soon
-
-    def interrupted(*call: Any) -> None:
-        monkeypatch.undo()
-        call_soon(*call)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(agent.loop, "call_soon", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        agent.start(ChildSpec("unknown", "fork", b"", b""), Recorder())
-    agent.loop.run_for(0)
-    assert link.sent[-1] == messages.Signal(2, signal.SIGKILL)
 
 
 def test_what_was_asked_before_it_joined_is_sent_when_it_does(remote: Any) -> None:
@@ -422,27 +402,25 @@ def test_a_lost_agent_starts_nothing_more(remote: Any) -> None:
     agent, _, _ = remote
     agent.on_lost("silence")
     with pytest.raises(RuntimeError, match="agent far cannot start child: silence"):
-        agent.start(ChildSpec("child", "fork", b"", b""), Recorder())
+        agent.child(ChildSpec("child", "fork", b"", b""), Recorder())
 
 
-def test_an_agent_that_is_lost_while_a_child_is_on_its_way_there_tells_its_end(remote: Any) -> None:
-    agent, link, observer = remote
-    late = Recorder()
-    agent.start(ChildSpec("late", "fork", b"", b""), late)
-    assert agent.children == 2, "before the loop has looked at them"
-    agent.on_lost("silence")
+def test_a_child_whose_agent_is_lost_before_it_starts_is_lost_with_it(remote: Any) -> None:
+    agent, link, _ = remote
     agent.join(link)
-    agent.loop.run_for(0)
-    assert observer.events == late.events == ["exited"]
-    assert link.sent == []
+    observer = Recorder()
+    child = agent.child(ChildSpec("child", "fork", b"", b""), observer)
+    agent.on_lost("silence")
+    sent = len(link.sent)
+    child.start()
+    assert observer.events == ["exited"]
+    assert observer.wait_for_exit().reason == "agent far lost: silence"
+    assert len(link.sent) == sent
 
 
-def test_a_start_that_a_signal_interrupts_leaves_nothing(remote: Any) -> None:
+def test_a_child_that_is_to_start_counts_until_it_is_dropped(remote: Any) -> None:
     agent, _, _ = remote
-    before = agent.children
-    with (
-        mock.patch.object(agent.loop, "call_soon", side_effect=KeyboardInterrupt),
-        pytest.raises(KeyboardInterrupt),
-    ):
-        agent.start(ChildSpec("never", "fork", b"", b""), Recorder())
-    assert agent.children == before
+    child = agent.child(ChildSpec("child", "fork", b"", b""), Recorder())
+    assert agent.children == 2
+    del child
+    assert agent.children == 1

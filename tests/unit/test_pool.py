@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -238,6 +240,18 @@ def test_imap_goes_on_behind_a_task_that_raised(pool: Pool) -> None:
 
 
 # Callbacks
+
+
+def test_without_a_thread_for_its_callback_a_result_is_there_and_that_is_seen(
+    pool: Pool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusal = RuntimeError("can't start new thread")
+    shown: list[BaseException] = []
+    monkeypatch.setattr(sys, "excepthook", lambda _kind, error, _traceback: shown.append(error))
+    monkeypatch.setattr(pool._executor.callbacks, "submit", mock.Mock(side_effect=refusal))
+    called: list[int] = []
+    assert pool.apply_async(tasks.square, (3,), callback=called.append).get(PATIENCE) == 9
+    assert (called, shown) == ([], [refusal])
 
 
 def test_callbacks_come_in_order_and_before_the_result(pool: Pool) -> None:

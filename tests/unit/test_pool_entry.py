@@ -17,14 +17,19 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from multiprocessing import util
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import Any
 
 import pytest
 
 import fiber
+from fiber import pool as pool_module
+from fiber import process
+from fiber._agent import agent, local_child
 from fiber._engine.scheduler import Scheduler
+from fiber._runtime import executor, launcher, popen, state, worker_handle
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.state import runtime
 from fiber.pool import Pool
@@ -76,15 +81,17 @@ each_call = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS.keys())
 
 
 class Striking:
-    """For a ``with`` block: do something once at each line of Fiber's that this thread passes.
+    """For a ``with`` block: do something once at each line of Fiber's, or of some of its modules,
+    that this thread passes.
 
     What that raises is raised at the line, and nothing is done at further ones; lines of finalizers
     are spared then, as what is raised there is lost.
     """
 
-    def __init__(self, action: Callable[[], object]) -> None:
+    def __init__(self, action: Callable[[], object], *modules: ModuleType) -> None:
         self.struck: set[tuple[Any, int]] = set()
         self._action = action
+        self._files = tuple(str(module.__file__) for module in modules) or FIBER
         self._before: Any = None
 
     def begin(self) -> None:
@@ -102,7 +109,7 @@ class Striking:
         self.end()
 
     def _trace(self, frame: FrameType, event: str, argument: Any) -> Any:
-        if not frame.f_code.co_filename.startswith(FIBER) or _within_finalizer(frame):
+        if not frame.f_code.co_filename.startswith(self._files) or _within_finalizer(frame):
             return None
         line = (frame.f_code, frame.f_lineno)
         if event == "line" and line not in self.struck:
@@ -361,6 +368,65 @@ def test_a_pool_that_the_collector_finds_while_the_loop_works_for_it_ends(
     finally:
         gc.enable()
     wait_until(lambda: not multiprocessing.active_children(), "its workers end")
+
+
+# Starts
+
+
+STARTING = (
+    agent,
+    executor,
+    launcher,
+    local_child,
+    pool_module,
+    popen,
+    process,
+    state,
+    worker_handle,
+)
+
+
+def living() -> list[Any]:
+    """The children of this host's agent, which knows all that there are."""
+    return list(runtime().backend._agent._children.values())  # type: ignore[attr-defined]
+
+
+def at_exit() -> list[Any]:
+    """Pools that are there, and will be waited for."""
+    gc.collect()
+    finalizers: list[Any] = list(util._finalizer_registry.values())  # type: ignore[attr-defined]
+    return [each for each in finalizers if each._callback is pool_module._abandon]
+
+
+@pytest.mark.usefixtures("_signals_raise")
+@pytest.mark.filterwarnings("ignore:unclosed running:ResourceWarning")
+def test_a_pool_whose_start_was_interrupted_at_any_line_leaves_no_worker() -> None:
+    striking = Striking(lambda: signal.raise_signal(signal.SIGUSR1), *STARTING)
+    struck = -1
+    while len(striking.struck) > struck:
+        struck = len(striking.struck)
+        pools = []
+        with contextlib.suppress(Stop), striking:
+            pools.append(fiber.Pool(1))
+        pools.clear()
+        wait_until(lambda: not living(), "its worker ends")
+        wait_until(lambda: not at_exit(), "the end of the program has nothing to wait for")
+    assert struck > 100
+
+
+@pytest.mark.usefixtures("_signals_raise")
+def test_a_process_whose_start_was_interrupted_at_any_line_ends_or_is_known() -> None:
+    striking = Striking(lambda: signal.raise_signal(signal.SIGUSR1), *STARTING)
+    struck = -1
+    while len(striking.struck) > struck:
+        struck = len(striking.struck)
+        with contextlib.suppress(Stop), striking:
+            fiber.Process(target=time.sleep, args=(PATIENCE,)).start()
+        for known in multiprocessing.active_children():
+            known.kill()
+            known.join()
+        wait_until(lambda: not living(), "it ends")
+    assert struck > 50
 
 
 # Forks

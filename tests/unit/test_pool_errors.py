@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 
 import fiber
+from fiber._runtime.background import BackgroundThread
 from fiber.errors import UnpicklableError
-from fiber.pool import Pool
+from fiber.pool import AsyncResult, Pool
 from unit import pool_tasks as tasks
 
 PATIENCE = tasks.PATIENCE
@@ -197,10 +198,57 @@ def test_a_function_that_does_not_pickle(pool: Pool, call: str) -> None:
         run(pool, call, tasks.Unpicklable().__repr__)
 
 
+class Unreadable:
+    """It has a length, and fails when it is read."""
+
+    def __len__(self) -> int:
+        return 1
+
+    def __iter__(self) -> Iterator[int]:
+        raise ValueError("unreadable")
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda pool, tell: pool.apply_async(tasks.square, (threading.Lock(),), {}, None, tell),
+        lambda pool, tell: pool.map_async(tasks.Unpicklable().__repr__, [1], None, None, tell),
+        lambda pool, tell: pool.map_async(tasks.square, Unreadable(), None, None, tell),
+    ],
+    ids=["a call", "a function", "items"],
+)
+def test_of_what_cannot_be_sent_results_hear_on_the_loop_as_of_all_else(
+    pool: Pool,
+    ask: Callable[[Pool, Callable[[Any], None]], AsyncResult],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """So that the callbacks' thread is started, used and stopped by one thread."""
+    on_loop: list[bool] = []
+    submit = BackgroundThread.submit
+
+    def noting(thread: BackgroundThread, *args: Any) -> bool:
+        on_loop.append(pool._executor.on_loop())
+        return submit(thread, *args)
+
+    monkeypatch.setattr(BackgroundThread, "submit", noting)
+    told: list[BaseException] = []
+    result = ask(pool, told.append)
+    with pytest.raises(Exception) as caught:
+        result.get(tasks.PATIENCE)
+    assert told == [caught.value]
+    assert on_loop == [True]
+
+
 @pytest.mark.parametrize("call", ["map", "starmap", "imap", "apply", "broadcast"])
 def test_a_function_that_does_not_unpickle(pool: Pool, call: str) -> None:
     with pytest.raises(RuntimeError, match="cannot be unpickled in a worker"):
         run(pool, call, tasks.UnreadableInWorker())
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_error_of_a_function_may_raise_anything_when_it_is_unpickled(pool: Pool) -> None:
+    with pytest.raises(SystemExit):
+        pool.map_async(tasks.ExitingInMaster(), [1]).get(PATIENCE)
 
 
 def run(pool: Pool, call: str, function: Any) -> Any:

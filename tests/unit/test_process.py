@@ -248,6 +248,9 @@ class Port:
     def __init__(self) -> None:
         self.signals: list[int] = []
 
+    def start(self) -> None:
+        """Nothing comes of it."""
+
     def signal(self, signum: int) -> None:
         self.signals.append(signum)
 
@@ -256,9 +259,21 @@ class Port:
 def silent(monkeypatch: pytest.MonkeyPatch, runtime: state.Runtime) -> Port:
     """An agent that never answers."""
     port = Port()
-    monkeypatch.setattr(runtime, "start", lambda *_, **__: port)
+
+    def start(_process: Any, owner: Any, **_: Any) -> Port:
+        runtime.loop.call_soon(owner.begin, port)
+        return port
+
+    monkeypatch.setattr(runtime, "start", start)
     monkeypatch.setattr(runtime, "config", config.load({"start_timeout": 0.05}))
     return port
+
+
+def settle(runtime: state.Runtime) -> None:
+    """Let the loop do all that it was asked for."""
+    done = threading.Event()
+    runtime.loop.call_soon(done.set)
+    assert done.wait(PATIENCE)
 
 
 def test_an_agent_that_does_not_answer_is_an_error_and_the_late_child_is_killed(
@@ -267,6 +282,7 @@ def test_an_agent_that_does_not_answer_is_an_error_and_the_late_child_is_killed(
     before = open_files()
     with pytest.raises(StartError, match=r"process 'slow' did not start.*'elsewhere'.*0\.05 s"):
         fiber.Process(target=os.getpid, name="slow").start()
+    settle(state.runtime())
     assert silent.signals == [signal.SIGKILL]
     assert open_files() == before
 
@@ -280,6 +296,7 @@ def test_an_interrupted_start_kills_the_late_child(
     monkeypatch.setattr(popen.Popen, "_wait_for_birth", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fiber.Process(target=os.getpid).start()
+    settle(state.runtime())
     assert silent.signals == [signal.SIGKILL]
 
 

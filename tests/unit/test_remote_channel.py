@@ -30,9 +30,9 @@ class Far:
         nothing: Any = mock.MagicMock()
         self.agent = RemoteAgent("far", self.loop, nothing, nothing, on_lost=lambda *_: None)
         self.observer = Recorder()
-        self.child: RemoteChild = self.agent.start(
-            ChildSpec("child", "fork", b"", b"", tasks=True), self.observer
-        )
+        spec = ChildSpec("child", "fork", b"", b"", tasks=True)
+        self.child: RemoteChild = self.agent.child(spec, self.observer)
+        self.child.start()
         self.agent.join(self.link)
 
     def sent(self) -> list[int]:

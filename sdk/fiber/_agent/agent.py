@@ -3,9 +3,9 @@
 In a program with the local backend it lives in the program itself, on its loop; elsewhere it is a
 process of its own (``python -m fiber.agent``) whose ``ChildObserver`` is the link to the master.
 
-Everything happens on the loop's thread.  ``start``, and a child's ``recall`` and ``signal``,
-come from anywhere and only put into the loop's queue; so no lock is needed that a finalizer or a
-signal handler could meet.
+Everything happens on the loop's thread.  ``child``, which changes nothing here, and a child's
+``recall`` and ``signal``, which only put into the loop's queue, come from anywhere; so no lock is
+needed that a finalizer or a signal handler could meet.
 """
 
 from __future__ import annotations
@@ -45,32 +45,24 @@ class Agent:
         self._zygotes: list[ZygoteLink] = []
         self._closed = False
 
-    def start(self, spec: ChildSpec, observer: ChildObserver) -> LocalChild:
-        """Start a child; it has its pid when ``observer.started`` is called.
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> LocalChild:
+        """A child to be started; it has its pid when ``observer.started`` is called.
 
         What keeps it from starting is its ``exited``, but for what can be seen here and now.
         """
         if self._closed:
             close_all(spec.fds)
             raise RuntimeError(_ENDING)
-        child = LocalChild(self, next(self._ids), spec, observer)
-        if self.loop.on_thread():
-            self._start(child)  # what is asked of it next, in this very turn, finds it there
-            return child
-        try:
-            self.loop.call_soon(self._start, child)
-        except BaseException:  # Ctrl-C: it may be started, and nobody will know it
-            child.signal(signal.SIGKILL)
-            raise
-        return child
+        return LocalChild(self, next(self._ids), spec, observer)
 
-    def _start(self, child: LocalChild) -> None:
+    def start(self, child: LocalChild) -> None:
+        """Start one of our children."""
         self._children[child.id] = child
         try:
             child.open()
             if self._closed:
                 raise RuntimeError(_ENDING)
-            child.start(self._zygote(), self._access())
+            child.fork_from(self._zygote(), self._access())
         except Exception as error:
             child.start_error = error
             self._child_exited(child, 1, f"could not be started: {error}")
@@ -160,7 +152,8 @@ class Agent:
             return  # and the end of its zygote is its own
         old = child.zygote
         try:
-            child.start(self._zygote(preload=self._zygotes[-1] is not old), self._access())
+            new = self._zygote(preload=self._zygotes[-1] is not old)
+            child.fork_from(new, self._access())
         except Exception as error:
             self._child_exited(child, 1, f"could not be started: {error}")
             return

@@ -97,6 +97,9 @@ class ChildHandle(Protocol):
     start_error: Exception | None
     """What kept it from being started, where that is not only told by its report."""
 
+    def start(self) -> None:
+        """Start it; what becomes of that, the observer hears.  Once, on the loop's thread."""
+
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to its task channel, ``seq`` (eight bytes) in front.
 
@@ -125,8 +128,8 @@ class AgentHandle(Protocol):
 
     host: str
 
-    def start(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
-        """Start a child; what goes wrong is told to the observer."""
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
+        """A child to be started; raises what is known to be in the way.  From anywhere."""
 
     def close(self) -> None:
         """Kill every child and end."""

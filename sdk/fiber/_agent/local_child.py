@@ -38,6 +38,9 @@ class Owner(Protocol):
     loop: Loop
     progress_table: ProgressTable
 
+    def start(self, child: LocalChild) -> None:
+        """Start it.  On the loop's thread."""
+
     def abandon(self, child: LocalChild) -> None:
         """It was killed before it was born.  On the loop's thread."""
 
@@ -63,12 +66,10 @@ class LocalChild:
         self._theirs: socket.socket | None = None
         self._outbox: Outbox | None = None
         self._lent = False
-        try:
-            if spec.tasks:
-                self._make_channel()
-        except BaseException:
-            self.release_descriptors()
-            raise
+
+    def start(self) -> None:
+        """Start it; what is asked of it next, in this very turn, finds it there."""
+        self._owner.start(self)
 
     def _make_channel(self) -> None:
         slot = self._owner.progress_table.claim()
@@ -85,11 +86,13 @@ class LocalChild:
 
     def open(self) -> None:
         """Be ready to hear it."""
+        if self._spec.tasks:
+            self._make_channel()
         if self._ours is not None:
             self._outbox = Outbox(self._loop, self._ours)
             self._loop.register(self._ours.fileno(), self._receive)
 
-    def start(self, zygote: ZygoteLink, hub: HubAddress | None) -> None:
+    def fork_from(self, zygote: ZygoteLink, hub: HubAddress | None) -> None:
         """Have ``zygote`` start it; ``hub`` is what it is told of its host's hub."""
         self.leave_zygote()
         self.zygote = zygote

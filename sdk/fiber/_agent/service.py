@@ -127,7 +127,8 @@ class _Observed:
         """Start it."""
         try:
             self._capture = Capture(loop, self._wrote, self._service.busy)
-            self._child = agent.start(replace(spec, stdio=self._capture.stdio), self)
+            self._child = agent.child(replace(spec, stdio=self._capture.stdio), self)
+            self._child.start()
         except Exception as error:
             # Whatever keeps a child from starting here, the one who asked is the master.
             self.exited(ExitReport(1, f"could not be started: {error}", host=agent.host))

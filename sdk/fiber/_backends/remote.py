@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import pickle
 import signal
+import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 
@@ -48,6 +49,7 @@ class RemoteAgent:
         self._on_lost = on_lost
         self._ids = itertools.count(1)
         self._children: dict[int, RemoteChild] = {}
+        self._to_start: weakref.WeakSet[RemoteChild] = weakref.WeakSet()
         self._link: Link | None = None
         self._early: list[Frame] = []
         self._lost: str | None = None
@@ -59,12 +61,12 @@ class RemoteAgent:
 
     @property
     def children(self) -> int:
-        """How many children it has."""
-        return len(self._children)
+        """How many children it has, or is about to have."""
+        return len(self._children) + len(self._to_start)
 
     def can_take(self, limit: float) -> bool:
         """Whether it may have one more child, of at most so many."""
-        return self._lost is None and len(self._children) < limit
+        return self._lost is None and self.children < limit
 
     @property
     def joined(self) -> bool:
@@ -79,21 +81,22 @@ class RemoteAgent:
             link.send(frame)
         link.attach(self)
 
-    def start(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
-        """Start a child there."""
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
+        """A child to be started there."""
         if self._lost is not None:
             raise RuntimeError(f"agent {self.host} cannot start {spec.name}: {self._lost}")
-        fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
-        child = RemoteChild(self, next(self._ids), spec.name, observer)
-        frame = messages.Start(child.number, pickle.dumps(fields, protocol=5)).encode()
-        self._children[child.number] = child  # it counts at once, wherever the next one is placed
-        try:
-            self.loop.call_soon(self._start, child, frame)
-        except BaseException:  # Ctrl-C: it may be started, and nobody will know it
-            self._children.pop(child.number, None)
-            child.signal(signal.SIGKILL)
-            raise
+        child = RemoteChild(self, next(self._ids), spec, observer)
+        self._to_start.add(child)
         return child
+
+    def start(self, child: RemoteChild, message: messages.Start) -> None:
+        """Start it.  On the loop's thread."""
+        self._to_start.discard(child)
+        if self._lost is not None:
+            child.end(self._report_of_loss(self._lost))
+            return
+        self._children[child.number] = child
+        self._send(message.encode())
 
     def send(self, message: messages.Message) -> None:
         """Send a frame as soon as there is a link."""
@@ -112,28 +115,20 @@ class RemoteAgent:
         try:
             self._on_lost(self, reason)
         finally:  # whatever becomes of it, nobody must wait for these
-            for number in list(self._children):
-                self._lose_child(number)
+            children, self._children = self._children, {}
+            for child in children.values():
+                child.end(self._report_of_loss(reason))
+
+    def _report_of_loss(self, reason: str) -> ExitReport:
+        return ExitReport(-signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host)
 
     # On the loop's thread
-
-    def _start(self, child: RemoteChild, frame: Frame) -> None:
-        if self._lost is None:
-            self._children[child.number] = child
-            self._send(frame)
-        else:
-            self._lose_child(child.number)
 
     def _send(self, frame: Frame) -> None:
         if self._link is None:
             self._early.append(frame)
         else:
             self._link.send(frame)
-
-    def _lose_child(self, number: int) -> None:
-        if (child := self._children.pop(number, None)) is not None:
-            reason = f"agent {self.host} lost: {self._lost}"
-            child.end(ExitReport(-signal.SIGKILL, reason, host=self.host))
 
     # What comes over the link
 
@@ -169,9 +164,11 @@ class RemoteAgent:
 class RemoteChild:
     """A ``ChildHandle`` whose child is on another host."""
 
-    def __init__(self, agent: RemoteAgent, number: int, name: str, observer: ChildObserver) -> None:
+    def __init__(
+        self, agent: RemoteAgent, number: int, spec: ChildSpec, observer: ChildObserver
+    ) -> None:
         self.number = number
-        self.name = name
+        self.name = spec.name
         self.host = agent.host
         self.pid: int | None = None
         self.start_error: Exception | None = None
@@ -181,6 +178,16 @@ class RemoteChild:
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None
         self._gone = False
+        fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
+        self._start: messages.Start | None = messages.Start(
+            number, pickle.dumps(fields, protocol=5)
+        )
+
+    def start(self) -> None:
+        """Have it started."""
+        message, self._start = self._start, None
+        assert message is not None
+        self._agent.start(self, message)
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to its task channel; False if its end is known."""

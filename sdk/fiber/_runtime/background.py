@@ -13,8 +13,8 @@ class BackgroundThread:
     """Does one thing after the other on a thread of its own, which starts when first needed.
 
     As ``ThreadPoolExecutor(1)``, with two differences: the thread is a daemon, so that what hangs
-    in it cannot keep the program from ending, and ``stop`` does not wait.  Only the loop's thread
-    submits, so nothing here needs a lock.
+    in it cannot keep the program from ending, and ``stop`` does not wait.  ``submit`` and ``stop``
+    are for the loop's thread only, so nothing here needs a lock.
     """
 
     def __init__(self, name: str) -> None:
@@ -25,13 +25,17 @@ class BackgroundThread:
         self._stopped = False
 
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
-        """Have it done, after what came before; False: it has been stopped, and drops it."""
+        """Have it done, after what came before; False: it has been stopped, and drops it.
+
+        RuntimeError if the system has no room for the thread; the next call tries again.
+        """
         if self._stopped:
             return False
-        self._queue.put((action, args))
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-            self._thread.start()
+            thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+            thread.start()
+            self._thread = thread
+        self._queue.put((action, args))
         return True
 
     def stop(self) -> None:

@@ -20,11 +20,12 @@ thread, values whose unpickling could stay ``Pickled``.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
@@ -103,7 +104,6 @@ class Executor:
             self._loop,
             self._background,
             on_failed=self._never_started,
-            on_late=self._ready,
         )
         self._leases = Leases(
             self._scheduler, self._loop, on_adopted=self._adopt, on_back=self._back
@@ -143,10 +143,11 @@ class Executor:
             self._end()
             raise
         handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
-        self._loop.call_soon(self._begin, handles)
         try:
+            self._loop.call_soon(self._begin, handles)
             self._launcher.launch_now(handles, self._host.config.start_timeout)
         except BaseException as error:
+            self._loop.call_soon(self._launcher.give_up, handles)
             self.terminate(error)
             raise
 
@@ -159,7 +160,7 @@ class Executor:
         timeout: float | None = None,
     ) -> None:
         """One call of a function."""
-        call = pickle_call(future, function, args, kwargs)
+        call = pickle_call(future, function, args, kwargs, self.reject)
         if call is None:
             return
         self._check()
@@ -175,7 +176,7 @@ class Executor:
         timeout: float | None = None,
     ) -> Any:
         """The result of one call, which this thread waits for, or its exception."""
-        call = pickle_call(future, function, args, kwargs)
+        call = pickle_call(future, function, args, kwargs, self.reject)
         if call is None:
             return future.get()
         self._check()
@@ -202,10 +203,15 @@ class Executor:
 
     def broadcast(self, future: Future, function: Callable[..., Any], args: Sequence[Any]) -> None:
         """The same call on every worker, present or starting; an outcome of each."""
-        call = pickle_call(future, function, args, {})
+        call = pickle_call(future, function, args, {}, self.reject)
         if call is not None:
             self._check()
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
+
+    def reject(self, future: Future, error: BaseException) -> None:
+        """What was asked for cannot even begin, which its future is told, as all, on the loop."""
+        self._check()
+        self._loop.call_soon(future.set_exception, error)
 
     def function(self, function: Callable[..., Any]) -> Function:
         """``function``, pickled; one that pickles as an earlier one did is the same."""
@@ -344,24 +350,8 @@ class Executor:
 
     def _start_reading(self, item: WorkItem, iterable: Iterable[Any]) -> None:
         # Here, since a signal that strikes in Thread.start() leaves an error of its own.
-        reader = threading.Thread(
-            target=self._read, args=(item, iterable), name="fiber-pool-feeder", daemon=True
-        )
-        try:
-            reader.start()
-        except RuntimeError as error:  # the system has no room for it
-            self._finish(item, error)
-
-    def _read(self, item: WorkItem, iterable: Iterable[Any]) -> None:
-        """On that thread."""
-        error = None
-        try:
-            stream = item.stream
-            if stream is not None:
-                stream.read(iterable)
-        except BaseException as raised:
-            error = raised
-        self.finish(item, error)
+        if item.stream is not None:
+            item.stream.read_on_thread(iterable, partial(self.finish, item))
 
     def _finish(self, item: WorkItem, error: BaseException | None) -> None:
         self._jobs.end_stream(item, error)
@@ -491,7 +481,7 @@ class Executor:
         for handle in handles:
             self._scheduler.starting(handle)
 
-    def _never_started(self, handles: Iterable[WorkerHandle], error: Exception | None) -> None:
+    def _never_started(self, handles: Iterable[WorkerHandle], error: BaseException | None) -> None:
         """Workers whose processes there never were; ``error``: not for want of trying."""
         failure = None
         if error is not None:
@@ -502,9 +492,6 @@ class Executor:
 
     def _ready(self, handle: WorkerHandle) -> None:
         """A worker is initialized."""
-        handle.is_ready = True
-        if handle.port is None:  # whoever started it is about to note how to reach it, and calls
-            return
         self._scheduler.ready(handle, self._loop.now())
         self._advance()
 
@@ -541,7 +528,8 @@ class Executor:
         if report is not None:
             self._jobs.put_losses(losses, handle.name, handle.pid, report)
         if failure is not None and (news := self._scheduler.workers.news(failure, now)):
-            self._background.submit(_say, news)
+            with contextlib.suppress(RuntimeError):  # the system has no room for its thread
+                self._background.submit(_say, news)
 
     # The end
 
@@ -584,6 +572,9 @@ class Executor:
         self._leases.close()
         self._background.stop()
         self.callbacks.stop()
+        self._ended_by = (
+            None  # its traceback may hold the pool, which this outlives in its finalizer
+        )
         self.ended.set()
 
 

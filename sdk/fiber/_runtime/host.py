@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from fiber._agent.interface import ChildHandle
-
 
 class Timer(Protocol):
     """A call that is due."""
@@ -47,5 +45,5 @@ class Host(Protocol):
     def config(self) -> Any:
         """Its configuration, of which ``start_timeout`` is wanted."""
 
-    def start(self, process: Any, observer: Any, *, tasks: bool, method: str) -> ChildHandle:
-        """Start a worker's process."""
+    def start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> object:
+        """Start a worker's process, whose ``owner`` hears of it."""

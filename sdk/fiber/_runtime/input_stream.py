@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import queue
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -70,6 +71,24 @@ class InputStream:
             if left:
                 items.extend(chunk)
                 return
+
+    def read_on_thread(
+        self, iterable: Iterable[Any], finish: Callable[[BaseException | None], None]
+    ) -> None:
+        """Read it all on a thread of its own, and ``finish`` with what was raised, if anything."""
+
+        def run() -> None:
+            error = None
+            try:
+                self.read(iterable)
+            except BaseException as raised:
+                error = raised
+            finish(error)
+
+        try:
+            threading.Thread(target=run, name="fiber-pool-feeder", daemon=True).start()
+        except RuntimeError as error:  # the system has no room for it
+            finish(error)
 
     # The user's thread
 

@@ -17,8 +17,7 @@ class Launcher:
 
     Not on the loop's thread: the user's initializer and its arguments are pickled for each, and
     agents may need the loop.  ``on_failed`` is called, on the loop's thread, with workers whose
-    processes there will never be, and why, if that was tried; ``on_late`` with a worker that was
-    ready before it could be reached.
+    processes there will never be, and why, if that was tried.
     """
 
     def __init__(
@@ -27,25 +26,22 @@ class Launcher:
         loop: Loop,
         background: BackgroundThread,
         *,
-        on_failed: Callable[[Sequence[WorkerHandle], Exception | None], None],
-        on_late: Callable[[WorkerHandle], None],
+        on_failed: Callable[[Sequence[WorkerHandle], BaseException | None], None],
     ) -> None:
         self._options = options
         self._loop = loop
         self._background = background
         self._on_failed = on_failed
-        self._on_late = on_late
 
     def launch_now(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
         """Start some on the calling thread; raises what stands in the way of one."""
-        try:
-            for handle in handles:
-                self._start(handle)
-        except BaseException:  # of those that have a port the end will be heard
-            unstarted = [handle for handle in handles if handle.port is None]
-            self._loop.call_soon(self._on_failed, unstarted, None)
-            raise
+        for handle in handles:
+            self._start(handle)
         self._raise_start_error(handles, timeout)
+
+    def give_up(self, handles: Sequence[WorkerHandle]) -> None:
+        """Starting them was interrupted; on the loop's thread, which knows whose child begins."""
+        self._on_failed([handle for handle in handles if handle.port is None], None)
 
     def _raise_start_error(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
         """Wait until their agent has looked at them: the system may have no room for them."""
@@ -66,17 +62,14 @@ class Launcher:
         )
         process.start()
         handle.process = process
-        if handle.is_ready:
-            self._loop.call_soon(self._on_late, handle)
-        if handle.leaving:  # it was told to before it could be reached
-            self._loop.call_soon(handle.dismiss)
-            if handle.unwanted:
-                handle.kill()
 
     def launch_soon(self, handles: Sequence[WorkerHandle]) -> None:
         """Start some on the background thread; called on the loop's."""
         for handle in handles:
-            self._background.submit(self._launch, handle)
+            try:
+                self._background.submit(self._launch, handle)
+            except RuntimeError as error:  # the system has no room for its thread
+                self._loop.call_soon(self._on_failed, (handle,), error)
 
     def _launch(self, handle: WorkerHandle) -> None:
         error = None
@@ -84,6 +77,6 @@ class Launcher:
             try:
                 self._start(handle)
                 return
-            except Exception as raised:  # want of descriptors or memory, mostly
+            except BaseException as raised:  # want of descriptors; or the user's pickler's own
                 error = raised
         self._loop.call_soon(self._on_failed, (handle,), error)

@@ -31,19 +31,17 @@ class Popen:
         self._port: ChildHandle | None = None
         self._born = Latch()
         self._exited = Latch()
+        loop = runtime().loop
+        loop.depend(self)
         with naming_the_limit("starting a process"):
             # Held by whoever writes to it meanwhile, so that it is closed, but never another's.
             self._at_exit: Wakeup | None = Wakeup()
         self.sentinel = self._at_exit.fd
         try:
-            runtime().loop.depend(self)
-            port = runtime().start(process, self, method=method)
-            if self.returncode is None:
-                self._port = port
-            self._wait_for_birth(port)
+            self._wait_for_birth(runtime().start(process, self, method=method))
         except BaseException:
-            # Whoever asked does not know of it: it must not go on.
-            self.kill()
+            # Whoever asked does not know of it: it must not go on, if it begins.
+            loop.call_soon(self.kill)
             self.close()
             raise
 
@@ -61,6 +59,11 @@ class Popen:
             raise StartError(f"process {self._name!r}", self.report.reason)
 
     # What the agent says, on the loop's thread
+
+    def begin(self, child: ChildHandle) -> None:
+        """It is started."""
+        self._port = child
+        child.start()
 
     def started(self, pid: int) -> None:
         """It has a pid."""

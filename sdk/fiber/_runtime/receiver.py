@@ -109,12 +109,19 @@ class Receiver:
             self._sender.split(seq, error)
         elif batch is not None:
             self._sender.dropped(batch)
-            self._background.submit(self._unpickle_fault, batch, error)
+            try:
+                self._background.submit(self._unpickle_fault, batch, error)
+            except RuntimeError as refused:  # the system has no room for its thread
+                self._unusable(batch, refused)
         self._advance()
 
     def _unpickle_fault(self, batch: Batch, error: Pickled) -> None:
         """On the background thread: whatever a worker found with a function is the user's."""
-        self._loop.call_soon(self._unusable, batch, error.decode().error)
+        try:
+            fault = error.decode().error
+        except BaseException as raised:  # what its unpickling raises may be anything
+            fault = raised
+        self._loop.call_soon(self._unusable, batch, fault)
 
     def _unusable(self, batch: Batch, error: BaseException) -> None:
         """A worker cannot unpickle the function of a batch, and has dropped it."""

@@ -54,7 +54,10 @@ class Sender:
         item: WorkItem = batch.job.owner
         if not pickles_without_user_code(item, batch):
             self._unsent.add(batch.seq)
-            self._background.submit(self._encode, item, batch)
+            try:
+                self._background.submit(self._encode, item, batch)
+            except RuntimeError as error:  # the system has no room for its thread
+                self._unsendable(batch, error)
             return
         try:
             encoded = encode(item, batch, plain=True)
@@ -68,9 +71,10 @@ class Sender:
         error: BaseException | None = None
         if batch.job is not None:
             try:
-                encoded = encode(item, batch, plain=False)
-            except Exception as raised:
-                error = blame_items(item, batch, raised)
+                try:
+                    encoded = encode(item, batch, plain=False)
+                except Exception as raised:
+                    error = blame_items(item, batch, raised)
             except BaseException as raised:  # whatever the user's pickler raises is its own
                 error = raised
         self._loop.call_soon(self._encoded, item, batch, encoded, error)

@@ -13,7 +13,7 @@ import threading
 from dataclasses import replace
 from multiprocessing import process as mp_process
 from multiprocessing import spawn, util
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber import config, inherited, reduction
 from fiber._agent import child
@@ -65,23 +65,23 @@ class Runtime:
     def start(
         self,
         process: mp_process.BaseProcess,
-        observer: ChildObserver,
+        owner: ChildOwner,
         *,
         tasks: bool = False,
         method: str = "fork",
     ) -> ChildHandle:
         """Start ``process`` as a child of some agent; ``tasks`` makes it a pool worker.
 
-        Returns at once; the observer hears what becomes of it.  An error in pickling is raised
-        here.
+        Returns at once; the owner hears what becomes of it, ``begin`` first.  An error in pickling
+        is raised here.  Whoever is interrupted here will be called ``begin``, or nothing has
+        happened; what is asked of the loop from then on comes after it.
         """
         agent = self.backend.place()
         same_host = self.backend.same_host
         preparation = self._preparation(process, agent, same_host)
         with collecting_grants(reusable=False) as grants:
             payload, fds = reduction.dump_process(process, same_host=same_host)
-        if grants:
-            observer = _Releasing(observer, grants)
+        observer = _Releasing(owner, grants) if grants else owner
         spec = ChildSpec(
             name=process.name,
             method=method,
@@ -91,7 +91,9 @@ class Runtime:
             tasks=tasks,
             executable=spawn.get_executable() if same_host else None,
         )
-        return agent.start(spec, observer)
+        made = agent.child(spec, observer)
+        self.loop.call_soon(owner.begin, made)
+        return made
 
     def _preparation(self, process: Any, agent: AgentHandle, same_host: bool) -> bytes:
         # pdb leaves its program a main module without one, which multiprocessing does not expect.
@@ -125,6 +127,13 @@ class Runtime:
         self.backend.close()
         self.loop.stop()
         self._close_hub()
+
+
+class ChildOwner(ChildObserver, Protocol):
+    """Who has a child started, and is to have it at hand from the first moment on."""
+
+    def begin(self, child: ChildHandle) -> None:
+        """Note how to reach it, and start it.  On the loop's thread, before all else."""
 
 
 class _Releasing:

@@ -125,15 +125,19 @@ class WorkItem:
 
 
 def pickle_call(
-    future: Future, function: Callable[..., Any], args: Iterable[Any], kwargs: Mapping[str, Any]
+    future: Future,
+    function: Callable[..., Any],
+    args: Iterable[Any],
+    kwargs: Mapping[str, Any],
+    reject: Callable[[Future, BaseException], None],
 ) -> Call | None:
-    """A call, pickled; None if it does not pickle, which the future is told."""
+    """A call, pickled; None if it does not pickle, and ``reject`` has told its future."""
     try:
         data, buffers, grants = reduction.encode_reusable((function, args, kwargs))
         if len(buffers) > work.BUFFERS:
             data, buffers = reduction.dumps((function, args, kwargs), 5), []
     except Exception as error:
-        future.set_exception(_blame_call(function, args, kwargs, error))
+        reject(future, _blame_call(function, args, kwargs, error))
         return None
     return Call(name_of(function), data, buffers, grants, future)
 

@@ -50,8 +50,6 @@ class WorkerHandle:
         """What its initializer, or its birth, failed with."""
         self.leaving = False
         """It was told to go, or will be at once."""
-        self.is_ready = False
-        """It said so."""
         self.unwanted = False
         """It was told to end at once, whatever it does."""
         self.returncode: int | None = None
@@ -71,9 +69,18 @@ class WorkerHandle:
     def launch(self, process: BaseProcess, method: str) -> None:
         """Start the process; returns before it exists."""
         self._launched = process
-        self.port = self._host.start(process, self, tasks=True, method=method)
+        self._host.start(process, self, tasks=True, method=method)
 
     # What the agent says, on the loop's thread
+
+    def begin(self, child: ChildHandle) -> None:
+        """It is started."""
+        self.port = child
+        child.start()
+        if self.leaving:  # it was told to before it could be reached
+            self.dismiss()
+            if self.unwanted:
+                self.kill()
 
     def started(self, pid: int) -> None:
         """It has a pid."""
