@@ -286,10 +286,9 @@ class Audit:
 
     def _check_demand(self, places: dict[Job, list[tuple[str, int, int]]]) -> None:
         wanted = sum(
-            size
+            max(0, min(size, job.reached - first)) if job.paused and place == "waiting" else size
             for job, where in places.items()
             for place, first, size in where
-            if not (job.paused and place == "waiting" and first >= job.reached)
         )
         # Whoever runs a task that was cancelled is not there for others.
         unwanted = sum(

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import random
-import sys
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
+import memory_link
+from fiber._transport import resumable_link
 from fiber._transport.link import Keepalive
 from fiber._transport.resumable_link import ResumableLink
 from fiber._transport.stream import Frame
 from memory_link import Cable, SimulatedLoop
+from unit.interrupting import is_interrupted
 
 
 class Notes:
@@ -256,33 +255,14 @@ def test_what_is_sent_after_the_end_is_not_kept(loop: SimulatedLoop) -> None:
 def test_a_send_that_a_signal_interrupts_does_not_keep_later_ones_back(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     notes = Notes(cable.agent)
-    line = 0
-    while interrupted_in(line, cable.master.send, b"lost or sent"):
-        line += 1
-        cable.master.send(b"%d" % line)
+    files = {resumable_link.__file__, memory_link.__file__}
+    step = 0
+    while is_interrupted(lambda: cable.master.send(b"lost or sent"), step, files):
+        step += 1
+        cable.master.send(b"%d" % step)
         loop.run_for(1)
-        assert notes.frames[-1] == b"%d" % line
-    assert line > 2
-
-
-def interrupted_in(line: int, call: Callable[[bytes], None], frame: bytes) -> bool:
-    """Whether a signal's handler could raise before so many lines of a call had run."""
-    lines = itertools.count()
-
-    def trace(*_: object) -> Any:
-        if next(lines) == line:
-            raise KeyboardInterrupt
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        call(frame)
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.settrace(before)
-    return False
+        assert notes.frames[-1] == b"%d" % step
+    assert step > 2
 
 
 def test_keepalive_is_configurable(loop: SimulatedLoop) -> None:
