@@ -307,12 +307,13 @@ class Executor:
         self._took_calls = now
         busy = job.fed - job.done >= self._scheduler.workers.size
         # One for each who is idle: whoever turns out to be stuck then holds up no other.
-        for call in calls[: self._ledger.idle_count()]:
+        alone = self._ledger.idle_count()
+        for call in calls[:alone]:
             self._ledger.feed(job, [call])
-            calls = calls[1:]
             self._advance()
-        self._ledger.feed(job, calls)
-        if hurried and busy and not (calls and calls[-1].blocking):
+        together = calls[alone:]
+        self._ledger.feed(job, together)
+        if hurried and busy and not (together and together[-1].blocking):
             self._wake_at(now + TICK)
         else:
             self._advance()
