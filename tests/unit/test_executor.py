@@ -464,6 +464,31 @@ def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
     rig.close()
 
 
+def test_a_pool_that_gives_up_kills_the_workers_that_do_not_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(worker_set, "TRIES", 1)
+    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", 0.0)
+    rig = Rig(2, ready=False)
+    results = rig.map(range(5))
+    rig.handles[0].exited(ExitReport(1, "exit status 1"))
+    assert results.error is not None
+    assert rig.ports[1].signals == [signal.SIGTERM]
+    rig.loop.pass_time(KILL_AFTER)
+    assert rig.ports[1].signals == [signal.SIGTERM, signal.SIGKILL]
+    rig.close()
+
+
+def test_of_a_call_that_was_tried_again_nothing_is_kept(rig: Rig) -> None:
+    results = rig.call()
+    (handle,) = rig.busy
+    rig.lose(handle, running=(rig.port(handle).packets[0][0], 0))
+    (job,) = rig.ledger.jobs
+    assert list(job.attempts.values()) == [1]
+    rig.answer_all()
+    assert (results.done, job.attempts) == (1, {})
+
+
 # The end
 
 

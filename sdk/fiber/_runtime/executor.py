@@ -391,8 +391,7 @@ class Executor:
         for job, error in decisions.failed:
             self._jobs.fail(job, error)
         handle: Any
-        for handle in decisions.end:
-            handle.terminate()
+        self._end_workers(decisions.end)
         for held in decisions.recall:
             held.key.port.recall()
         for handle in decisions.dismiss:
@@ -543,12 +542,16 @@ class Executor:
         self.callbacks.stop()
         for job in list(self._ledger.jobs):
             self._jobs.fail(job, error)
-        handles: list[Any] = list(self._scheduler.terminate())
+        self._end_workers(self._scheduler.terminate())
+        self._advance()
+
+    def _end_workers(self, members: Iterable[Any]) -> None:
+        """At once, and by force if that is of no use."""
+        handles = list(members)
         for handle in handles:
             handle.terminate()
         if handles and self._kill is None:
-            self._kill = self._loop.call_later(KILL_AFTER, _kill_all, handles)
-        self._advance()
+            self._kill = self._loop.call_later(KILL_AFTER, self._kill_all)
 
     def broken(self, error: FiberError) -> None:
         """The loop has failed: nobody will hear of the workers any more."""
@@ -558,6 +561,11 @@ class Executor:
         for handle in handles:
             handle.kill()
             handle.exited(ExitReport(UNKNOWN, str(error)))
+
+    def _kill_all(self) -> None:
+        handles: list[Any] = list(self._scheduler.workers.members)
+        for handle in handles:
+            handle.kill()
 
     def _end(self) -> None:
         """Nobody is left."""
@@ -571,11 +579,6 @@ class Executor:
         self._background.stop()
         self.callbacks.stop()
         self.ended.set()
-
-
-def _kill_all(handles: list[WorkerHandle]) -> None:
-    for handle in handles:
-        handle.kill()
 
 
 def _say(news: str) -> None:
