@@ -455,6 +455,23 @@ def test_a_process_whose_start_was_interrupted_at_any_line_ends_or_is_known() ->
     assert struck > 50
 
 
+def test_a_runtime_whose_making_was_interrupted_leaves_no_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise Stop
+
+    state.shutdown()
+    monkeypatch.setattr(state.util, "Finalize", interrupt)
+    with pytest.raises(Stop):
+        runtime()
+    monkeypatch.undo()
+    assert "fiber-io" not in [thread.name for thread in threading.enumerate()]
+    with fiber.Pool(1) as pool:
+        assert pool.apply(tasks.square, (3,)) == 9
+    pool.join()
+
+
 # Forks
 
 

@@ -239,7 +239,8 @@ class Loop:
         """End the loop after what it is doing; from another thread, wait until it has ended."""
         if self._closed:
             return
-        if self._thread is None and self._ident is None:  # it never ran
+        if self._ident is None and (self._thread is None or self._thread.ident is None):
+            # It never ran.
             self._close()
             return
         self.call_soon(self._stop)
