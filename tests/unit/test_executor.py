@@ -7,11 +7,11 @@ import pickle
 import signal
 import weakref
 from collections.abc import Iterator
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import pytest
 
-from fiber._agent.interface import ExitReport
+from fiber._agent.interface import Cause, ExitReport
 from fiber._engine import worker_set
 from fiber._engine.ledger import PATIENCE
 from fiber._runtime.executor import KILL_AFTER
@@ -461,6 +461,28 @@ def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
     assert "no such device" in str(results.error)
     with pytest.raises(FiberError, match="no such device"):
         rig.call()
+    rig.close()
+
+
+@pytest.mark.parametrize(
+    ("cause", "told"), [(Cause.CHILD, True), (Cause.REFUSED, True), (Cause.AGENT_LOST, False)]
+)
+def test_what_an_end_says_of_a_worker_is_told_by_its_cause_in_whatever_words(
+    cause: Cause, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures: list[worker_set.StartFailure | None] = []
+    gone = worker_set.WorkerSet.gone
+
+    def noting(self: Any, member: Any, now: float, failure: Any = None) -> None:
+        failures.append(failure)
+        gone(self, member, now, failure)
+
+    monkeypatch.setattr(worker_set.WorkerSet, "gone", noting)
+    rig = Rig(1, ready=False)
+    rig.handles[0].exited(ExitReport(1, "agent could not be started", cause=cause))
+    assert [failure is not None for failure in failures] == [told]
+    assert [failure.killed for failure in failures if failure] == [cause is Cause.REFUSED] * told
+    rig.background.run()
     rig.close()
 
 

@@ -29,7 +29,7 @@ from functools import partial
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from fiber._agent.interface import UNKNOWN, ExitReport
+from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._engine.chunks import FLOOR
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import StartFailure
@@ -499,11 +499,10 @@ class Executor:
             self._exits[handle] = report  # whoever uses it notices, and brings it back
             return
         failure = None
-        if not report.reason.startswith("agent "):  # a lost host says nothing of the worker
+        if report.cause != Cause.AGENT_LOST:  # a lost host says nothing of the worker
             text = handle.complaint or "\n".join(report.log)
             reason = "it raised an error" if handle.complaint else report.reason
-            refused = report.reason.startswith("could not be started")
-            killed = refused or (not handle.complaint and report.exitcode < 0)
+            killed = report.cause == Cause.REFUSED or (not handle.complaint and report.exitcode < 0)
             failure = StartFailure(f"pool worker {handle.name!r}", reason, text, killed)
         self._lost(handle, failure, report)
         self._advance()
