@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
-from fiber._agent.interface import ChildObserver, ExitReport
+from fiber._agent.interface import Cause, ChildObserver, ExitReport
 from fiber._transport.link import Keepalive
 from memory_link import SimulatedLoop
 from simulation import schedule
@@ -238,7 +238,8 @@ class Child:
 
     def give_up(self) -> None:
         """Its agent is lost, and nothing is known of it any more."""
-        report = ExitReport(-signal.SIGKILL, f"agent {self.host} lost", host=self.host)
+        reason, cause = f"agent {self.host} lost", Cause.AGENT_LOST
+        report = ExitReport(-signal.SIGKILL, reason, host=self.host, cause=cause)
         self._end(report)
 
     def _started(self) -> None:

@@ -7,6 +7,7 @@ interrupted where it runs the user's code or starts a process.
 
 from __future__ import annotations
 
+import math
 import random
 import threading
 from collections import deque
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 from fiber._agent import service
-from fiber._agent.interface import UNKNOWN, ExitReport
+from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._backends import remote
 from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._runtime import executor, launcher
@@ -117,7 +118,7 @@ class Stage:
 
     def _tell_refusal(self, port: Any, owner: Any, error: OSError) -> None:
         port.start_error = error
-        owner.exited(ExitReport(UNKNOWN, f"could not be started: {error}"))
+        owner.exited(ExitReport(UNKNOWN, f"could not be started: {error}", cause=Cause.REFUSED))
 
     def run_user_code(self) -> None:
         """What every piece of the user's code does."""
@@ -230,8 +231,8 @@ class Actor:
 
     # As the queue that a thread waits at
 
-    def get(self) -> Any:
-        """In the actor: the next entry, once there is one."""
+    def get(self, timeout: float = math.inf) -> Any:
+        """In the actor: the next entry, once there is one, however long that takes."""
         while not self._entries:
             self._waits = True
             self._pause()

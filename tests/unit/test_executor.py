@@ -8,11 +8,11 @@ import signal
 import weakref
 from collections.abc import Iterator
 from functools import partial
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import pytest
 
-from fiber._agent.interface import ExitReport
+from fiber._agent.interface import Cause, ExitReport
 from fiber._engine import worker_set
 from fiber._engine.ledger import PATIENCE
 from fiber._runtime.executor import KILL_AFTER
@@ -464,6 +464,53 @@ def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
     with pytest.raises(FiberError, match="no such device"):
         rig.call()
     rig.close()
+
+
+@pytest.mark.parametrize(
+    ("cause", "told"), [(Cause.CHILD, True), (Cause.REFUSED, True), (Cause.AGENT_LOST, False)]
+)
+def test_what_an_end_says_of_a_worker_is_told_by_its_cause_in_whatever_words(
+    cause: Cause, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures: list[worker_set.StartFailure | None] = []
+    gone = worker_set.WorkerSet.gone
+
+    def noting(self: Any, member: Any, now: float, failure: Any = None) -> None:
+        failures.append(failure)
+        gone(self, member, now, failure)
+
+    monkeypatch.setattr(worker_set.WorkerSet, "gone", noting)
+    rig = Rig(1, ready=False)
+    rig.handles[0].exited(ExitReport(1, "agent could not be started", cause=cause))
+    assert [failure is not None for failure in failures] == [told]
+    assert [failure.killed for failure in failures if failure] == [cause is Cause.REFUSED] * told
+    rig.background.run()
+    rig.close()
+
+
+def test_a_pool_that_gives_up_kills_the_workers_that_do_not_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(worker_set, "TRIES", 1)
+    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", 0.0)
+    rig = Rig(2, ready=False)
+    results = rig.map(range(5))
+    rig.handles[0].exited(ExitReport(1, "exit status 1"))
+    assert results.error is not None
+    assert rig.ports[1].signals == [signal.SIGTERM]
+    rig.loop.pass_time(KILL_AFTER)
+    assert rig.ports[1].signals == [signal.SIGTERM, signal.SIGKILL]
+    rig.close()
+
+
+def test_of_a_call_that_was_tried_again_nothing_is_kept(rig: Rig) -> None:
+    results = rig.call()
+    (handle,) = rig.busy
+    rig.lose(handle, running=(rig.port(handle).packets[0][0], 0))
+    (job,) = rig.ledger.jobs
+    assert list(job.attempts.values()) == [1]
+    rig.answer_all()
+    assert (results.done, job.attempts) == (1, {})
 
 
 # The end

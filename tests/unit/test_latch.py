@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from fiber._runtime.input_stream import InputStream
 from fiber._runtime.latch import Latch, Waiters, acquire
 
 PATIENCE = 15.0
@@ -219,6 +220,34 @@ def test_a_signal_that_did_not_wake_the_waiting_thread_is_not_slept_over() -> No
         latch.wait(PATIENCE)
     striker.join()
     assert time.monotonic() - begin < PATIENCE / 2
+
+
+@pytest.mark.usefixtures("_signals_raise")
+def test_nor_is_it_by_a_thread_that_reads_what_a_pool_is_to_do() -> None:
+    stream = InputStream(1, None, lambda: None)
+    reads, over = threading.Event(), threading.Event()
+
+    class Items:
+        def __iter__(self) -> Iterator[int]:
+            reads.set()
+            return iter(())
+
+    def strike() -> None:
+        reads.wait()
+        while not asleep(threading.main_thread()):
+            pass
+        signal.pthread_kill(threading.get_ident(), signal.SIGUSR1)
+        over.wait(PATIENCE)
+        stream.end()
+
+    striker = threading.Thread(target=strike)
+    begin = time.monotonic()
+    striker.start()
+    with pytest.raises(Stop):
+        stream.read(Items())
+    assert time.monotonic() - begin < PATIENCE / 2
+    over.set()
+    striker.join()
 
 
 def asleep(thread: threading.Thread) -> bool:

@@ -231,6 +231,21 @@ def test_stop_waits_for_the_end_and_leaves_no_descriptor() -> None:
     loop.stop()  # again is nothing
 
 
+def test_one_whose_thread_could_not_be_started_can_be_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    before = len(os.listdir("/proc/self/fd"))
+    loop = Loop()
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        loop.start_thread("never")
+    loop.stop()
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
 def test_a_call_after_the_end_writes_into_nobody_elses_descriptor() -> None:
     loop = Loop()
     loop.start_thread("short")

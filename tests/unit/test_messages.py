@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fiber._agent.interface import Cause
 from fiber._wire.messages import (
     PROTOCOL,
     Deliver,
@@ -55,6 +56,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
         st.none() | st.tuples(ids, ids),
         st.lists(any_text, max_size=3).map(tuple),
         any_text,
+        st.sampled_from(Cause),
     ),
     st.builds(Output, ids, any_text),
     st.builds(TunnelOpen, ids, any_text),
@@ -106,10 +108,10 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         (Output(1, "x").encode() + b"\xff", "of kind output .* is malformed"),
         (Exited(1, 0, 0, "").encode()[:-1], "of kind exited .* is malformed"),
         (
-            Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, "0", "", [], null, [], ""]',
+            Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, "0", "", [], null, [], "", 0]',
             "number",
         ),
-        (Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, 0, 1, [], null, [], ""]', "text"),
+        (Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, 0, 1, [], null, [], "", 0]', "text"),
         (Recall(1).encode()[:1] + b"\x08" + bytes(8) + b"7", "of kind exited .* is malformed"),
         (
             Recall(1).encode()[:1] + b"\x08" + bytes(8) + b"[" * 30_000,
@@ -167,7 +169,7 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
             Exited(3, 2, -9, SECRET, (1, 2), (1, 0), (SECRET,), SECRET),
             "Exited(child=3, delivered=2, exitcode=-9, reason=<14 characters>, "
             "unread=(1, 2), running=(1, 0), "
-            "log=<1 items>, host=<14 characters>)",
+            "log=<1 items>, host=<14 characters>, cause=0)",
         ),
         (
             TunnelData(3, bytearray(SECRET.encode())),

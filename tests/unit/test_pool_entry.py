@@ -336,6 +336,40 @@ def test_a_pool_may_be_dropped_at_any_line_of_the_loop(pool: Pool) -> None:
         assert latch.wait(PATIENCE)
 
 
+def test_a_finalizer_on_the_loops_thread_is_refused_what_it_would_wait_for() -> None:
+    done = run_program("""
+        import threading, time
+        import fiber
+        from fiber._runtime.state import runtime
+        from unit import pool_tasks as tasks
+        with fiber.Pool(2) as pool:
+            late = pool.apply_async(time.sleep, (tasks.PATIENCE,))
+            for wait in (
+                lambda: pool.map(tasks.square, [3]),
+                lambda: pool.map(tasks.square, iter([3])),
+                lambda: pool.starmap(time.sleep, [(tasks.PATIENCE,)]),
+                lambda: next(pool.imap(tasks.square, [3])),
+                lambda: pool.broadcast(tasks.square, 3),
+                late.get,
+                fiber.Process(target=time.sleep, args=(tasks.PATIENCE,)).start,
+            ):
+                over = threading.Event()
+                def attempt():
+                    try:
+                        wait()
+                    except RuntimeError as error:
+                        print(error)
+                    over.set()
+                runtime().loop.call_soon(attempt)
+                over.wait()
+            print(late.ready(), pool.apply_async(tasks.square, (3,)).get())
+    """)
+    *refusals, last = done.stdout.splitlines()
+    assert (last, done.stderr) == ("False 9", "")
+    assert len(refusals) == 7
+    assert all("cannot wait" in refusal for refusal in refusals)
+
+
 @pytest.mark.parametrize("method", ["ready", "decide", "gone"])
 def test_a_pool_that_the_collector_finds_while_the_loop_works_for_it_ends(
     method: str, monkeypatch: pytest.MonkeyPatch
@@ -427,6 +461,23 @@ def test_a_process_whose_start_was_interrupted_at_any_line_ends_or_is_known() ->
             known.join()
         wait_until(lambda: not living(), "it ends")
     assert struck > 50
+
+
+def test_a_runtime_whose_making_was_interrupted_leaves_no_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise Stop
+
+    state.shutdown()
+    monkeypatch.setattr(state.util, "Finalize", interrupt)
+    with pytest.raises(Stop):
+        runtime()
+    monkeypatch.undo()
+    assert "fiber-io" not in [thread.name for thread in threading.enumerate()]
+    with fiber.Pool(1) as pool:
+        assert pool.apply(tasks.square, (3,)) == 9
+    pool.join()
 
 
 # Forks

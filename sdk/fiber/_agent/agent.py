@@ -16,7 +16,7 @@ import threading
 from typing import Any
 
 from fiber._agent import zygote
-from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink, close_all
@@ -65,7 +65,7 @@ class Agent:
             child.fork_from(self._zygote(), self._access())
         except Exception as error:
             child.start_error = error
-            self._child_exited(child, 1, f"could not be started: {error}")
+            self._refused(child, error)
 
     def close(self) -> None:
         """Kill every child and end the zygotes.  Not on the loop's thread."""
@@ -117,7 +117,7 @@ class Agent:
         elif reply[0] == zygote.EXITED:
             self._child_exited(child, reply[2], describe(reply[2]))
         elif reply[0] == zygote.FAILED:
-            self._child_exited(child, 1, f"could not be started: {reply[2]}")
+            self._refused(child, reply[2])
         elif reply[0] == zygote.FORK_UNSAFE:
             self._restart_elsewhere(child)
 
@@ -155,18 +155,24 @@ class Agent:
             new = self._zygote(preload=self._zygotes[-1] is not old)
             child.fork_from(new, self._access())
         except Exception as error:
-            self._child_exited(child, 1, f"could not be started: {error}")
+            self._refused(child, error)
             return
         if old is not None and not old.children:
             old.send(zygote.QUIT)
 
-    def _child_exited(self, child: LocalChild, exitcode: int, reason: str) -> None:
+    def _refused(self, child: LocalChild, why: object) -> None:
+        self._child_exited(child, 1, f"could not be started: {why}", Cause.REFUSED)
+
+    def _child_exited(
+        self, child: LocalChild, exitcode: int, reason: str, cause: Cause = Cause.CHILD
+    ) -> None:
         del self._children[child.id]
         child.leave_zygote()
         unread, running = self._release(child)
         if child.fault is not None:
             reason = f"killed by its agent: {child.fault}"
-        child.observer.exited(ExitReport(exitcode, reason, unread, running, host=self.host))
+        report = ExitReport(exitcode, reason, unread, running, host=self.host, cause=cause)
+        child.observer.exited(report)
 
     def _release(self, child: LocalChild) -> tuple[tuple[int, ...], tuple[int, int] | None]:
         """Give back what it had; what it never read and what it was running."""

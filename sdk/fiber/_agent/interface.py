@@ -9,12 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 from fiber._wire.packet import BytesLike, Message
 
 UNKNOWN = 255
 """Exit code of a child of which it is not known, as in multiprocessing."""
+
+
+class Cause(IntEnum):
+    """What a child's end says something of."""
+
+    CHILD = 0
+    """The child: it ended, or was killed."""
+    REFUSED = 1
+    """Its host: the system had no room for it, and it never was."""
+    AGENT_LOST = 2
+    """The way to its host."""
 
 
 class ExitReport(NamedTuple):
@@ -31,6 +43,7 @@ class ExitReport(NamedTuple):
     log: tuple[str, ...] = ()
     """The last lines that it wrote, where its output is captured."""
     host: str = ""
+    cause: int = Cause.CHILD
 
 
 @dataclass(frozen=True, slots=True)

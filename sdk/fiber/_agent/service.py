@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from fiber._agent.agent import Agent
 from fiber._agent.capture import Capture
-from fiber._agent.interface import ChildSpec, ExitReport
+from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
 from fiber._hub.hub import Hub
 from fiber._transport.link import Link
@@ -131,7 +131,8 @@ class _Observed:
             self._child.start()
         except Exception as error:
             # Whatever keeps a child from starting here, the one who asked is the master.
-            self.exited(ExitReport(1, f"could not be started: {error}", host=agent.host))
+            reason = f"could not be started: {error}"
+            self.exited(ExitReport(1, reason, host=agent.host, cause=Cause.REFUSED))
 
     def handle(self, message: messages.Deliver | messages.Signal | messages.Recall) -> None:
         """What the master wants of it."""

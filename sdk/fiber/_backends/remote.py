@@ -9,7 +9,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
 from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._hub.hub import Hub
@@ -120,7 +120,8 @@ class RemoteAgent:
                 child.end(self._report_of_loss(reason))
 
     def _report_of_loss(self, reason: str) -> ExitReport:
-        return ExitReport(-signal.SIGKILL, f"agent {self.host} lost: {reason}", host=self.host)
+        why, cause = f"agent {self.host} lost: {reason}", Cause.AGENT_LOST
+        return ExitReport(-signal.SIGKILL, why, host=self.host, cause=cause)
 
     # On the loop's thread
 

@@ -29,7 +29,7 @@ from functools import partial
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from fiber._agent.interface import UNKNOWN, ExitReport
+from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._engine.chunks import FLOOR
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import StartFailure
@@ -310,12 +310,13 @@ class Executor:
         self._took_calls = now
         busy = job.fed - job.done >= self._scheduler.workers.size
         # One for each who is idle: whoever turns out to be stuck then holds up no other.
-        for call in calls[: self._ledger.idle_count()]:
+        alone = self._ledger.idle_count()
+        for call in calls[:alone]:
             self._ledger.feed(job, [call])
-            calls = calls[1:]
             self._advance()
-        self._ledger.feed(job, calls)
-        if hurried and busy and not (calls and calls[-1].blocking):
+        together = calls[alone:]
+        self._ledger.feed(job, together)
+        if hurried and busy and not (together and together[-1].blocking):
             self._wake_at(now + TICK)
         else:
             self._advance()
@@ -393,8 +394,7 @@ class Executor:
         for job, error in decisions.failed:
             self._jobs.fail(job, error)
         handle: Any
-        for handle in decisions.end:
-            handle.terminate()
+        self._end_workers(decisions.end)
         for held in decisions.recall:
             held.key.port.recall()
         for handle in decisions.dismiss:
@@ -502,11 +502,10 @@ class Executor:
             self._exits[handle] = report  # whoever uses it notices, and brings it back
             return
         failure = None
-        if not report.reason.startswith("agent "):  # a lost host says nothing of the worker
+        if report.cause != Cause.AGENT_LOST:  # a lost host says nothing of the worker
             text = handle.complaint or "\n".join(report.log)
             reason = "it raised an error" if handle.complaint else report.reason
-            refused = report.reason.startswith("could not be started")
-            killed = refused or (not handle.complaint and report.exitcode < 0)
+            killed = report.cause == Cause.REFUSED or (not handle.complaint and report.exitcode < 0)
             failure = StartFailure(f"pool worker {handle.name!r}", reason, text, killed)
         self._lost(handle, failure, report)
         self._advance()
@@ -545,12 +544,16 @@ class Executor:
         self.callbacks.stop()
         for job in list(self._ledger.jobs):
             self._jobs.fail(job, error)
-        handles: list[Any] = list(self._scheduler.terminate())
+        self._end_workers(self._scheduler.terminate())
+        self._advance()
+
+    def _end_workers(self, members: Iterable[Any]) -> None:
+        """At once, and by force if that is of no use."""
+        handles = list(members)
         for handle in handles:
             handle.terminate()
         if handles and self._kill is None:
-            self._kill = self._loop.call_later(KILL_AFTER, _kill_all, handles)
-        self._advance()
+            self._kill = self._loop.call_later(KILL_AFTER, self._kill_all)
 
     def broken(self, error: FiberError) -> None:
         """The loop has failed: nobody will hear of the workers any more."""
@@ -560,6 +563,11 @@ class Executor:
         for handle in handles:
             handle.kill()
             handle.exited(ExitReport(UNKNOWN, str(error)))
+
+    def _kill_all(self) -> None:
+        handles: list[Any] = list(self._scheduler.workers.members)
+        for handle in handles:
+            handle.kill()
 
     def _end(self) -> None:
         """Nobody is left."""
@@ -576,11 +584,6 @@ class Executor:
             None  # its traceback may hold the pool, which this outlives in its finalizer
         )
         self.ended.set()
-
-
-def _kill_all(handles: list[WorkerHandle]) -> None:
-    for handle in handles:
-        handle.kill()
 
 
 def _say(news: str) -> None:

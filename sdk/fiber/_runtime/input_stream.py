@@ -7,6 +7,7 @@ at a semaphore (a SimpleQueue, whose entries are the grants) when it has used th
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import queue
 import threading
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from fiber._engine.chunks import Pace
+from fiber._runtime.latch import DOZE, check_may_wait
 
 AHEAD = 3
 """Messages worth of tasks that are read ahead for each worker."""
@@ -52,10 +54,11 @@ class InputStream:
 
     def read(self, iterable: Iterable[Any]) -> None:
         """Read it all; raises what the iterable raises."""
+        check_may_wait()
         iterator = iter(iterable)
         items, unit = self._items, self._unit
         chunk: list[Any] = []
-        while (credit := self._credit.get()) > 0:
+        while (credit := self._next_credit()) > 0:
             left = credit
             for item in itertools.islice(iterator, credit):
                 left -= 1
@@ -71,6 +74,11 @@ class InputStream:
             if left:
                 items.extend(chunk)
                 return
+
+    def _next_credit(self) -> int:
+        while True:
+            with contextlib.suppress(queue.Empty):
+                return self._credit.get(timeout=DOZE)  # a signal may be slept over
 
     def read_on_thread(
         self, iterable: Iterable[Any], finish: Callable[[BaseException | None], None]

@@ -133,6 +133,7 @@ class Jobs:
                 self._ledger.pause(receipt.job, True)
             return
         for task, outcome in enumerate(results, receipt.start):
+            receipt.job.attempts.pop(task, None)  # the job of the calls lasts as long as the pool
             future = receipt.item(task).future
             future.add_results(0, [outcome], mixed)
             future.set_done()

@@ -3,7 +3,8 @@
 ``threading.Event`` has a lock that all who wait and whoever sets it share.  A signal handler that
 raises while one is between taking and releasing it leaves it in a state that nobody can wait at any
 more, and one that itself waits or sets finds it taken, by its own thread.  Here each who waits has
-a lock of its own, which nobody else waits for.
+a lock of its own, which nobody else waits for.  A finalizer on the loop's thread may set it, and is
+refused if it waits.
 
 CPython notes a signal and runs its handler between two instructions.  One that strikes after the
 last of them and before the kernel has put the thread to sleep on a lock is noted, and then slept
@@ -16,6 +17,8 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+
+from fiber._transport import loop
 
 DOZE = 0.2
 """Seconds that a signal is slept over at most."""
@@ -80,8 +83,19 @@ class Latch:
         return self.is_set()
 
 
+def check_may_wait() -> None:
+    """Raise RuntimeError on a loop's thread: what it waited for would come through that thread."""
+    if loop.runs_here():
+        raise RuntimeError(
+            "a finalizer that the garbage collector runs in Fiber's own thread cannot wait for "
+            "what comes through that thread: use apply_async(), or wait in a thread of its own"
+        )
+
+
 def acquire(lock: threading.Lock, timeout: float | None) -> bool:
     """Wait until ``lock`` is released; False if ``timeout`` seconds are over first."""
+    if timeout is None or timeout > 0:
+        check_may_wait()
     longest = threading.TIMEOUT_MAX
     deadline = time.monotonic() + (longest if timeout is None else min(timeout, longest))
     while not lock.acquire(True, max(0.0, min(DOZE, deadline - time.monotonic()))):

@@ -43,12 +43,12 @@ class Runtime:
         try:
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
+            reduction.readers_are_remote(not self.backend.same_host)
+            self.loop.start_thread("fiber-io")
         except BaseException:
             self._close_hub()
             self.loop.stop()
             raise
-        reduction.readers_are_remote(not self.backend.same_host)
-        self.loop.start_thread("fiber-io")
 
     def _make_hub(self) -> Hub | None:
         # One hub a host: a process that Fiber started uses the one that its agent has.
@@ -185,19 +185,23 @@ def runtime() -> Runtime:
         with _lock:
             if _runtime is None:
                 with naming_the_limit("starting Fiber"):
-                    _adopt(Runtime())
+                    _make()
     assert _runtime is not None
     return _runtime
 
 
-def _adopt(made: Runtime) -> None:
+def _make() -> None:
     global _runtime
-    if _runtime is not None:  # a finalizer was faster
-        made.close()
-        return
-    hub_client.set_local_hub(made.hub)
-    _runtime = made
-    util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
+    made = None
+    try:
+        made = Runtime()
+        if _runtime is None:  # else a finalizer was faster
+            hub_client.set_local_hub(made.hub)
+            util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
+            _runtime = made
+    finally:
+        if made is not None and made is not _runtime:  # or it was interrupted
+            made.close()
 
 
 def shutdown() -> None:

@@ -31,6 +31,13 @@ would never end by itself if somebody closed the descriptors.
 
 _MANY_TIMERS = 1024
 
+_this_thread = threading.local()
+
+
+def runs_here() -> bool:
+    """Whether some loop runs on the calling thread, which then must not wait."""
+    return getattr(_this_thread, "runs_a_loop", False)
+
 
 class Dependent(Protocol):
     """Waits for what only a loop can bring."""
@@ -185,13 +192,15 @@ class Loop:
     def run(self) -> None:
         """Call back until stopped."""
         self._ident = threading.get_ident()
-        self._running = True
+        self._running = _this_thread.runs_a_loop = True
         try:
             while self._running:
                 self._run_once()
         except BaseException as error:
             self._break(error)
             raise
+        finally:
+            _this_thread.runs_a_loop = False
         self._close()
 
     def _run_once(self) -> None:
@@ -230,7 +239,8 @@ class Loop:
         """End the loop after what it is doing; from another thread, wait until it has ended."""
         if self._closed:
             return
-        if self._thread is None and self._ident is None:  # it never ran
+        if self._ident is None and (self._thread is None or self._thread.ident is None):
+            # It never ran.
             self._close()
             return
         self.call_soon(self._stop)

@@ -128,6 +128,7 @@ class Exited(NamedTuple):
     running: tuple[int, int] | None = None
     log: tuple[str, ...] = ()
     host: str = ""
+    cause: int = 0
 
     def encode(self) -> bytes:
         """The frame."""
@@ -329,7 +330,7 @@ def _read_recalled(view: memoryview) -> Recalled:
 
 def _read_exited(view: memoryview) -> Exited:
     child = _NUMBER.unpack_from(view)[2]
-    delivered, exitcode, reason, unread, running, log, host = json.loads(
+    delivered, exitcode, reason, unread, running, log, host, cause = json.loads(
         _text(view[_NUMBER.size :])
     )
     if running is not None:
@@ -344,6 +345,7 @@ def _read_exited(view: memoryview) -> Exited:
         running,
         tuple(map(_string, log)),
         _string(host),
+        _integer(cause),
     )
 
 
