@@ -23,10 +23,14 @@ from fiber._runtime.worker_handle import WorkerHandle
 from simulation.explore import first_failure
 from simulation.suites import SUITES
 
-SEEDS = range(4400)
+SEEDS = range(10_100)
 """Among these each fault must show."""
 
-RARE = {"forgets_what_is_unsent": 350, "lends_what_is_needed": 600, "blames_what_was_dropped": 4300}
+RARE = {
+    "forgets_what_is_unsent": 350,
+    "lends_what_is_needed": 600,
+    "blames_what_was_dropped": 10_000,
+}
 """Where the search begins for those that show late; it goes on with all the others."""
 
 Patch = pytest.MonkeyPatch

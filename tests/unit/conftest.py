@@ -12,6 +12,7 @@ from fiber._transport.credentials import MasterCredentials, make_credentials
 from fiber._transport.loop import Loop
 from fiber.connection import Connection
 from hosts import Far, Hosts, Wire
+from unit.executor_rig import Rig
 
 if TYPE_CHECKING:
     from unit.link_site import Site
@@ -37,6 +38,13 @@ def site(credentials: MasterCredentials) -> Iterator[Site]:
     site = Site(credentials)
     yield site
     site.end()
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = Rig(2)
+    yield rig
+    rig.close()
 
 
 @pytest.fixture

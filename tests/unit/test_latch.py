@@ -224,7 +224,7 @@ def test_a_signal_that_did_not_wake_the_waiting_thread_is_not_slept_over() -> No
 
 @pytest.mark.usefixtures("_signals_raise")
 def test_nor_is_it_by_a_thread_that_reads_what_a_pool_is_to_do() -> None:
-    stream = InputStream(1, None, lambda: None)
+    stream = InputStream(1, lambda: None)
     reads, over = threading.Event(), threading.Event()
 
     class Items:
