@@ -177,11 +177,13 @@ def test_a_descriptor_that_a_callback_forgot_is_not_called_in_the_same_round(loo
     ends = [os.pipe() for _ in range(2)]
     readers = [reader for reader, _ in ends]
     calls: list[int] = []
+    called = threading.Event()
 
     def first_come(me: int) -> None:
         calls.append(me)
         for reader in readers:
             loop.unregister(reader)
+        called.set()
 
     def both_ready() -> None:
         for reader in readers:
@@ -190,7 +192,7 @@ def test_a_descriptor_that_a_callback_forgot_is_not_called_in_the_same_round(loo
             os.write(writer, b"x")
 
     loop.call_soon(both_ready)  # on its thread, so that one poll sees both
-    settled(loop)
+    assert called.wait(PATIENCE)
     settled(loop)
     assert len(calls) == 1
     for fd in (fd for pair in ends for fd in pair):
