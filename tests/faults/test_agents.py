@@ -45,7 +45,7 @@ def start(*args: Any) -> Any:
 
 
 def host_of(child: Any) -> str:
-    host: str = child._popen._port.host
+    host: str = child._popen._child.host
     return host
 
 

@@ -65,11 +65,11 @@ class Names:
 
     def child(self, worker: engine.Worker) -> Child:
         """Which process it is."""
-        port = worker.key.port
-        if isinstance(port, RemoteChild):
-            seen: Any = port.observer
+        handle = worker.key.child
+        if isinstance(handle, RemoteChild):
+            seen: Any = handle.observer
             return seen  # type: ignore[no-any-return]
-        child: Child = port
+        child: Child = handle
         return child
 
 
@@ -384,7 +384,7 @@ class ExecutorMaster:
         self._executor.terminate(RuntimeError("terminated"))
 
     def heard_late(self, child: Child, said: Any) -> None:
-        """A port says nothing after the end of its child."""
+        """A child handle says nothing after the end of its child."""
 
     # What must hold
 

@@ -112,12 +112,12 @@ class Stage:
         if self.rng.random() < 0.5:
             raise error
         attributes = "start", "start_error", "name", "deliver", "signal"
-        port = mock.Mock(spec_set=attributes, start_error=None)
-        self.loop.call_soon(owner.begin, port)
-        self.loop.call_soon(self._tell_refusal, port, owner, error)
+        child = mock.Mock(spec_set=attributes, start_error=None)
+        self.loop.call_soon(owner.begin, child)
+        self.loop.call_soon(self._tell_refusal, child, owner, error)
 
-    def _tell_refusal(self, port: Any, owner: Any, error: OSError) -> None:
-        port.start_error = error
+    def _tell_refusal(self, child: Any, owner: Any, error: OSError) -> None:
+        child.start_error = error
         owner.exited(ExitReport(UNKNOWN, f"could not be started: {error}", cause=Cause.REFUSED))
 
     def run_user_code(self) -> None:

@@ -110,7 +110,7 @@ class ManualThread:
             action(*args)
 
 
-class Port:
+class FakeChild:
     """Keeps what is delivered."""
 
     def __init__(self, name: str) -> None:
@@ -181,7 +181,7 @@ class Rig:
         self, count: int, *, start: bool = True, ready: bool = True, **options: Any
     ) -> None:
         self.loop = ManualLoop()
-        self.ports: list[Port] = []
+        self.children: list[FakeChild] = []
         self.handles: list[WorkerHandle] = []
         self.refusal: BaseException | None = None
         """What stands in the way of another worker."""
@@ -204,13 +204,13 @@ class Rig:
         self.threads[name] = ManualThread(name)
         return self.threads[name]
 
-    def _start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> Port:
+    def _start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> FakeChild:
         if self.refusal is not None:
             raise self.refusal
-        self.ports.append(Port(process.name))
+        self.children.append(FakeChild(process.name))
         self.handles.append(owner)
-        self.loop.call_soon(owner.begin, self.ports[-1])
-        return self.ports[-1]
+        self.loop.call_soon(owner.begin, self.children[-1])
+        return self.children[-1]
 
     @property
     def ledger(self) -> Ledger:
@@ -293,14 +293,14 @@ class Rig:
 
     # What was sent
 
-    def port(self, handle: WorkerHandle) -> Port:
-        assert isinstance(handle.port, Port)
-        return handle.port
+    def child(self, handle: WorkerHandle) -> FakeChild:
+        assert isinstance(handle.child, FakeChild)
+        return handle.child
 
     def head(self, handle: WorkerHandle, index: int) -> work.Head:
         """The head of a message that a worker got."""
-        return work.Head._make(work.HEAD.unpack_from(self.port(handle).packets[index][1]))
+        return work.Head._make(work.HEAD.unpack_from(self.child(handle).packets[index][1]))
 
     def deliveries(self) -> Iterable[tuple[int, bytes]]:
         """All that all workers were sent."""
-        return [packet for port in self.ports for packet in port.packets]
+        return [packet for child in self.children for packet in child.packets]

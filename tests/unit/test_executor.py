@@ -35,9 +35,9 @@ def pickled() -> list[int]:
 
 def test_a_map(rig: Rig) -> None:
     results = rig.map(range(4))
-    for handle, port in zip(rig.handles, rig.ports, strict=True):
-        assert [seq for seq, _ in port.packets]
-        for seq, _ in list(port.packets):
+    for handle, child in zip(rig.handles, rig.children, strict=True):
+        assert [seq for seq, _ in child.packets]
+        for seq, _ in list(child.packets):
             rig.answer(handle, seq, [seq])
     assert len(results.outcomes) == 4
     assert results.done == 1
@@ -46,14 +46,14 @@ def test_a_map(rig: Rig) -> None:
 def test_a_call(rig: Rig) -> None:
     results = rig.call()
     (handle,) = rig.busy
-    rig.answer(handle, rig.port(handle).packets[0][0], [9])
+    rig.answer(handle, rig.child(handle).packets[0][0], [9])
     assert (results.outcomes, results.done) == ({0: 9}, 1)
 
 
 def test_many_short_calls_in_a_row_travel_together(rig: Rig) -> None:
     first = [rig.call() for _ in range(2)]
     for handle in list(rig.busy):
-        rig.say(handle, rig.port(handle).packets[0][0], 0, None, 1e-7, [9], [])
+        rig.say(handle, rig.child(handle).packets[0][0], 0, None, 1e-7, [9], [])
     assert [results.done for results in first] == [1, 1]
     sent = len(list(rig.deliveries()))
     many = [rig.call() for _ in range(10)]
@@ -73,15 +73,15 @@ def test_a_function_is_sent_once_to_each_worker(rig: Rig) -> None:
 
 def test_a_function_that_was_not_read_is_sent_again(rig: Rig) -> None:
     rig.map(range(4))
-    handle, port = rig.handles[0], rig.ports[0]
-    handle.recalled([seq for seq, _ in port.packets])
+    handle, child = rig.handles[0], rig.children[0]
+    handle.recalled([seq for seq, _ in child.packets])
     assert rig.head(handle, 2).size
 
 
 def test_a_worker_that_forgot_a_function_is_sent_it_again(rig: Rig) -> None:
     rig.map(range(4))
-    handle, port = rig.handles[0], rig.ports[0]
-    rig.say(handle, work.UNKNOWN, port.packets[1][0])
+    handle, child = rig.handles[0], rig.children[0]
+    rig.say(handle, work.UNKNOWN, child.packets[1][0])
     assert rig.head(handle, 2).size
 
 
@@ -96,7 +96,7 @@ def test_users_picklers_do_not_run_on_the_loop(rig: Rig, pickled: list[int]) -> 
     assert pickled == []
     rig.background.run()
     assert len(pickled) == 4
-    rig.answer(rig.handles[0], rig.ports[0].packets[0][0], [None])
+    rig.answer(rig.handles[0], rig.children[0].packets[0][0], [None])
     assert len(pickled) == 4
     rig.background.run()
     assert len(pickled) == 5
@@ -104,24 +104,24 @@ def test_users_picklers_do_not_run_on_the_loop(rig: Rig, pickled: list[int]) -> 
 
 def test_plain_items_are_sent_from_the_loop(rig: Rig) -> None:
     rig.map([(n, str(n)) for n in range(6)])
-    rig.answer(rig.handles[0], rig.ports[0].packets[0][0], [None])
-    assert len(rig.ports[0].packets) == 3
+    rig.answer(rig.handles[0], rig.children[0].packets[0][0], [None])
+    assert len(rig.children[0].packets) == 3
     assert not rig.background.submitted
 
 
 def test_idle_workers_get_what_busy_ones_have_not_read(rig: Rig) -> None:
     results = rig.map(range(4))
     idle, busy = rig.handles
-    for seq, _ in list(rig.ports[0].packets):
+    for seq, _ in list(rig.children[0].packets):
         rig.answer(idle, seq, [seq])
-    assert rig.ports[1].recalls == 0
+    assert rig.children[1].recalls == 0
     rig.loop.pass_time(PATIENCE)
-    assert rig.ports[1].recalls == 1
-    unread = rig.ports[1].packets[1][0]
+    assert rig.children[1].recalls == 1
+    unread = rig.children[1].packets[1][0]
     busy.recalled([unread])
-    rig.answer(idle, rig.ports[0].packets[-1][0], [7])
+    rig.answer(idle, rig.children[0].packets[-1][0], [7])
     rig.answer(busy, unread, ["late"])
-    rig.answer(busy, rig.ports[1].packets[0][0], [8])
+    rig.answer(busy, rig.children[1].packets[0][0], [8])
     assert results.done == 1
     assert "late" not in results.outcomes.values()
 
@@ -149,7 +149,7 @@ def test_a_pickler_may_raise_anything(rig: Rig, tries: int) -> None:
 def test_broadcast(rig: Rig) -> None:
     results = Results()
     rig.executor.broadcast(results, tasks.pid, ())
-    assert [len(port.packets) for port in rig.ports] == [1, 1]
+    assert [len(child.packets) for child in rig.children] == [1, 1]
     rig.answer_all()
     assert (len(results.outcomes), results.done) == (2, 1)
 
@@ -211,7 +211,7 @@ def test_users_values_are_not_unpickled_on_the_loop(rig: Rig) -> None:
     results = rig.map(range(1))
     (handle,) = rig.busy
     data = pickle.dumps(tasks.UnreadableInWorker())
-    seq = rig.port(handle).packets[0][0]
+    seq = rig.child(handle).packets[0][0]
     rig.answer(handle, seq, [None], [(0, work.VALUE, data, 0)])
     outcome = results.outcomes[0]
     assert type(outcome) is Pickled
@@ -222,9 +222,9 @@ def test_a_batch_that_its_worker_cannot_read_is_sent_in_pieces(rig: Rig) -> None
     results = rig.map(range(2), unit=2)
     (handle,) = rig.busy
     error = pickle.dumps(AttributeError("no such class"))
-    rig.say(handle, work.UNREADABLE, rig.port(handle).packets[0][0], error)
+    rig.say(handle, work.UNREADABLE, rig.child(handle).packets[0][0], error)
     for handle in list(rig.busy):
-        rig.say(handle, work.UNREADABLE, rig.port(handle).packets[-1][0], error)
+        rig.say(handle, work.UNREADABLE, rig.child(handle).packets[-1][0], error)
     assert (len(results.outcomes), results.done) == (2, 1)
     assert all("no such class" in str(o.decode().error) for o in results.outcomes.values())
 
@@ -280,7 +280,7 @@ def test_what_was_assigned_and_not_sent_is_not_held_against_its_tasks(
 
 
 def test_a_packet_that_nobody_took_is_not_held_against_its_tasks(rig: Rig) -> None:
-    rig.ports[0].gone = rig.ports[1].gone = True
+    rig.children[0].gone = rig.children[1].gone = True
     rig.map(range(2))
     (job,) = rig.maps
     rig.lose(rig.handles[0])
@@ -303,7 +303,7 @@ def test_a_task_that_kills_its_workers(rig: Rig) -> None:
     results = rig.call()
     for _ in range(4):
         (handle,) = rig.busy
-        rig.lose(handle, running=(rig.port(handle).packets[-1][0], 0))
+        rig.lose(handle, running=(rig.child(handle).packets[-1][0], 0))
         rig.background.run()
         rig.all_ready()
     outcome = results.outcomes[0]
@@ -326,8 +326,8 @@ def test_a_task_over_its_time_fails_and_its_worker_is_killed(rig: Rig) -> None:
     rig.loop.pass_time(2.0)
     assert "2 s" in str(results.outcomes[0].error)
     assert results.done == 1
-    assert rig.port(handle).signals == [signal.SIGKILL]
-    rig.answer(handle, rig.port(handle).packets[0][0], [9])
+    assert rig.child(handle).signals == [signal.SIGKILL]
+    rig.answer(handle, rig.child(handle).packets[0][0], [9])
     rig.lose(handle)
     assert (len(results.outcomes), results.done) == (1, 1)
 
@@ -337,7 +337,7 @@ def test_a_task_over_its_time_fails_and_its_worker_is_killed(rig: Rig) -> None:
 
 def test_a_worker_that_was_told_to_end_as_a_recall_was_on_its_way_is_told_again(rig: Rig) -> None:
     rig.executor.close()
-    told = rig.ports[0].packets
+    told = rig.children[0].packets
     assert told == [(0, work.STOP_MESSAGE)]
     rig.handles[0].recalled([0])
     assert told == [(0, work.STOP_MESSAGE)] * 2
@@ -364,8 +364,8 @@ def test_a_call_that_a_recall_took_from_a_lent_worker_is_sent_again(rig: Rig) ->
             rig.answer_all()
             return self.done
 
-    for handle, port in zip(rig.handles, rig.ports, strict=True):
-        port.lend = partial(Recalled, handle)  # type: ignore[assignment,method-assign]
+    for handle, child in zip(rig.handles, rig.children, strict=True):
+        child.lend = partial(Recalled, handle)  # type: ignore[assignment,method-assign]
     for _ in range(2):  # the first one's answer has its worker lent
         assert rig.executor.call_and_wait(Awaited(), tasks.square, (3,), {}) == 1
     assert len(list(rig.deliveries())) == 2, "the second call was not sent again"
@@ -376,10 +376,10 @@ def test_after_close_what_is_there_is_done_and_the_workers_leave(rig: Rig) -> No
     rig.executor.close()
     with pytest.raises(ValueError, match="not running"):
         rig.call()
-    assert not any(port.told_to_end for port in rig.ports)
+    assert not any(child.told_to_end for child in rig.children)
     rig.answer_all()
     assert [found.done for found in results] == [1, 1]
-    assert all(port.told_to_end for port in rig.ports)
+    assert all(child.told_to_end for child in rig.children)
     for handle in list(rig.handles):
         handle.exited(ExitReport(0, "exit status 0"))
     assert rig.executor.ended.is_set()
@@ -407,9 +407,9 @@ def test_terminate_fails_what_is_not_done(rig: Rig) -> None:
     rig.executor.terminate(error)
     assert [results.error for results in found] == [error] * 4
     assert stream.ended
-    assert [port.signals for port in rig.ports] == [[signal.SIGTERM]] * 2
+    assert [child.signals for child in rig.children] == [[signal.SIGTERM]] * 2
     rig.loop.pass_time(KILL_AFTER)
-    assert [port.signals[1:] for port in rig.ports] == [[signal.SIGKILL]] * 2
+    assert [child.signals[1:] for child in rig.children] == [[signal.SIGKILL]] * 2
 
 
 def test_nobody_waits_for_a_loop_that_has_failed() -> None:
@@ -420,7 +420,7 @@ def test_nobody_waits_for_a_loop_that_has_failed() -> None:
     with pytest.raises(FiberError, match="the loop has failed"):
         rig.call()
     assert rig.executor.ended.is_set()
-    assert [port.signals[-1:] for port in rig.ports] == [[signal.SIGKILL]] * 2
+    assert [child.signals[-1:] for child in rig.children] == [[signal.SIGKILL]] * 2
 
 
 def test_idle_workers_above_the_minimum_leave() -> None:
@@ -431,7 +431,7 @@ def test_idle_workers_above_the_minimum_leave() -> None:
     assert len(rig.members) == 3
     rig.answer_all()
     rig.loop.pass_time(9.0)
-    assert not any(port.told_to_end for port in rig.ports)
+    assert not any(child.told_to_end for child in rig.children)
     rig.loop.pass_time(1.5)
-    assert sum(port.told_to_end for port in rig.ports) == 2
+    assert sum(child.told_to_end for child in rig.children) == 2
     rig.close()

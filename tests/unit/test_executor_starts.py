@@ -76,7 +76,7 @@ def test_without_a_thread_to_look_at_it_a_function_is_still_unusable(
     results = rig.map([1])
     (handle,) = rig.busy
     error = pickle.dumps(ValueError("it does not unpickle"))
-    rig.say(handle, work.BROKEN, rig.port(handle).packets[0][0], error)
+    rig.say(handle, work.BROKEN, rig.child(handle).packets[0][0], error)
     assert results.error is no_thread
     assert not rig.busy
 
@@ -115,7 +115,7 @@ def test_an_initializers_pickler_may_raise_anything() -> None:
 def test_a_worker_that_is_not_ready_when_the_pool_is_closed_is_told_to_end() -> None:
     rig = Rig(1, ready=False)
     rig.executor.close()
-    assert rig.ports[0].told_to_end
+    assert rig.children[0].told_to_end
     rig.lose(rig.handles[0])
     assert rig.executor.ended.is_set()
     rig.close()
@@ -169,16 +169,16 @@ def test_a_pool_that_gives_up_kills_the_workers_that_do_not_end(
     results = rig.map(range(5))
     rig.handles[0].exited(ExitReport(1, "exit status 1"))
     assert results.error is not None
-    assert rig.ports[1].signals == [signal.SIGTERM]
+    assert rig.children[1].signals == [signal.SIGTERM]
     rig.loop.pass_time(KILL_AFTER)
-    assert rig.ports[1].signals == [signal.SIGTERM, signal.SIGKILL]
+    assert rig.children[1].signals == [signal.SIGTERM, signal.SIGKILL]
     rig.close()
 
 
 def test_of_a_call_that_was_tried_again_nothing_is_kept(rig: Rig) -> None:
     results = rig.call()
     (handle,) = rig.busy
-    rig.lose(handle, running=(rig.port(handle).packets[0][0], 0))
+    rig.lose(handle, running=(rig.child(handle).packets[0][0], 0))
     (job,) = rig.ledger.jobs
     assert list(job.attempts.values()) == [1]
     rig.answer_all()

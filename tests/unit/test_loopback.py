@@ -287,7 +287,7 @@ def test_while_another_agent_is_there_no_place_is_given_up(
         os.kill(backend._processes[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
         assert census.wait_until(lambda: len(backend._failures) >= 3, PATIENCE)
         child = start()  # on the other one
-        assert child._popen._port.host == "loopback-1"
+        assert child._popen._child.host == "loopback-1"
         assert census.wait_until(lambda: backend._processes[0].agent.joined, PATIENCE)
         stop(child)
     assert "The others go on; the next attempt is in 0.1 s" in capfd.readouterr().err

@@ -242,7 +242,7 @@ def test_the_start_during_the_import_of_main_is_refused(monkeypatch: pytest.Monk
 # Starts that fail, with agents that only a test can have
 
 
-class Port:
+class FakeChild:
     name, host, pid, start_error = "p", "elsewhere", None, None
 
     def __init__(self) -> None:
@@ -256,17 +256,17 @@ class Port:
 
 
 @pytest.fixture
-def silent(monkeypatch: pytest.MonkeyPatch, runtime: state.Runtime) -> Port:
+def silent(monkeypatch: pytest.MonkeyPatch, runtime: state.Runtime) -> FakeChild:
     """An agent that never answers."""
-    port = Port()
+    child = FakeChild()
 
-    def start(_process: Any, owner: Any, **_: Any) -> Port:
-        runtime.loop.call_soon(owner.begin, port)
-        return port
+    def start(_process: Any, owner: Any, **_: Any) -> FakeChild:
+        runtime.loop.call_soon(owner.begin, child)
+        return child
 
     monkeypatch.setattr(runtime, "start", start)
     monkeypatch.setattr(runtime, "config", config.load({"start_timeout": 0.05}))
-    return port
+    return child
 
 
 def settle(runtime: state.Runtime) -> None:
@@ -277,7 +277,7 @@ def settle(runtime: state.Runtime) -> None:
 
 
 def test_an_agent_that_does_not_answer_is_an_error_and_the_late_child_is_killed(
-    silent: Port,
+    silent: FakeChild,
 ) -> None:
     before = open_files()
     with pytest.raises(StartError, match=r"process 'slow' did not start.*'elsewhere'.*0\.05 s"):
@@ -288,7 +288,7 @@ def test_an_agent_that_does_not_answer_is_an_error_and_the_late_child_is_killed(
 
 
 def test_an_interrupted_start_kills_the_late_child(
-    silent: Port, monkeypatch: pytest.MonkeyPatch
+    silent: FakeChild, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -303,9 +303,9 @@ def test_an_interrupted_start_kills_the_late_child(
 def test_a_start_that_the_system_refuses_says_why(
     monkeypatch: pytest.MonkeyPatch, runtime: state.Runtime
 ) -> None:
-    def refuse(_process: Any, observer: Any, **_: Any) -> Port:
+    def refuse(_process: Any, observer: Any, **_: Any) -> FakeChild:
         observer.exited(ExitReport(1, "could not be started: no memory"))
-        return Port()
+        return FakeChild()
 
     monkeypatch.setattr(runtime, "start", refuse)
     with pytest.raises(

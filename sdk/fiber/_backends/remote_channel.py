@@ -13,8 +13,8 @@ from fiber._wire.packet import BytesLike, Message
 class RemoteTaskChannel:
     """A ``DirectChannel``.  What it sends and receives passes the loop, and nothing above it.
 
-    ``deliver`` is the port's own.  Each wait has a lock of its own, which the loop releases: an
-    interruption at any line leaves at most a lock that nobody waits for.
+    ``deliver`` is the child handle's own.  Each wait has a lock of its own, which the loop
+    releases: an interruption at any line leaves at most a lock that nobody waits for.
     """
 
     def __init__(self, loop: EventLoop, deliver: Callable[..., bool]) -> None:

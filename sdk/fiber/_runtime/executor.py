@@ -360,7 +360,7 @@ class Executor:
 
     def _cancel(self, item: WorkItem) -> None:
         for held in self._jobs.cancel(item):
-            held.key.port.recall()
+            held.key.child.recall()
         self._advance()
 
     def _resume(self, item: WorkItem) -> None:
@@ -396,7 +396,7 @@ class Executor:
         handle: Any
         self._end_workers(decisions.end)
         for held in decisions.recall:
-            held.key.port.recall()
+            held.key.child.recall()
         for handle in decisions.dismiss:
             handle.dismiss()
         if decisions.start:

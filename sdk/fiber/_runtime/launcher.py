@@ -41,7 +41,7 @@ class Launcher:
 
     def give_up(self, handles: Sequence[WorkerHandle]) -> None:
         """Starting them was interrupted; on the loop's thread, which knows whose child begins."""
-        self._on_failed([handle for handle in handles if handle.port is None], None)
+        self._on_failed([handle for handle in handles if handle.child is None], None)
 
     def _raise_start_error(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
         """Wait until their agent has looked at them: the system may have no room for them."""
@@ -50,8 +50,8 @@ class Launcher:
         if not self._loop.on_thread():
             looked_at.wait(timeout)
         for handle in handles:
-            if handle.port is not None and handle.port.start_error is not None:
-                raise handle.port.start_error
+            if handle.child is not None and handle.child.start_error is not None:
+                raise handle.child.start_error
 
     def _start(self, handle: WorkerHandle) -> None:
         options = self._options

@@ -143,11 +143,11 @@ class Leases:
 
     def offer(self, handle: WorkerHandle) -> None:
         """Lend a worker that has become idle, if nobody else needs it."""
-        if handle.worker is None or handle.port is None:
+        if handle.worker is None or handle.child is None:
             return
         if not self._scheduler.lend(handle.worker):
             return
-        channel = handle.port.lend()
+        channel = handle.child.lend()
         if channel is None:
             self._scheduler.return_idle(handle.worker, self._loop.now())
             return
@@ -222,10 +222,10 @@ class Leases:
     def _return_abandoned(self, handle: WorkerHandle) -> None:
         """It may be running something that nobody wants any more."""
         assert handle.worker is not None
-        assert handle.port is not None
+        assert handle.child is not None
         seq = self._scheduler.ledger.next_seq()
         self._scheduler.return_busy(handle.worker, seq, None, None, self._loop.now())
-        handle.port.deliver(seq, NO_OP_MESSAGE)
+        handle.child.deliver(seq, NO_OP_MESSAGE)
         self._on_back(handle)
 
     def _end(self, lease: Lease) -> WorkerHandle:
@@ -235,5 +235,5 @@ class Leases:
         return lease.handle
 
     def _take_over(self, handle: WorkerHandle) -> None:
-        if handle.port is not None:
-            handle.port.reclaim()
+        if handle.child is not None:
+            handle.child.reclaim()

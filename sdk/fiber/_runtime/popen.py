@@ -28,7 +28,7 @@ class Popen:
         self.returncode: int | None = None
         self.report: ExitReport | None = None
         self.pid: int | None = None
-        self._port: ChildHandle | None = None
+        self._child: ChildHandle | None = None
         self._born = Latch()
         self._exited = Latch()
         loop = runtime().loop
@@ -45,24 +45,24 @@ class Popen:
             self.close()
             raise
 
-    def _wait_for_birth(self, port: ChildHandle) -> None:
+    def _wait_for_birth(self, child: ChildHandle) -> None:
         timeout = runtime().config.start_timeout
         if not self._born.wait(timeout):
             raise StartError(
                 f"process {self._name!r}",
-                f"its agent on host {port.host!r} did not start it within {timeout:g} s "
+                f"its agent on host {child.host!r} did not start it within {timeout:g} s "
                 "(start_timeout)",
             )
         if self.pid is None and self.report is not None:
-            if port.start_error is not None:
-                raise port.start_error
+            if child.start_error is not None:
+                raise child.start_error
             raise StartError(f"process {self._name!r}", self.report.reason)
 
     # What the agent says, on the loop's thread
 
     def begin(self, child: ChildHandle) -> None:
         """It is started."""
-        self._port = child
+        self._child = child
         child.start()
 
     def started(self, pid: int) -> None:
@@ -89,7 +89,7 @@ class Popen:
         self._exited.set()
         self._born.set()
         # Each held the other; the sentinel's descriptor goes when the last user of this lets go.
-        self._port = None
+        self._child = None
 
     def broken(self, error: FiberError) -> None:
         """Nobody will say how it ends: then it ends now."""
@@ -119,9 +119,9 @@ class Popen:
         self._signal(signal.SIGKILL)
 
     def _signal(self, signum: int) -> None:
-        port = self._port
-        if port is not None:
-            port.signal(signum)
+        child = self._child
+        if child is not None:
+            child.signal(signum)
 
     def close(self) -> None:
         """Give the sentinel's descriptor back."""

@@ -94,12 +94,12 @@ class Sender:
 
     def _deliver(self, item: WorkItem, batch: Batch, encoded: Encoded) -> None:
         handle: WorkerHandle = batch.worker.key
-        assert handle.port is not None
+        assert handle.child is not None
         seq = batch.seq
         if item.timeout is not None:
             self._deadlines[seq] = self._loop.call_later(item.timeout, self._expire, seq)
         try:
-            taken = handle.port.deliver(seq, *pack(item, batch, encoded, handle.known))
+            taken = handle.child.deliver(seq, *pack(item, batch, encoded, handle.known))
         except Exception as error:  # the system has no memory or descriptor for it
             self._unsendable(batch, error)
             return

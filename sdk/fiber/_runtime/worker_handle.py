@@ -41,7 +41,7 @@ class WorkerHandle:
     def __init__(self, supervisor: Supervisor, host: Any) -> None:
         self.process: BaseProcess | None = None
         """Once it is started."""
-        self.port: ChildHandle | None = None
+        self.child: ChildHandle | None = None
         self.worker: Worker | None = None
         """Its entry in the ledger, once it is ready."""
         self.known: dict[int, None] = {}
@@ -64,7 +64,7 @@ class WorkerHandle:
     @property
     def name(self) -> str:
         """The worker's name."""
-        return self.port.name if self.port is not None else "?"
+        return self.child.name if self.child is not None else "?"
 
     def launch(self, process: BaseProcess, method: str) -> None:
         """Start the process; returns before it exists."""
@@ -75,7 +75,7 @@ class WorkerHandle:
 
     def begin(self, child: ChildHandle) -> None:
         """It is started."""
-        self.port = child
+        self.child = child
         child.start()
         if self.leaving:  # it was told to before it could be reached
             self.dismiss()
@@ -135,15 +135,15 @@ class WorkerHandle:
 
     def signal(self, signum: int) -> None:
         """Send it a signal."""
-        if self.returncode is None and self.port is not None:
+        if self.returncode is None and self.child is not None:
             # A program that has closed our descriptors has to hear of that, not of this.
             with contextlib.suppress(OSError):
-                self.port.signal(signum)
+                self.child.signal(signum)
 
     def dismiss(self) -> None:
         """Tell it to end once it has read this."""
-        if self.port is not None:
-            self.port.deliver(0, work.STOP_MESSAGE)
+        if self.child is not None:
+            self.child.deliver(0, work.STOP_MESSAGE)
 
     def terminate(self) -> None:
         """SIGTERM."""
