@@ -67,22 +67,24 @@ def cases(size: float) -> list[Case]:
 
 def run(bench: Bench, workers: int, cached: bool, programs: int) -> dict[str, float]:
     """The median times over so many programs, after one that leaves its bytecode behind."""
-    if cached:
-        _times_of_one(bench.contender, workers, {})
-        times = [_times_of_one(bench.contender, workers, {}) for _ in range(programs)]
-    else:
-        times = []
+    times = []
+    with _bytecode_folder(writable=cached) as environment:
+        if cached:
+            _times_of_one(bench.contender, workers, environment)
         for _ in range(programs):
-            with _no_bytecode() as environment:
-                times.append(_times_of_one(bench.contender, workers, environment))
+            times.append(_times_of_one(bench.contender, workers, environment))
     return {name: median(each[name] for each in times) for name in (READY.name, MAP.name)}
 
 
 @contextmanager
-def _no_bytecode() -> Iterator[dict[str, str]]:
-    """An environment in which none is found, and none is left."""
+def _bytecode_folder(*, writable: bool) -> Iterator[dict[str, str]]:
+    """An environment in which only that bytecode is found that was left there, if it may be.
+
+    Whatever the machine has cached, or forbids to cache, is the same for all contenders then.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        yield {"PYTHONPYCACHEPREFIX": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+        forbidden = "" if writable else "1"
+        yield {"PYTHONPYCACHEPREFIX": folder, "PYTHONDONTWRITEBYTECODE": forbidden}
 
 
 def _times_of_one(contender: str, workers: int, environment: Mapping[str, str]) -> dict[str, float]:
