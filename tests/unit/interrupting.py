@@ -8,19 +8,34 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+LINES = ("line", "return")
+INSTRUCTIONS = ("opcode",)
 
-def is_interrupted(action: Callable[[], object], stop: int, files: set[str]) -> bool:
+
+def is_interrupted(
+    action: Callable[[], object],
+    stop: int,
+    files: set[str] | None = None,
+    *,
+    steps: tuple[str, ...] = LINES,
+) -> bool:
     """Do it, with a KeyboardInterrupt at step ``stop`` of the code in ``files``; False: too short.
 
-    A step is a line, or a return.  The locks of ``threading`` count as in all of them.
+    None stands for all files.  Where steps are lines, the locks of ``threading`` count as in any.
     """
     step = -1
 
+    def counts(frame: FrameType) -> bool:
+        if files is None or frame.f_code.co_filename in files:
+            return True
+        return steps == LINES and frame.f_globals is vars(threading)
+
     def trace(frame: FrameType, event: str, _arg: Any) -> Any:
         nonlocal step
-        if frame.f_code.co_filename not in files and frame.f_globals is not vars(threading):
+        if not counts(frame):
             return None
-        if event in ("line", "return"):
+        frame.f_trace_opcodes = steps == INSTRUCTIONS
+        if event in steps:
             step += 1
             if step == stop:
                 raise KeyboardInterrupt
@@ -31,7 +46,7 @@ def is_interrupted(action: Callable[[], object], stop: int, files: set[str]) -> 
     try:
         action()
     except KeyboardInterrupt:
-        return True
+        pass
     finally:
         sys.settrace(before)
-    return False
+    return step >= stop

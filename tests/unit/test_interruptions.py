@@ -29,7 +29,7 @@ from fiber._transport import unix
 from fiber._wire.arena import Arena, Block
 from fiber.connection import Connection, wait
 from hosts import PATIENCE, Hosts, objects_kept
-from unit.interrupting import is_interrupted
+from unit.interrupting import INSTRUCTIONS, is_interrupted
 from unit.pool_programs import run_program
 
 MORE_THAN_FITS = 2000
@@ -387,7 +387,12 @@ def test_a_far_pipe_is_there_whatever_interrupts_its_use(
 ) -> None:
     here, far = pipe
     step = 0
-    while without_deadlock(lambda: [interrupted_at(step, far.poll, {remote.__file__})])[0]:  # noqa: B023 - it ends before the next
+    files = {remote.__file__}
+
+    def poll() -> list[bool]:
+        return [is_interrupted(far.poll, step, files, steps=INSTRUCTIONS)]
+
+    while without_deadlock(poll)[0]:
         here.send(step)
         assert far.recv() == step
         step += 1
@@ -417,36 +422,12 @@ def test_whatever_interrupts_making_or_dropping_something_no_descriptor_is_left(
     gc.collect()
     before = os.listdir("/proc/self/fd")
     step = 0
-    while interrupted_at(step, make):
+    while is_interrupted(make, step, steps=INSTRUCTIONS):
         step += 1
         if os.listdir("/proc/self/fd") != before:
             gc.collect()
             assert os.listdir("/proc/self/fd") == before, f"left at step {step}"
     assert step > 10, "it was hardly interrupted"
-
-
-def interrupted_at(stop: int, function: Callable[[], Any], files: set[str] | None = None) -> bool:
-    """Call it, and raise KeyboardInterrupt at its instruction number ``stop`` in ``files``."""
-    step = -1
-
-    def trace(frame: FrameType, event: str, _arg: Any) -> Any:
-        nonlocal step
-        frame.f_trace_opcodes = files is None or frame.f_code.co_filename in files
-        if event == "opcode":
-            step += 1
-            if step == stop:
-                raise KeyboardInterrupt
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        function()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        sys.settrace(before)
-    return step >= stop
 
 
 def test_a_socket_whose_making_was_interrupted_ends_in_silence(
