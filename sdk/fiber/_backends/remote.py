@@ -29,7 +29,7 @@ class RemoteAgent:
 
     It takes work before its link is there; what it cannot do it reports as exits.
 
-    ``start``, ``send`` and ``close``, and a child's ``recall`` and ``signal``, come from anywhere
+    ``child``, ``send`` and ``close``, and a child's ``recall`` and ``signal``, come from anywhere
     and only put into the loop's queue; everything else happens on the loop's thread.
     """
 

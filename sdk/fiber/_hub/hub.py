@@ -29,7 +29,7 @@ from fiber._hub.protocol import HubAddress, ObjectKind
 from fiber._hub.registry import Registry
 from fiber._hub.streams import SocketStream, Stream
 from fiber._hub.tunnel import Router, Send, Tunnels
-from fiber._transport.loop import Loop
+from fiber._transport.loop import DOZE, Loop
 from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire.descriptor import Descriptor, own
 from fiber.errors import TooManyOpenFiles
@@ -38,11 +38,6 @@ _PEER = struct.Struct("iII")  # pid, uid, gid
 
 _ACCEPT_AGAIN = 0.1
 """Seconds until the next try when no descriptor is free to accept a stream with."""
-
-_DOZE = 0.2
-"""Seconds after which whoever waits for the loop looks whether it is still there; it is also as
-long as a signal may be slept over that comes just before the sleep.
-"""
 
 
 class Hub:
@@ -113,7 +108,7 @@ class Hub:
         self._loop.call_soon(self._answer, number, grant, answers)
         while not self._closed and not self._loop.broken:
             try:
-                answer = answers.get(timeout=_DOZE)
+                answer = answers.get(timeout=DOZE)
             except Empty:
                 continue
             if isinstance(answer, Exception):

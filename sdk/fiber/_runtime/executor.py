@@ -209,7 +209,7 @@ class Executor:
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
 
     def reject(self, future: Future, error: BaseException) -> None:
-        """What was asked for cannot even begin, which its future is told, as all, on the loop."""
+        """What was asked for cannot begin; its future hears so on the loop, as of all else."""
         self._check()
         self._loop.call_soon(future.set_exception, error)
 
@@ -580,9 +580,8 @@ class Executor:
         self._leases.close()
         self._background.stop()
         self.callbacks.stop()
-        self._ended_by = (
-            None  # its traceback may hold the pool, which this outlives in its finalizer
-        )
+        # Its traceback may hold the pool, whose finalizer holds this.
+        self._ended_by = None
         self.ended.set()
 
 

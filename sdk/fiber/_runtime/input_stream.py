@@ -16,7 +16,8 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from fiber._engine.chunks import Pace
-from fiber._runtime.latch import DOZE, check_may_wait
+from fiber._runtime.latch import check_may_wait
+from fiber._transport.loop import DOZE
 
 AHEAD = 3
 """Messages worth of tasks that are read ahead for each worker."""

@@ -19,9 +19,7 @@ import threading
 import time
 
 from fiber._transport import loop
-
-DOZE = 0.2
-"""Seconds that a signal is slept over at most."""
+from fiber._transport.loop import DOZE
 
 
 class Waiters:

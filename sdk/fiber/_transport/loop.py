@@ -29,6 +29,11 @@ LONGEST_POLL = 60.0
 would never end by itself if somebody closed the descriptors.
 """
 
+DOZE = 0.2
+"""Seconds that a wait for the loop, on another thread, lasts at most at a time: so long a signal
+may be slept over that comes just before the sleep (``fiber._runtime.latch`` says why).
+"""
+
 _MANY_TIMERS = 1024
 
 _this_thread = threading.local()
