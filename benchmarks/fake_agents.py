@@ -31,20 +31,21 @@ class FakeBackend:
 
     name = "fake"
     same_host = True
+    elastic = False
 
     def __init__(self, agent: FakeAgent) -> None:
         self._agent = agent
 
-    def place(self) -> Any:
-        """The one agent, an ``AgentHandle``."""
-        return self._agent
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> Any:
+        """A child of the one agent."""
+        return self._agent.child(spec, observer)
 
     def close(self) -> None:
         """Nothing is left behind by objects."""
 
 
 class FakeAgent:
-    """An `AgentHandle` whose children are objects. `on_ready` is called for each that is ready."""
+    """An agent whose children are objects. `on_ready` is called for each that is ready."""
 
     def __init__(
         self,
@@ -75,6 +76,8 @@ class FakeChild:
         self.host = agent.host
         self.pid: int | None = None
         self.start_error: Exception | None = None
+        self.waiting = False
+        self.node = ""
         self._number = number
         self._agent = agent
         self._observer = observer

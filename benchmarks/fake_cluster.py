@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 import os
 import subprocess
 import sys
@@ -16,8 +16,11 @@ from typing import TypeAlias
 from benchmarks import processes
 from benchmarks.agent_host import Order
 
+from fiber._agent.interface import ChildObserver, ChildSpec
+from fiber._backends.agent_set import AgentSet
 from fiber._backends.output import Output
-from fiber._backends.remote import RemoteAgent
+from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._engine.placement import Placement
 from fiber._runtime.state import Runtime
 from fiber._transport.credentials import make_credentials
 from fiber._transport.link import Link
@@ -34,7 +37,7 @@ Host: TypeAlias = subprocess.Popen[str]
 
 
 class FakeCluster:
-    """A `Backend` whose agents live in `hosts`; its children go to each of them in turn.
+    """A `Backend` whose agents live in `hosts`.
 
     `joined` are the seconds that it took all agents to join, from the order to dial, and `joining`
     those of a processor that this process used meanwhile; `master_memory` and `agent_memory` the
@@ -43,16 +46,18 @@ class FakeCluster:
 
     name = "fake"
     same_host = False
+    elastic = False
 
     def __init__(self, runtime: Runtime, hosts: Sequence[Host], agents: int) -> None:
         assert runtime.hub is not None
         self._hosts = hosts
         self._output = Output()
-        self._agents = {
-            name: RemoteAgent(name, runtime.loop, runtime.hub, self._output, on_lost=self._lost)
-            for name in (f"fake-{number}" for number in range(agents))
-        }
-        self._turns = itertools.cycle(self._agents.values())
+        self._loop = runtime.loop
+        self._names = [f"fake-{number}" for number in range(agents)]
+        placement: Placement[RemoteAgent, RemoteChild] = Placement(math.inf, spread=True)
+        self._agents = AgentSet(
+            runtime.loop, runtime.hub, self._output, placement, on_lost=self._lost
+        )
         self._missing = agents
         self._all_joined = threading.Event()
         self._problem = ""
@@ -69,7 +74,7 @@ class FakeCluster:
 
     def join(self) -> None:
         """Have all agents dial, and wait until the last of them has its link."""
-        names = list(self._agents)
+        names = self._names
         before = self._memory()
         begin, used = time.perf_counter(), time.process_time()
         for number, host in enumerate(self._hosts):
@@ -95,14 +100,13 @@ class FakeCluster:
         if self._problem:
             raise RuntimeError(self._problem)
 
-    def place(self) -> RemoteAgent:
-        """The agent whose turn it is."""
-        return next(self._turns)
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
+        """A child of the agent that has the fewest."""
+        return self._agents.child(spec, observer)
 
     def close(self) -> None:
         """End the agents, and with them their hosts; those that never began do not matter."""
-        for agent in self._agents.values():
-            agent.close()
+        self._loop.call_soon(self._close_agents)
         for host in self._hosts:
             with suppress(subprocess.TimeoutExpired):
                 host.wait(_END if not self._missing else 0)
@@ -118,10 +122,14 @@ class FakeCluster:
     # On the loop's thread
 
     def _link(self, link: Link) -> None:
-        self._agents[link.peer.name].join(link)
+        self._agents.join(link.peer.name, link)
         self._missing -= 1
         if not self._missing:
             self._all_joined.set()
+
+    def _close_agents(self) -> None:
+        for agent in self._agents.agents.values():
+            agent.close()
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
         if self._missing:

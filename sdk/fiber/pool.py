@@ -30,9 +30,11 @@ from fiber._runtime.executor import Executor
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import runtime
 from fiber._runtime.work_items import WorkItem
+from fiber._runtime.worker_view import WorkerInfo
 from fiber._wire import work
-from fiber.errors import FiberError
+from fiber.errors import FiberError, TimeoutError
 from fiber.process import PoolProcess, process_type
+from fiber.resources import Resources
 from fiber.results import (
     ApplyResult,
     AsyncResult,
@@ -51,6 +53,7 @@ __all__ = [
     "Pool",
     "RemoteTraceback",
     "ThreadPool",
+    "WorkerInfo",
 ]
 
 IDLE_TIMEOUT = 60.0
@@ -78,6 +81,9 @@ class Pool:
       runs again, too, before the exception counts.
     * A task that runs for longer than ``task_timeout`` seconds, or the ``timeout=`` of its call,
       raises TimeoutError, and its worker is killed and replaced.
+    * On Kubernetes, ``pool`` is the name of a FiberPool that is there already, whose pods are used
+      in place of the program's own.  Workers start with the first task there, and have what
+      ``fiber.meta`` says that its function needs.
     """
 
     _state = INIT  # until ``__init__`` is through; ``__del__`` looks at it
@@ -97,6 +103,7 @@ class Pool:
         error_handling: bool = False,
         task_timeout: float | None = None,
         idle_timeout: float | None = IDLE_TIMEOUT,
+        pool: str | None = None,
     ) -> None:
         minimum, maximum = options.sizes(processes, min_workers, max_workers)
         if initializer is not None and not callable(initializer):
@@ -117,6 +124,7 @@ class Pool:
                 retries=options.retries(retries),
                 retryable=(Exception,) if error_handling else options.exceptions(retry_exceptions),
                 idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
+                resources=Resources(pool=pool),
             ),
             runtime(),
         )
@@ -140,7 +148,7 @@ class Pool:
         TimeoutError, and the worker is killed, if it runs for longer than ``timeout`` seconds; None
         stands for the pool's ``task_timeout``, infinity for no limit.
         """
-        self._check_running()
+        self._check_running(func)
         result = AsyncResult(self)
         return self._executor.call_and_wait(result, func, args, kwds, self._limit(timeout))
 
@@ -159,18 +167,45 @@ class Pool:
         In another thread ``callback`` is called with the result, or ``error_callback`` with what
         was raised; both must be quick, since all of a pool's callbacks wait for each other.
         """
-        self._check_running()
+        self._check_running(func)
         result = AsyncResult(self, callback, error_callback)
         self._executor.call(result, func, args, kwds, self._limit(timeout))
         return result
 
     def broadcast(self, func: _Function, *args: Any) -> list[Any]:
         """Call ``func(*args)`` once in every worker, and return the results of all."""
-        self._check_running()
+        self._check_running(func)
         result = MapResult(self)
         self._executor.broadcast(result, func, args)
         values: list[Any] = result.get()
         return values
+
+    # Workers
+
+    def start_workers(self) -> None:
+        """Start the workers now, where the first task would: on a cluster, where they are then such
+        as a function without wishes needs.
+        """
+        self._check_running()
+        self._executor.start_workers()
+
+    def wait_until_workers_up(self, timeout: float | None = None) -> None:
+        """Wait until all workers (with ``min_workers``: so many) are ready for tasks.
+
+        TimeoutError after ``timeout`` seconds; what keeps them from starting is raised.
+        """
+        self._check_running()
+        if not self._executor.wait_until_up(options.seconds("timeout", timeout)):
+            infos = self.workers()
+            ready = sum(info.state in ("idle", "busy") for info in infos)
+            raise TimeoutError(
+                f"{ready} of {len(infos)} workers are ready after {timeout:g} s: see workers()"
+            )
+
+    def workers(self) -> list[WorkerInfo]:
+        """The workers that there are, or that are being started, the oldest first."""
+        self._check_owner()
+        return self._executor.workers.describe()
 
     # Maps
 
@@ -342,7 +377,7 @@ class Pool:
         timeout: float | None,
     ) -> WorkItem | None:
         """A map to come; None if its function does not pickle, which the future will be told."""
-        self._check_running()
+        self._check_running(func)
         unit = 1 if chunksize is None else options.chunksize(chunksize)
         limit = self._limit(timeout)
         try:
@@ -389,15 +424,17 @@ class Pool:
     @property
     def _pool(self) -> list[Any]:
         """The processes of its workers."""
-        return list(self._executor.processes())
+        return list(self._executor.workers.processes())
 
     def _repopulate_pool(self) -> None:
         """Nothing: workers are replaced as they go."""
 
-    def _check_running(self) -> None:
+    def _check_running(self, func: _Function | None = None) -> None:
         self._check_owner()
         if self._state != RUN:
             raise ValueError("Pool not running")
+        if func is not None:
+            self._executor.suit(func)
 
     def _check_owner(self) -> None:
         if os.getpid() != self._owner:

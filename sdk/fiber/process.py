@@ -64,7 +64,7 @@ class Process(BaseProcess):
         return partial(_ended.append, weakref.ref(self))
 
     def start(self) -> None:
-        """Start it; returns when it has a pid."""
+        """Start it; returns when it has a pid, or waits for a pod that is yet to be made."""
         self._check_closed()  # type: ignore[attr-defined]
         assert self.pid is None, "cannot start a process twice"
         assert self._parent_pid == os.getpid(), (  # type: ignore[attr-defined]

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-__all__ = ["Resources", "meta", "resources_of"]
+__all__ = ["Resources", "merged", "meta", "resources_of", "with_resources"]
 
 _ATTRIBUTE = "__fiber_meta__"
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -27,6 +27,8 @@ class Resources:
     """Memory in MiB."""
     gpu: int | None = None
     """GPUs."""
+    pool: str | None = None
+    """The FiberPool whose pods are meant; None: one of the program's own."""
 
 
 def meta(
@@ -54,7 +56,7 @@ def meta(
                 f"fiber.meta() is for functions, not for {function!r}: "
                 "decorate the function that is run, of a Process subclass its run() method"
             )
-        result: _F = _attach(function, _merged(resources_of(function), wishes))
+        result: _F = _attach(function, merged(resources_of(function), wishes))
         return result
 
     return decorate
@@ -68,7 +70,14 @@ def resources_of(function: Callable[..., Any]) -> Resources:
     return wishes if isinstance(wishes, Resources) else Resources()
 
 
-def _merged(inner: Resources, outer: Resources) -> Resources:
+def with_resources(function: _F, wishes: Resources) -> _F:
+    """`function` with these wishes, for whoever has them in hand."""
+    result: _F = function if wishes == Resources() else _attach(function, wishes)
+    return result
+
+
+def merged(inner: Resources, outer: Resources) -> Resources:
+    """What ``inner`` wishes and ``outer`` adds or wishes otherwise."""
     given = {f.name: getattr(outer, f.name) for f in fields(outer)}
     return replace(inner, **{name: wish for name, wish in given.items() if wish is not None})
 

@@ -64,7 +64,7 @@ def backend(request: pytest.FixtureRequest) -> Iterator[str]:
             # The thread that writes what agents tell lives as long as the runtime.
             loopback: Any = runtime.backend
             loopback._output.write("test", "begins")
-            wait_for(lambda: all(process.agent.joined for process in loopback._processes))
+            wait_for(lambda: len(loopback.agents.agents) == len(loopback._slots))
         yield request.param
 
 

@@ -30,9 +30,9 @@ def backend() -> Iterator[LoopbackBackend]:
 
 
 def pid_of(backend: LoopbackBackend, host: str) -> int:
-    for process in backend._processes:
-        if process.agent.host == host:
-            pid = process.process.pid
+    for slot in backend._slots:
+        if slot.name == host:
+            pid = slot.process.pid
             assert pid is not None
             return pid
     raise AssertionError(f"{host} is gone")
@@ -88,7 +88,7 @@ def test_a_stopped_agent_gets_no_new_process_then_is_lost_and_replaced(
     host, pid = host_of(child), child.pid
     agent_pid = pid_of(backend, host)
     stop_and_wait(agent_pid)
-    agent = next(p.agent for p in backend._processes if p.agent.host == host)
+    agent = backend.agents.agents[host]
     wait_for(lambda: agent.suspect)
     others = [start(targets.nothing) for _ in range(3)]
     assert all(other._popen.report is not None or host_of(other) != host for other in others)
@@ -142,7 +142,7 @@ def test_every_agent_killed_again_and_again_the_pool_goes_on(backend: LoopbackBa
         assert pool.apply(abs, (-1,)) == 1
         result = pool.map_async(targets.slow_square, range(200), chunksize=1)
         for _ in range(3):
-            hosts = [process.agent.host for process in backend._processes]
+            hosts = [slot.name for slot in backend._slots]
             for host in hosts:
                 os.kill(pid_of(backend, host), signal.SIGKILL)
             wait_for(partial(_joined, backend, hosts))
@@ -150,7 +150,8 @@ def test_every_agent_killed_again_and_again_the_pool_goes_on(backend: LoopbackBa
 
 
 def _joined(backend: LoopbackBackend, old: list[str]) -> bool:
-    return all(p.agent.joined and p.agent.host not in old for p in backend._processes)
+    joined = backend.agents.agents
+    return all(slot.name in joined and slot.name not in old for slot in backend._slots)
 
 
 def _gone(pid: int) -> bool:
@@ -182,7 +183,7 @@ def test_after_good_work_agents_end_with_status_0(launch: Callable[..., Program]
                 pool.map(abs, range(10))
             child = fiber.Process(target=print)
             child.start()
-            agents = [process.process._process for process in state.runtime().backend._processes]
+            agents = [slot.process._process for slot in state.runtime().backend._slots]
             child.join()
             state.shutdown()
             print({agent.returncode for agent in agents})

@@ -28,7 +28,7 @@ class Wire:
         self.backend = backend
 
     def agents(self) -> list[str]:
-        return [process.agent.host for process in self.backend._processes]
+        return [slot.name for slot in self.backend._slots]
 
     def start(self, target: Any = targets.block, *args: Any) -> Any:
         child = fiber.Process(target=target, args=args)

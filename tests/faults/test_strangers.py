@@ -80,8 +80,8 @@ def test_garbage_on_the_masters_port(backend: LoopbackBackend, data: bytes) -> N
 def test_strangers_that_say_nothing_and_stay_hold_nobody_up(backend: LoopbackBackend) -> None:
     strangers = [socket.create_connection(address(backend), PATIENCE) for _ in range(50)]
     works()
-    backend._processes[0].process.kill()
-    wait_for(lambda: backend._processes[0].agent.host != "loopback-0")
+    backend._slots[0].process.kill()
+    wait_for(lambda: backend._slots[0].name != "loopback-0")
     works()  # by an agent that had to come in past them
     for stranger in strangers:
         stranger.close()

@@ -157,6 +157,8 @@ class Child:
         self.name = f"worker {number}"
         self.pid: int | None = None
         self.start_error: Exception | None = None
+        self.waiting = False
+        self.node = ""
         self.host = agent.host
         self.agent = agent
         self.worker = Worker(agent.world, number, self)

@@ -50,11 +50,15 @@ class RemoteHost(Agent):
             drop=self._rng.choice((0.0, 0.0, 0.05)),
         )
         nothing: Any = mock.MagicMock()
-        self._remote = RemoteAgent(name, loop, nothing, nothing, self._lose_remote)
+        observer = SimpleNamespace(
+            lost=self._lose_remote, child_gone=lambda _: None, suspected=lambda *_: None
+        )
+        link = self._cable.master
+        self._remote = RemoteAgent(name, link, loop, nothing, nothing, observer)
         here: Any = LocalPort(self)
         self._service = service.AgentService(loop, self._cable.agent, here, nothing, nothing)
         self._cable.agent.attach(self._service)
-        self._remote.join(self._cable.master)
+        link.attach(self._remote)
 
     @property
     def is_cut(self) -> bool:
@@ -65,7 +69,7 @@ class RemoteHost(Agent):
         """A worker as the master has it, to be started."""
         seen = self._seen[name] = Seen(self, name, observer)
         spec = ChildSpec(name, "fork", b"", b"", tasks=True)
-        return self._remote.child(spec, seen)
+        return RemoteChild(self._remote, spec, seen)
 
     def seen(self, name: str) -> Seen:
         """What the master knows of a worker."""

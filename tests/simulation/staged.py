@@ -40,6 +40,7 @@ class Stage:
     def __init__(self, world: World) -> None:
         self.loop = world.loop
         self.config = SimpleNamespace(start_timeout=1.0)
+        self.elastic = False
         self.rng = random.Random(f"{world.schedule.seed} stage")
         self.world = world
         self._started = 0

@@ -118,6 +118,8 @@ class FakeChild:
         self.host = "here"
         self.pid = 1
         self.start_error: Exception | None = None
+        self.waiting = False
+        self.node = ""
         self.packets: list[tuple[int, bytes]] = []
         self.recalls = 0
         self.signals: list[int] = []
@@ -186,7 +188,10 @@ class Rig:
         self.refusal: BaseException | None = None
         """What stands in the way of another worker."""
         host: Any = SimpleNamespace(
-            loop=self.loop, start=self._start, config=SimpleNamespace(start_timeout=1.0)
+            loop=self.loop,
+            start=self._start,
+            elastic=False,
+            config=SimpleNamespace(start_timeout=1.0),
         )
         self.threads: dict[str, ManualThread] = {}
         new_process = partial(PoolProcess, like=Process)

@@ -12,8 +12,8 @@ import pytest
 
 from fiber._agent.interface import ExitReport
 from fiber._engine.ledger import PATIENCE
-from fiber._runtime.executor import KILL_AFTER
 from fiber._runtime.input_stream import InputStream
+from fiber._runtime.launcher import KILL_AFTER
 from fiber._runtime.outcome import Failure, Pickled
 from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work

@@ -10,7 +10,7 @@ import pytest
 
 from fiber._agent.interface import Cause, ExitReport
 from fiber._engine import worker_set
-from fiber._runtime.executor import KILL_AFTER
+from fiber._runtime.launcher import KILL_AFTER
 from fiber._wire import work
 from fiber.errors import FiberError
 from unit import pool_tasks as tasks

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -23,7 +24,7 @@ from fiber import config
 from fiber._agent.interface import ChildSpec
 from fiber._backends import agent_process, loopback
 from fiber._backends.output import Output
-from fiber._backends.remote import RemoteAgent
+from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._hub.protocol import HubAddress
 from fiber._runtime import state
 from fiber._wire import messages
@@ -73,7 +74,7 @@ def stop(*children: Any) -> None:
 
 def test_processes_go_to_the_agent_that_has_the_fewest(shared: Any) -> None:
     children = [start() for _ in range(3)]
-    counts = sorted(process.agent.children for process in shared._processes)
+    counts = sorted(shared.agents._placement.loads.values())
     assert counts == [1, 2]
     stop(*children)
 
@@ -91,7 +92,7 @@ def test_nothing_secret_is_on_a_command_line_or_in_the_environment_of_children(
     shared: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
     child = start()
-    agents = [process.process.pid for process in shared._processes]
+    agents = [slot.process.pid for slot in shared._slots]
     for found in census.everything():
         if found.pid in agents or found.parent in agents or found.pid == child.pid:
             assert shared._listener.address not in found.command
@@ -167,14 +168,13 @@ def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() ->
     with running() as backend:
         child = start()
         pid = child.pid
-        process = backend._processes[0]
-        os.kill(process.process.pid, signal.SIGKILL)
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL
         assert "agent loopback-0 lost" in child._popen.report.reason
         assert census.wait_until(lambda: census.read(pid) is None, PATIENCE)
         another = start()  # at once: it waits for the next agent
-        assert backend._processes[0].agent.host == "loopback-1"
+        assert backend._slots[0].name == "loopback-1"
         stop(another)
 
 
@@ -214,7 +214,7 @@ def test_an_agent_that_cannot_be_replaced_at_once_is_replaced_later_and_that_is_
         child = start()
         reluctant = Reluctant(2, errno.EAGAIN)
         monkeypatch.setattr(agent_process.subprocess, "Popen", reluctant)
-        os.kill(backend._processes[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL, "its end is reported whatever comes after"
         another = start()
@@ -236,8 +236,8 @@ def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.Monke
             return popen(*args, **options)
 
         monkeypatch.setattr(agent_process.subprocess, "Popen", slow)
-        os.kill(backend._processes[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
-        assert census.wait_until(lambda: backend._processes[0].agent.host != "loopback-0", PATIENCE)
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        assert census.wait_until(lambda: backend._slots[0].name != "loopback-0", PATIENCE)
         turned = threading.Event()
         backend._loop.call_soon(turned.set)
         assert turned.wait(PATIENCE)
@@ -263,7 +263,7 @@ def test_an_agent_that_cannot_be_watched_is_ended_before_the_next_attempt(
         stop(start())
         first, second = started
         assert census.read(first) is None
-        assert backend._processes[0].process.pid == second
+        assert backend._slots[0].process.pid == second
 
 
 def test_an_agent_that_can_never_be_started_is_an_error_with_the_cause(
@@ -281,14 +281,13 @@ def test_while_another_agent_is_there_no_place_is_given_up(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with running(agents=2) as backend:
-        for process in backend._processes:
-            assert census.wait_until(lambda process=process: process.agent.joined, PATIENCE)
+        assert census.wait_until(lambda: len(backend.agents.agents) == 2, PATIENCE)
         monkeypatch.setattr(agent_process.subprocess, "Popen", Reluctant(4, errno.ENOEXEC))
-        os.kill(backend._processes[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
         assert census.wait_until(lambda: len(backend._failures) >= 3, PATIENCE)
         child = start()  # on the other one
         assert child._popen._child.host == "loopback-1"
-        assert census.wait_until(lambda: backend._processes[0].agent.joined, PATIENCE)
+        assert census.wait_until(lambda: len(backend.agents.agents) == 2, PATIENCE)
         stop(child)
     assert "The others go on; the next attempt is in 0.1 s" in capfd.readouterr().err
 
@@ -364,16 +363,15 @@ class Silent:
 
 @pytest.fixture
 def remote() -> tuple[RemoteAgent, Silent, Recorder]:
-    link = Silent()
-    agent = RemoteAgent("far", SimulatedLoop(), link, Output(), on_lost=lambda *_: None)  # type: ignore[arg-type]
+    link, unheard = Silent(), mock.Mock()
+    agent = RemoteAgent("far", link, SimulatedLoop(), link, Output(), unheard)  # type: ignore[arg-type]
     observer = Recorder()
-    agent.child(ChildSpec("child", "fork", b"", b"", tasks=True), observer).start()
+    RemoteChild(agent, ChildSpec("child", "fork", b"", b"", tasks=True), observer).start()
     return agent, link, observer
 
 
 def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
-    agent, link, observer = remote
-    agent.join(link)
+    agent, _, observer = remote
     agent.on_frame(messages.Started(1, 77).encode())
     agent.on_frame(messages.FromChild(1, pickle.dumps("in time"), ()).encode())
     agent.on_lost("silence")
@@ -385,42 +383,21 @@ def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
     assert observer.report.exitcode == -signal.SIGKILL
 
 
-def test_what_was_asked_before_it_joined_is_sent_when_it_does(remote: Any) -> None:
-    agent, link, observer = remote
+def test_nothing_is_delivered_to_a_child_whose_agent_is_lost(remote: Any) -> None:
+    agent, _, observer = remote
     (child,) = agent._children.values()
-    for seq in (3, 4, 5):
-        child.deliver(seq, b"work")
-    agent.join(link)
-    agent.loop.run_for(0)
-    assert [message.seq for message in link.sent[1:]] == [3, 4, 5]
     agent.on_lost("silence")
     assert not child.deliver(6, b"too late")
     assert observer.events == ["exited"]
 
 
-def test_a_lost_agent_starts_nothing_more(remote: Any) -> None:
-    agent, _, _ = remote
-    agent.on_lost("silence")
-    with pytest.raises(RuntimeError, match="agent far cannot start child: silence"):
-        agent.child(ChildSpec("child", "fork", b"", b""), Recorder())
-
-
 def test_a_child_whose_agent_is_lost_before_it_starts_is_lost_with_it(remote: Any) -> None:
     agent, link, _ = remote
-    agent.join(link)
     observer = Recorder()
-    child = agent.child(ChildSpec("child", "fork", b"", b""), observer)
+    child = RemoteChild(agent, ChildSpec("child", "fork", b"", b""), observer)
     agent.on_lost("silence")
     sent = len(link.sent)
     child.start()
     assert observer.events == ["exited"]
     assert observer.wait_for_exit().reason == "agent far lost: silence"
     assert len(link.sent) == sent
-
-
-def test_a_child_that_is_to_start_counts_until_it_is_dropped(remote: Any) -> None:
-    agent, _, _ = remote
-    child = agent.child(ChildSpec("child", "fork", b"", b""), Recorder())
-    assert agent.children == 2
-    del child
-    assert agent.children == 1

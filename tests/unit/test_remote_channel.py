@@ -28,12 +28,11 @@ class Far:
         self.loop = SimulatedLoop()
         self.link: Any = mock.Mock()
         nothing: Any = mock.MagicMock()
-        self.agent = RemoteAgent("far", self.loop, nothing, nothing, on_lost=lambda *_: None)
+        self.agent = RemoteAgent("far", self.link, self.loop, nothing, nothing, nothing)
         self.observer = Recorder()
         spec = ChildSpec("child", "fork", b"", b"", tasks=True)
-        self.child: RemoteChild = self.agent.child(spec, self.observer)
+        self.child = RemoteChild(self.agent, spec, self.observer)
         self.child.start()
-        self.agent.join(self.link)
 
     def sent(self) -> list[int]:
         """The packets that the link was given."""

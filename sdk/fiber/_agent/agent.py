@@ -32,7 +32,7 @@ _CLOSE_TIMEOUT = 10.0
 
 
 class Agent:
-    """Runs the children of this host; an ``AgentHandle``."""
+    """Runs the children of this host."""
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None = None) -> None:
         self.host = host

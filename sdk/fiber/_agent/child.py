@@ -54,6 +54,8 @@ class StartRequest(NamedTuple):
     """Where it finds the hub of its host."""
     ancestors: tuple[int, ...]
     """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
+    host: str
+    """What the master calls the host."""
 
 
 def lineage() -> tuple[int, ...]:
@@ -144,7 +146,7 @@ def _load(start: StartRequest) -> Any:
     if start.hub is not None:
         hub_client.set_hub_address(start.hub)
     prepare_paths(data)
-    _prepare_environment(data)
+    _prepare_environment(data, start.host)
     with inheriting():
         prepare_main(data)
         process = pickle.loads(start.payload)
@@ -186,9 +188,9 @@ def prepare_main(data: dict[str, Any]) -> None:
     multiprocessing.spawn.prepare(wanted)
 
 
-def _prepare_environment(data: dict[str, Any]) -> None:
+def _prepare_environment(data: dict[str, Any], own_host: str) -> None:
     global host
-    host = data["host"]
+    host = own_host
     environ = data.get("environ")
     if environ is not None and environ != os.environb:
         os.environb.clear()

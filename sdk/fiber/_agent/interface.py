@@ -1,8 +1,7 @@
 """The seam between whoever wants children and whoever runs them.
 
-The master asks through ``AgentHandle`` and ``ChildHandle`` and hears through ``ChildObserver``.
-The agent in this process (``agent.py``) and the agent behind a link (``fiber._backends``) both are
-one.
+The master asks through ``ChildHandle`` and hears through ``ChildObserver``.  A child of this very
+process (``local_child.py``) and one behind a link (``fiber._backends``) both are one.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 from fiber._wire.packet import BytesLike, Message
+from fiber.resources import Resources
 
 UNKNOWN = 255
 """Exit code of a child of which it is not known, as in multiprocessing."""
@@ -27,6 +27,8 @@ class Cause(IntEnum):
     """Its host: the system had no room for it, and it never was."""
     AGENT_LOST = 2
     """The way to its host."""
+    NO_HOST = 3
+    """There is no host for it, and none will come."""
 
 
 class ExitReport(NamedTuple):
@@ -64,6 +66,8 @@ class ChildSpec:
     executable: str | None = None
     stdio: tuple[int, int] | None = field(default=None)
     """Descriptors for its stdout and stderr; None: those of the agent's process."""
+    resources: Resources = field(default=Resources())
+    """What it wishes of its host, heeded where hosts are made for children."""
 
 
 class ChildObserver(Protocol):
@@ -106,7 +110,12 @@ class ChildHandle(Protocol):
 
     name: str
     host: str
+    """Where it is; empty while it waits for a host."""
+    node: str
+    """The node of its pod; empty where there is none, or while that is not known."""
     pid: int | None
+    waiting: bool
+    """Whether it waits for a host."""
     start_error: Exception | None
     """What kept it from being started, where that is not only told by its report."""
 
@@ -134,15 +143,3 @@ class ChildHandle(Protocol):
 
     def signal(self, signum: int) -> None:
         """Send it a signal; nothing if it is gone."""
-
-
-class AgentHandle(Protocol):
-    """One agent: starts children on one host."""
-
-    host: str
-
-    def child(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
-        """A child to be started; raises what is known to be in the way.  From anywhere."""
-
-    def close(self) -> None:
-        """Kill every child and end."""

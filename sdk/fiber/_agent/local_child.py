@@ -52,7 +52,9 @@ class LocalChild:
         self.id = id_
         self.name = spec.name
         self.host = owner.host
+        self.node = ""
         self.pid: int | None = None
+        self.waiting = False
         self.slot: int | None = None
         self.start_error: Exception | None = None
         self.fault: Exception | None = None
@@ -109,6 +111,7 @@ class LocalChild:
             open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
             hub=hub,
             ancestors=lineage(),
+            host=self.host,
         )
         zygote.start(self.id, request, fds)
 

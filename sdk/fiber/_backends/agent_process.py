@@ -37,8 +37,6 @@ class AgentProcess:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._unwanted = False
-        self.delayed = False
-        """Whether something keeps it from starting now."""
 
     @property
     def pid(self) -> int | None:
@@ -68,7 +66,6 @@ class AgentProcess:
                 process.wait()
                 raise
             self._process = process
-            self.delayed = False
         self._loop.register(self._watched, self._ended)
 
     def fail(self, reason: str) -> None:
@@ -152,7 +149,6 @@ class AgentLauncher:
                 if error.errno not in _MAY_PASS or time.monotonic() + pause > deadline:
                     process.fail(reason)
                     return
-            process.delayed = True
             self._on_trouble(f"agent {name} has to wait, {reason}; next attempt in {pause:g} s")
             if self._closing.wait(pause):
                 return

@@ -1,10 +1,10 @@
-"""What a backend is: it turns "I want a child" into an agent that can run it."""
+"""What a backend is: it turns "I want a child" into one, wherever that runs."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
-from fiber._agent.interface import AgentHandle
+from fiber._agent.interface import ChildHandle, ChildObserver, ChildSpec
 
 
 class Backend(Protocol):
@@ -14,9 +14,12 @@ class Backend(Protocol):
     same_host: bool
     """Whether its agents run on the program's own host, so that descriptors can be handed over."""
 
-    def place(self) -> AgentHandle:
-        """The agent for the next child, at once, though it may not have joined yet; StartError if
-        none can take one more.
+    elastic: bool
+    """Whether a host may be made for a child: starting one does not wait for that."""
+
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
+        """A child to be started, at once or when there is room for it; raises what is known to be
+        in the way.  From anywhere.
         """
 
     def close(self) -> None:

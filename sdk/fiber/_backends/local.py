@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from fiber._agent.agent import Agent
+from fiber._agent.interface import ChildObserver, ChildSpec
+from fiber._agent.local_child import LocalChild
 from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
 
@@ -11,14 +13,15 @@ class LocalBackend:
     """Children are subprocesses of this program."""
 
     name = "local"
+    elastic = False
     same_host = True
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None) -> None:
         self._agent = Agent(loop, host, hub)
 
-    def place(self) -> Agent:
-        """The one agent."""
-        return self._agent
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> LocalChild:
+        """A child of this very process."""
+        return self._agent.child(spec, observer)
 
     def close(self) -> None:
         """Kill the children that are left."""

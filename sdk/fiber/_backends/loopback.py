@@ -10,11 +10,15 @@ import math
 import os
 import threading
 import time
+from functools import partial
 from typing import NamedTuple
 
+from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_process import AgentLauncher, AgentProcess
+from fiber._backends.agent_set import AgentSet
 from fiber._backends.output import Output
-from fiber._backends.remote import RemoteAgent
+from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._engine.placement import Placement
 from fiber._hub.hub import Hub
 from fiber._transport.credentials import make_credentials
 from fiber._transport.link import Keepalive, Link
@@ -40,6 +44,7 @@ class LoopbackBackend:
     """
 
     name = "loopback"
+    elastic = False
     same_host = False
 
     def __init__(self, loop: Loop, hub: Hub, config: Config) -> None:
@@ -50,10 +55,14 @@ class LoopbackBackend:
         self._failures: tuple[str, ...] = ()
         self._closing = False
         self._numbers = itertools.count()
-        self._processes: list[_Slot] = []
+        self._limit = config.processes_per_agent or math.inf
+        self._slots: list[_Slot] = []
         self._by_name: dict[str, _Slot] = {}
         self._vacant: list[_Slot] = []
         """Those whose agents are lost and not yet replaced."""
+        self.agents = AgentSet(
+            loop, hub, self._output, Placement(self._limit, spread=True), on_lost=self._lost
+        )
         credentials = make_credentials("loopback")
         self._listener = MasterListener(
             loop,
@@ -71,30 +80,24 @@ class LoopbackBackend:
         for index in range(config.agents):
             self._launch(index)
 
-    def place(self) -> RemoteAgent:
-        """The agent with the fewest children; StartError if none can take one more."""
-        limit = self._config.processes_per_agent or math.inf
-        free = [slot for slot in self._processes if slot.agent.can_take(limit)]
-        if free:
-            return min(free, key=_Slot.preference).agent
-        there = sum(not slot.agent.lost for slot in self._processes)
-        if there:
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
+        """A child for the agent with the fewest; StartError if none can take one more."""
+        there = len(self._slots) - len(self._vacant)
+        if there and self.agents.children >= there * self._limit:
             raise StartError(
                 "one more process",
-                f"all {there} agents run {limit} processes already (processes_per_agent); "
+                f"all {there} agents run {self._limit} processes already (processes_per_agent); "
                 "raise FIBER_AGENTS or FIBER_PROCESSES_PER_AGENT",
             )
-        reasons = "\n".join(self._failures)
-        raise StartError("the loopback agents", "none joined", reasons, _ATTEMPTS)
+        return self.agents.child(spec, observer)
 
     def close(self) -> None:
         """End the agents and wait for them."""
         self._closing = True
         self._launcher.close()
-        for slot in self._processes:
-            slot.agent.close()
+        self._loop.call_soon(self._shut_down)
         deadline = time.monotonic() + _QUIT_TIMEOUT
-        for slot in self._processes:
+        for slot in self._slots:
             slot.process.wait(max(deadline - time.monotonic(), 0.0))
         done = threading.Event()
         self._listener.close("the master ended", then=done.set)
@@ -104,13 +107,11 @@ class LoopbackBackend:
     def _launch(self, index: int, pause: float = 0.0) -> None:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
-        agent = RemoteAgent(name, self._loop, self._hub, self._output, on_lost=self._lost)
-        process = AgentProcess(self._loop, agent.lose)
-        slot = self._by_name[name] = _Slot(index, agent, process)
-        self._processes[index : index + 1] = [slot]
+        process = AgentProcess(self._loop, partial(self._ended, name))
+        self._by_name[name] = slot = _Slot(index, name, process)
+        self._slots[index : index + 1] = [slot]
         launch = self._launcher.launch, process, name, self._environment(name)
         if pause:
-            process.delayed = True
             self._loop.call_later(pause, *launch)
         else:
             launch[0](*launch[1:])
@@ -128,34 +129,55 @@ class LoopbackBackend:
     # On the loop's thread
 
     def _joined(self, link: Link) -> str | None:
-        slot = self._by_name.get(link.peer.name)
-        if slot is None or slot.agent.joined:
-            return f"the master expects no agent named {link.peer.name}"
+        name = link.peer.name
+        if name not in self._by_name or name in self.agents.agents:
+            return f"the master expects no agent named {name}"
         self._failures = ()
-        slot.agent.join(link)
+        self.agents.join(name, link)
         self._fill_vacant()  # those that were given up: it can be done after all
         return None
 
+    def _shut_down(self) -> None:
+        for slot in self._slots:
+            agent = self.agents.agents.get(slot.name)
+            if agent is None:
+                slot.process.kill()  # it has not joined
+            else:
+                agent.close()
+
+    def _ended(self, name: str, reason: str) -> None:
+        """Its process is gone, or was never there."""
+        agent = self.agents.agents.get(name)
+        if agent is not None:
+            agent.lose(reason)
+        elif name in self._by_name:
+            self._failures += (f"{name}: {reason}",)
+            self._replace(name, reason)
+
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
-        """Have a place for new children before the ends of its own make anybody ask for one."""
+        self._replace(agent.host, reason)
+
+    def _replace(self, name: str, reason: str) -> None:
         if self._closing:
             return
-        slot = self._by_name.pop(agent.host)
+        slot = self._by_name.pop(name)
         slot.process.kill()
         self._vacant.append(slot)
-        if not agent.joined:
-            self._failures += (f"{agent.host}: {reason}",)
         in_a_row = len(self._failures)
         if in_a_row < _ATTEMPTS:
             self._fill_vacant()
-        elif any(slot.agent.joined and not slot.agent.lost for slot in self._processes):
+        elif self.agents.agents:
             pause = min(_PAUSE_MIN * 2 ** (in_a_row - _ATTEMPTS), _PAUSE_MAX)
             self._output.write(
                 "fiber",
-                f"agent {agent.host} was lost before it joined, as {in_a_row - 1} before it: "
+                f"agent {name} was lost before it joined, as {in_a_row - 1} before it: "
                 f"{reason}. The others go on; the next attempt is in {pause:g} s",
             )
             self._fill_vacant(pause)
+        else:
+            reasons = "\n".join(self._failures)
+            error = StartError("the loopback agents", "none joined", reasons, _ATTEMPTS)
+            self.agents.fail(error)
 
     def _fill_vacant(self, pause: float = 0.0) -> None:
         vacant, self._vacant = self._vacant, []
@@ -164,12 +186,8 @@ class LoopbackBackend:
 
 
 class _Slot(NamedTuple):
-    """The place of an agent among the others, the agent, and the process that it is."""
+    """The place of an agent among the others, the agent's name, and the process that it is."""
 
     position: int
-    agent: RemoteAgent
+    name: str
     process: AgentProcess
-
-    def preference(self) -> tuple[bool, bool, int]:
-        """Lower is better for one more child."""
-        return self.agent.suspect, self.process.delayed, self.agent.children

@@ -1,13 +1,13 @@
-"""An agent behind a link, as the master sees it: the same ports as the agent in this process."""
+"""Agents behind links and their children, as the master sees them."""
 
 from __future__ import annotations
 
 import itertools
 import pickle
 import signal
-import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
@@ -20,100 +20,101 @@ from fiber._wire.packet import BytesLike
 
 _SHUTDOWN_GRACE = 0.5
 
+_FATAL = (signal.SIGKILL, signal.SIGTERM)
+"""Signals that end a child that has not begun."""
+
 _REMEMBERED = 1024
 """Packets to one child whose sequence numbers are remembered; a worker has a few at a time."""
 
 
+class AgentObserver(Protocol):
+    """Hears what becomes of an agent; on the loop's thread."""
+
+    def lost(self, agent: RemoteAgent, reason: str) -> None:
+        """It is gone for good; its children are told after this."""
+
+    def child_gone(self, agent: RemoteAgent) -> None:
+        """One of its children is gone."""
+
+    def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
+        """It is silent; or heard again."""
+
+
+class Starter(Protocol):
+    """Sees to it that children get an agent; on the loop's thread."""
+
+    loop: EventLoop
+
+    def start(self, child: RemoteChild) -> None:
+        """Have it started, now or as soon as there is room."""
+
+    def withdraw(self, child: RemoteChild) -> bool:
+        """It is not to be started any more; False if it has an agent already."""
+
+
 class RemoteAgent:
-    """An ``AgentHandle``.
-
-    It takes work before its link is there; what it cannot do it reports as exits.
-
-    ``child``, ``send`` and ``close``, and a child's ``recall`` and ``signal``, come from anywhere
-    and only put into the loop's queue; everything else happens on the loop's thread.
+    """An agent that has dialled in.  Everything but ``send`` and ``close`` happens on the loop's
+    thread.
     """
 
     def __init__(
         self,
         host: str,
+        link: Link,
         loop: EventLoop,
         hub: Hub,
         output: Output,
-        on_lost: Callable[[RemoteAgent, str], None],
+        observer: AgentObserver,
     ) -> None:
         self.host = host
         self.loop = loop
-        self._hub = hub
-        self._tunnels = hub.link(host, self.send, dialer=False)
-        self._output = output
-        self._on_lost = on_lost
-        self._ids = itertools.count(1)
-        self._children: dict[int, RemoteChild] = {}
-        self._to_start: weakref.WeakSet[RemoteChild] = weakref.WeakSet()
-        self._link: Link | None = None
-        self._early: list[Frame] = []
-        self._lost: str | None = None
-
-    @property
-    def lost(self) -> bool:
-        """Whether it is gone for good."""
-        return self._lost is not None
-
-    @property
-    def children(self) -> int:
-        """How many children it has, or is about to have."""
-        return len(self._children) + len(self._to_start)
-
-    def can_take(self, limit: float) -> bool:
-        """Whether it may have one more child, of at most so many."""
-        return self._lost is None and self.children < limit
-
-    @property
-    def joined(self) -> bool:
-        """Whether it has its link."""
-        return self._link is not None
-
-    def join(self, link: Link) -> None:
-        """Its process dialled in.  On the loop's thread."""
+        self.lost: str | None = None
+        """Why it is gone for good."""
+        self.node = ""
+        """Where its pod runs; empty if it is in none, or while that is not known."""
+        self.suspect = False
+        """Whether it has been silent for a while."""
         self._link = link
-        early, self._early = self._early, []
-        for frame in early:
-            link.send(frame)
-        link.attach(self)
+        self._hub = hub
+        self._output = output
+        self._observer = observer
+        self._tunnels = hub.link(host, self.send, dialer=False)
+        self._numbers = itertools.count(1)
+        self._children: dict[int, RemoteChild] = {}
 
-    def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
-        """A child to be started there."""
-        if self._lost is not None:
-            raise RuntimeError(f"agent {self.host} cannot start {spec.name}: {self._lost}")
-        child = RemoteChild(self, next(self._ids), spec, observer)
-        self._to_start.add(child)
-        return child
-
-    def start(self, child: RemoteChild, message: messages.Start) -> None:
-        """Start it.  On the loop's thread."""
-        self._to_start.discard(child)
-        if self._lost is not None:
-            child.end(self._report_of_loss(self._lost))
+    def start(self, child: RemoteChild) -> None:
+        """Start a child."""
+        if self.lost is not None:
+            child.end(self._report_of_loss(self.lost))
             return
-        self._children[child.number] = child
-        self._send(message.encode())
+        number = next(self._numbers)
+        self._children[number] = child
+        child.begin(self, number)
+
+    def withdraw(self, child: RemoteChild) -> bool:
+        """None waits here."""
+        return False
 
     def send(self, message: messages.Message) -> None:
-        """Send a frame as soon as there is a link."""
-        self.loop.call_soon(self._send, message.encode())
+        """Send a message.  From anywhere."""
+        self.loop.call_soon(self._link.send, message.encode())
+
+    def transmit(self, message: messages.Message) -> None:
+        """Send a message now."""
+        self._link.send(message.encode())
 
     def close(self) -> None:
-        """End it and its children."""
+        """End it and its children.  From anywhere."""
         self.send(messages.Shutdown(_SHUTDOWN_GRACE))
 
     def lose(self, reason: str) -> None:
-        """It is gone, and its children with it.  On the loop's thread."""
-        if self._lost is not None:
+        """It is gone, and its children with it."""
+        if self.lost is not None:
             return
-        self._lost = reason
+        self.lost = reason
         self._hub.unlink(self.host, reason)
         try:
-            self._on_lost(self, reason)
+            self._observer.lost(self, reason)
         finally:  # whatever becomes of it, nobody must wait for these
             children, self._children = self._children, {}
             for child in children.values():
@@ -122,14 +123,6 @@ class RemoteAgent:
     def _report_of_loss(self, reason: str) -> ExitReport:
         why, cause = f"agent {self.host} lost: {reason}", Cause.AGENT_LOST
         return ExitReport(-signal.SIGKILL, why, host=self.host, cause=cause)
-
-    # On the loop's thread
-
-    def _send(self, frame: Frame) -> None:
-        if self._link is None:
-            self._early.append(frame)
-        else:
-            self._link.send(frame)
 
     # What comes over the link
 
@@ -144,18 +137,19 @@ class RemoteAgent:
         if child is None:
             return
         if isinstance(message, messages.Exited):
-            self._children.pop(message.child, None)
+            del self._children[message.child]
+            self._observer.child_gone(self)  # there is room for what its end makes anybody start
         child.heard(message, self._output)
 
     def on_suspect(self) -> None:
-        """Silent for a while: the backend places nothing on it until it is heard again."""
+        """Silent for a while."""
         self.suspect = True
+        self._observer.suspected(self, True)
 
     def on_trusted(self) -> None:
         """Heard again."""
         self.suspect = False
-
-    suspect = False
+        self._observer.suspected(self, False)
 
     def on_lost(self, reason: str) -> None:
         """The link is over."""
@@ -163,47 +157,69 @@ class RemoteAgent:
 
 
 class RemoteChild:
-    """A ``ChildHandle`` whose child is on another host."""
+    """A ``ChildHandle`` whose child is, or will be, on another host."""
 
-    def __init__(
-        self, agent: RemoteAgent, number: int, spec: ChildSpec, observer: ChildObserver
-    ) -> None:
-        self.number = number
+    def __init__(self, starter: Starter, spec: ChildSpec, observer: ChildObserver) -> None:
         self.name = spec.name
-        self.host = agent.host
+        self.host = ""
+        """Where it is; empty while it waits for an agent."""
         self.pid: int | None = None
         self.start_error: Exception | None = None
         self.observer = observer
-        self._agent = agent
+        self._starter = starter
+        self._loop = starter.loop
+        self._agent: RemoteAgent | None = None
+        self._number = 0
+        self._early: list[tuple[int, BytesLike, Sequence[memoryview]]] = []
+        """What to deliver once it has an agent."""
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None
         self._gone = False
         fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
-        self._start: messages.Start | None = messages.Start(
-            number, pickle.dumps(fields, protocol=5)
-        )
+        self._start: bytes | None = pickle.dumps(fields, protocol=5)
+
+    @property
+    def node(self) -> str:
+        """The node of its agent's pod."""
+        return "" if self._agent is None else self._agent.node
+
+    @property
+    def waiting(self) -> bool:
+        """Whether it has no agent yet."""
+        return self._agent is None and not self._gone
 
     def start(self) -> None:
         """Have it started."""
-        message, self._start = self._start, None
-        assert message is not None
-        self._agent.start(self, message)
+        self._starter.start(self)
+
+    def begin(self, agent: RemoteAgent, number: int) -> None:
+        """It has an agent."""
+        self._agent, self._number, self.host = agent, number, agent.host
+        start, self._start = self._start, None
+        assert start is not None
+        agent.transmit(messages.Start(number, start))
+        early, self._early = self._early, []
+        for packet_ in early:
+            self.deliver(*packet_)
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to its task channel; False if its end is known."""
         if self._gone:
             return False
+        if self._agent is None:
+            self._early.append((seq, payload, buffers))
+            return True
         self._delivered += 1
         self._latest.append(seq)
-        self._agent.send(messages.Deliver(self.number, seq, payload, buffers))
+        self._agent.transmit(messages.Deliver(self._number, seq, payload, buffers))
         return True
 
     def lend(self) -> RemoteTaskChannel | None:
         """Its task channel, for direct use; None if it is gone."""
         if self._gone:
             return None
-        self._channel = RemoteTaskChannel(self._agent.loop, self.deliver)
+        self._channel = RemoteTaskChannel(self._loop, self.deliver)
         return self._channel
 
     def reclaim(self) -> None:
@@ -215,11 +231,20 @@ class RemoteChild:
 
     def recall(self) -> None:
         """Recall unread packets."""
-        self._agent.send(messages.Recall(self.number))
+        self._loop.call_soon(self._ask, messages.Recall)
 
     def signal(self, signum: int) -> None:
         """Send it a signal."""
-        self._agent.send(messages.Signal(self.number, signum))
+        self._loop.call_soon(self._ask, messages.Signal, signum)
+
+    def _ask(self, message: Callable[..., messages.Message], *fields: int) -> None:
+        if self._gone:
+            return
+        if self._agent is not None:
+            self._agent.transmit(message(self._number, *fields))
+        elif fields and fields[0] in _FATAL and self._starter.withdraw(self):
+            name = signal.Signals(fields[0]).name
+            self.end(ExitReport(-fields[0], f"killed by {name} before it had a host"))
 
     def heard(self, message: messages.Message, output: Output) -> None:
         """Something about this child."""
@@ -242,7 +267,7 @@ class RemoteChild:
 
     def end(self, report: ExitReport, crossed: int = 0) -> None:
         """It is gone; the last ``crossed`` packets met the news of that on their way."""
-        self._gone = True
+        self._gone, self._start = True, None
         if self._channel is not None:
             self._channel.end()
         missed = list(self._latest)[max(0, len(self._latest) - crossed) :]

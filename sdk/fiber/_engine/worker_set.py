@@ -57,9 +57,13 @@ class StartFailure(NamedTuple):
     killed: bool = False
     """By a signal, or the system had no room for it: it may have done nothing wrong."""
     cause: BaseException | None = None
+    final: FiberError | None = None
+    """What keeps every worker from starting: another try is of no use."""
 
-    def error(self, attempts: int) -> StartError:
+    def error(self, attempts: int) -> FiberError:
         """What the pool's user hears."""
+        if self.final is not None:
+            return self.final
         error = StartError(self.who, self.reason, self.text, attempts)
         error.__cause__ = self.cause
         return error
@@ -80,7 +84,7 @@ class WorkerSet:
         self.size = 0
         self.starting = 0
         self.failures = 0
-        self.trouble: StartError | None = None
+        self.trouble: FiberError | None = None
         self.error: FiberError | None = None
         self._failing_since = 0.0
         self._raises = 0  # those of the failures that were the workers' own doing
@@ -192,7 +196,9 @@ class WorkerSet:
         if not self._pause or now >= self._try_at():  # else it is of the same wave
             self._pause = min(max(2 * self._pause, FIRST_PAUSE), LAST_PAUSE_AT_WORK)
             self._wave_at = now
-        if failure.killed:
+        if failure.final is not None:
+            tries, since, patience = TRIES, now, 0.0
+        elif failure.killed:
             tries, since, patience = self.failures, self._failing_since, KILLED_PATIENCE
         else:
             tries, since, patience = self._raises, self._raising_since, RAISED_PATIENCE

@@ -26,7 +26,6 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
@@ -47,12 +46,11 @@ from fiber._runtime.receiver import Receiver
 from fiber._runtime.sender import Sender
 from fiber._runtime.work_items import Call, Future, WorkItem, pickle_call
 from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.worker_resources import WorkerResources
+from fiber._runtime.worker_view import WorkerView
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import FiberError
-
-KILL_AFTER = 2.0
-"""Seconds between SIGTERM and SIGKILL for workers that are to end at once."""
 
 TICK = 1e-4
 """Seconds that any timer waits: less, by a rounding error, would be too early again and again."""
@@ -81,6 +79,7 @@ class Executor:
         self.ended = Latch()
         """Nobody is left."""
         self._host = host
+        self._elastic = host.elastic
         self._loop: Loop = host.loop
         self._background = thread("fiber-pool")
         self._scheduler = Scheduler(
@@ -90,6 +89,7 @@ class Executor:
             idle_timeout=options.idle_timeout,
         )
         self._ledger = self._scheduler.ledger
+        self.workers = WorkerView(self._scheduler.workers, host.loop)
         self._jobs = Jobs(self._ledger, options.retries, retry=bool(options.retryable))
         self._sender = Sender(
             self._loop,
@@ -99,8 +99,10 @@ class Executor:
             advance=self._advance,
             on_timeout=self._timed_out,
         )
+        self._resources = WorkerResources(options.resources)
         self._launcher = Launcher(
             options,
+            self._resources,
             self._loop,
             self._background,
             on_failed=self._never_started,
@@ -127,7 +129,6 @@ class Executor:
         self._called: deque[Call] = deque()
         self._took_calls = -math.inf
         self._wake: Timer | None = None
-        self._kill: Timer | None = None
         self._ended_by: BaseException | None = None
         """What those hear whose calls are not done when the pool is terminated."""
         self._acting = False
@@ -136,12 +137,17 @@ class Executor:
     # What is asked of it, on any thread
 
     def start(self) -> None:
-        """Start the first workers; raises what stands in the way of one."""
+        """Start the first workers; raises what stands in the way of one.
+
+        Where hosts are made for them, they start with the first task.
+        """
         try:
             self._loop.depend(self)
         except BaseException:
             self._end()
             raise
+        if self._elastic:
+            return  # the first task says what they need, and starts them
         handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
         try:
             self._loop.call_soon(self._begin, handles)
@@ -150,6 +156,15 @@ class Executor:
             self._loop.call_soon(self._launcher.give_up, handles)
             self.terminate(error)
             raise
+
+    def start_workers(self) -> None:
+        """Start the first workers if the first task would."""
+        self._loop.call_soon(self._advance)
+
+    def suit(self, function: Callable[..., Any]) -> None:
+        """Have workers that ``function`` can run on, where that can be chosen."""
+        if self._elastic:
+            self._resources.choose_for(function)
 
     def call(
         self,
@@ -274,16 +289,18 @@ class Executor:
         """Whether this is the loop's thread, which must not wait."""
         return self._loop.on_thread()
 
-    def processes(self) -> list[BaseProcess]:
-        """The processes of the workers that are there."""
-        handles: list[Any] = list(self._scheduler.workers.members)
-        return [handle.process for handle in handles if handle.process is not None]
-
     def _check(self) -> None:
         """Refuse at once what can be seen from here to be of no use."""
         error = self._refusal()
         if error is not None:
             raise error
+
+    def wait_until_up(self, timeout: float | None) -> bool:
+        """Wait for the first workers; False after ``timeout`` seconds, or why there are none."""
+        self.start_workers()
+        up = self.workers.wait_until_up(timeout)
+        self._check()
+        return up
 
     def _refusal(self) -> BaseException | None:
         if self._scheduler.workers.error is not None:
@@ -394,7 +411,7 @@ class Executor:
         for job, error in decisions.failed:
             self._jobs.fail(job, error)
         handle: Any
-        self._end_workers(decisions.end)
+        self._launcher.end(decisions.end)
         for held in decisions.recall:
             held.key.child.recall()
         for handle in decisions.dismiss:
@@ -493,6 +510,7 @@ class Executor:
     def _ready(self, handle: WorkerHandle) -> None:
         """A worker is initialized."""
         self._scheduler.ready(handle, self._loop.now())
+        self.workers.changed()
         self._advance()
 
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
@@ -501,12 +519,8 @@ class Executor:
         if lent and not self._leases.recall_one(handle):
             self._exits[handle] = report  # whoever uses it notices, and brings it back
             return
-        failure = None
-        if report.cause != Cause.AGENT_LOST:  # a lost host says nothing of the worker
-            text = handle.complaint or "\n".join(report.log)
-            reason = "it raised an error" if handle.complaint else report.reason
-            killed = report.cause == Cause.REFUSED or (not handle.complaint and report.exitcode < 0)
-            failure = StartFailure(f"pool worker {handle.name!r}", reason, text, killed)
+        # A lost host says nothing of the worker.
+        failure = None if report.cause == Cause.AGENT_LOST else handle.start_failure(report)
         self._lost(handle, failure, report)
         self._advance()
 
@@ -524,6 +538,7 @@ class Executor:
             if running is not None:
                 unread.discard(running[0])
         losses = self._scheduler.gone(handle, now, unread=unread, running=running, failure=failure)
+        self.workers.changed()
         if report is not None:
             self._jobs.put_losses(losses, handle.name, handle.pid, report)
         if failure is not None and (news := self._scheduler.workers.news(failure, now)):
@@ -544,16 +559,8 @@ class Executor:
         self.callbacks.stop()
         for job in list(self._ledger.jobs):
             self._jobs.fail(job, error)
-        self._end_workers(self._scheduler.terminate())
+        self._launcher.end(self._scheduler.terminate())
         self._advance()
-
-    def _end_workers(self, members: Iterable[Any]) -> None:
-        """At once, and by force if that is of no use."""
-        handles = list(members)
-        for handle in handles:
-            handle.terminate()
-        if handles and self._kill is None:
-            self._kill = self._loop.call_later(KILL_AFTER, self._kill_all)
 
     def broken(self, error: FiberError) -> None:
         """The loop has failed: nobody will hear of the workers any more."""
@@ -564,18 +571,13 @@ class Executor:
             handle.kill()
             handle.exited(ExitReport(UNKNOWN, str(error)))
 
-    def _kill_all(self) -> None:
-        handles: list[Any] = list(self._scheduler.workers.members)
-        for handle in handles:
-            handle.kill()
-
     def _end(self) -> None:
         """Nobody is left."""
         if self.ended.is_set():
             return
-        for timer in (self._wake, self._kill):
-            if timer is not None:
-                timer.cancel()
+        if self._wake is not None:
+            self._wake.cancel()
+        self._launcher.close()
         self._sender.close()
         self._leases.close()
         self._background.stop()

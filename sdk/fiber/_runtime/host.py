@@ -42,6 +42,10 @@ class Host(Protocol):
         """Its loop."""
 
     @property
+    def elastic(self) -> bool:
+        """Whether hosts are made for what is started."""
+
+    @property
     def config(self) -> Any:
         """Its configuration, of which ``start_timeout`` is wanted."""
 

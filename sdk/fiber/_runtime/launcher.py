@@ -1,19 +1,25 @@
-"""Starting the processes of a pool's workers."""
+"""Starting the processes of a pool's workers, and ending them by force."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 from fiber._agent import worker
 from fiber._runtime.background import BackgroundThread
-from fiber._runtime.host import Loop
+from fiber._runtime.host import Loop, Timer
 from fiber._runtime.latch import Latch
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.worker_resources import WorkerResources
+from fiber.resources import with_resources
+
+KILL_AFTER = 2.0
+"""Seconds between SIGTERM and SIGKILL for workers that are to end at once."""
 
 
 class Launcher:
-    """Starts workers of one pool.
+    """Starts workers of one pool, and ends them by force.
 
     Not on the loop's thread: the user's initializer and its arguments are pickled for each, and
     agents may need the loop.  ``on_failed`` is called, on the loop's thread, with workers whose
@@ -23,15 +29,19 @@ class Launcher:
     def __init__(
         self,
         options: PoolOptions,
+        resources: WorkerResources,
         loop: Loop,
         background: BackgroundThread,
         *,
         on_failed: Callable[[Sequence[WorkerHandle], BaseException | None], None],
     ) -> None:
         self._options = options
+        self._resources = resources
         self._loop = loop
         self._background = background
         self._on_failed = on_failed
+        self._ending: list[WorkerHandle] = []
+        self._kill: Timer | None = None
 
     def launch_now(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
         """Start some on the calling thread; raises what stands in the way of one."""
@@ -57,7 +67,7 @@ class Launcher:
         options = self._options
         process = options.new_process(
             handle,
-            target=worker.run,
+            target=with_resources(worker.run, self._resources.chosen),
             args=(options.initializer, options.initargs, options.retryable),
         )
         process.start()
@@ -70,6 +80,24 @@ class Launcher:
                 self._background.submit(self._launch, handle)
             except RuntimeError as error:  # the system has no room for its thread
                 self._loop.call_soon(self._on_failed, (handle,), error)
+
+    def end(self, handles: Iterable[Any]) -> None:
+        """End these at once, and by force if that is of no use.  On the loop's thread."""
+        for handle in handles:
+            handle.terminate()
+            self._ending.append(handle)
+        if self._ending and self._kill is None:
+            self._kill = self._loop.call_later(KILL_AFTER, self._kill_all)
+
+    def _kill_all(self) -> None:
+        for handle in self._ending:
+            handle.kill()
+
+    def close(self) -> None:
+        """Nobody is left."""
+        self._ending.clear()
+        if self._kill is not None:
+            self._kill.cancel()
 
     def _launch(self, handle: WorkerHandle) -> None:
         error = None

@@ -101,7 +101,7 @@ class Leases:
         lease.used = True
         try:
             seq = self._scheduler.ledger.next_seq()
-            answer = self._exchange(lease.channel, seq, call)
+            answer = self._exchange(lease, seq, call)
             if answer is ADOPTED:
                 self._loop.call_soon(self._adopt, lease, seq, call)
                 return ADOPTED
@@ -114,7 +114,8 @@ class Leases:
         (*_, values, odd), buffers = answer
         return outcomes(values, odd, buffers)[0] if odd else values[0]
 
-    def _exchange(self, channel: DirectChannel, seq: int, call: Call) -> Any:
+    def _exchange(self, lease: Lease, seq: int, call: Call) -> Any:
+        handle, channel = lease.handle, lease.channel
         try:
             channel.send(seq, call.message(), call.buffers)
         except OSError:  # whoever sends it in our place will see why
@@ -131,6 +132,7 @@ class Leases:
             words, buffers = pickle.loads(message.payload), message.buffers
             message.release()
             if words[0] == seq:
+                handle.tasks += 1
                 return words, buffers
 
     def _put_back(self, lease: Lease) -> None:

@@ -9,9 +9,13 @@ from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
 from fiber import config, cpu
+from fiber.resources import Resources
 
 LARGEST_CHUNK = 2**32 - 1
 """What a message can say; more than anybody has."""
+
+
+NO_WISHES = Resources()
 
 
 class PoolOptions(NamedTuple):
@@ -28,6 +32,8 @@ class PoolOptions(NamedTuple):
     retries: int = 3
     retryable: tuple[type[BaseException], ...] = ()
     idle_timeout: float = 60.0
+    resources: Resources = NO_WISHES
+    """What workers wish of their hosts, besides what the first task's function does."""
 
 
 def whole(name: str, value: Any) -> int:

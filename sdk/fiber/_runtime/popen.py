@@ -27,33 +27,36 @@ class Popen:
         self._on_exit = on_exit
         self.returncode: int | None = None
         self.report: ExitReport | None = None
-        self.pid: int | None = None
+        self._pid: int | None = None
         self._child: ChildHandle | None = None
+        self._may_wait = runtime().backend.elastic
+        self._answered = Latch()
+        """Whoever starts it need not wait any more."""
         self._born = Latch()
         self._exited = Latch()
-        loop = runtime().loop
+        self._loop = loop = runtime().loop
         loop.depend(self)
         with naming_the_limit("starting a process"):
             # Held by whoever writes to it meanwhile, so that it is closed, but never another's.
             self._at_exit: Wakeup | None = Wakeup()
         self.sentinel = self._at_exit.fd
         try:
-            self._wait_for_birth(runtime().start(process, self, method=method))
+            self._wait_for_answer(runtime().start(process, self, method=method))
         except BaseException:
             # Whoever asked does not know of it: it must not go on, if it begins.
             loop.call_soon(self.kill)
             self.close()
             raise
 
-    def _wait_for_birth(self, child: ChildHandle) -> None:
+    def _wait_for_answer(self, child: ChildHandle) -> None:
         timeout = runtime().config.start_timeout
-        if not self._born.wait(timeout):
+        if not self._answered.wait(timeout):
             raise StartError(
                 f"process {self._name!r}",
                 f"its agent on host {child.host!r} did not start it within {timeout:g} s "
                 "(start_timeout)",
             )
-        if self.pid is None and self.report is not None:
+        if self._pid is None and self.report is not None:
             if child.start_error is not None:
                 raise child.start_error
             raise StartError(f"process {self._name!r}", self.report.reason)
@@ -64,11 +67,14 @@ class Popen:
         """It is started."""
         self._child = child
         child.start()
+        if child.waiting and self._may_wait:
+            self._answered.set()
 
     def started(self, pid: int) -> None:
         """It has a pid."""
-        self.pid = pid
+        self._pid = pid
         self._born.set()
+        self._answered.set()
 
     def received(self, message: Message) -> None:
         """Only pool workers talk."""
@@ -88,6 +94,7 @@ class Popen:
         self._on_exit()
         self._exited.set()
         self._born.set()
+        self._answered.set()
         # Each held the other; the sentinel's descriptor goes when the last user of this lets go.
         self._child = None
 
@@ -100,6 +107,13 @@ class Popen:
             self.exited(ExitReport(UNKNOWN, str(error)))
 
     # What Process asks
+
+    @property
+    def pid(self) -> int | None:
+        """Its pid.  Waits for one for ``start_timeout`` seconds; None if it never had one."""
+        if self._pid is None and not self._loop.on_thread():
+            self._born.wait(runtime().config.start_timeout)
+        return self._pid
 
     def poll(self) -> int | None:
         """The exit code, None while it runs."""

@@ -63,7 +63,7 @@ class Receiver:
         if type(kind) is int and handle.worker is not None and handle.worker.lent:
             self._last_words[handle] = words, buffers, size
         elif type(kind) is int:
-            self._answered(words, buffers, size)
+            self._answered(handle, words, buffers, size)
         elif kind == work.READY:
             self._on_ready(handle)
         elif kind == work.INIT_FAILED:
@@ -76,7 +76,7 @@ class Receiver:
     def replay(self, handle: WorkerHandle) -> None:
         """A worker is not lent any more: what was heard of it meanwhile counts now."""
         if handle in self._last_words:
-            self._answered(*self._last_words.pop(handle))
+            self._answered(handle, *self._last_words.pop(handle))
         if handle in self._taken_back:
             self.recalled(handle, self._taken_back.pop(handle))
 
@@ -85,8 +85,11 @@ class Receiver:
         self._last_words.pop(handle, None)
         self._taken_back.pop(handle, None)
 
-    def _answered(self, words: tuple[Any, ...], buffers: list[memoryview], size: int) -> None:
+    def _answered(
+        self, handle: WorkerHandle, words: tuple[Any, ...], buffers: list[memoryview], size: int
+    ) -> None:
         seq, offset, kept, seconds, values, odd = words
+        handle.tasks += len(values)
         results = outcomes(values, odd, buffers) if odd else values
         receipt = self._ledger.receive(
             seq, offset, len(results), self._loop.now(), seconds=seconds, kept=kept

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber import config, inherited, reduction
 from fiber._agent import child
-from fiber._agent.interface import AgentHandle, ChildHandle, ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import ChildHandle, ChildObserver, ChildSpec, ExitReport
 from fiber._hub import client as hub_client
 from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.hub import Hub
@@ -25,6 +25,7 @@ from fiber._runtime import methods
 from fiber._transport.loop import Loop
 from fiber._transport.unix import naming_the_limit
 from fiber.errors import StartError
+from fiber.resources import resources_of
 
 if TYPE_CHECKING:
     from fiber._backends.base import Backend
@@ -62,6 +63,11 @@ class Runtime:
         if self.hub is not None:
             self.hub.close()
 
+    @property
+    def elastic(self) -> bool:
+        """Whether hosts are made for what is started."""
+        return self.backend.elastic
+
     def start(
         self,
         process: mp_process.BaseProcess,
@@ -70,15 +76,14 @@ class Runtime:
         tasks: bool = False,
         method: str = "fork",
     ) -> ChildHandle:
-        """Start ``process`` as a child of some agent; ``tasks`` makes it a pool worker.
+        """Start ``process`` as a child; ``tasks`` makes it a pool worker.
 
         Returns at once; the owner hears what becomes of it, ``begin`` first.  An error in pickling
         is raised here.  Whoever is interrupted here will be called ``begin``, or nothing has
         happened; what is asked of the loop from then on comes after it.
         """
-        agent = self.backend.place()
         same_host = self.backend.same_host
-        preparation = self._preparation(process, agent, same_host)
+        preparation = self._preparation(process, same_host)
         with collecting_grants(reusable=False) as grants:
             payload, fds = reduction.dump_process(process, same_host=same_host)
         observer = _Releasing(owner, grants) if grants else owner
@@ -90,12 +95,13 @@ class Runtime:
             fds=tuple(fds),
             tasks=tasks,
             executable=spawn.get_executable() if same_host else None,
+            resources=resources_of(getattr(process, "_target", None) or process.run),
         )
-        made = agent.child(spec, observer)
+        made = self.backend.child(spec, observer)
         self.loop.call_soon(owner.begin, made)
         return made
 
-    def _preparation(self, process: Any, agent: AgentHandle, same_host: bool) -> bytes:
+    def _preparation(self, process: Any, same_host: bool) -> bytes:
         # pdb leaves its program a main module without one, which multiprocessing does not expect.
         vars(sys.modules["__main__"]).setdefault("__spec__", None)
         try:
@@ -104,7 +110,6 @@ class Runtime:
             reason = "its working directory is this program's, which was deleted; os.chdir() first"
             raise StartError(f"process {process.name!r}", reason) from error
         data["authkey"] = bytes(data["authkey"])
-        data["host"] = agent.host
         # What such a process starts itself runs on its own host.
         data["calls"] = [
             (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),

@@ -8,12 +8,14 @@ from multiprocessing import process as mp_process
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
-from fiber._agent.interface import ChildHandle, ExitReport
+from fiber._agent.interface import Cause, ChildHandle, ExitReport
 from fiber._engine.ledger import Worker
+from fiber._engine.worker_set import StartFailure
 from fiber._runtime.latch import Latch
 from fiber._transport.loop import Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
+from fiber.errors import FiberError
 
 
 class Supervisor(Protocol):
@@ -52,6 +54,8 @@ class WorkerHandle:
         """It was told to go, or will be at once."""
         self.unwanted = False
         """It was told to end at once, whatever it does."""
+        self.tasks = 0
+        """How many it has done."""
         self.returncode: int | None = None
         self._supervisor = supervisor
         self._host = host
@@ -106,6 +110,20 @@ class WorkerHandle:
         # Its caller adds it, and looks at ``returncode`` afterwards.
         mp_process._children.discard(self._launched)  # type: ignore[attr-defined]
         self._supervisor.on_exit(self, report)
+
+    def start_failure(self, report: ExitReport) -> StartFailure:
+        """What its end says of the start of workers, if it was not ready."""
+        text = self.complaint or "\n".join(report.log)
+        reason = "it raised an error" if self.complaint else report.reason
+        killed = report.cause == Cause.REFUSED or (not self.complaint and report.exitcode < 0)
+        final = self.child.start_error if self.child and report.cause == Cause.NO_HOST else None
+        return StartFailure(
+            f"pool worker {self.name!r}",
+            reason,
+            text,
+            killed,
+            final=final if isinstance(final, FiberError) else None,
+        )
 
     # What its Process object asks
 

@@ -1,0 +1,128 @@
+"""The agents of one shape, and the children that wait for them: what loopback and pods share."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+
+from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
+from fiber._backends.output import Output
+from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._engine.placement import Placement
+from fiber._hub.hub import Hub
+from fiber._transport.link import EventLoop, Link
+
+
+class AgentSet:
+    """Gives each child an agent: at once, or as soon as one has room.
+
+    ``on_change`` is called, on the loop's thread, whenever more or fewer agents may be wanted;
+    ``on_lost`` with an agent that is gone and why, before its children are told.  ``child`` comes
+    from anywhere, everything else happens on the loop's thread.
+    """
+
+    def __init__(
+        self,
+        loop: EventLoop,
+        hub: Hub,
+        output: Output,
+        placement: Placement[RemoteAgent, RemoteChild],
+        *,
+        on_change: Callable[[], None] = lambda: None,
+        on_lost: Callable[[RemoteAgent, str], None] = lambda agent, reason: None,
+    ) -> None:
+        self.loop = loop
+        self.agents: dict[str, RemoteAgent] = {}
+        """Those that have joined and are not lost, by name."""
+        self.error: Exception | None = None
+        """Why no agent will come."""
+        self._hub = hub
+        self._output = output
+        self._placement = placement
+        self._on_change = on_change
+        self._on_lost = on_lost
+        self._not_started: weakref.WeakSet[RemoteChild] = weakref.WeakSet()
+
+    @property
+    def children(self) -> int:
+        """How many there are, waiting and about to be started ones included."""
+        placement = self._placement
+        return placement.children + len(placement.waiting) + len(self._not_started)
+
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
+        """A child to be started."""
+        child = RemoteChild(self, spec, observer)
+        self._not_started.add(child)
+        return child
+
+    def start(self, child: RemoteChild) -> None:
+        """Give it an agent, now or as soon as there is room."""
+        self._not_started.discard(child)
+        if self.error is not None and not self.agents:
+            _refuse(child, self.error)
+            return
+        self._placement.wait(child)
+        self._place()
+
+    def withdraw(self, child: RemoteChild) -> bool:
+        """It is not to be started any more; False if it has an agent already."""
+        waited = self._placement.leave(child)
+        if waited:
+            self._on_change()
+        return waited
+
+    def join(self, host: str, link: Link) -> RemoteAgent:
+        """An agent has dialled in."""
+        agent = RemoteAgent(host, link, self.loop, self._hub, self._output, self)
+        self.agents[host] = agent
+        self.error = None
+        self._placement.add(agent, self.loop.now())
+        link.attach(agent)
+        self._place()
+        return agent
+
+    def fail(self, error: Exception) -> None:
+        """No agent will come: if there is none, nobody has to wait."""
+        self.error = error
+        if not self.agents:
+            waiting = list(self._placement.waiting)
+            self._placement.waiting.clear()
+            for child in waiting:
+                _refuse(child, error)
+
+    def _place(self) -> None:
+        while (placed := self._placement.place()) is not None:
+            child, agent = placed
+            agent.start(child)
+        self._on_change()
+
+    # What becomes of agents
+
+    def lost(self, agent: RemoteAgent, reason: str) -> None:
+        """It is gone."""
+        del self.agents[agent.host]
+        if agent in self._placement.loads:
+            self._placement.remove(agent)
+        self._on_lost(agent, reason)
+        self._on_change()
+
+    def child_gone(self, agent: RemoteAgent) -> None:
+        """There is room for another."""
+        if agent in self._placement.loads:
+            self._placement.ended(agent, self.loop.now())
+            self._place()
+
+    def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
+        """It gets no children while it is silent."""
+        if agent not in self._placement.loads:
+            return
+        if suspect:
+            self._placement.withhold(agent)
+        else:
+            self._placement.restore(agent)
+        self._place()
+
+
+def _refuse(child: RemoteChild, error: Exception) -> None:
+    child.start_error = error
+    child.end(ExitReport(1, f"could not be started: {error}", cause=Cause.NO_HOST))

@@ -1,0 +1,182 @@
+"""Which agent runs the next child, and how many agents that takes."""
+
+from __future__ import annotations
+
+import math
+import random
+
+from fiber._engine.demand import LINGER, Demand
+from fiber._engine.placement import Placement
+
+IDLE = 60.0
+
+
+def with_agents(*agents: str, slots: float = 2, spread: bool = False) -> Placement[str, str]:
+    placement: Placement[str, str] = Placement(slots, spread=spread)
+    for number, agent in enumerate(agents):
+        placement.add(agent, now=float(number))
+    return placement
+
+
+def put(placement: Placement[str, str], *children: str) -> list[str]:
+    """The agents that these get, one after the other."""
+    agents = []
+    for child in children:
+        placement.wait(child)
+        if (placed := placement.place()) is not None:
+            assert placed[0] == child
+            agents.append(placed[1])
+    return agents
+
+
+def test_children_wait_in_order_until_an_agent_has_room() -> None:
+    placement = with_agents(slots=1)
+    assert put(placement, "first", "second") == []
+    placement.add("a", now=0)
+    assert placement.place() == ("first", "a")
+    assert placement.place() is None
+    placement.ended("a", now=1)
+    assert placement.place() == ("second", "a")
+
+
+def test_one_that_waits_no_longer_gets_no_agent() -> None:
+    placement = with_agents()
+    put(placement, "first", "second")
+    assert placement.leave("first")
+    assert not placement.leave("first")
+    placement.add("a", now=0)
+    assert placement.place() == ("second", "a")
+    assert placement.place() is None
+
+
+def test_spread_children_go_to_the_agent_with_the_fewest() -> None:
+    placement = with_agents("a", "b", slots=math.inf, spread=True)
+    assert put(placement, *"12345") == ["a", "b", "a", "b", "a"]
+    assert placement.room == math.inf
+
+
+def test_packed_children_leave_agents_idle_and_those_that_are_idle_longest_stay_so() -> None:
+    placement = with_agents("a", "b", "c")
+    assert put(placement, *"123") == ["c", "c", "b"]
+    assert list(placement.idle) == ["a"]
+    assert placement.room == 3
+
+
+def test_a_silent_agent_gets_none_until_it_is_heard_again() -> None:
+    placement = with_agents("a", slots=2)
+    placement.withhold("a")
+    assert put(placement, "1") == []
+    assert placement.room == 0
+    placement.restore("a")
+    assert placement.place() == ("1", "a")
+    placement.withhold("a")
+    placement.ended("a", now=5)
+    assert put(placement, "2") == []
+    placement.remove("a")
+    assert placement.children == 0
+
+
+def test_counts_are_those_of_a_recount_whatever_happens() -> None:
+    rng = random.Random(9)
+    placement = with_agents("0", slots=3)
+    running: dict[str, list[str]] = {"0": []}
+    withheld: set[str] = set()
+    for step in range(3000):
+        event = rng.choice(("wait", "wait", "place", "ended", "add", "remove", "silent", "heard"))
+        agent = rng.choice(list(running)) if running else None
+        if event == "wait":
+            placement.wait(f"child {step}")
+        elif event == "place" and (placed := placement.place()) is not None:
+            assert placed[1] not in withheld
+            running[placed[1]].append(placed[0])
+        elif event == "add":
+            placement.add(str(step), now=step)
+            running[str(step)] = []
+        elif agent is not None and event == "ended" and running[agent]:
+            running[agent].pop()
+            placement.ended(agent, now=step)
+        elif agent is not None and event == "remove":
+            del running[agent]
+            withheld.discard(agent)
+            placement.remove(agent)
+        elif agent is not None and event == "silent":
+            withheld.add(agent)
+            placement.withhold(agent)
+        elif agent is not None and event == "heard":
+            withheld.discard(agent)
+            placement.restore(agent)
+        assert placement.children == sum(map(len, running.values()))
+        assert set(placement.idle) == {agent for agent in running if not running[agent]}
+        assert list(placement.idle.values()) == sorted(placement.idle.values())
+        assert placement.room == sum(
+            3 - len(children) for agent, children in running.items() if agent not in withheld
+        )
+
+
+# How many agents are wanted
+
+
+def demand(placement: Placement[str, str], maximum: int = 1000) -> Demand:
+    return Demand(placement, maximum=maximum, idle_timeout=IDLE)
+
+
+def test_as_many_are_wanted_as_children_wait_for_at_once() -> None:
+    placement = with_agents(slots=8)
+    wanted = demand(placement)
+    assert wanted.decide(now=0).agents == 0
+    put(placement, *(f"{number}" for number in range(17)))
+    assert wanted.decide(now=0).agents == 3
+
+
+def test_never_more_than_the_maximum() -> None:
+    placement = with_agents(slots=1)
+    put(placement, *"12345")
+    assert demand(placement, maximum=3).decide(now=0).agents == 3
+
+
+def test_an_idle_agent_is_released_by_name_after_its_time_and_gets_no_child_any_more() -> None:
+    placement = with_agents("a", "b", slots=1)  # idle since 0 and 1
+    wanted = demand(placement)
+    wish = wanted.decide(now=2)
+    assert (wish.agents, wish.release, wish.wake_at) == (2, [], IDLE)
+    wish = wanted.decide(now=IDLE)
+    assert (wish.agents, wish.release, wish.wake_at) == (1, ["a"], IDLE + 1)
+    assert put(placement, "child", "another") == ["b"]
+    assert wanted.decide(now=IDLE).agents == 2
+
+
+def test_one_that_is_at_work_is_never_released() -> None:
+    placement = with_agents("a", slots=1)
+    put(placement, "child")
+    wish = demand(placement).decide(now=1e9)
+    assert (wish.agents, wish.release, wish.wake_at) == (1, [], math.inf)
+
+
+def test_a_worker_that_dies_and_is_started_again_does_not_change_what_is_wanted() -> None:
+    placement = with_agents("a", "b", slots=1)
+    wanted = demand(placement)
+    put(placement, "1", "2")
+    assert wanted.decide(now=0).agents == 2
+    placement.remove("a")  # its pod is gone
+    wish = wanted.decide(now=1)
+    assert (wish.agents, wish.wake_at) == (2, 1 + LINGER)
+    placement.wait("1 again")
+    assert wanted.decide(now=1.1).agents == 2
+
+
+def test_agents_that_have_not_joined_are_given_up_when_nobody_waits_for_long_enough() -> None:
+    placement = with_agents(slots=1)
+    wanted = demand(placement)
+    put(placement, *"123")
+    assert wanted.decide(now=0).agents == 3
+    for child in "123":
+        placement.leave(child)
+    assert wanted.decide(now=1).agents == 3
+    assert wanted.decide(now=1 + LINGER).agents == 0
+
+
+def test_the_minimum_stays() -> None:
+    placement = with_agents("a", "b", slots=1)
+    wanted = Demand(placement, minimum=1, maximum=9, idle_timeout=IDLE)
+    assert wanted.decide(now=1e9).release == ["a"]
+    assert wanted.decide(now=2e9).agents == 1
