@@ -11,6 +11,7 @@ is, and what belongs to it (see `fiber.agent`).
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 import os
@@ -32,6 +33,8 @@ class _Rule(NamedTuple):
     expects: str
     check: Callable[[object], object]
     from_text: Callable[[str], object] = str
+    is_path: bool = False
+    """Whether a text is a path, relative to the folder of the file that it stands in."""
 
 
 def _choice(*choices: str) -> _Rule:
@@ -67,13 +70,37 @@ def _seconds() -> _Rule:
     return _Rule("a number of seconds above 0", check, from_text=float)
 
 
-def _host() -> _Rule:
+def _word(expects: str, pattern: str = r"\S+") -> _Rule:
     def check(value: object) -> str:
-        if not isinstance(value, str) or not value.strip():
+        if not isinstance(value, str) or not re.fullmatch(pattern, value.strip()):
             raise ValueError
         return value.strip()
 
-    return _Rule("a host name or address", check)
+    return _Rule(expects, check)
+
+
+def _pool() -> _Rule:
+    def check(value: object) -> str:
+        from fiber_api import names  # needed by programs on Kubernetes alone
+
+        if not isinstance(value, str):
+            raise ValueError
+        return names.check_pool_name(value.strip())
+
+    return _Rule("the name of a FiberPool: lower-case letters, digits and '-', at most 50", check)
+
+
+def _template() -> _Rule:
+    def check(value: object) -> str | dict[str, Any]:
+        if isinstance(value, Mapping):
+            return copy.deepcopy(dict(value))
+        if not isinstance(value, str | os.PathLike) or not os.fspath(value):
+            raise ValueError
+        # Read later: a program that runs nothing on Kubernetes does not need the file.
+        return os.path.abspath(os.fsdecode(value))
+
+    expects = "the path of a YAML or JSON file with a pod template, or a dict of one"
+    return _Rule(expects, check, is_path=True)
 
 
 def _directory() -> _Rule:
@@ -90,6 +117,9 @@ def _directory() -> _Rule:
     return _Rule("the absolute path of a directory that exists and can be written to", check)
 
 
+_LABEL = "[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?"
+
+
 def _key(default: Any, rule: _Rule, *, fixed: bool = False) -> Any:
     """A key of Config; `fixed`: read once, when the runtime starts."""
     return field(default=default, metadata={"rule": rule, "fixed": fixed})
@@ -102,13 +132,34 @@ class Config:
     Keys marked * are read when the first process, pool, pipe, queue, event or semaphore is
     made, and cannot change after that; the others hold for what is made next.
 
+    A key whose default is None takes None too, as if it were not given.
+
     backend*: where processes run. "local" starts them on this machine as children of the
         program. "loopback" does the same through agents, separate processes that reach the
-        program over encrypted nng links, as they would on other machines.
+        program over encrypted nng links, as they would on other machines. "kubernetes" runs
+        them in pods, which Fiber's operator makes. "auto" is "kubernetes" in a pod whose
+        service account may create FiberPools, and "local" everywhere else.
     agents*: how many agents the loopback backend starts.
     processes_per_agent*: how many processes one agent runs at most, a further one being a
         StartError when all agents are full; 0 means no limit.
-    listen_host*: the address at which the program listens for agents.
+    namespace*: the Kubernetes namespace of the program's FiberPools; None means the kubeconfig
+        context's, or in a pod the pod's own.
+    context*: the context of the kubeconfig to use; None means the current one, or in a pod the
+        pod's service account.
+    image*: the image that workers run; None means in a pod the program's own, elsewhere
+        Fiber's worker image of this version.
+    template*: what pods of workers have beyond that, and in place of it: a pod template as in
+        a Deployment ({"spec": …}), or the path of a YAML or JSON file with one, merged over
+        what Fiber makes as kubectl would, containers by their names. The container that runs
+        the processes is called "worker".
+    pool*: the name of a FiberPool that is there already, to use instead of making one.
+    processes_per_pod*: how many processes one pod runs; it asks for as many times what
+        `fiber.meta` says that each needs.
+    max_pods*: how many pods one FiberPool of the program may have at most.
+    idle_timeout*: seconds after which a pod that runs nothing is let go.
+    listen_host*: the address at which the program listens for agents; None means the loopback
+        address for agents on this machine, and for pods the one that they reach it at, which
+        is found.
     listen_port*: the port for it; 0 takes one that is free.
     start_timeout: seconds that a process or an agent may take to start.
     heartbeat_interval*: seconds between two signs of life of an agent.
@@ -121,10 +172,18 @@ class Config:
         None means `tempfile.gettempdir()`. Socket paths are short: so should this be.
     """
 
-    backend: str = _key("local", _choice("local", "loopback"), fixed=True)
+    backend: str = _key("auto", _choice("local", "loopback", "kubernetes", "auto"), fixed=True)
     agents: int = _key(2, _whole(1), fixed=True)
     processes_per_agent: int = _key(0, _whole(0), fixed=True)
-    listen_host: str = _key("127.0.0.1", _host(), fixed=True)
+    namespace: str | None = _key(None, _word("the name of a namespace", _LABEL), fixed=True)
+    context: str | None = _key(None, _word("the name of a context", r"\S(.*\S)?"), fixed=True)
+    image: str | None = _key(None, _word("the name of an image"), fixed=True)
+    template: str | dict[str, Any] | None = _key(None, _template(), fixed=True)
+    pool: str | None = _key(None, _pool(), fixed=True)
+    processes_per_pod: int = _key(1, _whole(1, 1024), fixed=True)
+    max_pods: int = _key(1000, _whole(1, 100_000), fixed=True)
+    idle_timeout: float = _key(60.0, _seconds(), fixed=True)
+    listen_host: str | None = _key(None, _word("a host name or address"), fixed=True)
     listen_port: int = _key(0, _whole(0, 65535), fixed=True)
     start_timeout: float = _key(60.0, _seconds())
     heartbeat_interval: float = _key(1.0, _seconds(), fixed=True)
@@ -218,6 +277,7 @@ class _Setting(NamedTuple):
     source: str
     spelling: Callable[[str], str] = str  # how a key is written in this kind of source
     is_text: bool = False
+    folder: str = ""  # that of the file that it stands in
 
 
 def load(
@@ -248,11 +308,16 @@ def load(
 def _checked(setting: _Setting) -> object:
     if setting.key not in _KEYS:
         raise ConfigError(_unknown(setting))
-    rule: _Rule = _KEYS[setting.key].metadata["rule"]
+    entry = _KEYS[setting.key]
+    if setting.value is None and entry.default is None:
+        return None
+    rule: _Rule = entry.metadata["rule"]
     try:
         value = rule.from_text(str(setting.value)) if setting.is_text else setting.value
+        if rule.is_path and isinstance(value, str) and value:
+            value = os.path.join(setting.folder, value)
         return rule.check(value)
-    except ValueError:
+    except (ValueError, FileNotFoundError):  # a relative path in a folder that was deleted
         raise ConfigError(
             f"bad value {setting.value!r} for {setting.key!r} in {setting.source}: "
             f"expected {rule.expects}"
@@ -302,6 +367,8 @@ AGENT_VARIABLES = frozenset(
         "FIBER_AGENT_PARENT",
         "FIBER_AGENT_POOL",
         "FIBER_AGENT_PROCESSES",
+        "FIBER_AGENT_TEMPLATE_HASH",
+        "FIBER_AGENT_UID",
     }
 )
 """What an agent is told, by a backend or in a pod: known by name, so that a typo is found."""
@@ -340,7 +407,7 @@ def _from_pyproject(directory: str | None) -> Iterator[_Setting]:
     if not isinstance(table, dict):
         raise ConfigError(f"bad value {table!r} for tool.fiber in {path}: expected a table")
     for key, value in table.items():
-        yield _Setting(key, value, source)
+        yield _Setting(key, value, source, folder=os.path.dirname(path))
 
 
 def _nearest_pyproject(directory: str | None) -> str | None:

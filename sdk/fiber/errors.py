@@ -10,6 +10,7 @@
     │       ├── AgentLost         an agent that is out of reach
     │       ├── ConfigError       a key or value that is wrong (also ValueError)
     │       ├── ConnectionClosed  the other end of a link is gone (also EOFError)
+    │       ├── FiberPoolError    a FiberPool on Kubernetes that cannot serve
     │       ├── LinkError         no way between program and agent, a port in use for instance
     │       ├── NotInFiber        a part of multiprocessing that Fiber has not (yet)
     │       ├── StartError        a process that does not start, an initializer that fails
@@ -42,6 +43,7 @@ __all__ = [
     "ConfigError",
     "ConnectionClosed",
     "FiberError",
+    "FiberPoolError",
     "LinkError",
     "MaybeEncodingError",
     "NotInFiber",
@@ -119,6 +121,20 @@ class ConnectionClosed(EOFError, FiberError):
             message += f" ({reason})"
         super().__init__(message)
         self.peer = peer
+        self.reason = reason
+
+
+class FiberPoolError(FiberError):
+    """A FiberPool that cannot be made, or that cannot give what was asked of it any more.
+
+    `reason` is one word: that of the problem in the pool's status (`ImagePullError`), or
+    Kubernetes' own for a call that it refuses (`Forbidden`).
+    """
+
+    def __init__(self, message: str, *, pool: str, namespace: str, reason: str) -> None:
+        super().__init__(message)
+        self.pool = pool
+        self.namespace = namespace
         self.reason = reason
 
 
@@ -208,7 +224,9 @@ class WorkerDied(FiberError):
 
     The attributes are the last attempt's: `task` and `worker` are names, `exitcode` follows
     multiprocessing (negative: the signal; None: unknown), `log` holds the last lines that
-    the worker wrote, `attempts` counts how often the task was tried.
+    the worker wrote, `attempts` counts how often the task was tried. On Kubernetes `pod` and
+    `node` are the names of the worker's pod and of the pod's node, elsewhere None, and `reason`
+    begins with Kubernetes' word where the pod has ended ("OOMKilled: ...").
     """
 
     def __init__(
@@ -222,6 +240,8 @@ class WorkerDied(FiberError):
         reason: str,
         log: Sequence[str] = (),
         attempts: int = 1,
+        pod: str | None = None,
+        node: str | None = None,
     ) -> None:
         self.task = task
         self.worker = worker
@@ -231,26 +251,49 @@ class WorkerDied(FiberError):
         self.reason = reason
         self.log = tuple(log)
         self.attempts = attempts
+        self.pod = pod
+        self.node = node
         super().__init__(self._message())
 
     def _message(self) -> str:
-        pid = "" if self.pid is None else f", pid {self.pid}"
         lines = [
             f"worker {self.worker!r} died while it ran {self.task}",
-            f"Why: {self.reason} (on host {self.host!r}{pid}).",
+            f"Why: {self.reason} ({self._place()}).",
         ]
         if self.attempts > 1:
             lines.append(f"The task was tried {self.attempts} times; each time its worker died.")
-        lines.append(f"What to do: {_advice(self.exitcode)}")
+        lines.append(f"What to do: {_advice(self.exitcode, self.reason)}")
         if self.log:
             lines.append(_block("Its last output:", self.log))
         return "\n".join(lines)
+
+    def _place(self) -> str:
+        place = f"on host {self.host!r}"
+        if self.pod:
+            place = f"in pod {self.pod!r}" + (f" on node {self.node!r}" if self.node else "")
+        return place + ("" if self.pid is None else f", pid {self.pid}")
 
 
 _CRASHES = frozenset({signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE, signal.SIGABRT})
 
 
-def _advice(exitcode: int | None) -> str:
+_ADVICE_ON_PODS = {
+    "Deleted": "find out who deletes the pods; allow more attempts (retries) if that is as it is.",
+    "Evicted": "its node ran short of what the pod used beyond its share, or is drained. Ask for "
+    "what a task needs with @fiber.meta(memory=, cpu=), or allow more attempts (retries).",
+    "NodeLost": "look at the node; if nodes come and go, allow more attempts (retries).",
+    "OOMKilled": "give each process more memory than that with @fiber.meta(memory=), or let a task "
+    "hold less.",
+    "Preempted": "pods of a higher priority took its place. Give these a priorityClassName in the "
+    "template of fiber.init(), let tasks be shorter, or allow more attempts (retries).",
+}
+"""By Kubernetes' word for the end of a pod."""
+
+
+def _advice(exitcode: int | None, reason: str) -> str:
+    on_pod = _ADVICE_ON_PODS.get(reason.partition(":")[0])
+    if on_pod:
+        return on_pod
     if exitcode is None:
         return "look at the host and its agent; how the worker itself ended is not known."
     if exitcode == -signal.SIGKILL:

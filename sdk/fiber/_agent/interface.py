@@ -46,6 +46,9 @@ class ExitReport(NamedTuple):
     """The last lines that it wrote, where its output is captured."""
     host: str = ""
     cause: int = Cause.CHILD
+    pod: str = ""
+    """The pod that it ran in, and that pod's node, where there is one."""
+    node: str = ""
 
 
 @dataclass(frozen=True, slots=True)

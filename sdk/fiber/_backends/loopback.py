@@ -33,6 +33,8 @@ _ATTEMPTS = 3
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 30.0
 """Seconds before another one is started after those, if there are others to work with."""
 
+_LOOPBACK = "127.0.0.1"
+
 _QUIT_TIMEOUT = 5.0
 """Seconds for all agents together to end by themselves."""
 
@@ -66,7 +68,7 @@ class LoopbackBackend:
         credentials = make_credentials("loopback")
         self._listener = MasterListener(
             loop,
-            f"{config.listen_host}:{config.listen_port}",
+            f"{config.listen_host or _LOOPBACK}:{config.listen_port}",
             credentials,
             on_agent=self._joined,
             on_refused=lambda reason: self._output.write("fiber", f"refused an agent: {reason}"),

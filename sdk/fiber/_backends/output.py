@@ -11,6 +11,10 @@ _ROOM = 4 << 20
 """Characters that may wait for stderr.  Above that lines are left out, until half of it is free."""
 
 
+_ERASE = "\r\x1b[K"
+"""Takes away what stands in a terminal's last line."""
+
+
 class Output:
     """Lines on their way to stderr.  One that is slow, stuck or broken holds up nobody: what it
     has no room for is left out, and how much that was is said in its place.
@@ -24,12 +28,14 @@ class Output:
         """Characters in the queue, and those that are being written."""
         self._left_out = 0
         """Lines since the last that was taken."""
+        self._line = ""
+        """What is to stand below them."""
+        self._redraws = False
+        """Whether the thread is to look at that."""
 
     def write(self, who: str, text: str) -> None:
         """Lines of ``who``; returns at once."""
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="fiber-output", daemon=True)
-            self._thread.start()
+        self._start()
         lines = "".join(f"[{who}] {line}\n" for line in text.split("\n"))
         with self._lock:
             if self._waiting > (_ROOM // 2 if self._left_out else _ROOM):
@@ -38,13 +44,31 @@ class Output:
                 self._say_what_is_left_out()
                 self._put(lines)
 
+    def show(self, line: str) -> None:
+        """Have ``line`` stand below all that is written, in place of the one before; returns at
+        once.  For a terminal.
+        """
+        self._start()
+        with self._lock:
+            self._line = line
+            if not self._redraws:
+                self._redraws = True
+                self._lines.put("")
+
     def close(self) -> None:
         """Write what is left."""
+        if self._line:
+            self.show("")
         if self._thread is not None:
             with self._lock:
                 self._say_what_is_left_out()
             self._lines.put(None)
             self._thread.join(timeout=2)
+
+    def _start(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="fiber-output", daemon=True)
+            self._thread.start()
 
     def _say_what_is_left_out(self) -> None:
         number, self._left_out = self._left_out, 0
@@ -59,11 +83,15 @@ class Output:
         self._lines.put(lines)
 
     def _run(self) -> None:
+        shown = ""
         while (lines := self._lines.get()) is not None:
+            with self._lock:
+                line, self._redraws = self._line, False
             # A full disk or a closed terminal must not cost more than the lines.
             with contextlib.suppress(OSError, ValueError):
-                sys.stderr.write(lines)
+                sys.stderr.write(f"{_ERASE if shown else ''}{lines}{line}")
                 sys.stderr.flush()
+            shown = line
             with self._lock:
                 self._waiting -= len(lines)
                 if not self._waiting:

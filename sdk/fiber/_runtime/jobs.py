@@ -163,6 +163,8 @@ class Jobs:
                 reason=report.reason,
                 log=report.log,
                 attempts=loss.attempts,
+                pod=report.pod or None,
+                node=report.node or None,
             )
             if item.future is not None:
                 item.future.add_results(loss.task, [Failure(error)], True)

@@ -1,0 +1,1 @@
+"""Agents that are pods: FiberPools, which Fiber's operator turns into them."""

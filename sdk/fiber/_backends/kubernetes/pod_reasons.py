@@ -1,0 +1,131 @@
+"""Why a pod ended, in Kubernetes' words, from its document."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from fiber_api import names
+
+
+class PodEnd(NamedTuple):
+    """The end of a pod, as an ``ExitReport`` and a ``WorkerDied`` tell it."""
+
+    reason: str
+    """One word, a colon, and what is known of it: ``OOMKilled: its memory limit is 512Mi``."""
+    node: str
+    """Empty if it never had one."""
+    exitcode: int | None = None
+    """As multiprocessing has it; None if no program of it ended, or nobody knows how."""
+
+
+def pod_end(pod: Mapping[str, Any], container: str = names.WORKER_CONTAINER) -> PodEnd | None:
+    """How ``pod`` ended or is about to; None if it is well, as far as Kubernetes knows.
+
+    What ended it comes before what became of its programs for that.
+    """
+    status = pod.get("status") or {}
+    worker = _ended(status, container)
+    reason = (
+        _out_of_memory(pod, worker, container)
+        or _disruption(pod)
+        or _deletion(pod)
+        or _own_end(status, worker)
+    )
+    return None if reason is None else PodEnd(reason, node_of(pod), _exitcode(worker))
+
+
+def node_of(pod: Mapping[str, Any]) -> str:
+    """The name of its node; empty while it has none."""
+    return str((pod.get("spec") or {}).get("nodeName") or "")
+
+
+def _ended(status: Mapping[str, Any], container: str) -> Mapping[str, Any]:
+    """The end of the container of that name; empty while it goes on."""
+    for found in status.get("containerStatuses") or ():
+        if found.get("name") == container:
+            return (found.get("state") or {}).get("terminated") or {}
+    return {}
+
+
+def _out_of_memory(
+    pod: Mapping[str, Any], worker: Mapping[str, Any], container: str
+) -> str | None:
+    if worker.get("reason") != "OOMKilled":
+        return None
+    containers = (pod.get("spec") or {}).get("containers") or ()
+    own = next((c for c in containers if c.get("name") == container), {})
+    limit = ((own.get("resources") or {}).get("limits") or {}).get("memory")
+    # Without a limit of its own it was the node that had no more.
+    return f"OOMKilled: its memory limit is {limit}" if limit else "OOMKilled: it has no limit"
+
+
+_DISRUPTIONS = {
+    "DeletionByPodGC": "NodeLost",
+    "DeletionByTaintManager": "NodeLost",
+    "EvictionByEvictionAPI": "Evicted",
+    "PreemptionByScheduler": "Preempted",
+    # In the status itself, by the kubelet.
+    "Evicted": "Evicted",
+    "NodeLost": "NodeLost",
+    "NodeShutdown": "NodeLost",
+    "Preempting": "Preempted",
+    "Shutdown": "NodeLost",
+    "Terminated": "NodeLost",
+}
+"""Kubernetes' words for why it ended a pod, and what people call it."""
+
+
+def _disruption(pod: Mapping[str, Any]) -> str | None:
+    status = pod.get("status") or {}
+    conditions = status.get("conditions") or ()
+    for told in (status, *(c for c in conditions if c.get("type") == "DisruptionTarget")):
+        word = _DISRUPTIONS.get(str(told.get("reason")))
+        if word and told.get("status") != "False":
+            return _sentence(word, str(told.get("message") or ""))
+    return None
+
+
+_LOST_CONTAINERS = ("ContainerStatusUnknown", "Unknown")
+"""For a container that a node lost sight of, as when it restarted, it makes up an exit code."""
+
+
+def _deletion(pod: Mapping[str, Any]) -> str | None:
+    if not (pod.get("metadata") or {}).get("deletionTimestamp"):
+        return None
+    return "Deleted: somebody deleted the pod"
+
+
+def _own_end(status: Mapping[str, Any], worker: Mapping[str, Any]) -> str | None:
+    reason, message = str(status.get("reason") or ""), str(status.get("message") or "")
+    exitcode = _exitcode(worker)
+    if worker.get("reason") in _LOST_CONTAINERS:
+        return "NodeLost: its node lost sight of it"
+    if exitcode is not None:
+        word = reason or str(worker.get("reason") or "Error")
+        return _sentence(word, f"its agent {_ending(exitcode)}")
+    if reason or status.get("phase") in ("Failed", "Succeeded"):
+        return _sentence(reason or str(status["phase"]), message)
+    return None
+
+
+def _sentence(word: str, rest: str) -> str:
+    rest = rest.strip().rstrip(".")
+    return f"{word}: {rest}" if rest else word
+
+
+def _exitcode(worker: Mapping[str, Any]) -> int | None:
+    code = worker.get("exitCode")
+    if not isinstance(code, int) or worker.get("reason") in _LOST_CONTAINERS:
+        return None
+    return 128 - code if code > 128 else code  # runtimes add 128 to a signal
+
+
+def _ending(exitcode: int) -> str:
+    if exitcode >= 0:
+        return f"ended with exit status {exitcode}"
+    try:
+        return f"was killed by {signal.Signals(-exitcode).name}"
+    except ValueError:
+        return f"was killed by signal {-exitcode}"

@@ -1,0 +1,211 @@
+"""What the program asks for: the pod template of a shape, and the FiberPool around it.
+
+A worker is to find what its program has.  In a pod that is the program's own container: its image,
+environment, volumes, account and so on, without what belongs to that one pod.  Elsewhere it is an
+image.  Wishes of functions come on top, and what the user's own template says wins over all.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import fiber
+from fiber._backends.kubernetes.merge import merge_template
+from fiber._backends.kubernetes.shape import Shape, quantity
+from fiber.config import Config
+from fiber.resources import Resources
+from fiber_api import names
+
+Document = dict[str, Any]
+
+WORKER_IMAGE = f"fiber-worker:{fiber.__version__}"
+"""What workers run where nothing else is said: as charts and manifests name it."""
+
+GPU = "nvidia.com/gpu"
+
+_AGENT = ("-m", "fiber.agent")
+
+
+# ---- the pod template -----------------------------------------------------------------------
+
+
+def pod_template(
+    shape: Shape, own_pod: Mapping[str, Any] | None, container: str, python: str = "python"
+) -> Document:
+    """The template of a shape's pods.
+
+    ``own_pod`` is the pod that this program runs in, ``container`` its container there and
+    ``python`` its interpreter; without a pod the last two have no meaning.
+    """
+    spec = _like(own_pod, container) if own_pod is not None else _elsewhere()
+    worker = spec["containers"][0]
+    own_image = worker["image"] if own_pod is not None else None
+    if shape.image is not None and shape.image != worker["image"]:
+        worker["image"] = shape.image
+        worker.pop("imagePullPolicy", None)  # it was said of the other
+    _ask_for(worker, shape.resources, shape.processes_per_pod)
+    template = merge_template({"spec": spec}, json.loads(shape.template))
+    for worker in _workers(template):
+        if not ("command" in worker or "args" in worker):
+            # What the image runs by itself may be the program, and that must not start anew.
+            interpreter = python if worker.get("image") == own_image else "python"
+            worker["command"] = [interpreter, *_AGENT]
+    return template
+
+
+def _elsewhere() -> Document:
+    return {"containers": [{"name": names.WORKER_CONTAINER, "image": WORKER_IMAGE}]}
+
+
+def _workers(template: Document) -> Iterator[Document]:
+    for container in template["spec"].get("containers") or ():
+        if container.get("name") == names.WORKER_CONTAINER:
+            yield container
+
+
+def _ask_for(worker: Document, resources: Resources, processes: int) -> None:
+    """Guarantee what ``processes`` processes need: requests and limits alike."""
+    wishes = {
+        "cpu": None if resources.cpu is None else quantity(resources.cpu * processes),
+        "memory": None if resources.memory is None else f"{resources.memory * processes}Mi",
+    }
+    requests = {kind: amount for kind, amount in wishes.items() if amount is not None}
+    limits = dict(requests)
+    if resources.gpu:
+        limits[GPU] = str(resources.gpu * processes)  # which is its request too
+    if limits:
+        worker["resources"] = {"limits": limits, **({"requests": requests} if requests else {})}
+
+
+# ---- like the program's own pod -------------------------------------------------------------
+
+_OF_THE_POD = (
+    "affinity",
+    "dnsConfig",
+    "dnsPolicy",
+    "hostAliases",
+    "imagePullSecrets",
+    "nodeSelector",
+    "runtimeClassName",
+    "schedulerName",
+    "securityContext",
+    "serviceAccountName",
+    "tolerations",
+)
+"""What a worker's pod has of the program's.  Not its name and labels, by which others select it;
+not its other containers; not what it asks for, since the program is no worker."""
+
+_OF_THE_CONTAINER = (
+    "env",
+    "envFrom",
+    "image",
+    "imagePullPolicy",
+    "securityContext",
+    "volumeDevices",
+    "volumeMounts",
+    "workingDir",
+)
+
+_ACCOUNT = "/var/run/secrets/kubernetes.io/serviceaccount"
+"""Where a pod has its token, which is its own: workers need nothing of the API."""
+
+
+def _like(pod: Mapping[str, Any], container: str) -> Document:
+    own = copy.deepcopy(dict(pod["spec"]))
+    found = next(c for c in own["containers"] if c["name"] == container)
+    worker = {"name": names.WORKER_CONTAINER, **_given(found, _OF_THE_CONTAINER)}
+    _set(worker, "env", [v for v in found.get("env") or () if not v["name"].startswith("FIBER_")])
+    mounts = [m for m in found.get("volumeMounts") or () if not _is_the_pods(m)]
+    _set(worker, "volumeMounts", mounts)
+    spec = {**_given(own, _OF_THE_POD), "containers": [worker]}
+    used = {m["name"] for m in (*mounts, *(found.get("volumeDevices") or ()))}
+    _set(spec, "volumes", [v for v in own.get("volumes") or () if v["name"] in used])
+    _set(spec, "tolerations", [t for t in own.get("tolerations") or () if not _is_default(t)])
+    _rename(spec, container)
+    return spec
+
+
+def _given(document: Document, fields: tuple[str, ...]) -> Document:
+    return {name: document[name] for name in fields if document.get(name)}
+
+
+def _set(document: Document, name: str, items: list[Any]) -> None:
+    document.pop(name, None)
+    if items:
+        document[name] = items
+
+
+def _is_the_pods(mount: Mapping[str, Any]) -> bool:
+    return mount["mountPath"].rstrip("/") in (_ACCOUNT, names.CREDENTIALS_DIRECTORY)
+
+
+def _is_default(toleration: Mapping[str, Any]) -> bool:
+    """Whether the API server gave it to the pod.  The operator gives workers shorter ones, which
+    it leaves out where the template has its own.
+    """
+    key = str(toleration.get("key"))
+    return toleration.get("tolerationSeconds") == 300 and key.startswith("node.kubernetes.io/")
+
+
+def _rename(document: object, container: str) -> None:
+    """Let what refers to the program's container refer to the worker's."""
+    if isinstance(document, list):
+        for item in document:
+            _rename(item, container)
+    elif isinstance(document, dict):
+        reference = document.get("resourceFieldRef")
+        if isinstance(reference, dict) and reference.get("containerName") == container:
+            reference["containerName"] = names.WORKER_CONTAINER
+        for item in document.values():
+            _rename(item, container)
+
+
+_TERMINATION_LOG = re.compile(r"/pods/[^/ ]+/containers/([^/ ]+)/\S+ /dev/termination-log ")
+
+
+def own_container(pod: Mapping[str, Any], mountinfo: str) -> str:
+    """Which container of its pod this program runs in; ``mountinfo`` is /proc/self/mountinfo.
+
+    The kubelet keeps the file that it mounts in each container in a folder of that name.  Where
+    that cannot be seen it is the one that kubectl takes if told of none.
+    """
+    containers = [container["name"] for container in pod["spec"]["containers"]]
+    seen = _TERMINATION_LOG.search(mountinfo)
+    annotations = pod["metadata"].get("annotations") or {}
+    told = annotations.get("kubectl.kubernetes.io/default-container")
+    for name in (seen and seen[1], told):
+        if name in containers:
+            return str(name)
+    return str(containers[0])
+
+
+# ---- the FiberPool --------------------------------------------------------------------------
+
+
+def fiber_pool_body(
+    name: str, template: Mapping[str, Any], config: Config, master: Mapping[str, Any]
+) -> Document:
+    """A FiberPool that is the program's own: it goes with it, and wants no pod yet.
+
+    ``master`` is ``spec.master``, as whoever listens knows it.
+    """
+    return {
+        "apiVersion": names.API_VERSION,
+        "kind": names.KIND,
+        "metadata": {"name": name, "labels": {names.LABEL_MANAGED_BY: names.SDK_MANAGER}},
+        "spec": {
+            "replicas": 0,
+            "maxReplicas": config.max_pods,
+            "processesPerPod": config.processes_per_pod,
+            "template": dict(template),
+            "master": dict(master),
+            "onLost": "Delete",
+            "credentialsSecretName": names.secret_name(name),
+            "scaleDown": {"idleTimeoutSeconds": math.ceil(config.idle_timeout)},
+        },
+    }
