@@ -193,14 +193,14 @@ def test_a_start_drops_the_children_that_ended() -> None:
 def test_a_child_that_ends_before_its_start_returns_is_dropped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    wait_for_birth = popen.Popen._wait_for_birth
+    wait_for_birth = popen.Popen._wait_for_answer
 
     def wait_for_end(self: popen.Popen, host: str) -> None:
         wait_for_birth(self, host)
         self.wait(PATIENCE)
         process._drop_ended()
 
-    monkeypatch.setattr(popen.Popen, "_wait_for_birth", wait_for_end)
+    monkeypatch.setattr(popen.Popen, "_wait_for_answer", wait_for_end)
     child = fiber.Process(target=os.getpid)
     child.start()
     assert child not in multiprocessing.process._children
@@ -293,7 +293,7 @@ def test_an_interrupted_start_kills_the_late_child(
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(popen.Popen, "_wait_for_birth", interrupt)
+    monkeypatch.setattr(popen.Popen, "_wait_for_answer", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fiber.Process(target=os.getpid).start()
     settle(state.runtime())

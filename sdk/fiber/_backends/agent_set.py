@@ -85,10 +85,15 @@ class AgentSet:
         """No agent will come: if there is none, nobody has to wait."""
         self.error = error
         if not self.agents:
-            waiting = list(self._placement.waiting)
-            self._placement.waiting.clear()
-            for child in waiting:
-                _refuse(child, error)
+            self.refuse_waiting(error)
+
+    def refuse_waiting(self, error: Exception) -> None:
+        """Nobody is to wait any longer."""
+        waiting = list(self._placement.waiting)
+        self._placement.waiting.clear()
+        for child in waiting:
+            _refuse(child, error)
+        self._on_change()
 
     def _place(self) -> None:
         while (placed := self._placement.place()) is not None:

@@ -70,8 +70,10 @@ class RemoteAgent:
         self.loop = loop
         self.lost: str | None = None
         """Why it is gone for good."""
-        self.node = ""
-        """Where its pod runs; empty if it is in none, or while that is not known."""
+        self.pod = self.node = ""
+        """The pod that it runs in, and that pod's node; empty if it is in none."""
+        self.ending = ""
+        """Why its pod is about to go, where that is known."""
         self.suspect = False
         """Whether it has been silent for a while."""
         self._link = link
@@ -121,7 +123,7 @@ class RemoteAgent:
                 child.end(self._report_of_loss(reason))
 
     def _report_of_loss(self, reason: str) -> ExitReport:
-        why, cause = f"agent {self.host} lost: {reason}", Cause.AGENT_LOST
+        why, cause = self.ending or f"agent {self.host} lost: {reason}", Cause.AGENT_LOST
         return ExitReport(-signal.SIGKILL, why, host=self.host, cause=cause)
 
     # What comes over the link
@@ -271,4 +273,7 @@ class RemoteChild:
         if self._channel is not None:
             self._channel.end()
         missed = list(self._latest)[max(0, len(self._latest) - crossed) :]
-        self.observer.exited(report._replace(unread=(*report.unread, *missed)))
+        report = report._replace(unread=(*report.unread, *missed))
+        if self._agent is not None:
+            report = report._replace(pod=self._agent.pod, node=self._agent.node)
+        self.observer.exited(report)

@@ -49,6 +49,10 @@ class Demand:
         self._wanted = minimum
         self._less_since: float | None = None
 
+    def set_bounds(self, minimum: int, maximum: int) -> None:
+        """Others from now on."""
+        self._minimum, self._maximum = minimum, maximum
+
     def decide(self, now: float) -> Wish:
         """What there should be; who is to be released counts as gone."""
         release, wake_at = self._release(now)

@@ -158,13 +158,27 @@ class _Releasing:
 
 
 def _make_backend(runtime: Runtime) -> Backend:
-    if runtime.config.backend == "loopback" and runtime.hub is not None:
+    loop, hub, settings = runtime.loop, runtime.hub, runtime.config
+    if hub is not None and settings.backend == "loopback":
         from fiber._backends.loopback import LoopbackBackend
 
-        return LoopbackBackend(runtime.loop, runtime.hub, runtime.config)
+        return LoopbackBackend(loop, hub, settings)
+    if hub is not None and (settings.backend == "kubernetes" or _is_on_cluster(settings)):
+        from fiber._backends.kubernetes.backend import KubernetesBackend
+
+        return KubernetesBackend(loop, hub, settings)
     from fiber._backends.local import LocalBackend
 
     return LocalBackend(runtime.loop, runtime.host, runtime.hub)
+
+
+def _is_on_cluster(settings: config.Config) -> bool:
+    """Whether a program that chose no backend is in a pod that may make others."""
+    if settings.backend != "auto" or "KUBERNETES_SERVICE_HOST" not in os.environ:
+        return False
+    from fiber._backends.kubernetes.detection import may_make_pools
+
+    return may_make_pools(settings.namespace)
 
 
 def _modules_of(process: Any) -> list[str]:

@@ -1,0 +1,56 @@
+"""The backend whose agents are pods: one FiberPool for each shape that a program asks for."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from fiber._agent.interface import ChildObserver, ChildSpec
+from fiber._backends.kubernetes.pods import Pods
+from fiber._backends.kubernetes.program import Program
+from fiber._backends.kubernetes.shape import Shape
+from fiber._backends.output import Output
+from fiber._backends.remote import RemoteChild
+from fiber._hub.hub import Hub
+from fiber._transport.loop import Loop
+from fiber.config import Config
+
+
+class KubernetesBackend:
+    """Shares the pods of each shape among all of the program's pools and processes."""
+
+    name = "kubernetes"
+    same_host = False
+    elastic = True
+
+    def __init__(self, loop: Loop, hub: Hub, config: Config) -> None:
+        self._loop = loop
+        self._hub = hub
+        self._config = config
+        self._output = Output()
+        self._program = Program(config)
+        self._shape = Shape.of(config)
+        self._pods: dict[Shape | str, Pods] = {}
+
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
+        """A child in a pod that has what it wishes."""
+        pool = spec.resources.pool or self._config.pool
+        key = pool or self._shape.with_resources(spec.resources)
+        pods = self._pods.get(key)
+        if pods is None:  # one that another thread makes meanwhile has had no effect yet
+            pods = self._pods.setdefault(key, self._make(key))
+        return pods.agents.child(spec, observer)
+
+    def _make(self, key: Shape | str) -> Pods:
+        program, loop = self._program, self._loop
+        opens = (
+            partial(program.open_warm, key, loop)
+            if isinstance(key, str)
+            else partial(program.open_own, key, loop)
+        )
+        return Pods(loop, self._hub, self._output, self._config, program.api, opens)
+
+    def close(self) -> None:
+        """End the pods, and the pools or their use."""
+        for pods in self._pods.values():
+            pods.close()
+        self._output.close()

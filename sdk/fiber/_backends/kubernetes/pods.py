@@ -1,0 +1,247 @@
+"""The pods of one FiberPool as hosts for children: as many as these need, for as long as they do."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from fiber._backends.agent_set import AgentSet
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
+from fiber._backends.kubernetes.pod_reasons import node_of, pod_end
+from fiber._backends.kubernetes.problems import PoolName, failure, new_problems, overdue, summary
+from fiber._backends.kubernetes.program import Opened, Serve
+from fiber._backends.kubernetes.progress import Progress
+from fiber._backends.output import Output
+from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._engine.demand import Demand
+from fiber._engine.placement import Placement
+from fiber._hub.hub import Hub
+from fiber._transport.link import Link
+from fiber._transport.loop import Loop, Timer
+from fiber.config import Config
+from fiber.errors import FiberError, FiberPoolError
+
+_END_TIMEOUT = 10.0
+"""Seconds for the API server, and as many for the agents, to hear of the end."""
+
+_ENDED = ("Failed", "Succeeded")
+
+Document = Mapping[str, Any]
+
+
+class Pods:
+    """Begins with the first child, and asks for pods as children come and go.
+
+    ``open`` makes the pool, or attaches to it; it blocks and raises FiberError.  Everything but
+    ``agents.child`` and ``close`` happens on the loop's thread.
+    """
+
+    def __init__(
+        self,
+        loop: Loop,
+        hub: Hub,
+        output: Output,
+        config: Config,
+        api: Api,
+        open: Callable[[Serve], Opened],
+    ) -> None:
+        self._loop = loop
+        self._output = output
+        self._config = config
+        self._api = api
+        self._open = open
+        self._placement: Placement[RemoteAgent, RemoteChild] = Placement(
+            config.processes_per_pod, spread=False
+        )
+        self._demand = Demand(
+            self._placement, maximum=config.max_pods, idle_timeout=config.idle_timeout
+        )
+        self.agents = AgentSet(
+            loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
+        )
+        self._opener: threading.Thread | None = None
+        self._opened: Opened | None = None
+        self._client: FiberPoolClient | None = None
+        self._closing = False
+        self._decision_is_due = False
+        self._timer: Timer | None = None
+        self._patience: Timer | None = None
+        self._wanted = 0
+        self._pods: dict[str, Document] = {}
+        self._given_up: set[str] = set()
+        """Pods that are there and of which nothing is expected any more."""
+        self._status: Document = {}
+        self._progress = Progress(loop, output, self._describe)
+
+    def close(self) -> None:
+        """End the children, and the pool or its use.  Not on the loop's thread."""
+        self._closing = True
+        if self._opener is None:
+            return
+        self._opener.join()
+        done = threading.Event()
+        self._loop.call_soon(self._shut_down, done)
+        done.wait()
+        if self._client is not None:
+            self._client.close(_END_TIMEOUT)
+        if self._opened is not None:
+            done.clear()
+            self._opened.listener.close("the master ended", then=done.set)
+            done.wait(_END_TIMEOUT)
+
+    def _shut_down(self, done: threading.Event) -> None:
+        for timer in (self._timer, self._patience):
+            if timer is not None:
+                timer.cancel()
+        self._progress.stop()
+        for agent in self.agents.agents.values():
+            agent.close()
+        done.set()
+
+    # -- The pool begins
+
+    def _begin(self) -> None:
+        """Calls of the API server take their time: a thread makes them."""
+        self._opener = threading.Thread(target=self._run_open, name="fiber-open", daemon=True)
+        self._opener.start()
+
+    def _run_open(self) -> None:
+        serve = Serve(self._joined, lambda why: self._output.write("fiber", f"refused {why}"))
+        try:
+            opened = self._open(serve)
+        except FiberError as error:
+            self._loop.call_soon(self._failed_to_open, error)
+        else:
+            self._loop.call_soon(self._began, opened)
+
+    def _failed_to_open(self, error: FiberError) -> None:
+        self._opener = None  # the next child may have more luck
+        self.agents.refuse_waiting(error)
+
+    def _began(self, opened: Opened) -> None:
+        self._opened = opened
+        self._placement.slots = opened.slots
+        self._demand.set_bounds(opened.minimum, opened.maximum)
+        self._client = FiberPoolClient(self._api, self._loop, opened.tenure, self)
+        self._client.start()
+        self._changed()
+
+    # -- What it needs
+
+    def _changed(self) -> None:
+        if not self._decision_is_due:
+            self._decision_is_due = True
+            self._loop.call_soon(self._decide)
+
+    def _decide(self) -> None:
+        self._decision_is_due = False
+        if self._closing:
+            return
+        wish = self._demand.decide(self._loop.now())
+        if wish.agents and self._opener is None:
+            self._begin()
+        released = [agent.host for agent in wish.release]
+        self._given_up.update(released)
+        if self._client is not None and (released or wish.agents != self._wanted):
+            self._wanted = wish.agents
+            self._client.demand(wish.agents, released)
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if wish.wake_at < float("inf"):
+            self._timer = self._loop.call_later(wish.wake_at - self._loop.now(), self._decide)
+        self._watch_the_wait()
+
+    def _watch_the_wait(self) -> None:
+        """Somebody who waits for a first host is told what for, and not kept for ever."""
+        waits = bool(self._placement.waiting) and not self.agents.agents
+        if not waits:
+            self._progress.stop()
+            if self._patience is not None:
+                self._patience.cancel()
+                self._patience = None
+        elif self._patience is None:
+            self._progress.start()
+            timeout = self._config.start_timeout
+            self._patience = self._loop.call_later(timeout, self._give_up_waiting)
+
+    def _give_up_waiting(self) -> None:
+        self._patience = None
+        timeout = self._config.start_timeout
+        self.agents.refuse_waiting(overdue(self._name, self._status, timeout, time.time()))
+
+    # -- Agents
+
+    def _joined(self, link: Link) -> str | None:
+        name = link.peer.name
+        if name in self._given_up:
+            return f"{name}, which had been given up"
+        if name in self.agents.agents:
+            return f"{name}, which is there already"
+        agent = self.agents.join(name, link)
+        agent.pod = name
+        self._tell(agent)
+        return None
+
+    def _lost(self, agent: RemoteAgent, reason: str) -> None:
+        name = agent.host
+        if name in self._pods and name not in self._given_up and not self._closing:
+            # Its pod may live on where nobody hears it: another takes its place.
+            self._given_up.add(name)
+            if self._client is not None:
+                self._client.demand(self._wanted, [name])
+
+    def _tell(self, agent: RemoteAgent) -> None:
+        """Say what is known of its pod."""
+        pod = self._pods.get(agent.host)
+        if pod is not None:
+            end = pod_end(pod)
+            agent.node = node_of(pod)
+            agent.ending = end.reason if end is not None else ""
+
+    # -- What the API server says
+
+    def on_pod(self, name: str, pod: Document | None) -> None:
+        """A pod of the pool, as it is now; None once it is gone."""
+        agent = self.agents.agents.get(name)
+        if pod is None:
+            self._pods.pop(name, None)
+            self._given_up.discard(name)
+            if agent is not None:
+                agent.lose("its pod is gone")
+            return
+        self._pods[name] = pod
+        if agent is not None:
+            self._tell(agent)
+            if (pod.get("status") or {}).get("phase") in _ENDED:
+                agent.lose("its pod has ended")
+            elif agent.ending:
+                self.agents.suspected(agent, True)
+
+    def on_status(self, status: Document) -> None:
+        """The pool's status, as it is now."""
+        before, self._status = self._status, status
+        for problem in new_problems(self._name, before, status):
+            self._output.write("fiber", problem)
+        error = failure(self._name, status, len(self.agents.agents))
+        if error is not None:
+            self.agents.refuse_waiting(error)
+
+    def on_warning(self, message: str) -> None:
+        """Something that keeps the pool waiting, and may pass."""
+        self._output.write("fiber", message)
+
+    def on_error(self, error: FiberPoolError) -> None:
+        """Nothing comes of the pool any more."""
+        self.agents.fail(error)
+
+    def _describe(self) -> str:
+        return f"waiting for pods: {summary(self._status, time.time())}"
+
+    @property
+    def _name(self) -> PoolName:
+        tenure = None if self._opened is None else self._opened.tenure
+        return PoolName("", "") if tenure is None else PoolName(tenure.name, tenure.namespace)

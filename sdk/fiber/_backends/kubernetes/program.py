@@ -1,0 +1,159 @@
+"""This program on a cluster: who it is there, where pods reach it, and how its FiberPools begin."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import secrets
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from fiber._backends.kubernetes.address import reachable_address
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.api_errors import ApiError, Body, explain
+from fiber._backends.kubernetes.fiber_pool import Tenure
+from fiber._backends.kubernetes.held_pool import Master
+from fiber._backends.kubernetes.own_pool import OwnPool
+from fiber._backends.kubernetes.resources import PODS, POOLS
+from fiber._backends.kubernetes.secret import make_credentials
+from fiber._backends.kubernetes.shape import Shape, pool_name, program_name
+from fiber._backends.kubernetes.template import fiber_pool_body, own_container, pod_template
+from fiber._backends.kubernetes.warm_pool import WarmPool, read_credentials
+from fiber._transport.credentials import MasterCredentials
+from fiber._transport.link import Keepalive, Link
+from fiber._transport.listener import MasterListener
+from fiber._transport.loop import Loop
+from fiber.config import Config
+from fiber_api import names
+
+_SUFFIX_BYTES = 4
+
+
+class Opened(NamedTuple):
+    """A FiberPool that is about to have this program as its master."""
+
+    listener: MasterListener
+    tenure: Tenure
+    slots: int
+    """Processes that each of its pods runs."""
+    minimum: int
+    """Pods that it keeps whatever is wanted."""
+    maximum: int
+
+
+class Program:
+    """Opens FiberPools for one program.  Its methods ask the API server, and block."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._api = Api.connect(config.context)
+        self.api = self._api
+        self.namespace = config.namespace or self._api.namespace
+        self._lock = threading.Lock()
+        self._own_pod: Body | None = None
+        self._name = program_name(getattr(sys.modules["__main__"], "__file__", None))
+        self._suffix = secrets.token_hex(_SUFFIX_BYTES)
+        self._numbers = itertools.count()
+
+    def open_own(self, shape: Shape, loop: Loop, serve: Serve) -> Opened:
+        """A pool of this program's own, for pods of this shape."""
+        number = next(self._numbers)
+        suffix = self._suffix if not number else f"{self._suffix}-{number}"
+        name = pool_name(self._name, shape, suffix)
+        credentials = make_credentials(name, self.namespace)
+        host, listener = self._listen(name, credentials, loop, serve)
+        master = self._master(host, listener)
+        own = self._find_own_pod()
+        container = own_container(own, _mountinfo()) if own is not None else ""
+        template = pod_template(shape, own, container, sys.executable)
+        body = fiber_pool_body(name, template, self._config, master.spec(name, 1))
+        tenure = OwnPool(self._api, self.namespace, body, credentials, master, self._owner(own))
+        slots = self._config.processes_per_pod
+        return Opened(listener, tenure, slots, 0, self._config.max_pods)
+
+    def open_warm(self, name: str, loop: Loop, serve: Serve) -> Opened:
+        """A pool that somebody else keeps."""
+        try:
+            spec = self._api.get(POOLS.path(self.namespace, name))["spec"]
+            credentials = read_credentials(self._api, self.namespace, name)
+        except ApiError as error:
+            raise explain(
+                error, self._api, f"attach to the FiberPool {name!r}", name, self.namespace
+            ) from error
+        host, listener = self._listen(name, credentials, loop, serve)
+        tenure = WarmPool(self._api, self.namespace, name, self._master(host, listener))
+        return Opened(
+            listener,
+            tenure,
+            int(spec.get("processesPerPod", 1)),
+            int(spec.get("minReplicas", 0)),
+            int(spec.get("maxReplicas", self._config.max_pods)),
+        )
+
+    def _listen(
+        self, pool: str, credentials: MasterCredentials, loop: Loop, serve: Serve
+    ) -> tuple[str, MasterListener]:
+        config = self._config
+        host = reachable_address(
+            self._api, config.listen_host, pool=pool, namespace=self.namespace
+        )
+        listener = MasterListener(
+            loop,
+            names.address_of(config.listen_host or host, config.listen_port),
+            credentials,
+            on_agent=serve.on_agent,
+            on_refused=serve.on_refused,
+            keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
+            lost_grace=Master.lost_grace,
+        )
+        return host, listener
+
+    def _master(self, host: str, listener: MasterListener) -> Master:
+        port = int(listener.address.rpartition(":")[2])
+        # The port makes it this very listener's, and not an earlier program's of the same pid.
+        return Master(host, port, f"{socket.gethostname()}:{os.getpid()}:{self._suffix}")
+
+    def _find_own_pod(self) -> Body | None:
+        """The pod that this program runs in, if it is in one."""
+        if not self._api.in_cluster:
+            return None
+        with self._lock:
+            if self._own_pod is None:
+                name = os.environ.get("HOSTNAME") or socket.gethostname()
+                try:
+                    self._own_pod = self._api.get(PODS.path(self._api.namespace, name))
+                except ApiError as error:
+                    raise explain(
+                        error, self._api, f"read this program's own pod {name!r}", "", self.namespace
+                    ) from error
+            return self._own_pod
+
+    def _owner(self, pod: Body | None) -> Body | None:
+        """What the pool names as its owner, to go with it; owners are of the same namespace."""
+        if pod is None or pod["metadata"]["namespace"] != self.namespace:
+            return None
+        metadata = pod["metadata"]
+        return {
+            "apiVersion": PODS.api_version,
+            "kind": PODS.kind,
+            "name": metadata["name"],
+            "uid": metadata["uid"],
+        }
+
+
+class Serve(NamedTuple):
+    """Who hears of agents that dial in; on the loop's thread."""
+
+    on_agent: Callable[[Link], str | None]
+    on_refused: Callable[[str], None]
+
+
+def _mountinfo() -> str:
+    try:
+        with open("/proc/self/mountinfo") as file:
+            return file.read()
+    except OSError:
+        return ""
