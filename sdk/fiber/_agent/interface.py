@@ -114,13 +114,17 @@ class ChildHandle(Protocol):
     name: str
     host: str
     """Where it is; empty while it waits for a host."""
-    node: str
-    """The node of its pod; empty where there is none, or while that is not known."""
     pid: int | None
-    waiting: bool
-    """Whether it waits for a host."""
     start_error: Exception | None
     """What kept it from being started, where that is not only told by its report."""
+
+    @property
+    def node(self) -> str:
+        """The node of its pod; empty where there is none, or while that is not known."""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether it waits for a host."""
 
     def start(self) -> None:
         """Start it; what becomes of that, the observer hears.  Once, on the loop's thread."""

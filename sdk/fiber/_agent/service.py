@@ -17,6 +17,9 @@ from fiber._transport.loop import Loop
 from fiber._transport.stream import Frame
 from fiber._wire import messages, packet
 
+_KNOWN_HERE = ExitReport._fields.index("pod")
+"""Fields of an exit report that an agent knows; the master adds the others."""
+
 _BACKLOG = 4 << 20
 """Bytes waiting on the link above which no more output of children is read."""
 
@@ -169,7 +172,7 @@ class _Observed:
     def exited(self, report: ExitReport) -> None:
         """Its last lines, then its end."""
         log = self._capture.finish() if self._capture is not None else ()
-        *told, _pod, _node = report._replace(log=log)  # the master knows these
+        told = report._replace(log=log)[:_KNOWN_HERE]
         end = messages.Exited(self._number, self._delivered, *told)
         self._service.send(end)
         self._service.forget(self._number)
