@@ -6,6 +6,7 @@ import pickle
 import signal
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from fiber._agent.agent import Agent
 from fiber._agent.capture import Capture
@@ -172,7 +173,7 @@ class _Observed:
     def exited(self, report: ExitReport) -> None:
         """Its last lines, then its end."""
         log = self._capture.finish() if self._capture is not None else ()
-        told = report._replace(log=log)[:_KNOWN_HERE]
+        told: Any = report._replace(log=log)[:_KNOWN_HERE]
         end = messages.Exited(self._number, self._delivered, *told)
         self._service.send(end)
         self._service.forget(self._number)
