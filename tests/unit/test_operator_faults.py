@@ -239,7 +239,7 @@ async def test_a_lost_lease_stops_a_scale_up_at_once(world: World) -> None:
     await world.until(lambda: len(world.pods()) > 10)
     spec = {"holderIdentity": "another", "leaseDurationSeconds": 15, "renewTime": "now"}
     world.store.merge("leases", "fiber-system", "fiber-operator", {"spec": spec})
-    await world.until(lambda: not world.program.guard.held)
+    await world.until(lambda: not world.program.elector.is_leader)
     at_loss = len(world.created())
     assert world.program.health.ready() != []
     await world.settled(12)
@@ -264,7 +264,7 @@ def test_two_operators_do_the_work_of_one() -> None:
             await world.kill()
             await world.until_settled(60)
             assert len(world.created()) == 60
-            assert second.guard.held
+            assert second.elector.is_leader
             stop.set()
             await task
 

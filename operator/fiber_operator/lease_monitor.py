@@ -27,17 +27,17 @@ AT_ONCE = 8
 log = logging.getLogger(__name__)
 
 
-class Term(NamedTuple):
+class MasterLease(NamedTuple):
     """What is watched: one master of a pool.  Another epoch is another master."""
 
-    lease: str
+    name: str
     epoch: int
     seconds: float
 
 
 @dataclass
 class _Watched:
-    term: Term
+    lease: MasterLease
     due: float
     verdict: LeaseVerdict
     seen: tuple[object, ...] | None = None
@@ -48,10 +48,10 @@ class _Watched:
 
     @property
     def pause(self) -> float:
-        return min(self.term.seconds / LOOKS, LONGEST_PAUSE)
+        return min(self.lease.seconds / LOOKS, LONGEST_PAUSE)
 
 
-class Masters:
+class LeaseMonitor:
     """Looks at the Leases that pools name and tells when a verdict changes."""
 
     def __init__(self, cluster: Cluster, on_change: Callable[[Key], None]) -> None:
@@ -60,14 +60,14 @@ class Masters:
         self._watched: dict[Key, _Watched] = {}
         self._wake = asyncio.Event()
 
-    def follow(self, key: Key, term: Term | None) -> LeaseVerdict:
+    def follow(self, key: Key, lease: MasterLease | None) -> LeaseVerdict:
         """Watch this master of the pool from now on (None: none) and say what is known of it."""
         watched = self._watched.get(key)
-        if term is None:
+        if lease is None:
             self._watched.pop(key, None)
             return LeaseVerdict()
-        if watched is None or watched.term != term:
-            watched = self._watched[key] = _Watched(term, self._now(), LeaseVerdict())
+        if watched is None or watched.lease != lease:
+            watched = self._watched[key] = _Watched(lease, self._now(), LeaseVerdict())
             self._wake.set()
         return watched.verdict
 
@@ -91,7 +91,7 @@ class Masters:
             return
         lease: Body = {}
         try:
-            lease = await self._cluster.read(LEASES, key.namespace, watched.term.lease)
+            lease = await self._cluster.read(LEASES, key.namespace, watched.lease.name)
         except Gone:
             pass  # judged like one that does not change: it may be made yet
         except ApiError as error:
@@ -124,7 +124,7 @@ class Masters:
         elif seen != watched.seen:
             # One that was deleted or let go may be taken up by the next master: that is waited for.
             watched.changed, alive = now, True if holder else alive
-        elif now - watched.changed >= watched.term.seconds:
+        elif now - watched.changed >= watched.lease.seconds:
             alive = False
         watched.seen = seen
         return LeaseVerdict(alive=alive, holder=str(holder), missing=not lease)

@@ -14,31 +14,31 @@ from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Store
 from fakes.world import configuration
 from fiber_operator.cluster import Cluster
-from fiber_operator.masters import Masters, Term
+from fiber_operator.lease_monitor import LeaseMonitor, MasterLease
 from fiber_operator.planning.plans import LeaseVerdict
 from fiber_operator.turns import Key
 
 ES = Key("team", "es")
-TERM = Term("lease", 1, 30.0)
+LEASE = MasterLease("lease", 1, 30.0)
 
 
 class Watch:
-    """``Masters`` at work, and a master that renews its Lease."""
+    """``LeaseMonitor`` at work, and a master that renews its Lease."""
 
     def __init__(self, api: KubernetesApi, door: Cluster) -> None:
         self.api, self.store = api, api.store
         self.told: list[tuple[float, LeaseVerdict]] = []
-        self.masters = Masters(door, self._tell)
-        self.task = asyncio.ensure_future(self.masters.run())
+        self.monitor = LeaseMonitor(door, self._tell)
+        self.task = asyncio.ensure_future(self.monitor.run())
         self._renewals: asyncio.Task[None] | None = None
         self._count = 0
 
     def _tell(self, key: Key) -> None:
         now = round(asyncio.get_running_loop().time(), 1)
-        self.told.append((now, self.masters.follow(key, TERM)))
+        self.told.append((now, self.monitor.follow(key, LEASE)))
 
     def alive(self) -> bool | None:
-        return self.masters.follow(ES, TERM).alive
+        return self.monitor.follow(ES, LEASE).alive
 
     def write(self, holder: str | None = "es-1", stamp: str = "") -> None:
         self._count += 1
@@ -98,7 +98,7 @@ async def test_one_that_renews_is_alive(watch: Watch) -> None:
 @played
 async def test_one_that_stops_is_lost_after_the_duration(watch: Watch) -> None:
     watch.renew()
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(41)
     watch.die()
     await asyncio.sleep(27)
@@ -111,7 +111,7 @@ async def test_one_that_stops_is_lost_after_the_duration(watch: Watch) -> None:
 @played
 async def test_one_that_comes_back_is_alive_again(watch: Watch) -> None:
     watch.renew()
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)
     watch.die()
     await asyncio.sleep(60)
@@ -123,11 +123,11 @@ async def test_one_that_comes_back_is_alive_again(watch: Watch) -> None:
 
 @played
 async def test_a_lease_that_is_never_made_does_not_change(watch: Watch) -> None:
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(25)
     assert watch.alive() is None
     await asyncio.sleep(16)
-    assert watch.masters.follow(ES, TERM) == LeaseVerdict(alive=False, missing=True)
+    assert watch.monitor.follow(ES, LEASE) == LeaseVerdict(alive=False, missing=True)
 
 
 @pytest.mark.parametrize("holder", ["", None])
@@ -135,7 +135,7 @@ def test_a_lease_that_is_let_go_may_be_taken_up(holder: str | None) -> None:
     @played
     async def test(watch: Watch) -> None:
         watch.renew()
-        watch.masters.follow(ES, TERM)
+        watch.monitor.follow(ES, LEASE)
         await asyncio.sleep(21)
         watch.die()
         watch.write(holder)
@@ -157,7 +157,7 @@ def test_a_lease_that_is_let_go_may_be_taken_up(holder: str | None) -> None:
 @played
 async def test_an_outage_of_the_api_server_is_not_the_masters(watch: Watch) -> None:
     watch.renew()
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)
     watch.api.down = True
     watch.die()  # it cannot renew it either
@@ -175,7 +175,7 @@ async def test_an_outage_of_the_api_server_is_not_the_masters(watch: Watch) -> N
 @played
 async def test_an_outage_puts_the_loss_off_and_does_not_hide_it(watch: Watch) -> None:
     watch.renew()
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)
     watch.die()
     watch.api.faults.append(Fault("get", "leases", status=500, times=3))
@@ -187,7 +187,7 @@ async def test_an_outage_puts_the_loss_off_and_does_not_hide_it(watch: Watch) ->
 async def test_time_in_which_nobody_looked_does_not_count(watch: Watch) -> None:
     """The operator's process was stopped, or its loop was busy."""
     watch.renew()
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)
     watch.die()
     loop = asyncio.get_running_loop()
@@ -199,26 +199,26 @@ async def test_time_in_which_nobody_looked_does_not_count(watch: Watch) -> None:
 @played
 async def test_what_cannot_be_read_is_not_judged(watch: Watch) -> None:
     watch.api.faults.append(Fault("get", "leases", status=403, times=10**6))
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(300)
-    assert watch.masters.follow(ES, TERM) == LeaseVerdict(alive=None, unreadable="this is a test")
+    assert watch.monitor.follow(ES, LEASE) == LeaseVerdict(alive=None, unreadable="this is a test")
     assert len(watch.told) == 1
 
 
 @played
 async def test_another_epoch_is_another_master(watch: Watch) -> None:
     watch.renew()
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)
     assert watch.alive() is True
-    assert watch.masters.follow(ES, TERM._replace(epoch=2)) == LeaseVerdict()
+    assert watch.monitor.follow(ES, LEASE._replace(epoch=2)) == LeaseVerdict()
 
 
 @played
 async def test_nobody_is_watched_for_nothing(watch: Watch) -> None:
-    watch.masters.follow(ES, TERM)
+    watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)
-    assert watch.masters.follow(ES, None) == LeaseVerdict()
+    assert watch.monitor.follow(ES, None) == LeaseVerdict()
     watch.api.calls.clear()
     await asyncio.sleep(300)
     assert watch.api.calls == []
@@ -229,7 +229,7 @@ def test_nonsense_in_a_lease_is_no_sign_of_life(spec: object) -> None:
     @played
     async def test(watch: Watch) -> None:
         watch.store.create("leases", "team", {"metadata": {"name": "lease"}, "spec": spec})
-        watch.masters.follow(ES, TERM)
+        watch.monitor.follow(ES, LEASE)
         await asyncio.sleep(45)
         assert watch.alive() is False
 
@@ -239,7 +239,7 @@ def test_nonsense_in_a_lease_is_no_sign_of_life(spec: object) -> None:
 @played
 async def test_many_are_looked_at(watch: Watch) -> None:
     for number in range(50):
-        watch.masters.follow(Key("team", f"pool-{number}"), TERM)
+        watch.monitor.follow(Key("team", f"pool-{number}"), LEASE)
     await asyncio.sleep(5)
     assert watch.api.count("get", "leases") == 50
     await asyncio.sleep(29)

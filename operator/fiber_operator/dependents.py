@@ -39,7 +39,7 @@ LOOK_AGAIN = 50.0
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Dependents:
     """What was found or made."""
 
     address: str | None
@@ -75,14 +75,14 @@ class _Obstructed(Exception):
         self.obstacle = obstacle
 
 
-class Keeper:
+class DependentsReconciler:
     """Makes and mends them.  ``now`` gives unix seconds."""
 
     def __init__(self, cluster: Cluster, now: Callable[[], float]) -> None:
         self._cluster = cluster
         self._now = now
 
-    async def ensure(self, pool: FiberPool, known: Surroundings | None) -> Surroundings:
+    async def ensure(self, pool: FiberPool, known: Dependents | None) -> Dependents:
         """What there is now; ``known`` is what this returned for the pool last time.
 
         What fails is an obstacle and not raised, but for a Conflict: then the next look finds out
@@ -111,7 +111,7 @@ class Keeper:
             whole = found[2].obstacle is None
         led = found[0].obstacle is None
         before = known.master if known is not None else None
-        return Surroundings(
+        return Dependents(
             address,
             tuple(step.obstacle for step in found if step.obstacle is not None),
             pool.spec.master if led else before,
