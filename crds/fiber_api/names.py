@@ -304,7 +304,7 @@ class Reason(StrEnum):
     MASTER_LOST = "MasterLost"
     """The master's Lease has expired."""
     LEASE_NOT_FOUND = "LeaseNotFound"
-    """There is no Lease of the name in ``spec.master.leaseName``; soon the master counts as lost."""
+    """There is no Lease of the name in ``spec.master.leaseName`` yet, or not any more."""
     API_UNAVAILABLE = "ApiUnavailable"
     """A call of the operator fails: an admission webhook is down, the API server is busy."""
 

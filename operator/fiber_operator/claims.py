@@ -20,7 +20,7 @@ from fiber_operator.leader_election import LeaderElector, NotLeader
 from fiber_operator.logs import about
 
 NAME = names.CRD_NAME
-"""Of the Lease.  No release's own Lease is called so: theirs have no dot."""
+"""Of the Lease.  No release's own is called so, nor one that the SDK makes, which has no dot."""
 SECONDS = 900
 """How long other releases wait for one that went away without a word."""
 LINGER = 60

@@ -1,7 +1,8 @@
-"""What a pool has beside its pods: the Secret, the Service and its EndpointSlice.
+"""What a pool has beside its pods: the Service, its EndpointSlice, and the Secret.
 
 They are looked at when the operator meets a pool, again every ``LOOK_AGAIN`` seconds, and for as
-long as something is wrong with them; between that, only a new master causes a call.
+long as something is wrong with them; between that, only a new master causes a call.  A Secret that
+``spec.credentialsSecretName`` names is its maker's: the operator does not even read it.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Dependents:
     """Where the EndpointSlice leads."""
     looked: float
     credentials: bool
-    """The Secret is the pool's own and whole."""
+    """The Secret is the pool's own and whole, or it is not the operator's."""
     credentials_made: float = 0.0
     """When the Secret was, as the cluster says; 0.0 where that is not known."""
     failure: ApiError | None = None
@@ -103,7 +104,7 @@ class DependentsReconciler:
             whole = False
             steps += [
                 (f"the Service {names.service_name(name)}", self._service),
-                (f"the Secret {names.secret_name(name)}", self._secret),
+                (f"the Secret {pool.credentials_secret}", self._secret),
             ]
         found = await _all(*(self._attempt(pool, *step) for step in steps))
         if len(found) > 1:
@@ -132,7 +133,9 @@ class DependentsReconciler:
             obstacle = setbacks.with_object(error, what)
             return _Found(None, obstacle, error if isinstance(error, Unavailable) else None)
 
-    async def _secret(self, pool: FiberPool) -> str:
+    async def _secret(self, pool: FiberPool) -> str | None:
+        if pool.spec.credentials_secret_name is not None:
+            return None
         now = datetime.datetime.fromtimestamp(self._now(), datetime.UTC)
         name, namespace = names.secret_name(pool.metadata.name), pool.metadata.namespace
 

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from fiber_api import names
 from fiber_operator.claims import Claims
 from fiber_operator.cluster import (
     POOLS,
@@ -123,7 +124,7 @@ class Program:
         self.elector = LeaderElector(
             lease_cluster,
             namespace=settings.namespace,
-            name=settings.lease,
+            name=names.operator_lease_name(settings.lease),
             identity=settings.identity,
             seconds=settings.lease_seconds,
             on_change=self._lease_changed,
@@ -164,6 +165,7 @@ class Program:
     async def _operate(self, stop: asyncio.Event) -> None:
         watcher = self._watcher(
             self.notice,
+            renewed=self._renewed,
             configure=self._configure,
             namespaces=self._settings.namespaces,
             gate=self.resync.answered,
@@ -209,6 +211,10 @@ class Program:
             self.queue.add(key)
         elif self.controller.is_news(key, uid, generation):
             self.queue.add(key, urgent=True)
+
+    def _renewed(self, namespace: str, lease: str, version: str) -> None:
+        self.metrics.watched("leases")
+        self.lease_monitor.heard(namespace, lease, version)
 
     async def _look(self, key: Key) -> Turn:
         if not self.elector.is_leader:

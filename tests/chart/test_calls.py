@@ -95,7 +95,7 @@ async def meets_masters(world: World) -> None:
     """Of one address family and the other, while somebody meddles with the Service."""
     world.store.create("leases", NAMESPACE, {"metadata": {"name": MASTER["leaseName"]}})
     world.edit(master=MASTER)
-    world.store.merge("services", NAMESPACE, "es-master", {"spec": {"selector": {"app": "x"}}})
+    world.store.merge("services", NAMESPACE, "es-fiber", {"spec": {"selector": {"app": "x"}}})
     await world.until(lambda: bool(counted(world, "patch", "services")))
     world.edit(master={**MASTER, "host": "fd00::7"})
     await world.until(lambda: bool(counted(world, "delete", "endpointslices")))

@@ -22,7 +22,7 @@ def host(cluster: Cluster) -> str:
 
 def endpoints(scene: Scene, pool: Pool) -> list[tuple[list[str], int]]:
     """Where the pool's Service leads."""
-    found = scene.now["endpointslices"].get(f"{pool.name}-master", {})
+    found = scene.now["endpointslices"].get(f"{pool.name}-fiber", {})
     ports = [port["port"] for port in found.get("ports") or []]
     return [
         (endpoint["addresses"], port) for endpoint in found.get("endpoints") or [] for port in ports
