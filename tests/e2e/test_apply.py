@@ -15,7 +15,7 @@ from e2e.release import Release
 from e2e.scene import Scene
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "manifests"
-SOMEWHERE: Body = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+SOMEWHERE: Body = {"host": "10.0.3.7", "port": 41337, "epoch": 1, "identity": "somebody"}
 """A master that nobody can tell to be absent: it has no Lease."""
 
 
@@ -182,7 +182,7 @@ def test_an_evicted_worker_is_replaced(pool: Pool, agent: Body) -> None:
 def test_kubectl_explains_the_fields(release: Release, kube: Kube) -> None:
     assert says(kube.kubectl("explain", "fiberpool"), "pool of worker pods", "spec", "status")
     assert "What becomes of the pool when its master is lost" in kube.kubectl(
-        "explain", "fiberpool.spec.master.onLost"
+        "explain", "fiberpool.spec.onLost"
     )
 
 
