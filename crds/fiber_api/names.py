@@ -28,7 +28,8 @@ CRD_NAME: Final = f"{PLURAL}.{GROUP}"
 SDK_MANAGER: Final = "fiber-sdk"
 """Owns ``spec.replicas``, ``spec.scaleDown.release`` and ``spec.master``."""
 OPERATOR_MANAGER: Final = "fiber-operator"
-"""Owns the status, the pods, the Service, its EndpointSlice and the Secret; never the spec."""
+"""Owns the status, the pods, the Service, its EndpointSlice and the Secret, unless
+``spec.credentialsSecretName`` names one; never the spec."""
 
 # -- Labels and annotations
 
@@ -46,6 +47,11 @@ LABEL_SLICE_MANAGED_BY: Final = "endpointslice.kubernetes.io/managed-by"
 """Kubernetes': who writes an EndpointSlice."""
 ANNOTATION_DELETION_COST: Final = "controller.kubernetes.io/pod-deletion-cost"
 """Kubernetes': of two pods alike, policy Any deletes the one with the lower cost first."""
+ANNOTATIONS_KEEP_NODE: Final = {
+    "cluster-autoscaler.kubernetes.io/safe-to-evict": "false",
+    "karpenter.sh/do-not-disrupt": "true",
+}
+"""What keeps the cluster autoscaler and Karpenter from emptying a node under workers at work."""
 
 # -- The worker container
 
@@ -53,7 +59,12 @@ WORKER_CONTAINER: Final = "worker"
 """What ``spec.workerContainer`` is when left out."""
 
 ENV_NAME: Final = "FIBER_AGENT_NAME"
-"""The pod's name: what the master calls the agent, and releases it by."""
+"""The pod's name: what the master calls the agent, and releases it by.  Always the operator's,
+whatever the template says."""
+ENV_UID: Final = "FIBER_AGENT_UID"
+"""The pod's uid, which no other pod of that name has."""
+ENV_TEMPLATE_HASH: Final = "FIBER_AGENT_TEMPLATE_HASH"
+"""The pod's LABEL_TEMPLATE_HASH: by it the master tells which agents are outdated."""
 ENV_ADDRESS: Final = "FIBER_AGENT_ADDRESS"
 """``host:port`` of the pool's Service."""
 ENV_CREDENTIALS: Final = "FIBER_AGENT_CREDENTIALS"
@@ -145,8 +156,8 @@ def pod_name(pool: str, suffix: str) -> str:
 
 
 def service_name(pool: str) -> str:
-    """The Service that agents dial: at most 57 characters."""
-    return f"{pool}-master"
+    """The Service that agents dial: at most 56 characters."""
+    return f"{pool}-fiber"
 
 
 def endpoint_slice_name(pool: str) -> str:
@@ -155,13 +166,24 @@ def endpoint_slice_name(pool: str) -> str:
 
 
 def secret_name(pool: str) -> str:
-    """The Secret with both halves of the credentials: at most 54 characters."""
-    return f"{pool}-tls"
+    """The Secret with both halves of the credentials: at most 60 characters.
+
+    Not ``<pool>-tls``, which is what many charts have cert-manager write to.
+    """
+    return f"{pool}-fiber-tls"
 
 
 def master_lease_name(pool: str) -> str:
-    """The Lease that the SDK makes and names in ``spec.master.leaseName``."""
-    return pool
+    """The Lease that the SDK makes and names in ``spec.master.leaseName``.
+
+    Its labels are LABEL_POOL and LABEL_POOL_UID, by which the operator hears of its renewals.
+    """
+    return f"fiber-{pool}"
+
+
+def operator_lease_name(release: str) -> str:
+    """The Lease by which one process of a release acts: with dots, which no master's Lease has."""
+    return f"{release}.operator.{GROUP}"
 
 
 def server_name(pool: str, namespace: str) -> str:
@@ -204,7 +226,8 @@ class ConditionType(StrEnum):
     MASTER_ALIVE = "MasterAlive"
     """Unknown while there is no master, or no Lease to tell by."""
     SCALING_LIMITED = "ScalingLimited"
-    """``replicas`` asks for more than ``maxReplicas``, or for fewer than ``minReplicas``."""
+    """``replicas`` asks for more than ``maxReplicas``, or for some and fewer than
+    ``minReplicas``."""
     SUSPENDED = "Suspended"
     """``spec.suspend`` holds the pool at no pods."""
 
@@ -281,7 +304,7 @@ class Reason(StrEnum):
     MASTER_LOST = "MasterLost"
     """The master's Lease has expired."""
     LEASE_NOT_FOUND = "LeaseNotFound"
-    """There is no Lease of the name in ``spec.master.leaseName``, and there was none before."""
+    """There is no Lease of the name in ``spec.master.leaseName`` yet, or not any more."""
     API_UNAVAILABLE = "ApiUnavailable"
     """A call of the operator fails: an admission webhook is down, the API server is busy."""
 

@@ -121,6 +121,8 @@ class FiberPoolStatus(Model):
     """Address of the master that the endpoint leads to now."""
     master_epoch: Annotated[int | None, Field(ge=0, le=2**53)] = None
     """The highest epoch that a master of this pool has had. A new master takes a higher one."""
+    idle_since: Time | None = None
+    """Since when the master has asked for no workers, where spec.idle is set."""
     credentials_secret: str | None = None
     """Name of the Secret that the master listens with, once it is made and whole."""
     template_hash: str | None = None

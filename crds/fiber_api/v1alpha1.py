@@ -26,6 +26,7 @@ __all__ = [
     "FiberPool",
     "FiberPoolSpec",
     "FiberPoolStatus",
+    "Idle",
     "InvalidPool",
     "Master",
     "Metadata",
@@ -47,6 +48,11 @@ class InvalidPool(ValueError):
 
 
 # -- spec
+
+ObjectName = Annotated[
+    str, Field(min_length=1, max_length=253, pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")
+]
+"""The name of an object of Kubernetes."""
 
 
 def _is_reachable(host: str) -> bool:
@@ -85,6 +91,16 @@ class Master(Model):
             "replaced. Let the new master take an epoch above the one that is there.",
             None,
         ),
+        Rule(
+            "epoch",
+            "self.epoch > oldSelf.epoch || (self.host == oldSelf.host && self.port == oldSelf.port"
+            " && self.identity == oldSelf.identity"
+            " && self.?leaseName.orValue('') == oldSelf.?leaseName.orValue(''))",
+            "must rise where host, port, identity or leaseName change: that is another master, "
+            "and one that is there would be replaced unseen. Take an epoch above the one that "
+            "is there.",
+            None,
+        ),
     )
 
     host: Annotated[str, Field(min_length=1, max_length=45)]
@@ -93,20 +109,24 @@ class Master(Model):
     """TCP port that the master listens at."""
     epoch: Annotated[int, Field(ge=1, le=2**53)]
     """Which master this is: higher with every new one, and never lower than before."""
-    lease_name: Annotated[
-        str | None,
-        Field(min_length=1, max_length=253, pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$"),
-    ] = None
+    identity: Annotated[str, Field(min_length=1, max_length=253)]
+    """Who holds the pool, for people and for the next one who wants it, such as laptop-7:4711."""
+    lease_name: ObjectName | None = None
     """Name of the Lease in this namespace that the master renews. Left out, nobody checks whether
     the master is alive."""
     lease_duration_seconds: Annotated[int, Field(ge=5, le=3600)] = 30
-    """The master counts as lost when its Lease was not renewed for so long. It renews it every
-    third of this."""
-    on_lost: Literal["Delete", "ScaleToMin", "Retain"] = "Delete"
-    """What becomes of the pool when its master is lost: Delete deletes it with everything it has,
-    ScaleToMin goes back to minReplicas, Retain changes nothing."""
+    """The master counts as lost when its Lease was not renewed, or not there, for so long. It
+    renews it every third of this."""
     lost_grace_seconds: Annotated[int, Field(ge=0, le=_DAY)] = 60
     """How long the workers and the pool outlive a lost master, so that it may come back."""
+
+
+class Idle(Model):
+    """When a master that is alive is taken to have been forgotten."""
+
+    timeout_seconds: Annotated[int, Field(ge=1, le=30 * _DAY)]
+    """A master whose replicas was 0 for so long does not hold minReplicas either. Without a master
+    minReplicas is kept."""
 
 
 PodName = Annotated[str, Field(min_length=1, max_length=63)]
@@ -205,12 +225,18 @@ class FiberPoolSpec(Model):
             "cannot be changed: the pods that run are judged by it. Make a new FiberPool.",
             None,
         ),
+        Rule(
+            "credentialsSecretName",
+            "self.?credentialsSecretName.orValue('') == oldSelf.?credentialsSecretName.orValue('')",
+            "cannot be changed: the pods that run hold the credentials of the old one. Make a new "
+            "FiberPool.",
+            None,
+        ),
     )
 
-    replicas: Annotated[int | None, Field(ge=0, le=2**31 - 1)] = None
-    """Workers wanted now. Held between minReplicas and maxReplicas; left out, it is minReplicas.
-    Written by the SDK or by kubectl scale: leave it out of manifests that are applied again and
-    again."""
+    replicas: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
+    """Workers wanted now. Held between minReplicas and maxReplicas. Written by the SDK or by
+    kubectl scale: leave it out of manifests that are applied again and again."""
     min_replicas: Annotated[int, Field(ge=0, le=100_000)] = 0
     """Workers that are kept even when there is nothing to do."""
     max_replicas: Annotated[int, Field(ge=1, le=100_000)] = 1000
@@ -226,6 +252,13 @@ class FiberPoolSpec(Model):
     """Name of the container that runs Fiber's agent and by which a worker is judged. Cannot be
     changed."""
     master: Master | None = None
+    on_lost: Literal["Delete", "ScaleToMin", "Retain"] = "ScaleToMin"
+    """What becomes of the pool when its master is lost: Delete deletes it with everything it has,
+    ScaleToMin goes back to minReplicas, Retain changes nothing."""
+    idle: Idle | None = None
+    credentials_secret_name: ObjectName | None = None
+    """Name of a Secret in this namespace with the credentials that the workers take, made by
+    whoever made the pool. Left out, the operator makes one. Cannot be changed."""
     scale_down: ScaleDown = ScaleDown()
     scale_up: ScaleUp = ScaleUp()
     failure_policy: FailurePolicy = FailurePolicy()
@@ -266,10 +299,12 @@ class FiberPool(Model):
         ),
         Rule(
             "spec.master.epoch",
-            "!has(self.spec.master) || !has(self.status) || !has(self.status.masterEpoch)"
-            " || self.spec.master.epoch >= self.status.masterEpoch",
-            "must not be below status.masterEpoch, which an earlier master of "
-            "this pool had. Let the new master take a higher one.",
+            # While a master is there its own rules hold; of one that comes nothing is there before.
+            "has(oldSelf.spec.master) || !has(self.spec.master) || !has(self.status)"
+            " || !has(self.status.masterEpoch)"
+            " || self.spec.master.epoch > self.status.masterEpoch",
+            "must not be below status.masterEpoch, which an earlier master of this pool had, nor "
+            "may a master that comes have the same. Let it take a higher one.",
             lambda pool: (
                 pool.spec.master is None
                 or pool.spec.master.epoch >= (pool.status.master_epoch or 0)
@@ -311,5 +346,9 @@ class FiberPool(Model):
     @property
     def wanted(self) -> int:
         """``replicas`` between the bounds."""
-        replicas = self.spec.min_replicas if self.spec.replicas is None else self.spec.replicas
-        return max(self.spec.min_replicas, min(self.spec.max_replicas, replicas))
+        return max(self.spec.min_replicas, min(self.spec.max_replicas, self.spec.replicas))
+
+    @property
+    def credentials_secret(self) -> str:
+        """The Secret that the workers take their credentials from."""
+        return self.spec.credentials_secret_name or names.secret_name(self.metadata.name)

@@ -22,13 +22,13 @@ from fiber_operator.cluster import (
     Refused,
 )
 from fiber_operator.creation import ENOUGH, Creator, Pace
+from fiber_operator.dependents import Dependents
 from fiber_operator.events import Recorder
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics
 from fiber_operator.planning import manifests, setbacks
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.plans import Deletion, Event, Obstacle, Plan, Refusal
-from fiber_operator.surroundings import Surroundings
 from fiber_operator.turns import GAP, Key, Turn
 
 DELETIONS = 50
@@ -45,7 +45,7 @@ class State:
     """What is remembered of one pool between looks, by uid.  Losing it costs only calls."""
 
     uid: str
-    surroundings: Surroundings | None = None
+    dependents: Dependents | None = None
     accepted: str | None = None
     """The template hash that passed the dry run."""
     refusal: Refusal | None = None
@@ -60,7 +60,7 @@ class State:
     @property
     def address(self) -> str | None:
         """Where agents dial, once that is known."""
-        return self.surroundings.address if self.surroundings else None
+        return self.dependents.address if self.dependents else None
 
     def refused(
         self, template_hash: str, error: ApiError, now: float, *, dry_run: bool = False

@@ -2,8 +2,8 @@
 
 Each namespace that is served has a Lease of one name, whatever the releases are called and whatever
 else they watch.  A release holds it, not a process: which process acts for a release is decided by
-the release's own Lease (lease.py).  So the one of the namespace may last long, a thousand of them
-cost a few requests a second, and a restart of the operator goes on at once.
+the release's own Lease (leader_election.py).  So the one of the namespace may last long, a thousand
+of them cost a few requests a second, and a restart of the operator goes on at once.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 from fiber_api import names
 from fiber_operator.cluster import Cluster
-from fiber_operator.lease import Guard, NotHolder
+from fiber_operator.leader_election import LeaderElector, NotLeader
 from fiber_operator.logs import about
 
 NAME = names.CRD_NAME
-"""Of the Lease.  No release's own Lease is called so: theirs have no dot."""
+"""Of the Lease.  No release's own is called so, nor one that the SDK makes, which has no dot."""
 SECONDS = 900
 """How long other releases wait for one that went away without a word."""
 LINGER = 60
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 @dataclass
 class _Claim:
     namespace: str
-    guard: Guard
+    elector: LeaderElector
     due: float
     held: bool = False
     """As it was told."""
@@ -84,17 +84,17 @@ class Claims:
         """Whether this operator may act in the namespace.  If that is not known it is found out."""
         claim = self._claims.get(namespace)
         if claim is None:
-            self._claims[namespace] = _Claim(namespace, self._guard(namespace), self._now())
+            self._claims[namespace] = _Claim(namespace, self._elector(namespace), self._now())
             self._wake.set()
             return False
-        return claim.guard.held
+        return claim.elector.is_leader
 
     def require(self, namespace: str) -> float:
-        """The seconds that a write there may last which begins now; NotHolder if none may."""
+        """The seconds that a write there may last which begins now; NotLeader if none may."""
         claim = self._claims.get(namespace)
         if claim is None:
-            raise NotHolder(f"this operator has not claimed the namespace {namespace}")
-        return claim.guard.require()
+            raise NotLeader(f"this operator has not claimed the namespace {namespace}")
+        return claim.elector.require()
 
     def refused(self, namespace: str) -> bool:
         """Whether it is known that this operator may not act there now."""
@@ -107,13 +107,13 @@ class Claims:
         Where all namespaces are watched it is right that some are served by others.
         """
         claims, used = list(self._claims.values()), {*self._namespaces, *self._used()}
-        tolerant = not self._namespaces and any(claim.guard.held for claim in claims)
+        tolerant = not self._namespaces and any(claim.elector.is_leader for claim in claims)
         wrong = [
             claim.complaint
             for claim in claims
             if claim.complaint
             and claim.namespace in used  # else it is given up when its next step is due
-            and not (tolerant and claim.guard.holder)
+            and not (tolerant and claim.elector.holder)
         ]
         more = [f"so are {len(wrong) - SHOWN} more namespaces"] if len(wrong) > SHOWN else []
         return wrong[:SHOWN] + more
@@ -148,21 +148,23 @@ class Claims:
             del self._claims[claim.namespace]
             await self._give_up([claim])
             return
-        claim.due = self._now() + await claim.guard.step()
+        claim.due = self._now() + await claim.elector.step()
         if self._claims.get(claim.namespace) is claim:
             self._tell(claim)
 
     async def _give_up(self, claims: list[_Claim]) -> None:
-        held = [claim.guard for claim in claims if claim.guard.held]
-        for guard in held:
-            guard.resign()
+        held = [claim.elector for claim in claims if claim.elector.is_leader]
+        for elector in held:
+            elector.resign()
         for start in range(0, len(held), AT_ONCE):
-            await asyncio.gather(*(guard.linger(LINGER) for guard in held[start : start + AT_ONCE]))
+            await asyncio.gather(
+                *(elector.linger(LINGER) for elector in held[start : start + AT_ONCE])
+            )
 
     def _tell(self, claim: _Claim) -> None:
-        held, complaint = claim.guard.held, self._complaint(claim)
+        held, complaint = claim.elector.is_leader, self._complaint(claim)
         if complaint and complaint != claim.complaint:
-            reason = "ServedByAnother" if claim.guard.holder else "NotClaimed"
+            reason = "ServedByAnother" if claim.elector.holder else "NotClaimed"
             log.warning("%s", complaint, extra=about(claim.namespace, reason=reason))
         elif claim.complaint and not complaint:
             log.info("this operator serves the namespace %s now", claim.namespace)
@@ -173,19 +175,19 @@ class Claims:
             self._on_change(claim.namespace, held)
 
     def _complaint(self, claim: _Claim) -> str:
-        if claim.guard.held:
+        if claim.elector.is_leader:
             return ""
-        if not claim.guard.holder:
-            return f"the namespace {claim.namespace} is not served: {claim.guard.why}"
+        if not claim.elector.holder:
+            return f"the namespace {claim.namespace} is not served: {claim.elector.why}"
         return (
             f"the namespace {claim.namespace} is served by another operator, release "
-            f"{claim.guard.holder}, which holds the Lease {NAME} there: this one, release "
+            f"{claim.elector.holder}, which holds the Lease {NAME} there: this one, release "
             f"{self._release}, does nothing in it. Uninstall one of the two, or let them watch "
             "different namespaces"
         )
 
-    def _guard(self, namespace: str) -> Guard:
-        return Guard(
+    def _elector(self, namespace: str) -> LeaderElector:
+        return LeaderElector(
             self._cluster,
             namespace=namespace,
             name=NAME,

@@ -19,17 +19,17 @@ from fiber_operator import inspection
 from fiber_operator.acting import Actor, Look, State
 from fiber_operator.cluster import PODS, POOLS, ApiError, Body, Cluster, Gone, TooMany, Unavailable
 from fiber_operator.creation import Creator
+from fiber_operator.dependents import DependentsReconciler
 from fiber_operator.events import Recorder
-from fiber_operator.lease import NotHolder
+from fiber_operator.leader_election import NotLeader
+from fiber_operator.lease_monitor import LeaseMonitor, MasterLease
 from fiber_operator.logs import about
-from fiber_operator.masters import Masters, Term
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.planning import reconcile, setbacks
 from fiber_operator.planning.documents import mapping, text, whole
 from fiber_operator.planning.plans import Memory, Plan
 from fiber_operator.planning.pods import PodView, observe
 from fiber_operator.planning.pods import State as Life
-from fiber_operator.surroundings import Keeper
 from fiber_operator.turns import Key, Turn
 
 LIST_SHARE = 2.0
@@ -49,16 +49,16 @@ class Controller:
         self,
         cluster: Cluster,
         *,
-        masters: Masters,
+        lease_monitor: LeaseMonitor,
         recorder: Recorder,
         metrics: Metrics,
         creator: Creator,
         now: Callable[[], float] = time.time,
     ) -> None:
         self._cluster = cluster
-        self._masters = masters
+        self._lease_monitor = lease_monitor
         self._metrics = metrics
-        self._keeper = Keeper(cluster, now)
+        self._dependents = DependentsReconciler(cluster, now)
         self._actor = Actor(cluster, creator=creator, recorder=recorder, metrics=metrics, now=now)
         self._now = now
         self._states: dict[Key, State] = {}
@@ -80,9 +80,9 @@ class Controller:
         try:
             turn = await self._look(key)
             outcome = "gone" if turn.forget else "incomplete" if turn.failed else "ok"
-        except NotHolder:
+        except NotLeader:
             # Whoever acts now looks at every pool when it begins.
-            outcome, turn = "not_holder", Turn()
+            outcome, turn = "not_leader", Turn()
         except ApiError as error:
             outcome = type(error).__name__.lower()
             log.warning("%s", error, extra=about(*key, reason=error.reason or outcome))
@@ -130,8 +130,8 @@ class Controller:
             log.warning("the status was damaged: %s", complaint, extra=about(*key, uid=state.uid))
         failure = None
         if pool.metadata.deletion_timestamp is None:
-            state.surroundings = await self._keeper.ensure(pool, state.surroundings)
-            failure = state.surroundings.failure
+            state.dependents = await self._dependents.ensure(pool, state.dependents)
+            failure = state.dependents.failure
         pods, rested = await self._pods(key, document, state, pool.spec.worker_container)
         plan = self._plan(key, pool, pods, state)
         if plan.inspect:
@@ -179,29 +179,29 @@ class Controller:
         return pods, rested
 
     def _plan(self, key: Key, pool: FiberPool, pods: Sequence[PodView], state: State) -> Plan:
-        around = state.surroundings
+        dependents = state.dependents
         memory = Memory(
             address=state.address,
-            credentials=around.credentials if around else None,
-            credentials_made=around.credentials_made if around else 0.0,
-            obstacles=around.obstacles if around else (),
-            led=around is None or around.master == pool.spec.master,
+            credentials=dependents.credentials if dependents else None,
+            credentials_made=dependents.credentials_made if dependents else 0.0,
+            obstacles=dependents.obstacles if dependents else (),
+            led=dependents is None or dependents.master == pool.spec.master,
             creation=state.creation,
             deletion=state.deletion,
             accepted=state.accepted,
             refusal=state.refusal,
-            master=self._masters.follow(key, _term(pool)),
+            master=self._lease_monitor.follow(key, _master_lease(pool)),
             warnings=dict(state.warnings),
         )
         return reconcile.plan(pool, pods, memory, self._now())
 
     async def _act(self, look: Look, pods: Sequence[PodView]) -> Turn:
-        plan, surroundings = look.plan, look.state.surroundings
+        plan, dependents = look.plan, look.state.dependents
         status = mapping(look.document, "status") if plan.status is None else plan.status
         self._metrics.pools[look.key] = PoolSample.of(status, pods)
         turn = await self._actor.act(look)
         wishes = [turn.again, plan.again - self._now() if plan.again is not None else None]
-        if surroundings is not None and surroundings.obstacles:
+        if dependents is not None and dependents.obstacles:
             wishes.append(OBSTRUCTED)
         again = min((max(wish, 0.0) for wish in wishes if wish is not None), default=None)
         rest = look.rested - asyncio.get_running_loop().time()
@@ -211,11 +211,11 @@ class Controller:
     def _drop(self, key: Key) -> None:
         self._states.pop(key, None)
         self._metrics.pools.pop(key, None)
-        self._masters.follow(key, None)
+        self._lease_monitor.follow(key, None)
 
 
-def _term(pool: FiberPool) -> Term | None:
+def _master_lease(pool: FiberPool) -> MasterLease | None:
     master = pool.spec.master
     if master is None or master.lease_name is None:
         return None
-    return Term(master.lease_name, master.epoch, master.lease_duration_seconds)
+    return MasterLease(master.lease_name, master.epoch, master.lease_duration_seconds)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from fiber_api import names
 from fiber_operator.cluster import EVENTS, ApiError, Body, Cluster
-from fiber_operator.lease import NotHolder
+from fiber_operator.leader_election import NotLeader
 from fiber_operator.logs import about
 from fiber_operator.planning.plans import Event
 from fiber_operator.turns import Key
@@ -79,7 +79,7 @@ class Recorder:
                     await self._post(place, key, event, now)
                 else:
                     await self._repeat(posted, key, now)
-        except (ApiError, TimeoutError, NotHolder) as error:
+        except (ApiError, TimeoutError, NotLeader) as error:
             log.warning("an event could not be posted: %s", error, extra=about(*key, uid=uid))
 
     async def _post(self, place: tuple[str, str, str], key: Key, event: Event, now: float) -> None:

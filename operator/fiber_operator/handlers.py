@@ -1,9 +1,10 @@
-"""kopf's part: it watches and says that something happened to a pool.  Nothing else imports kopf.
+"""kopf's part: it watches and says that something happened.  Nothing else imports kopf.
 
 kopf keeps watches alive well: it lists, watches, begins anew after 410, bookmarks and silence.
 It is used for that alone.  Its change detection would write annotations and finalizers on users'
 objects, its indices keep what was deleted during a 410, and its handlers are not repeated when
-they fail; so the one kind of handler is ``on.event``, which puts a pool's name into a queue.
+they fail; so the one kind of handler is ``on.event``, which puts a pool's name into a queue, or
+tells that a Lease has changed.
 
 kopf takes the event loop that it runs in for its own and cancels what it finds there, so it has a
 thread with a loop of its own.  Whatever ends it, a garbled answer or a resource that is gone, it
@@ -24,7 +25,7 @@ import aiohttp
 import kopf
 
 from fiber_api import names
-from fiber_operator.cluster import Configuration, open_session
+from fiber_operator.cluster import LEASES, Configuration, open_session
 from fiber_operator.planning.documents import mapping, text, whole
 from fiber_operator.turns import Key
 from fiber_operator.watches import Answered, tracing
@@ -38,6 +39,9 @@ END_WAIT = 4.0
 
 Notice = Callable[[Key, str, int | None], None]
 """Told of a pool: its uid and generation if it is the pool itself that changed, else None."""
+
+Renewed = Callable[[str, str, str], None]
+"""Told of a Lease of a pool: its namespace, name, and resourceVersion; empty: it is deleted."""
 
 Configure = Callable[[], Awaitable[Configuration]]
 """Where the API server is and how to log in; asked again when a login has expired."""
@@ -72,11 +76,12 @@ class _NoDiffs(kopf.DiffBaseStorage):
 
 def registry(
     notice: Notice,
+    renewed: Renewed,
     configure: Configure,
     answered: Answered,
     sessions: list[aiohttp.ClientSession],
 ) -> kopf.OperatorRegistry:
-    """The handlers: each says which pool it is about and returns nothing."""
+    """The handlers: each says which object it is about and returns nothing."""
     handlers = kopf.OperatorRegistry()
 
     @kopf.on.login(registry=handlers)
@@ -98,6 +103,12 @@ def registry(
         name = text(mapping(metadata, "labels").get(names.LABEL_POOL))
         notice(Key(text(metadata.get("namespace")), name), "", None)
 
+    @kopf.on.event(LEASES.group, LEASES.version, LEASES.plural, registry=handlers)
+    async def lease_event(type: str | None, body: Mapping[str, Any], **_: Any) -> None:
+        metadata = mapping(body, "metadata")
+        version = "" if type == "DELETED" else text(metadata.get("resourceVersion"))
+        renewed(text(metadata.get("namespace")), text(metadata.get("name")), version)
+
     return handlers
 
 
@@ -118,7 +129,9 @@ def kopf_settings() -> kopf.OperatorSettings:
     settings.watching.connect_timeout = 5
     settings.watching.inactivity_timeout = 90
     settings.watching.chunk_size = 100
-    settings.watching.label_selectors["v1", "pods"] = names.LABEL_POOL_UID
+    # Of the Leases of a namespace, and every node has one somewhere, those of masters.
+    for resource in (("v1", "pods"), LEASES):
+        settings.watching.label_selectors[resource] = names.LABEL_POOL_UID
     # A handler of ours takes no time, and a task for each of a thousand pods is memory.
     settings.queueing.idle_timeout = 0.05
     settings.queueing.exit_timeout = 0.5
@@ -129,6 +142,7 @@ def kopf_settings() -> kopf.OperatorSettings:
 async def watch(
     notice: Notice,
     *,
+    renewed: Renewed = lambda namespace, name, version: None,
     configure: Configure,
     namespaces: Collection[str],
     gate: Callable[[], Awaitable[None]],
@@ -151,7 +165,7 @@ async def watch(
         started, sessions = loop.time(), list[aiohttp.ClientSession]()
         on_start(True)
         try:
-            handlers = registry(notice, configure, answered, sessions)
+            handlers = registry(notice, renewed, configure, answered, sessions)
             await _run_kopf(handlers, namespaces, stop)
         finally:
             on_start(False)
@@ -228,6 +242,7 @@ class Watcher:
         self,
         notice: Notice,
         *,
+        renewed: Renewed = lambda namespace, name, version: None,
         configure: Configure,
         namespaces: Collection[str],
         gate: Callable[[], Coroutine[Any, Any, None]],
@@ -236,12 +251,13 @@ class Watcher:
     ) -> None:
         self._home = asyncio.get_running_loop()
         self._notice = notice
+        self._renewed = renewed
         self._configure = configure
         self._namespaces = namespaces
         self._gate = gate
         self._on_start = on_start
         self._answered = answered
-        self._untold: collections.deque[tuple[Any, ...]] = collections.deque()
+        self._untold: collections.deque[Callable[[], None]] = collections.deque()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop = asyncio.Event()
         self._stopping = threading.Event()
@@ -279,7 +295,8 @@ class Watcher:
 
     async def _watch(self) -> None:
         await watch(
-            self._tell,
+            functools.partial(self._tell, self._notice),
+            renewed=functools.partial(self._tell, self._renewed),
             configure=self._configure,
             namespaces=self._namespaces,
             gate=self._pass_gate,
@@ -288,17 +305,17 @@ class Watcher:
             stop=self._stop,
         )
 
-    def _tell(self, *notice: Any) -> None:
-        self._untold.append(notice)
+    def _tell(self, listener: Callable[..., None], *told: object) -> None:
+        self._untold.append(functools.partial(listener, *told))
         # Waking the other loop costs more than what is told: once for all that comes together.
         if len(self._untold) == 1 and self._loop is not None:
             self._loop.call_later(TOGETHER, self._call, self._pass_on)
 
     def _pass_on(self) -> None:
         while self._untold:
-            notice = self._untold.popleft()
+            tell = self._untold.popleft()
             try:
-                self._notice(*notice)
+                tell()
             except Exception:
                 # What is left would never be passed on: ``_tell`` waits for the last one to go.
                 log.exception("an event could not be passed on")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fiber_operator.claims import Claims
-from fiber_operator.lease import Guard
+from fiber_operator.leader_election import LeaderElector
 from fiber_operator.resync import Resync
 from fiber_operator.turns import Queue
 from fiber_operator.watches import Watches
@@ -28,7 +28,7 @@ MISSED_RESYNCS = 2.5
 class Health:
     """Both checks.  Each returns what is wrong, a sentence each."""
 
-    guard: Guard
+    elector: LeaderElector
     claims: Claims
     queue: Queue
     resync: Resync
@@ -58,8 +58,8 @@ class Health:
         """Why pools are not served as they should be."""
         now, statistics = self.clock(), self.queue.statistics()
         wrong = list(self.resync.failures.values())
-        if not self.guard.held:
-            wrong.append(f"this operator does not act: {self.guard.why}")
+        if not self.elector.is_leader:
+            wrong.append(f"this operator does not act: {self.elector.why}")
         wrong += self.claims.wrong()
         if self.resync.succeeded is None:
             wrong.append("the pools were not listed yet")

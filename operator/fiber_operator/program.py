@@ -4,8 +4,8 @@
 
     handlers ──► queue ──► controller ──► cluster
     resync  ────►  ▲          │  ▲            ▲
-    masters ───────┘          ▼  │            │ permit
-                            planning        guard (Lease of the release: this process acts)
+    leases  ────────┘         ▼  │            │ permit
+                            planning        elector (Lease of the release: this process acts)
                                             claims (Lease of a namespace: this release serves it)
 """
 
@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from fiber_api import names
 from fiber_operator.claims import Claims
 from fiber_operator.cluster import (
     POOLS,
@@ -33,8 +34,8 @@ from fiber_operator.creation import Creator, Draw, draw_suffix
 from fiber_operator.events import Recorder
 from fiber_operator.handlers import Configure, Watcher
 from fiber_operator.health import Health
-from fiber_operator.lease import Guard
-from fiber_operator.masters import Masters
+from fiber_operator.leader_election import LeaderElector
+from fiber_operator.lease_monitor import LeaseMonitor
 from fiber_operator.metrics import Metrics
 from fiber_operator.resync import Resync
 from fiber_operator.server import serving
@@ -120,10 +121,10 @@ class Program:
     def _build(self, cluster: Cluster, lease_cluster: Cluster, claim_cluster: Cluster) -> None:
         settings, clock = self._settings, asyncio.get_running_loop().time
         self._cluster = cluster
-        self.guard = Guard(
+        self.elector = LeaderElector(
             lease_cluster,
             namespace=settings.namespace,
-            name=settings.lease,
+            name=names.operator_lease_name(settings.lease),
             identity=settings.identity,
             seconds=settings.lease_seconds,
             on_change=self._lease_changed,
@@ -138,11 +139,11 @@ class Program:
             on_change=self._claim_changed,
             wall_clock=self._now,
         )
-        self.masters = Masters(cluster, lambda key: self.queue.add(key, urgent=True))
+        self.lease_monitor = LeaseMonitor(cluster, lambda key: self.queue.add(key, urgent=True))
         self.recorder = Recorder(cluster, self._now, settings.identity)
         self.controller = Controller(
             cluster,
-            masters=self.masters,
+            lease_monitor=self.lease_monitor,
             recorder=self.recorder,
             metrics=self.metrics,
             creator=Creator(cluster, self._draw),
@@ -156,12 +157,15 @@ class Program:
             on_success=lambda: self.metrics.resynced(self._now()),
         )
         self.watches = Watches(settings.namespaces)
-        self.health = Health(self.guard, self.claims, self.queue, self.resync, self.watches, clock)
-        self.metrics.watch_queue(self.queue.statistics, lambda: self.guard.held)
+        self.health = Health(
+            self.elector, self.claims, self.queue, self.resync, self.watches, clock
+        )
+        self.metrics.watch_queue(self.queue.statistics, lambda: self.elector.is_leader)
 
     async def _operate(self, stop: asyncio.Event) -> None:
         watcher = self._watcher(
             self.notice,
+            renewed=self._renewed,
             configure=self._configure,
             namespaces=self._settings.namespaces,
             gate=self.resync.answered,
@@ -169,9 +173,9 @@ class Program:
             answered=self.watches.answered,
         )
         parts: list[Part] = [
-            self.guard,
+            self.elector,
             self.claims,
-            self.masters,
+            self.lease_monitor,
             self.queue,
             self.resync,
             self.recorder,
@@ -181,15 +185,15 @@ class Program:
         stopped = asyncio.ensure_future(stop.wait())
         try:
             await asyncio.wait([*tasks, stopped], return_when=asyncio.FIRST_COMPLETED)
-            acting = self.guard.held
-            self.guard.resign()
+            acting = self.elector.is_leader
+            self.elector.resign()
             await self.queue.drain(DRAIN)
             if acting:
                 await self._release_claims()
             # Before the watches are waited for: another operator may begin.
             tasks[0].cancel()
             await asyncio.wait([tasks[0]])
-            await self.guard.release()
+            await self.elector.release()
         finally:
             for task in (*tasks, stopped):
                 task.cancel()
@@ -208,8 +212,12 @@ class Program:
         elif self.controller.is_news(key, uid, generation):
             self.queue.add(key, urgent=True)
 
+    def _renewed(self, namespace: str, lease: str, version: str) -> None:
+        self.metrics.watched("leases")
+        self.lease_monitor.heard(namespace, lease, version)
+
     async def _look(self, key: Key) -> Turn:
-        if not self.guard.held:
+        if not self.elector.is_leader:
             return Turn()
         if self.claims.holds(key.namespace):
             return await self.controller.look(key)
@@ -225,7 +233,7 @@ class Program:
         return False
 
     def _require(self, namespace: str) -> float:
-        return min(self.guard.require(), self.claims.require(namespace))
+        return min(self.elector.require(), self.claims.require(namespace))
 
     async def _release_claims(self) -> None:
         try:

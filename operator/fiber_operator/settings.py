@@ -42,8 +42,9 @@ class Settings:
     time may share it; the name of the operator's pod is right, and lets a container that was
     restarted go on at once."""
     lease: str = "fiber-operator"
-    """FIBER_OPERATOR_LEASE: name of the operator's own Lease.  Processes with the same Lease are
-    one release, of which one acts; with its namespace it says which release serves a pool."""
+    """FIBER_OPERATOR_LEASE: what the operator's own Lease is called after.  Processes with the same
+    Lease are one release, of which one acts; with its namespace it says which release serves a
+    pool."""
     lease_seconds: int = 15
     """FIBER_OPERATOR_LEASE_SECONDS: how long another process of the release waits for one
     that is silent."""

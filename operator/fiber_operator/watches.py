@@ -13,13 +13,15 @@ from types import SimpleNamespace
 import aiohttp
 
 from fiber_operator.answers import ApiError, complaint, document_of
-from fiber_operator.cluster import PODS, POOLS
+from fiber_operator.cluster import LEASES, PODS, POOLS
 
 Answered = Callable[[str, ApiError | None], None]
 """Told of an answer: what was asked (``watch pods in team``) and why that failed, if it did."""
 
 _PASSES = frozenset({401, 410})
 """A login that has expired and a watch that is too old: both are begun anew at once."""
+
+WATCHED = (POOLS, PODS, LEASES)
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +33,7 @@ class Watches:
         self._needed = [
             f"watch {resource.plural}{where}"
             for where in ([f" in {namespace}" for namespace in namespaces] or [""])
-            for resource in (POOLS, PODS)
+            for resource in WATCHED
         ]
         self._running = False
         self._open: set[str] = set()
@@ -93,7 +95,7 @@ def tracing(answered: Answered) -> aiohttp.TraceConfig:
 def _asked(request: aiohttp.TraceRequestEndParams) -> str:
     path = request.url.path
     before, namespace, plural = ["", "", *path.split("/")][-3:]
-    if plural not in (POOLS.plural, PODS.plural):
+    if plural not in [resource.plural for resource in WATCHED]:
         return f"get {path}"  # kopf asks first what the API server serves
     verb = "watch" if request.url.query.get("watch") == "true" else "list"
     return f"{verb} {plural} in {namespace}" if before == "namespaces" else f"{verb} {plural}"

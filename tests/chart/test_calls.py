@@ -23,7 +23,13 @@ from fiber_operator.cluster import Configuration
 from fiber_operator.events import PAUSE
 
 Right = tuple[str, str, str]
-MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1, "leaseName": "es", "onLost": "Delete"}
+MASTER = {
+    "host": "10.0.3.7",
+    "port": 41337,
+    "epoch": 1,
+    "identity": "laptop-7:4711",
+    "leaseName": "es",
+}
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +100,8 @@ async def gets_stuck(world: World) -> None:
 async def meets_masters(world: World) -> None:
     """Of one address family and the other, while somebody meddles with the Service."""
     world.store.create("leases", NAMESPACE, {"metadata": {"name": MASTER["leaseName"]}})
-    world.edit(master=MASTER)
-    world.store.merge("services", NAMESPACE, "es-master", {"spec": {"selector": {"app": "x"}}})
+    world.edit(master=MASTER, onLost="Delete")
+    world.store.merge("services", NAMESPACE, "es-fiber", {"spec": {"selector": {"app": "x"}}})
     await world.until(lambda: bool(counted(world, "patch", "services")))
     world.edit(master={**MASTER, "host": "fd00::7"})
     await world.until(lambda: bool(counted(world, "delete", "endpointslices")))
@@ -140,6 +146,9 @@ def test_what_it_may_do_to_pools_is_what_it_does(helm: Helm, calls: list[Call]) 
 def test_what_it_may_do_to_its_lease_is_what_it_does(helm: Helm, calls: list[Call]) -> None:
     role = named(helm.render(), "Role", "fiber-fiber-operator-lease")
     assert rights(calls, lambda call: call.namespace == OWN) == set(allowed(role))
+    (names,) = (rule["resourceNames"] for rule in role["rules"] if "resourceNames" in rule)
+    renewed = {call.name for call in calls if call.namespace == OWN and call.verb == "update"}
+    assert {name.replace("fiber-fiber-operator", "fiber-operator") for name in names} == renewed
 
 
 def test_of_the_leases_in_a_namespace_it_renews_one(helm: Helm, calls: list[Call]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from chart.helm import NAMESPACE, Helm, Manifest, is_hook, kinds, named
+from fiber_api.names import operator_lease_name
 from fiber_operator.settings import Settings
 
 CLUSTER: dict[str, Any] = {"scope": "cluster"}
@@ -98,7 +99,7 @@ def test_the_lease_is_the_operators_own(helm: Helm, values: dict[str, Any]) -> N
     leases = {rule["resources"][0] for rule in role["rules"]}
     names = [rule["resourceNames"] for rule in role["rules"] if "create" not in rule["verbs"]]
     assert leases == {"leases"}
-    assert names == [[settings.lease]]
+    assert names == [[operator_lease_name(settings.lease)]]
 
 
 @pytest.mark.parametrize(

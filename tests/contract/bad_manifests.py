@@ -25,7 +25,7 @@ GOOD: Final[dict[str, Any]] = {
     },
 }
 
-MASTER: Final = {"host": "10.0.3.7", "port": 41337, "epoch": 3}
+MASTER: Final = {"host": "10.0.3.7", "port": 41337, "epoch": 3, "identity": "laptop-7:4711"}
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,21 @@ BAD = (
         ("spec.master.host", "must be an IP address that the pods can reach"),
     ),
     Bad("port 0", {"spec.master": {**MASTER, "port": 0}}, ("spec.master.port",)),
-    Bad("master without an epoch", {"spec.master": {"host": "10.0.3.7", "port": 1}}, ("epoch",)),
+    Bad(
+        "master without an epoch",
+        {"spec.master": {"host": "10.0.3.7", "port": 1, "identity": "a"}},
+        ("spec.master.epoch",),
+    ),
+    Bad(
+        "master without an identity",
+        {"spec.master": {"host": "10.0.3.7", "port": 1, "epoch": 1}},
+        ("spec.master.identity",),
+    ),
+    Bad(
+        "master whose identity is empty",
+        {"spec.master": {**MASTER, "identity": ""}},
+        ("spec.master.identity", "at least 1"),
+    ),
     Bad(
         "lease that expires at once",
         {"spec.master": {**MASTER, "leaseDurationSeconds": 1}},
@@ -127,9 +141,12 @@ BAD = (
     Bad("lease name", {"spec.master": {**MASTER, "leaseName": "A b"}}, ("spec.master.leaseName",)),
     Bad(
         "unknown onLost",
-        {"spec.master": {**MASTER, "onLost": "Explode"}},
-        ("spec.master.onLost", "Delete", "ScaleToMin", "Retain"),
+        {"spec.onLost": "Explode"},
+        ("spec.onLost", "Delete", "ScaleToMin", "Retain"),
     ),
+    Bad("idle for no time", {"spec.idle": {"timeoutSeconds": 0}}, ("spec.idle.timeoutSeconds",)),
+    Bad("idle for how long", {"spec.idle": {}}, ("spec.idle.timeoutSeconds",)),
+    Bad("name of a Secret", {"spec.credentialsSecretName": "A b"}, ("credentialsSecretName",)),
     Bad(
         "unknown policy",
         {"spec.scaleDown": {"policy": "Some"}},
@@ -166,6 +183,38 @@ BAD_UPDATES = (
         {"spec.master": MASTER},
         {"spec.master.epoch": 2},
         ("spec.master.epoch", "must never fall", "an epoch above the one that is there"),
+    ),
+    *(
+        BadUpdate(
+            f"{field} changed and not the epoch",
+            {"spec.master": {**MASTER, "leaseName": "fiber-es"}},
+            {f"spec.master.{field}": value},
+            ("spec.master.epoch", "must rise where", "Take an epoch above"),
+        )
+        for field, value in {
+            "host": "10.0.3.8",
+            "port": 5000,
+            "identity": "laptop-8:12",
+            "leaseName": "another",
+        }.items()
+    ),
+    BadUpdate(
+        "lease given up and not the epoch",
+        {"spec.master": {**MASTER, "leaseName": "fiber-es"}},
+        {"spec.master.leaseName": ABSENT},
+        ("spec.master.epoch", "must rise where"),
+    ),
+    BadUpdate(
+        "other credentials",
+        {"spec.credentialsSecretName": "mine"},
+        {"spec.credentialsSecretName": "other"},
+        ("spec.credentialsSecretName", "cannot be changed", "Make a new FiberPool"),
+    ),
+    BadUpdate(
+        "credentials of its own",
+        {},
+        {"spec.credentialsSecretName": "other"},
+        ("spec.credentialsSecretName", "cannot be changed"),
     ),
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from contract.bad_manifests import BAD, BAD_UPDATES, DUPLICATE_RELEASE, GOOD, Bad, BadUpdate
+from contract.bad_manifests import BAD, BAD_UPDATES, DUPLICATE_RELEASE, GOOD, MASTER, Bad, BadUpdate
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
 
 
@@ -31,7 +31,7 @@ def test_a_pod_that_is_released_twice_does_no_harm() -> None:
 
 
 def test_an_epoch_below_one_that_was_is_refused() -> None:
-    master = {"host": "10.0.3.7", "port": 1, "epoch": 2}
+    master = {**MASTER, "epoch": 2}
     pool = {**GOOD, "spec": {**GOOD["spec"], "master": master}}
     assert FiberPool.read({**pool, "status": {"masterEpoch": 2}}).status.master_epoch == 2
     with pytest.raises(InvalidPool, match=r"spec\.master\.epoch: must not be below status"):

@@ -47,9 +47,11 @@ FULL_SPEC: dict[str, Any] = {
         **MASTER,
         "leaseName": "es",
         "leaseDurationSeconds": 30,
-        "onLost": "Delete",
         "lostGraceSeconds": 60,
     },
+    "onLost": "Delete",
+    "idle": {"timeoutSeconds": 3600},
+    "credentialsSecretName": "es-credentials",
     "scaleDown": {"policy": "Any", "release": ["es-1a2b3c4d5e"], "idleTimeoutSeconds": 60},
     "scaleUp": {"maxInFlight": 200},
     "failurePolicy": {
@@ -206,7 +208,7 @@ def test_no_resource_is_too_odd(document: object) -> None:
 def test_defaults_are_the_contracts() -> None:
     pool = FiberPool.read(GOOD)
     spec = pool.spec
-    assert (spec.replicas, spec.suspend, spec.processes_per_pod) == (None, False, 1)
+    assert (spec.replicas, spec.suspend, spec.processes_per_pod) == (0, False, 1)
     assert (spec.worker_container, spec.master) == ("worker", None)
     assert (spec.scale_down.policy, spec.scale_down.idle_timeout_seconds) == ("ReleasedOnly", 60)
     assert spec.scale_up.max_in_flight == 200
@@ -216,7 +218,8 @@ def test_defaults_are_the_contracts() -> None:
     assert spec.update.strategy == "OnIdle"
     master = Master.model_validate(MASTER)
     assert (master.lease_name, master.lease_duration_seconds) == (None, 30)
-    assert (master.on_lost, master.lost_grace_seconds) == ("Delete", 60)
+    assert master.lost_grace_seconds == 60
+    assert (spec.on_lost, spec.idle, spec.credentials_secret_name) == ("ScaleToMin", None, None)
     bounds = changed(GOOD, {"spec": {"template": GOOD["spec"]["template"]}})
     assert FiberPool.read(bounds).spec.min_replicas == 0
     assert FiberPool.read(bounds).spec.max_replicas == 1000
@@ -226,6 +229,12 @@ def test_defaults_are_the_contracts() -> None:
 def test_what_is_wanted_lies_between_the_bounds(replicas: int | None, wanted: int) -> None:
     change = {"spec.minReplicas": 1, "spec.replicas": replicas}
     assert FiberPool.read(changed(GOOD, change)).wanted == wanted
+
+
+def test_the_credentials_are_the_pools_own_unless_it_names_others() -> None:
+    assert FiberPool.read(GOOD).credentials_secret == "es-fiber-tls"
+    named = changed(GOOD, {"spec.credentialsSecretName": "mine"})
+    assert FiberPool.read(named).credentials_secret == "mine"
 
 
 def test_fields_of_a_newer_release_are_passed_over() -> None:

@@ -49,8 +49,8 @@ def test_the_names_in_certificates_are_dns_names(pool: str, namespace: str) -> N
 def test_the_longest_names() -> None:
     pool = "p" * names.MAX_POOL_NAME
     assert len(names.pod_name(pool, "0" * 10)) == 61
-    assert len(names.service_name(pool)) == 57
-    assert len(names.secret_name(pool)) == 54
+    assert len(names.service_name(pool)) == 56
+    assert len(names.secret_name(pool)) == 60
     assert len(names.server_name(pool, "n" * 63)) == 127
 
 
@@ -74,9 +74,21 @@ def test_a_pods_name_ends_with_hexadecimal_digits(suffix: str) -> None:
 
 
 def test_pools_of_different_names_share_no_object() -> None:
-    # "a" and "a-master": neither's pods, Service or Secret is called as one of the other's.
+    # "a" and "a-fiber": neither's pods, Service or Secret is called as one of the other's.
     made = [names.service_name, names.secret_name]
-    assert len({make(pool) for pool in ("a", "a-master", "a-tls") for make in made}) == 6
+    assert len({make(pool) for pool in ("a", "a-fiber", "a-tls") for make in made}) == 6
+
+
+@settings(deadline=None)
+@given(POOLS, POOLS)
+def test_no_masters_lease_is_an_operators(pool: str, release: str) -> None:
+    operators = {names.operator_lease_name(release), names.CRD_NAME}
+    assert names.master_lease_name(pool) not in operators
+    assert len(operators) == 2
+
+
+def test_no_secret_is_called_as_cert_managers_usually_are() -> None:
+    assert names.secret_name("es") not in ("es-tls", "es-cert", "es")
 
 
 @pytest.mark.parametrize(

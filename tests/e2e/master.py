@@ -17,13 +17,17 @@ into the pool.
 from __future__ import annotations
 
 import base64
+import http
 import json
 import os
 import signal
+import socket
 import ssl
 import threading
 import time
+import urllib.error
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +39,7 @@ from fiber._wire.messages import Recall
 from fiber_api import names
 
 ACCOUNT = Path("/var/run/secrets/kubernetes.io/serviceaccount")
+IDENTITY = f"{socket.gethostname()}:{os.getpid()}"
 
 
 class Api:
@@ -63,32 +68,53 @@ class Api:
             texts[names.KEY_MASTER_KEY],
         )
 
-    def next_epoch(self) -> int:
-        """Above those of all masters before."""
-        pool = self._call("GET", self._pool)
-        there = pool["spec"].get("master", {}).get("epoch", 0)
-        before = pool.get("status", {}).get("masterEpoch", 0)
-        return 1 + int(max(there, before))
+    def attach(self, master: dict[str, Any]) -> int:
+        """Be the pool's master, with an epoch above those of all before; which that is."""
+        epoch = 0
 
-    def attach(self, host: str, port: int, epoch: int, lost_grace: int | None) -> None:
-        """Be the pool's master."""
-        master = {"host": host, "port": port, "epoch": epoch}
-        if lost_grace is not None:
-            master["lostGraceSeconds"] = lost_grace
-        self._apply({"spec": {"master": master}})
+        def next_one(pool: dict[str, Any]) -> dict[str, Any]:
+            nonlocal epoch
+            there = pool["spec"].get("master", {}).get("epoch", 0)
+            epoch = 1 + int(max(there, pool.get("status", {}).get("masterEpoch", 0)))
+            return {"master": {**master, "epoch": epoch}}
+
+        self._apply(next_one)
+        return epoch
 
     def detach(self, epoch: int) -> None:
         """Leave the pool without a master, unless it has another one by now."""
-        pool = self._call("GET", self._pool)
-        if pool["spec"].get("master", {}).get("epoch") == epoch:
-            version = pool["metadata"]["resourceVersion"]
-            self._apply({"metadata": {"resourceVersion": version}, "spec": {}})
 
-    def _apply(self, part: dict[str, Any]) -> None:
-        """Write what is the master's part; what is not in it goes."""
-        body = {"apiVersion": names.API_VERSION, "kind": names.KIND, **part}
+        def nobody(pool: dict[str, Any]) -> dict[str, Any] | None:
+            master = pool["spec"].get("master", {})
+            ours = (master.get("epoch"), master.get("identity")) == (epoch, IDENTITY)
+            return {} if ours else None
+
+        self._apply(nobody)
+
+    def _apply(self, change: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
+        """Write what is the master's part of the spec; what is not in it goes.
+
+        Only into the pool as it was read: of two masters that come at once the second one sees
+        the first.  The operator writes too, so that it may take more than one reading.
+        """
         query = f"fieldManager={names.SDK_MANAGER}&force=true"
-        self._call("PATCH", f"{self._pool}?{query}", body)
+        while True:
+            pool = self._call("GET", self._pool)
+            spec = change(pool)
+            if spec is None:
+                return
+            body = {
+                "apiVersion": names.API_VERSION,
+                "kind": names.KIND,
+                "metadata": {"resourceVersion": pool["metadata"]["resourceVersion"]},
+                "spec": spec,
+            }
+            try:
+                self._call("PATCH", f"{self._pool}?{query}", body)
+                return
+            except urllib.error.HTTPError as error:
+                if error.code != http.HTTPStatus.CONFLICT:
+                    raise
 
     def _call(self, method: str, path: str, body: object = None) -> dict[str, Any]:
         request = urllib.request.Request(self._url + path, method=method)
@@ -150,9 +176,11 @@ def main() -> None:
         lost_grace=lost_grace,
     )
     port = int(listener.address.rpartition(":")[2])
-    epoch = api.next_epoch()
+    master: dict[str, Any] = {"host": host, "port": port, "identity": IDENTITY}
+    if lost_grace is not None:
+        master["lostGraceSeconds"] = lost_grace
     started = time.monotonic()
-    api.attach(host, port, epoch, lost_grace)
+    epoch = api.attach(master)
     say("attached", address=listener.address, epoch=epoch)
     told = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: told.set())

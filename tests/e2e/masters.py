@@ -12,7 +12,7 @@ from pathlib import Path
 
 from e2e.kube import Body, Stream, environment
 from e2e.pools import Pool
-from e2e.scene import Scene
+from fiber_api import names
 
 PROGRAM = Path(__file__).with_name("master.py")
 ACCOUNT = "master"
@@ -138,16 +138,19 @@ def outside(pool: Pool, host: str, lost_grace: int | None = None) -> Iterator[Ou
         master.kill()
 
 
-def may_use_pools(scene: Scene) -> None:
-    """Give the namespace an account with the role fiber-user, for masters inside."""
-    kube, group = scene.kube, "rbac.authorization.k8s.io"
-    kube.create(scene.path("serviceaccounts"), {"metadata": {"name": ACCOUNT}})
-    binding = {
-        "metadata": {"name": ACCOUNT},
-        "roleRef": {"apiGroup": group, "kind": "ClusterRole", "name": "fiber-user"},
-        "subjects": [{"kind": "ServiceAccount", "name": ACCOUNT, "namespace": scene.namespace}],
-    }
-    kube.create(scene.path("rolebindings"), binding)
+def may_use_pools(warm: Pool) -> None:
+    """Give the namespace an account for masters inside: the role fiber-user, and what the warm pool
+    needs beyond it, as the chart's README has it."""
+    scene = warm.scene
+    account = f"--serviceaccount={scene.namespace}:{ACCOUNT}"
+    secret = f"--resource-name={names.secret_name(warm.name)}"
+    for arguments in (
+        ("serviceaccount", ACCOUNT),
+        ("rolebinding", "fiber-user", "--clusterrole=fiber-user", account),
+        ("role", "warm-credentials", "--verb=get", "--resource=secrets", secret),
+        ("rolebinding", "warm-credentials", "--role=warm-credentials", account),
+    ):
+        warm.kubectl("create", *arguments)
 
 
 def _pod(pool: Pool, image: str) -> Body:

@@ -15,7 +15,7 @@ from e2e.release import Release
 from e2e.scene import Scene
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "manifests"
-SOMEWHERE: Body = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+SOMEWHERE: Body = {"host": "10.0.3.7", "port": 41337, "epoch": 1, "identity": "somebody"}
 """A master that nobody can tell to be absent: it has no Lease."""
 
 
@@ -66,7 +66,7 @@ def test_the_minimal_example_gives_workers(scene: Scene, image: str) -> None:
 def test_a_deleted_pool_takes_everything_along(pool: Pool, agent: Body) -> None:
     scene = pool.scene
     pool.apply(agent, minReplicas=2).ready(2)
-    secret, service = scene.path("secrets", "es-tls"), scene.path("services", "es-master")
+    secret, service = scene.path("secrets", "es-fiber-tls"), scene.path("services", "es-fiber")
     assert scene.kube.get(secret)
     assert scene.kube.get(service)
     pool.kubectl("delete", "fiberpool", "es")
@@ -145,11 +145,11 @@ def test_suspend_and_resume(pool: Pool, agent: Body) -> None:
         "Suspended",
     )
     assert not pool.status["problems"]
-    secret = scene.kube.get(scene.path("secrets", "es-tls"))
+    secret = scene.kube.get(scene.path("secrets", "es-fiber-tls"))
     pool.patch(suspend=False)
     assert set(pool.ready(2)).isdisjoint(before)
     assert pool.condition("Suspended")["status"] == "False"
-    assert scene.kube.get(scene.path("secrets", "es-tls")) == secret
+    assert scene.kube.get(scene.path("secrets", "es-fiber-tls")) == secret
     assert pool.status["failures"].get("total", 0) == 0
 
 
@@ -182,7 +182,7 @@ def test_an_evicted_worker_is_replaced(pool: Pool, agent: Body) -> None:
 def test_kubectl_explains_the_fields(release: Release, kube: Kube) -> None:
     assert says(kube.kubectl("explain", "fiberpool"), "pool of worker pods", "spec", "status")
     assert "What becomes of the pool when its master is lost" in kube.kubectl(
-        "explain", "fiberpool.spec.master.onLost"
+        "explain", "fiberpool.spec.onLost"
     )
 
 

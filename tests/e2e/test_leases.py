@@ -31,35 +31,42 @@ def pools(module_scene: Scene, agent: Body) -> Pools:
     fates = {"delete": "Delete", "shrink": "ScaleToMin", "retain": "Retain", "return": "Delete"}
     pools = {name: Pool(module_scene, name) for name in fates}
     for name, pool in pools.items():
-        renew(pool, create=True)
-        pool.apply(agent, minReplicas=1)
-        grace = 60 if name == "return" else GRACE
-        pool.attach(replicas=2, master=master_of(pool, fates[name], grace))
+        pool.apply(agent, minReplicas=1, onLost=fates[name])
+        pool.attach(replicas=2, master=master_of(pool, 60 if name == "return" else GRACE))
+        make_lease(pool)
     everyone = list(pools.values())
     while_renewed(everyone, lambda: all(map(is_ready, everyone)) and all(map(is_alive, everyone)))
     return pools
 
 
-def master_of(pool: Pool, on_lost: str, grace: int) -> Body:
+def master_of(pool: Pool, grace: int) -> Body:
     return {
         **SOMEWHERE,
-        "leaseName": pool.name,
+        "leaseName": names.master_lease_name(pool.name),
         "leaseDurationSeconds": DURATION,
-        "onLost": on_lost,
         "lostGraceSeconds": grace,
     }
 
 
-def renew(pool: Pool, *, create: bool = False) -> None:
+def make_lease(pool: Pool) -> None:
+    """What a master does once its pool is there."""
+    uid = pool.wait("it is there", lambda: pool.body["metadata"]["uid"] if pool.body else None)
+    kind = {"apiVersion": names.API_VERSION, "kind": names.KIND}
+    metadata = {
+        "name": names.master_lease_name(pool.name),
+        "labels": {names.LABEL_POOL: pool.name, names.LABEL_POOL_UID: uid},
+        "ownerReferences": [{**kind, "name": pool.name, "uid": uid}],
+    }
+    body = {"metadata": metadata, "spec": {"holderIdentity": "master-of-the-test"}}
+    pool.scene.kube.create(pool.scene.path("leases"), body)
+
+
+def renew(pool: Pool) -> None:
     """What a master that is alive does every few seconds."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
-    spec = {"holderIdentity": "master-of-the-test", "renewTime": now.replace("+00:00", "Z")}
-    scene = pool.scene
-    if create:
-        body = {"metadata": {"name": pool.name}, "spec": spec}
-        scene.kube.create(scene.path("leases"), body)
-    else:
-        scene.kube.patch(scene.path("leases", pool.name), {"spec": spec}, MERGE)
+    spec = {"renewTime": now.replace("+00:00", "Z")}
+    lease = pool.scene.path("leases", names.master_lease_name(pool.name))
+    pool.scene.kube.patch(lease, {"spec": spec}, MERGE)
 
 
 def while_renewed(pools: list[Pool], condition: Callable[[], bool]) -> None:
@@ -91,7 +98,7 @@ def test_a_lost_master_is_told(pools: Pools) -> None:
     pool = pools["retain"]
     problem = is_lost(pool)
     address = names.address_of(SOMEWHERE["host"], SOMEWHERE["port"])
-    words = ("Lease retain", "master-of-the-test", f"{DURATION} s", address, "workers stay")
+    words = ("Lease fiber-retain", "somebody", f"{DURATION} s", address, "workers stay")
     assert says(problem["message"], *words)
     alive = pool.condition("MasterAlive")
     assert (alive["status"], alive["reason"]) == ("False", "MasterLost")
@@ -111,9 +118,19 @@ def test_delete_deletes_the_pool(pools: Pools) -> None:
     pool = pools["delete"]
     pool.wait("the pool is gone", lambda: not pool.body, seconds=LATE + GRACE)
     pool.wait("its workers too", lambda: not pool.pods)
+    lease = pool.scene.path("leases", names.master_lease_name(pool.name))
+    pool.wait("its Lease too", lambda: not pool.scene.kube.get(lease))
     lost = pool.scene.first("fiberpools", _loses(pool))
     gone = next(m.at for m in pool.scene.moments if m.gone and m.name == pool.name)
     assert gone - lost > GRACE - 1  # times in the API are whole seconds
+
+
+def test_a_pool_whose_lease_is_never_made_goes_too(pool: Pool, agent: Body) -> None:
+    """Its program died between making the pool and the Lease."""
+    pool.apply(agent, onLost="Delete")
+    pool.attach(master=master_of(pool, GRACE))
+    pool.has_problem("LeaseNotFound", severity="Warning")
+    pool.wait("the pool is gone", lambda: not pool.body, seconds=LATE + GRACE)
 
 
 def test_scale_to_min_keeps_the_least(pools: Pools) -> None:

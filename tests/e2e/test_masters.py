@@ -10,6 +10,7 @@ from e2e.kube import Body
 from e2e.masters import Inside, Master, may_use_pools, outside
 from e2e.pools import Pool, is_ready, template
 from e2e.scene import Scene
+from e2e.test_apply import SOMEWHERE
 
 
 @pytest.fixture
@@ -22,7 +23,7 @@ def host(cluster: Cluster) -> str:
 
 def endpoints(scene: Scene, pool: Pool) -> list[tuple[list[str], int]]:
     """Where the pool's Service leads."""
-    found = scene.now["endpointslices"].get(f"{pool.name}-master", {})
+    found = scene.now["endpointslices"].get(f"{pool.name}-fiber", {})
     ports = [port["port"] for port in found.get("ports") or []]
     return [
         (endpoint["addresses"], port) for endpoint in found.get("endpoints") or [] for port in ports
@@ -75,7 +76,7 @@ def test_a_worker_that_comes_later_joins_too(pool: Pool, agent: Body, host: str)
 
 
 def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
-    may_use_pools(pool.scene)
+    may_use_pools(pool)
     pool.apply(agent, minReplicas=2)
     workers = pool.ready(2)
     first = Inside(pool, image)
@@ -118,8 +119,8 @@ def test_the_endpoint_follows_the_master(pool: Pool, agent: Body) -> None:
     pool.apply(agent)
     pool.wait("an endpoint slice", lambda: scene.now["endpointslices"])
     assert endpoints(scene, pool) == []
-    moves(pool, {"host": "10.0.3.7", "port": 41337, "epoch": 1})
-    moves(pool, {"host": "10.0.3.8", "port": 5000, "epoch": 2})
+    moves(pool, SOMEWHERE)
+    moves(pool, {"host": "10.0.3.8", "port": 5000, "epoch": 2, "identity": "somebody else"})
     pool.attach()
     pool.wait("nobody", lambda: endpoints(scene, pool) == [])
 

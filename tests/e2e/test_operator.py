@@ -67,7 +67,7 @@ def test_a_pool_that_is_deleted_meanwhile(scene: Scene, agent: Body, release: Re
         goes.delete()
         stays.kubectl("delete", "pod", victim, "--wait=false")
         scene.wait("the pool and its workers are gone", lambda: not goes.body and not goes.pods)
-        scene.wait("its endpoint too", lambda: "goes-master" not in scene.now["endpointslices"])
+        scene.wait("its endpoint too", lambda: "goes-fiber" not in scene.now["endpointslices"])
         scene.wait("the victim is gone", lambda: len(stays.pods) == 1)
     finally:
         release.start()

@@ -151,14 +151,14 @@ def test_workers_meet_the_restricted_standard(pool: Pool, agent: Body) -> None:
 def test_a_name_that_is_taken(pool: Pool, agent: Body) -> None:
     scene = pool.scene
     service = scene.path("services")
-    body = {"metadata": {"name": "es-master"}, "spec": {"ports": [{"port": 80}]}}
+    body = {"metadata": {"name": "es-fiber"}, "spec": {"ports": [{"port": 80}]}}
     before = scene.kube.create(service, body)
     pool.apply(agent, minReplicas=1)
     problem = pool.has_problem("NameTaken", severity="Error", terminal=True)
-    assert says(problem["message"], "Service es-master", "not this pool's", "Delete or rename it")
-    assert scene.kube.get(f"{service}/es-master") == before
+    assert says(problem["message"], "Service es-fiber", "not this pool's", "Delete or rename it")
+    assert scene.kube.get(f"{service}/es-fiber") == before
     assert not pool.ever
-    scene.kube.delete(f"{service}/es-master")
+    scene.kube.delete(f"{service}/es-fiber")
     pool.ready(1)
 
 

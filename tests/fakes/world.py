@@ -45,6 +45,7 @@ class Feed:
     def __init__(self, world: World, notice: Callable[..., None], **options: Any) -> None:
         self._world = world
         self._notice = notice
+        self._renewed = options["renewed"]
         self._gate = options["gate"]
         self._on_start = options["on_start"]
         self._answered = options["answered"]
@@ -54,7 +55,7 @@ class Feed:
         await self._gate()
         self._on_start(True)
         for where in [f" in {namespace}" for namespace in self._namespaces] or [""]:
-            for plural in ("fiberpools", "pods"):
+            for plural in ("fiberpools", "pods", "leases"):
                 self._answered(f"watch {plural}{where}", None)
         seen = 0
         while True:
@@ -67,9 +68,14 @@ class Feed:
                 if plural == "fiberpools":
                     generation = -1 if change.type == "DELETED" else metadata["generation"]
                     self._notice(Key(namespace, name), metadata["uid"], generation)
-                elif plural == "pods" and "fiber.dev/pool-uid" in metadata.get("labels", {}):
+                elif "fiber.dev/pool-uid" not in metadata.get("labels", {}):
+                    continue
+                elif plural == "pods":
                     pool = metadata["labels"]["fiber.dev/pool"]
                     self._notice(Key(namespace, pool), "", None)
+                elif plural == "leases":
+                    gone = change.type == "DELETED"
+                    self._renewed(namespace, name, "" if gone else metadata["resourceVersion"])
             seen = len(changes)
             await self._world.store.changed()
 

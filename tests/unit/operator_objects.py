@@ -18,7 +18,7 @@ NOW = 1_800_000_000.0
 UID = "11111111-2222-3333-4444-555555555555"
 ADDRESS = "10.96.1.2:7070"
 TEMPLATE = {"spec": {"containers": [{"name": "worker", "image": "registry/worker:1"}]}}
-MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1}
+MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1, "identity": "laptop-7:4711"}
 
 Json = dict[str, Any]
 

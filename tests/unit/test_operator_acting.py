@@ -17,7 +17,7 @@ from fiber_operator import events
 from fiber_operator.cluster import Cluster, Conflict, Permit, TooMany, Unavailable
 from fiber_operator.creation import ENOUGH, Created, Creator, Pace, draw_suffix
 from fiber_operator.events import Recorder
-from fiber_operator.lease import NotHolder
+from fiber_operator.leader_election import NotLeader
 from fiber_operator.planning.plans import Event
 from fiber_operator.turns import Key
 
@@ -151,10 +151,10 @@ async def test_a_creation_that_has_time_takes_it(api: KubernetesApi, door: Clust
 
 def test_without_the_lease_nothing_is_created() -> None:
     def refuse(namespace: str) -> float:
-        raise NotHolder
+        raise NotLeader
 
     async def test(api: KubernetesApi, door: Cluster) -> None:
-        with pytest.raises(NotHolder):
+        with pytest.raises(NotLeader):
             await create(door, 10)
         assert api.calls == []
 
@@ -208,7 +208,7 @@ def test_events_without_the_lease_are_given_up() -> None:
 
     def require(namespace: str) -> float:
         if not held:
-            raise NotHolder
+            raise NotLeader
         return 10.0
 
     async def test(api: KubernetesApi, door: Cluster) -> None:

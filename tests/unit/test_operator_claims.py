@@ -56,7 +56,7 @@ async def another(world: World, namespaces: tuple[str, ...]) -> AsyncIterator[Pr
 
 
 def acts(program: Program) -> bool:
-    return hasattr(program, "guard") and program.guard.held
+    return hasattr(program, "elector") and program.elector.is_leader
 
 
 def lease(world: World, namespace: str = NAMESPACE) -> Body:

@@ -106,8 +106,8 @@ async def is_attached(world: World) -> None:
 
 async def abandon(world: World) -> None:
     world.store.create("leases", NAMESPACE, {"metadata": {"name": "es"}})
-    lost = {"leaseName": "es", "leaseDurationSeconds": 6, "onLost": "Delete"}
-    world.edit(master={**MASTER, **lost, "lostGraceSeconds": 5})
+    lost = {"leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5}
+    world.edit(master={**MASTER, **lost}, onLost="Delete")
 
 
 async def is_deleted(world: World) -> None:

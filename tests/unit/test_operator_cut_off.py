@@ -29,7 +29,7 @@ async def test_a_service_that_was_deleted_comes_back_with_its_address(world: Wor
     world.make_pool(replicas=2, master=MASTER)
     await world.ready(2)
     endpoint = world.status()["endpoint"]
-    world.store.delete("services", NAMESPACE, "es-master")
+    world.store.delete("services", NAMESPACE, "es-fiber")
     await world.until(lambda: world.store.list("services") != [], within=125)
     await world.settled()
     assert world.status()["endpoint"] == endpoint
@@ -43,7 +43,7 @@ async def test_a_service_that_was_deleted_comes_back_with_its_address(world: Wor
         ("tls+tcp://10.96.0.77:7070", "10.96.0.77"),
         ("tls+tcp://[fd00::77]:7070", "fd00::77"),
         ("tls+tcp://[fd00::77", "10.96.0.2"),
-        ("tls+tcp://es-master:7070", "10.96.0.2"),
+        ("tls+tcp://es-fiber:7070", "10.96.0.2"),
         ("nonsense", "10.96.0.2"),
         ("", "10.96.0.2"),
     ],
@@ -54,7 +54,7 @@ def test_the_address_is_what_the_status_says_if_that_is_one(endpoint: str, addre
         world.make_pool()
         await world.until(lambda: "endpoint" in world.status())
         await world.stop()
-        world.store.delete("services", NAMESPACE, "es-master")
+        world.store.delete("services", NAMESPACE, "es-fiber")
         status = {**world.status(), "endpoint": endpoint}
         world.store.set_status("fiberpools", NAMESPACE, "es", status)
         world.start()
@@ -68,7 +68,7 @@ async def lose_the_address(world: World) -> str:
     """Delete the Service, and let another have its address; the one that workers dial."""
     (before,) = dialled(world)
     world.store.admit = taken
-    world.store.delete("services", NAMESPACE, "es-master")
+    world.store.delete("services", NAMESPACE, "es-fiber")
     await world.until(lambda: world.store.list("services") != [], within=125)
     return before
 
@@ -125,7 +125,7 @@ async def test_workers_without_a_master_that_hold_old_credentials_are_replaced(
     await world.ready(8)
     await world.settled()
     before = world.names()
-    world.store.delete("secrets", NAMESPACE, "es-tls")
+    world.store.delete("secrets", NAMESPACE, "es-fiber-tls")
     await world.until(lambda: "CredentialsChanged" in world.reasons(), 125)
     await world.until(lambda: not {*before} & {*world.names()})
     await world.ready(8)
@@ -140,7 +140,7 @@ async def test_workers_of_a_master_that_hold_old_credentials_stay_and_are_told(
     await world.ready(3)
     await world.settled()
     before = world.names()
-    world.store.delete("secrets", NAMESPACE, "es-tls")
+    world.store.delete("secrets", NAMESPACE, "es-fiber-tls")
     await world.until(lambda: "CredentialsChanged" in world.reasons(), 125)
     await world.settled(120)
     assert world.names() == before

@@ -10,9 +10,11 @@ import pytest
 from fakes import virtual_time
 from fakes.kubernetes_api import Call, Fault
 from fakes.world import NAMESPACE, World, a_world, played
+from fiber_api import names
 from fiber_operator import acting
 from unit.operator_objects import MASTER
 
+OWN_LEASE = names.operator_lease_name("fiber-operator")
 CALLS = [
     ("get", "fiberpools"),
     ("list", "fiberpools"),
@@ -238,8 +240,8 @@ async def test_a_lost_lease_stops_a_scale_up_at_once(world: World) -> None:
     world.make_pool(replicas=300)
     await world.until(lambda: len(world.pods()) > 10)
     spec = {"holderIdentity": "another", "leaseDurationSeconds": 15, "renewTime": "now"}
-    world.store.merge("leases", "fiber-system", "fiber-operator", {"spec": spec})
-    await world.until(lambda: not world.program.guard.held)
+    world.store.merge("leases", "fiber-system", OWN_LEASE, {"spec": spec})
+    await world.until(lambda: not world.program.elector.is_leader)
     at_loss = len(world.created())
     assert world.program.health.ready() != []
     await world.settled(12)
@@ -264,7 +266,7 @@ def test_two_operators_do_the_work_of_one() -> None:
             await world.kill()
             await world.until_settled(60)
             assert len(world.created()) == 60
-            assert second.guard.held
+            assert second.elector.is_leader
             stop.set()
             await task
 
@@ -285,7 +287,7 @@ async def test_sigterm_ends_a_scale_up_between_two_calls(world: World) -> None:
     assert len(world.created()) == made, "nothing was cut off in the middle"
     late = [call for call in world.api.calls[calls:] if call.plural == "pods"]
     assert late == []
-    lease = world.store.get("leases", "fiber-system", "fiber-operator")
+    lease = world.store.get("leases", "fiber-system", OWN_LEASE)
     assert lease["spec"]["holderIdentity"] == ""
     world.api.faults.clear()
     world.start(identity="operator-2")
@@ -315,9 +317,9 @@ async def test_a_pool_made_anew_in_the_middle_gets_nothing_of_the_old_ones(world
 
 @played
 async def test_a_master_that_comes_back_in_the_last_moment_keeps_its_pool(world: World) -> None:
-    lost = {"leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5, "onLost": "Delete"}
+    lost = {"leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5}
     world.store.create("leases", NAMESPACE, {"metadata": {"name": "es"}})
-    world.make_pool(replicas=3, master={**MASTER, **lost})
+    world.make_pool(replicas=3, master={**MASTER, **lost}, onLost="Delete")
     await world.ready(3)
 
     world.slow("delete", "fiberpools", 1.0)

@@ -97,7 +97,10 @@ SPEC: Body = {
     "replicas": 3,
     "minReplicas": 1,
     "maxReplicas": 9,
-    "master": {**MASTER, "leaseName": "es", "onLost": "Delete"},
+    "master": {**MASTER, "leaseName": "es"},
+    "onLost": "Delete",
+    "idle": {"timeoutSeconds": 60},
+    "credentialsSecretName": "mine",
     "scaleDown": {"policy": "ReleasedOnly", "release": [name_of(77)], "idleTimeoutSeconds": 5},
     "scaleUp": {"maxInFlight": 3},
     "failurePolicy": {
@@ -143,9 +146,7 @@ def troubled(**spec: Any) -> Body:
 
 
 def memory(pool: FiberPool, alive: bool | None) -> Memory:
-    return Memory(
-        address=ADDRESS, accepted=template_hash(pool), master=plans.LeaseVerdict(alive, "another")
-    )
+    return Memory(address=ADDRESS, accepted=template_hash(pool), master=plans.LeaseVerdict(alive))
 
 
 def written(made: Plan) -> Body:

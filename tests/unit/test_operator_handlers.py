@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import gc
 import itertools
 from collections.abc import AsyncIterator, Callable, Coroutine
@@ -26,6 +27,7 @@ from fiber_operator.turns import Key
 
 ES = Key(NAMESPACE, "es")
 Notice = tuple[Key, str, int | None]
+WATCHED = ("fiberpools", "pods", "leases")
 
 
 class Watching:
@@ -36,6 +38,7 @@ class Watching:
         self.api = world.api
         self.store = world.store
         self.notices: list[Notice] = []
+        self.renewals: list[tuple[str, str, str]] = []
         self.starts: list[bool] = []
         self.answers: dict[str, str] = {}
         """What was asked -> why that failed the last time, or nothing."""
@@ -44,6 +47,7 @@ class Watching:
         self._task = asyncio.ensure_future(
             handlers.watch(
                 lambda *notice: self.notices.append(notice),
+                renewed=lambda *renewal: self.renewals.append(renewal),
                 configure=self._configure,
                 namespaces=namespaces,
                 gate=self._gate,
@@ -73,11 +77,9 @@ class Watching:
         return told
 
     async def watched(self, times: int = 1) -> None:
-        """Wait until both watches are open, so many times each."""
+        """Wait until all watches are open, so many times each."""
         await self.world.until(
-            lambda: (
-                min(self.api.count("watch", "pods"), self.api.count("watch", "fiberpools")) >= times
-            )
+            lambda: min(self.api.count("watch", plural) for plural in WATCHED) >= times
         )
 
     def pod(self, name: str, namespace: str = NAMESPACE, pool: str = "es") -> Body:
@@ -143,6 +145,20 @@ async def test_other_pods_are_not_asked_for(kopf: Watching) -> None:
 
 
 @played()
+async def test_renewals_of_the_masters_leases_are_told_and_of_no_others(kopf: Watching) -> None:
+    await kopf.watched()
+    labels = {"fiber.dev/pool": "es", "fiber.dev/pool-uid": "1"}
+    kopf.store.create("leases", NAMESPACE, {"metadata": {"name": "kubernetes"}})
+    made = kopf.store.create("leases", NAMESPACE, {"metadata": {"name": "es", "labels": labels}})
+    renewed = kopf.store.merge("leases", NAMESPACE, "es", {"spec": {"renewTime": "now"}})
+    kopf.store.remove("leases", NAMESPACE, "es")
+    versions = [made["metadata"]["resourceVersion"], renewed["metadata"]["resourceVersion"], ""]
+    await kopf.world.until(lambda: len(kopf.renewals) >= 3)
+    assert kopf.renewals == [(NAMESPACE, "es", version) for version in versions]
+    assert kopf.notices == []
+
+
+@played()
 async def test_kopf_writes_nothing(kopf: Watching) -> None:
     marks = {"kopf.zalando.org/last-handled-configuration": "{nonsense"}
     kopf.store.create("fiberpools", NAMESPACE, {"metadata": {"name": "es", "annotations": marks}})
@@ -153,7 +169,7 @@ async def test_kopf_writes_nothing(kopf: Watching) -> None:
     kopf.store.delete("fiberpools", NAMESPACE, "es")
     await kopf.told(ES)
     assert {call.verb for call in kopf.api.calls} == {"list", "watch"}
-    assert {call.plural for call in kopf.api.calls} == {"pods", "fiberpools"}
+    assert {call.plural for call in kopf.api.calls} == set(WATCHED)
 
 
 @played("one", "two")
@@ -172,13 +188,13 @@ async def test_each_answer_to_kopf_is_told(kopf: Watching) -> None:
     assert {what for what in kopf.answers if not what.startswith("get ")} == {
         f"{verb} {plural} in {namespace}"
         for verb in ("list", "watch")
-        for plural in ("fiberpools", "pods")
+        for plural in WATCHED
         for namespace in ("one", "two")
     }
 
 
 @pytest.mark.parametrize("verb", ["list", "watch"])
-@pytest.mark.parametrize("plural", ["fiberpools", "pods"])
+@pytest.mark.parametrize("plural", WATCHED)
 def test_a_right_that_is_missing_is_told_and_so_is_its_return(verb: str, plural: str) -> None:
     @played()
     async def test(kopf: Watching) -> None:
@@ -358,16 +374,17 @@ def test_a_fault_of_ours_holds_up_no_other_event() -> None:
                 raise KeyError("a fault of ours")
 
         watcher = Watcher(
-            notice,  # type: ignore[arg-type]
+            lambda *_: None,
             configure=load_configuration,
             namespaces=(),
             gate=lambda: asyncio.sleep(0),
             on_start=lambda _: None,
         )
         watcher._loop = asyncio.get_running_loop()
+        tell = functools.partial(watcher._tell, notice)
         for pair in (("bad", "good"), ("bad", "again")):
             for what in pair:
-                watcher._tell(what)
+                tell(what)
             await asyncio.sleep(2 * handlers.TOGETHER)
         assert told == ["bad", "good", "bad", "again"]
 

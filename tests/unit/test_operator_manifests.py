@@ -47,7 +47,7 @@ def test_the_service_selects_nothing() -> None:
 
 def test_the_slice_leads_to_the_master() -> None:
     body = manifests.endpoint_slice(make_pool(master=MASTER))
-    assert body["metadata"]["labels"]["kubernetes.io/service-name"] == "es-master"
+    assert body["metadata"]["labels"]["kubernetes.io/service-name"] == "es-fiber"
     assert body["addressType"] == "IPv4"
     assert body["endpoints"][0]["addresses"] == ["10.0.3.7"]
     assert body["ports"] == [{"name": "fiber", "port": 41337, "protocol": "TCP"}]
@@ -83,7 +83,7 @@ def test_a_slice_without_its_labels_is_mended() -> None:
     body["metadata"]["labels"] = {}
     patch = manifests.slice_patch(pool, body)
     assert patch is not None
-    assert patch["metadata"]["labels"]["kubernetes.io/service-name"] == "es-master"
+    assert patch["metadata"]["labels"]["kubernetes.io/service-name"] == "es-fiber"
 
 
 def test_a_slice_is_replaced_when_the_address_family_changes() -> None:
@@ -96,7 +96,7 @@ def test_a_slice_is_replaced_when_the_address_family_changes() -> None:
 
 def test_the_secret_holds_what_it_is_given() -> None:
     body = manifests.secret(make_pool(), {"ca.crt": "PEM"})
-    assert body["metadata"]["name"] == "es-tls"
+    assert body["metadata"]["name"] == "es-fiber-tls"
     assert base64.b64decode(body["data"]["ca.crt"]) == b"PEM"
 
 

@@ -40,9 +40,8 @@ def environment(container: Json) -> dict[str, str]:
 
 
 def test_a_worker_knows_who_and_where_it_is() -> None:
-    worker = body_of(processesPerPod=8, master={**MASTER, "lostGraceSeconds": 90})["spec"][
-        "containers"
-    ][0]
+    pool = make_pool(processesPerPod=8, master={**MASTER, "lostGraceSeconds": 90})
+    worker = pod(pool, "es-0000000001", "10.96.1.2:7070")["spec"]["containers"][0]
     assert environment(worker) == {
         "FIBER_AGENT_NAME": "es-0000000001",
         "FIBER_AGENT_ADDRESS": "10.96.1.2:7070",
@@ -51,7 +50,11 @@ def test_a_worker_knows_who_and_where_it_is() -> None:
         "FIBER_AGENT_NAMESPACE": "team",
         "FIBER_AGENT_PROCESSES": "8",
         "FIBER_AGENT_LOST_GRACE": "90",
+        "FIBER_AGENT_TEMPLATE_HASH": template_hash(pool),
+        "FIBER_AGENT_UID": "",
     }
+    (uid,) = (v for v in worker["env"] if v["name"] == "FIBER_AGENT_UID")
+    assert uid["valueFrom"]["fieldRef"]["fieldPath"] == "metadata.uid"
 
 
 def test_the_users_environment_wins_and_comes_last() -> None:
@@ -65,6 +68,28 @@ def test_the_users_environment_wins_and_comes_last() -> None:
     assert "FIBER_AGENT_POOL" in environment(worker)
 
 
+def test_an_agent_is_called_as_its_pod_whatever_the_template_says() -> None:
+    own = [{"name": "FIBER_AGENT_NAME", "value": "mine"}, {"name": "A", "value": "1"}]
+    worker = worker_of({"env": own})
+    assert environment(worker)["FIBER_AGENT_NAME"] == "es-0000000001"
+    assert environment(worker)["A"] == "1"
+
+
+def test_autoscalers_leave_a_node_with_workers_alone_unless_the_template_says_otherwise() -> None:
+    evict, disrupt = "cluster-autoscaler.kubernetes.io/safe-to-evict", "karpenter.sh/do-not-disrupt"
+    assert body_of()["metadata"]["annotations"] == {evict: "false", disrupt: "true"}
+    metadata = {"annotations": {evict: "true", "note": "n"}}
+    found = body_of(metadata=metadata)["metadata"]["annotations"]
+    assert found == {evict: "true", disrupt: "true", "note": "n"}
+
+
+def test_a_pod_mounts_the_agents_half_of_the_secret_that_the_pool_names() -> None:
+    (volume,) = body_of(credentialsSecretName="mine")["spec"]["volumes"]
+    (source,) = volume["projected"]["sources"]
+    assert source["secret"]["name"] == "mine"
+    assert {item["key"]: item["path"] for item in source["secret"]["items"]} == names.AGENT_FILES
+
+
 def test_only_the_worker_gets_the_credentials_and_only_the_agents_half() -> None:
     body = body_of({"containers": [{"name": "x", "image": "i"}, {"name": "worker", "image": "i"}]})
     other, worker = body["spec"]["containers"]
@@ -75,7 +100,7 @@ def test_only_the_worker_gets_the_credentials_and_only_the_agents_half() -> None
     ]
     (volume,) = body["spec"]["volumes"]
     (source,) = volume["projected"]["sources"]
-    assert source["secret"]["name"] == "es-tls"
+    assert source["secret"]["name"] == "es-fiber-tls"
     items = {item["key"]: item["path"] for item in source["secret"]["items"]}
     assert items == names.AGENT_FILES
     assert not any("master" in key for key in items)
@@ -127,7 +152,7 @@ def test_metadata_is_the_users_but_for_what_makes_it_a_worker() -> None:
     assert found["labels"]["team"] == "rl"
     assert found["labels"][names.LABEL_POOL_UID] == UID
     assert found["labels"][names.LABEL_EPOCH] == "3"
-    assert found["annotations"] == {"note": "n"}
+    assert found["annotations"].items() >= {"note": "n"}.items()
     plain = pod(pool, "es-0000000001", "a:1")["metadata"]
     assert plain["labels"][names.LABEL_TEMPLATE_HASH] == template_hash(pool)
 

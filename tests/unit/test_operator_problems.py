@@ -322,18 +322,18 @@ def test_a_namespace_that_is_deleted_is_no_problem_of_its_pools() -> None:
 
 
 def test_an_obstacle_is_told_as_it_is() -> None:
-    obstacle = Obstacle(Reason.NAME_TAKEN, "the Service es-master is another's", True)
+    obstacle = Obstacle(Reason.NAME_TAKEN, "the Service es-fiber is another's", True)
     found = problem(POOL, running(1), obstacles=(obstacle,))
     assert (found.reason, found.message) == ("NameTaken", obstacle.message)
     assert found.terminal
 
 
 def test_a_lost_master_is_told_with_what_will_follow() -> None:
-    pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"})
-    expired = plans.LeaseVerdict(alive=False, holder="train-0")
+    pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"}, onLost="Delete")
+    expired = plans.LeaseVerdict(alive=False)
     found = problem(pool, running(1), master=expired)
     assert found.reason == "MasterLost"
-    for said in ("10.0.3.7:41337", "epoch 1", "train-0", "onLost is Delete"):
+    for said in ("10.0.3.7:41337", "epoch 1", "laptop-7:4711", "onLost is Delete"):
         assert said in found.message
 
 
@@ -342,10 +342,10 @@ def test_a_lease_that_is_gone_is_told_so() -> None:
     seen = then(pool, status_of(pool, running(1), master=plans.LeaseVerdict(alive=True)))
     found = problem(seen, running(1), master=plans.LeaseVerdict(alive=False, missing=True))
     assert found.reason == "MasterLost"
-    assert "The Lease es does not exist any more" in found.message
+    assert "The Lease es was not there for 30 s" in found.message
 
 
-def test_a_lease_that_never_was_is_told_with_what_to_do() -> None:
+def test_a_lease_that_is_not_there_is_told_with_what_to_do() -> None:
     pool = make_pool(replicas=1, master={**MASTER, "leaseName": "se"})
     first = status_of(pool, running(1), master=plans.LeaseVerdict(missing=True))
     (found,) = first.problems
@@ -354,8 +354,8 @@ def test_a_lease_that_never_was_is_told_with_what_to_do() -> None:
         assert said in found.message
     (alive,) = (c for c in first.conditions if c.type == "MasterAlive")
     assert (alive.status, alive.reason) == ("Unknown", "LeaseNotFound")
-    never = plans.LeaseVerdict(alive=False, missing=True)
-    later = problem(then(pool, first), running(1), now=NOW + 30, master=never)
+    missing = plans.LeaseVerdict(missing=True)
+    later = problem(then(pool, first), running(1), now=NOW + 30, master=missing)
     assert (later.reason, later.severity) == ("LeaseNotFound", "Error")
 
 

@@ -77,10 +77,11 @@ SPECS = st.fixed_dictionaries(
     },
     optional={
         "replicas": st.integers(0, 16),
+        "onLost": st.sampled_from(["Delete", "ScaleToMin", "Retain"]),
+        "idle": st.just({"timeoutSeconds": 60}),
         "master": st.fixed_dictionaries(
             {
                 **{key: st.just(value) for key, value in MASTER.items()},
-                "onLost": st.sampled_from(["Delete", "ScaleToMin", "Retain"]),
                 "lostGraceSeconds": st.sampled_from([0, 60]),
             },
             optional={"leaseName": st.just("es")},

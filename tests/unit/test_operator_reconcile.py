@@ -421,7 +421,7 @@ EXPIRED, UNKNOWN = plans.LeaseVerdict(alive=False), plans.LeaseVerdict(alive=Non
 
 @pytest.mark.parametrize("on_lost", ["Delete", "ScaleToMin", "Retain"])
 def test_a_lost_master_keeps_its_workers_for_its_grace(on_lost: str) -> None:
-    pool = tried(replicas=3, master={**LEASED, "onLost": on_lost})
+    pool = tried(replicas=3, master=LEASED, onLost=on_lost)
     made = plan_of(pool, running(1), running(2), master=EXPIRED)
     assert (made.delete, made.delete_pool, made.again) == ((), False, NOW + 60)
     assert made.create == (1 if on_lost == "Retain" else 0)
@@ -432,7 +432,7 @@ def test_a_lost_master_keeps_its_workers_for_its_grace(on_lost: str) -> None:
 
 def test_what_follows_from_a_lost_master() -> None:
     def after_grace(on_lost: str, lease: plans.LeaseVerdict = EXPIRED) -> Plan:
-        pool = lost(make_pool(replicas=3, minReplicas=1, master={**LEASED, "onLost": on_lost}), 60)
+        pool = lost(make_pool(replicas=3, minReplicas=1, master=LEASED, onLost=on_lost), 60)
         return plan_of(pool, running(1), running(2, age=50), master=lease)
 
     assert after_grace("Delete").delete_pool
@@ -447,7 +447,7 @@ def test_what_follows_from_a_lost_master() -> None:
 @pytest.mark.parametrize("ago", [-(10**9), 10**9, 2000])
 def test_a_loss_at_a_time_that_cannot_be_shortens_no_grace(ago: float) -> None:
     """Somebody has edited the status; the pool is a thousand seconds old."""
-    pool = lost(make_pool(replicas=1, master=LEASED), ago)
+    pool = lost(make_pool(replicas=1, master=LEASED, onLost="Delete"), ago)
     born = pool.metadata.model_copy(update={"creation_timestamp": NOW - 1000})
     pool = pool.model_copy(update={"metadata": born})
     made = plan_of(pool, running(1), master=EXPIRED)
@@ -467,7 +467,8 @@ def test_a_loss_at_a_time_that_cannot_be_shortens_no_grace(ago: float) -> None:
     ],
 )
 def test_an_edit_while_the_master_is_lost_gives_it_no_time(edit: Json) -> None:
-    spec = lost(make_pool(replicas=2, master=LEASED), ago=61).model_dump(mode="json", by_alias=True)
+    pool = make_pool(replicas=2, master=LEASED, onLost="Delete")
+    spec = lost(pool, ago=61).model_dump(mode="json", by_alias=True)
     pool = FiberPool.read({**spec, "spec": {**spec["spec"], **edit}})
     assert plan_of(pool, running(1), master=EXPIRED).delete_pool
     restarted = plan_of(pool, running(1), master=UNKNOWN)
@@ -487,7 +488,7 @@ def test_a_new_master_ends_the_mourning() -> None:
 
 
 def test_a_new_master_that_is_lost_too_has_a_grace_of_its_own() -> None:
-    pool = lost(make_pool(replicas=2, master=LEASED), ago=50)
+    pool = lost(make_pool(replicas=2, master=LEASED, onLost="Delete"), ago=50)
     assert pool.spec.master
     newer = pool.spec.master.model_copy(update={"epoch": 2})
     pool = pool.model_copy(update={"spec": pool.spec.model_copy(update={"master": newer})})
@@ -504,18 +505,6 @@ def test_a_new_master_is_announced() -> None:
     (event,) = (event for event in made.events if event.reason == Reason.MASTER_CHANGED)
     assert "10.0.3.7:41337" in event.message
     assert with_plan(pool, made).status.master_epoch == 4
-
-
-def test_a_lease_that_never_was_ends_nothing() -> None:
-    pool = tried(replicas=2, master={**LEASED, "lostGraceSeconds": 0})
-    never = plans.LeaseVerdict(alive=False, missing=True)
-    made = plan_of(pool, running(1), master=never)
-    assert (made.delete_pool, made.delete, made.create) == (False, (), 1)
-    told = with_plan(pool, made)
-    assert not plan_of(told, running(1), running(2), master=never, now=NOW + 9000).delete_pool
-    # What was seen once, if by an operator before this one, is lost when it is deleted.
-    seen = with_plan(pool, plan_of(pool, running(1), master=plans.LeaseVerdict(alive=True)))
-    assert plan_of(seen, running(1), master=never, now=NOW + 1).delete_pool
 
 
 # -- Looking again

@@ -54,7 +54,7 @@ async def releases(world: World) -> None:
 
 
 async def has_its_service_changed(world: World) -> None:
-    world.store.merge("services", NAMESPACE, "es-master", {"spec": {"selector": {"app": "x"}}})
+    world.store.merge("services", NAMESPACE, "es-fiber", {"spec": {"selector": {"app": "x"}}})
 
 
 async def gets_another_master(world: World) -> None:
@@ -67,7 +67,7 @@ async def gets_a_master_of_another_family(world: World) -> None:
 
 async def loses_its_master(world: World) -> None:
     world.store.create("leases", NAMESPACE, {"metadata": {"name": "es"}})  # nobody renews it
-    world.edit(master=LOST)
+    world.edit(master=LOST, onLost="Delete")
 
 
 async def is_made_anew(world: World) -> None:
@@ -98,6 +98,8 @@ BY_READINESS = [
     ("list", "fiberpools"),
     ("watch", "fiberpools"),
     ("watch", "pods"),
+    ("list", "leases"),
+    ("watch", "leases"),
     ("create", "leases"),
     ("update", "leases"),
 ]
@@ -202,7 +204,7 @@ async def test_a_master_that_is_not_led_to_is_not_told_as_if_it_were(world: Worl
     await world.until(lambda: world.status().get("observedGeneration") == 2, within=5)
     assert world.status()["phase"] == "Degraded"
     assert world.status()["master"] == "10.0.3.7:41337"
-    assert "the EndpointSlice es-master" in world.status()["problems"][0]["message"]
+    assert "the EndpointSlice es-fiber" in world.status()["problems"][0]["message"]
     await world.until(lambda: released not in world.names())
     world.api.faults.clear()
     await world.until(lambda: world.status()["master"] == "10.0.3.7:2", within=10)
@@ -222,7 +224,7 @@ async def test_a_lease_that_may_not_be_read_is_a_warning(world: World) -> None:
     assert "may not read the Lease es" in conditions["MasterAlive"]["message"]
     assert conditions["Accepted"]["status"] == "True"
     assert world.status()["phase"] == "Ready"
-    assert "onLost (Delete) is never applied" in world.status()["problems"][0]["message"]
+    assert "onLost (ScaleToMin) is never applied" in world.status()["problems"][0]["message"]
 
 
 # -- Calls that fail

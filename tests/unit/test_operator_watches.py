@@ -23,7 +23,7 @@ def all_well(*namespaces: str) -> Watches:
     watches = Watches(namespaces)
     watches.started(True)
     for where in [f" in {namespace}" for namespace in namespaces] or [""]:
-        for plural in ("fiberpools", "pods"):
+        for plural in ("fiberpools", "pods", "leases"):
             watches.answered(f"list {plural}{where}", None)
             watches.answered(f"watch {plural}{where}", None)
     return watches
@@ -39,6 +39,7 @@ def test_each_watch_must_have_begun() -> None:
     watches.started(True)
     watches.answered("list pods in one", None)
     watches.answered("watch pods in one", None)
+    watches.answered("watch leases in one", None)
     (said,) = watches.wrong()
     assert said == "changes are seen late: watch fiberpools in one has not begun yet"
 
@@ -47,7 +48,7 @@ def test_all_begins_anew_when_watching_does() -> None:
     watches = all_well()
     watches.started(False)
     watches.started(True)
-    assert len(watches.wrong()) == 2
+    assert len(watches.wrong()) == 3
 
 
 def test_a_missing_right_is_named_until_it_is_there(caplog: pytest.LogCaptureFixture) -> None:

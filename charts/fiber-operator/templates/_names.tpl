@@ -33,6 +33,11 @@ Service may not: it takes no dot and begins with a letter.
 {{- printf "%s/%s" .Release.Namespace (include "fiber-operator.fullname" .) -}}
 {{- end -}}
 
+{{/* As the operator calls the Lease of its release: no pool's Lease has a dot in its name. */}}
+{{- define "fiber-operator.leaseName" -}}
+{{- printf "%s.operator.fiber.dev" (include "fiber-operator.fullname" .) -}}
+{{- end -}}
+
 {{- define "fiber-operator.serviceAccountName" -}}
 {{- if .Values.serviceAccount.create -}}
 {{- default (include "fiber-operator.fullname" .) .Values.serviceAccount.name -}}

@@ -4,8 +4,8 @@ calls that the operator makes, both ways.
 
   pools    the operator, in each namespace that it watches
   own      the operator, in its own namespace: the Lease that keeps two of its processes from acting at once
-  user     who runs pools: people, and the programs that are masters
-  viewer   who looks on
+  user     programs that are masters: what the SDK calls, and nothing else
+  viewer   who looks on: people
   smoke    the helm test
 */}}
 {{- define "fiber-operator.rules" -}}
@@ -30,10 +30,11 @@ pools:
   - apiGroups: [discovery.k8s.io]
     resources: [endpointslices]
     verbs: [create, delete, get, patch]
-  # Get: the Lease that a master renews; the operator only looks at it. The name of what is created cannot be restricted.
+  # Get, list, watch: the Leases that masters renew, which the operator only looks at. The name of what is created
+  # cannot be restricted.
   - apiGroups: [coordination.k8s.io]
     resources: [leases]
-    verbs: [create, get]
+    verbs: [create, get, list, watch]
   # The Lease that keeps the operators of two releases from acting in one namespace.
   - apiGroups: [coordination.k8s.io]
     resources: [leases]
@@ -50,32 +51,25 @@ own:
     verbs: [create]
   - apiGroups: [coordination.k8s.io]
     resources: [leases]
-    resourceNames: [{{ include "fiber-operator.fullname" . }}]
+    resourceNames: [{{ include "fiber-operator.leaseName" . }}]
     verbs: [get, update]
 user:
   - apiGroups: [fiber.dev]
     resources: [fiberpools]
-    verbs: [create, delete, deletecollection, get, list, patch, update, watch]
-  - apiGroups: [fiber.dev]
-    resources: [fiberpools/scale]
-    verbs: [get, patch, update]
-  - apiGroups: [fiber.dev]
-    resources: [fiberpools/status]
-    verbs: [get]
-  # A master reads the credentials of its pool by name.
+    verbs: [create, delete, get, list, patch, watch]
+  # A master makes the credentials of its pool itself. It may read no Secret: for a pool that is somebody else's, give it
+  # the right to get that pool's one by name (docs/fiberpools.md).
   - apiGroups: [""]
     resources: [secrets]
-    verbs: [get]
-  # A master renews a Lease, so that its pool is not kept for a program that is gone.
+    verbs: [create]
+  # A master renews a Lease, so that its pool is not kept for a program that is gone. What it made goes with the pool.
   - apiGroups: [coordination.k8s.io]
     resources: [leases]
-    verbs: [create, delete, get, patch, update]
+    verbs: [create, get, patch, update]
+  # Why a worker ended; and its own pod, whose image and settings its workers take.
   - apiGroups: [""]
-    resources: [events, pods]
+    resources: [pods]
     verbs: [get, list, watch]
-  - apiGroups: [""]
-    resources: [pods/log]
-    verbs: [get]
 viewer:
   - apiGroups: [fiber.dev]
     resources: [fiberpools]

@@ -1,4 +1,6 @@
-"""Whether a master uses the pool: what may be taken from it, and what becomes of it without one."""
+"""Whether a master uses the pool: what may be taken from it, what becomes of it without one, and
+how long one that asks for nothing holds it.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ class Attachment:
     """Set while ``alive`` is False."""
     due: float | None = None
     """When the grace of a lost master ends, if it has not ended."""
-    unseen: bool = False
-    """There is no Lease of that name and never was, as far as anybody knows."""
+    missing: bool = False
+    """There is no Lease of that name, and it is too soon to call the master lost."""
     gone: bool = False
     """The grace is over and this process itself found the Lease expired: ``onLost`` applies."""
 
@@ -46,21 +48,46 @@ def judge(pool: FiberPool, lease: plans.LeaseVerdict, now: float) -> Attachment:
     if master.lease_name is None or lease.unreadable:
         return Attachment(attached=True, alive=None)
     before = _condition(pool)
-    if before is not None and before.status == "Unknown":
-        before = None
-    if lease.missing and before is None:
-        return Attachment(attached=True, alive=None, unseen=True)
     alive = lease.alive
-    if alive is None and before is not None:
+    if alive is None and before is not None and before.status != "Unknown":
         alive = before.status == "True"
     if alive is not False:
-        return Attachment(attached=True, alive=alive)
+        return Attachment(attached=True, alive=alive, missing=lease.missing)
     since = _lost_since(pool, before, now)
     due = since + master.lost_grace_seconds
     if now < due:
         return Attachment(attached=True, alive=False, lost_since=since, due=due)
     gone = lease.alive is False
     return Attachment(attached=not gone, alive=False, lost_since=since, gone=gone)
+
+
+@dataclass(frozen=True)
+class Idleness:
+    """A master that asks for no workers, where ``spec.idle`` says how long that may last."""
+
+    since: float | None = None
+    """None: it asks for some, there is none, or nobody minds."""
+    due: float | None = None
+    """When it has been forgotten, if it has not yet."""
+
+    @property
+    def forgotten(self) -> bool:
+        """It has asked for nothing for so long that it does not hold minReplicas any more."""
+        return self.since is not None and self.due is None
+
+
+def idleness(pool: FiberPool, attachment: Attachment, now: float) -> Idleness:
+    """What the spec and the status say of the master's wishes.
+
+    One that is lost is not idle: ``onLost`` says what follows.
+    """
+    idle, master = pool.spec.idle, pool.spec.master
+    if idle is None or master is None or pool.spec.replicas or attachment.alive is False:
+        return Idleness()
+    same = pool.status.master_epoch == master.epoch
+    since = (past(pool.status.idle_since, now) if same else None) or float(math.floor(now))
+    due = since + idle.timeout_seconds
+    return Idleness(since, due if now < due else None)
 
 
 def _lost_since(pool: FiberPool, before: Condition | None, now: float) -> float:

@@ -247,10 +247,10 @@ def _master_unknown(pool: FiberPool, outlook: Outlook) -> Finding:
 
 def _scaling_limited(pool: FiberPool) -> Finding:
     kind, spec = ConditionType.SCALING_LIMITED, pool.spec
-    if spec.replicas is not None and spec.replicas > spec.max_replicas:
+    if spec.replicas > spec.max_replicas:
         message = f"{spec.replicas} workers are asked for and maxReplicas is {spec.max_replicas}"
         return Finding(kind, "True", Reason.ABOVE_MAXIMUM, message)
-    if spec.replicas is not None and spec.replicas < spec.min_replicas:
+    if 0 < spec.replicas < spec.min_replicas:  # nobody who asks for none is told that some are
         message = f"{spec.replicas} workers are asked for and minReplicas is {spec.min_replicas}"
         return Finding(kind, "True", Reason.BELOW_MINIMUM, message)
     return Finding(kind, "False", Reason.WITHIN_BOUNDS)

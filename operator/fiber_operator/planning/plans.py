@@ -53,15 +53,13 @@ class Obstacle:
 class LeaseVerdict:
     """What the operator's own monotonic clock says of the master's Lease.
 
-    ``masters.py`` makes one for each pool whose ``spec.master.leaseName`` is set, anew for each
-    epoch.  After a restart of the operator ``alive`` is None until the Lease is seen to change
+    ``lease_monitor.py`` makes one for each pool whose ``spec.master.leaseName`` is set, anew for
+    each epoch.  After a restart of the operator ``alive`` is None until the Lease is seen to change
     (True) or a whole duration passes without a change (False).  A Lease that does not exist is one
-    that does not change; ``attachment.judge`` tells one that is gone from one that never was.
+    that does not change.
     """
 
     alive: bool | None = None
-    holder: str = ""
-    """``spec.holderIdentity`` of the Lease, for messages; may be empty."""
     missing: bool = False
     """There is no Lease of that name."""
     unreadable: str = ""

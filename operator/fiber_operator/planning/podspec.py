@@ -2,8 +2,8 @@
 
 What the user's template says wins, field by field, and what it says in a way that makes no sense
 is passed on: the API server's complaint about it is better than one of ours.  Only these are not
-the template's to say: the name, the owner, Fiber's labels, no finalizer, and ``restartPolicy:
-Never``.
+the template's to say: the name (the agent's variable of it included), the owner, Fiber's labels, no
+finalizer, and ``restartPolicy: Never``.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _pod(pool: FiberPool, name: str, address: str, revision: str) -> dict[str, A
     _secure(spec)
     for container in _containers(spec, "containers"):
         if container.get("name") == pool.spec.worker_container:
-            _equip(pool, spec, container, name, address)
+            _equip(pool, spec, container, name, address, revision)
     return {
         **_others(template, _POD),
         "apiVersion": "v1",
@@ -116,9 +116,10 @@ def _metadata(
         },
         "ownerReferences": [owner_reference(pool)],
     }
-    if annotations := template.get("annotations"):
-        metadata["annotations"] = annotations
-    return metadata
+    annotations = template.get("annotations") or {}
+    if isinstance(annotations, Mapping):
+        annotations = {**names.ANNOTATIONS_KEEP_NODE, **annotations}
+    return {**metadata, "annotations": annotations}
 
 
 def _others(document: Mapping[str, Any], known: frozenset[str]) -> dict[str, Any]:
@@ -180,16 +181,21 @@ def _secure_container(container: dict[str, Any], *, root_is_welcome: bool) -> No
 
 
 def _equip(
-    pool: FiberPool, spec: dict[str, Any], container: dict[str, Any], name: str, address: str
+    pool: FiberPool,
+    spec: dict[str, Any],
+    container: dict[str, Any],
+    name: str,
+    address: str,
+    revision: str,
 ) -> None:
     _default(container, "terminationMessagePolicy", "FallbackToLogsOnError")
-    _add_environment(pool, container, name, address)
+    _add_environment(pool, container, name, address, revision)
     projected = {
         "defaultMode": 0o444,  # by any user that the image runs as; no other container has it
         "sources": [
             {
                 "secret": {
-                    "name": names.secret_name(pool.metadata.name),
+                    "name": pool.credentials_secret,
                     "items": [{"key": k, "path": path} for k, path in names.AGENT_FILES.items()],
                 }
             }
@@ -203,10 +209,14 @@ def _equip(
         _mount(spec, container, {"name": _TMP_VOLUME, "emptyDir": {}}, _TMP, read_only=False)
 
 
-def _add_environment(pool: FiberPool, container: dict[str, Any], name: str, address: str) -> None:
+def _add_environment(
+    pool: FiberPool, container: dict[str, Any], name: str, address: str, revision: str
+) -> None:
     own = container.get("env")
     if own is not None and not isinstance(own, list):
         return
+    # An agent by another name than its pod's could never be released.
+    own = [v for v in own or () if not (isinstance(v, Mapping) and v.get("name") == names.ENV_NAME)]
     master = pool.spec.master
     grace = master.lost_grace_seconds if master else _LOST_GRACE
     ours = {
@@ -217,11 +227,14 @@ def _add_environment(pool: FiberPool, container: dict[str, Any], name: str, addr
         names.ENV_NAMESPACE: pool.metadata.namespace,
         names.ENV_PROCESSES: str(pool.spec.processes_per_pod),
         names.ENV_LOST_GRACE: str(grace),
+        names.ENV_TEMPLATE_HASH: revision,
     }
+    uid = {"fieldRef": {"apiVersion": "v1", "fieldPath": "metadata.uid"}}
     taken = {text(variable.get("name")) for variable in items(own)}
     # Ours first, so that the user's may refer to them.
-    added = [{"name": key, "value": value} for key, value in ours.items() if key not in taken]
-    container["env"] = added + list(own or ())
+    added: list[dict[str, Any]] = [{"name": key, "value": value} for key, value in ours.items()]
+    added.append({"name": names.ENV_UID, "valueFrom": uid})
+    container["env"] = [variable for variable in added if variable["name"] not in taken] + own
 
 
 def _mount(

@@ -95,12 +95,12 @@ def _masters(situation: Situation) -> Iterator[Problem]:
     if attachment.lost_since is not None:
         message = wording.master_lost(pool, attachment.lost_since, memory.master)
         yield situation.problem(Reason.MASTER_LOST, message)
-    if attachment.unseen:
+    if attachment.missing:
         severity = situation.severity(Reason.LEASE_NOT_FOUND)
         message = wording.no_lease(pool)
         yield situation.problem(Reason.LEASE_NOT_FOUND, message, severity=severity)
     if pool.spec.master and memory.master.unreadable:
-        message = setbacks.with_lease(pool.spec.master, memory.master.unreadable)
+        message = setbacks.with_lease(pool, memory.master.unreadable)
         yield situation.problem(Reason.FORBIDDEN, message, severity="Warning")
     if pool.spec.master and memory.address and _families_differ(pool, memory.address):
         message = wording.wrong_family(pool, memory.address)

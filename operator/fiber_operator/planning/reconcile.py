@@ -34,7 +34,7 @@ from typing import Any
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
 from fiber_operator.planning import cut_off, failures, problems, revisions, scaling, status, wording
-from fiber_operator.planning.attachment import judge
+from fiber_operator.planning.attachment import idleness, judge
 from fiber_operator.planning.conditions import Counts, Outlook
 from fiber_operator.planning.documents import items, mapping, text
 from fiber_operator.planning.plans import Deletion, Event, Memory, Obstacle, Plan
@@ -103,6 +103,7 @@ class _Planner:
         pods = [p if p.template_hash else replace(p, template_hash=self._hash) for p in pods]
         self._pods = [self._fairly_judged(pod) for pod in pods]
         self._attachment = judge(pool, memory.master, now)
+        self._idleness = idleness(pool, self._attachment, now)
         lost = cut_off.find(pool, [pod for pod in self._pods if pod.live], memory)
         self._pods = cut_off.outdated(self._pods, lost, attached=self._attachment.attached)
         self._ends = pool.metadata.deletion_timestamp is not None
@@ -120,8 +121,7 @@ class _Planner:
 
     def plan(self) -> Plan:
         """The whole of it."""
-        master = self._spec.master
-        if master and self._attachment.gone and master.on_lost == "Delete" and not self._ends:
+        if self._attachment.gone and self._spec.on_lost == "Delete" and not self._ends:
             return self._delete_pool()
         if not self._ends:
             self._delete()
@@ -194,14 +194,20 @@ class _Planner:
         )
 
     def _wanted(self) -> int:
-        master, attachment = self._spec.master, self._attachment
-        if self._spec.suspend:
+        attachment = self._attachment
+        if self._spec.suspend or self._idleness.forgotten:
             return 0
-        if master is None or master.on_lost != "ScaleToMin" or not attachment.grace_is_over:
+        if self._spec.on_lost != "ScaleToMin" or not attachment.grace_is_over:
             return self._pool.wanted
         floor = self._spec.min_replicas
         # Not yet confirmed by this process: keep what there is.
         return floor if attachment.gone else min(self._pool.wanted, max(floor, len(self._live)))
+
+    @property
+    def _floor(self) -> int:
+        """How many minReplicas keeps of those that the master does not want."""
+        spec, forgotten = self._spec, self._idleness.forgotten
+        return spec.min_replicas if spec.replicas < spec.min_replicas and not forgotten else 0
 
     @property
     def _accepted(self) -> bool:
@@ -231,8 +237,8 @@ class _Planner:
 
     def _is_orphaned(self) -> bool:
         """Its master is lost and what follows from that has not happened yet."""
-        master, attachment = self._spec.master, self._attachment
-        if master is None or master.on_lost == "Retain":
+        attachment = self._attachment
+        if self._spec.on_lost == "Retain":
             return False
         return attachment.alive is False and not attachment.gone
 
@@ -242,8 +248,13 @@ class _Planner:
         spec, attached = self._spec, self._attachment.attached
         if spec.suspend:
             self._take(self._live + self._ended, Reason.SUSPENDED)
-        release = set(spec.scale_down.release)
-        self._take([p for p in self._live + self._ended if p.name in release], Reason.RELEASED)
+        released = scaling.released_to_delete(
+            self._live + self._ended,
+            spec.scale_down.release,
+            floor=self._floor,
+            template_hash=self._hash,
+        )
+        self._take(released, Reason.RELEASED)
         late = [pod for pod in self._late if pod.name in self._record.counted]
         self._take(late, Reason.STARTUP_TIMEOUT, guarded=True)
         if self._accepted and self._may_create:
@@ -353,6 +364,7 @@ class _Planner:
             address=self._memory.address,
             led=self._memory.led,
             credentials=self._memory.credentials,
+            idle_since=self._idleness.since,
             template_hash=self._hash,
             now=self._now,
         )
@@ -385,6 +397,7 @@ class _Planner:
             self._account.again,
             self._now + NEXT_ROUND if self._postponed else None,
             self._attachment.due,
+            self._idleness.due,
             self._refused,
             self._record.waits_until(self._spec.failure_policy, self._now),
             *(self._next_inspection(pod) for pod in self._silent()[:1]),

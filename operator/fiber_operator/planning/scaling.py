@@ -81,6 +81,21 @@ def excess_to_delete(
     return candidates[: max(0, excess)]
 
 
+def released_to_delete(
+    pods: Sequence[PodView], released: Collection[str], *, floor: int, template_hash: str
+) -> list[PodView]:
+    """Pods that the master has released, but for those that would be made anew at once.
+
+    A new worker in the place of an idle one would be as idle, and released in turn: the last
+    ``floor`` live ones stay.  Those of an older template go, for that is how it is updated.
+    """
+    named = [pod for pod in pods if pod.name in released]
+    current = [pod for pod in named if pod.live and pod.template_hash == template_hash]
+    others = [pod for pod in named if pod not in current]
+    live = sum(pod.live for pod in pods) - sum(pod.live for pod in others)
+    return others + expendable(current, template_hash)[: max(0, live - floor)]
+
+
 @dataclass(frozen=True)
 class Trial:
     """How many more pods of a template may be there now."""

@@ -6,7 +6,7 @@ Whatever cannot be asked or done is told in the pool's status; silence would loo
 from __future__ import annotations
 
 from fiber_api.names import Reason
-from fiber_api.v1alpha1 import Master
+from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.answers import ApiError, Invalid, Refused
 from fiber_operator.planning.plans import Obstacle
 from fiber_operator.planning.wording import quoted
@@ -71,11 +71,12 @@ def with_list(error: ApiError) -> Obstacle:
     return Obstacle(Reason.API_UNAVAILABLE, message)
 
 
-def with_lease(master: Master, words: str) -> str:
+def with_lease(pool: FiberPool, words: str) -> str:
     """Nobody can tell whether the master is alive."""
+    lease = pool.spec.master.lease_name if pool.spec.master else None
     return (
         f"The operator may not get leases, so that nobody sees whether the master renews the Lease "
-        f"{master.lease_name}{quoted(words)}. Until then onLost ({master.on_lost}) is never applied"
+        f"{lease}{quoted(words)}. Until then onLost ({pool.spec.on_lost}) is never applied"
         f", and a pool whose master is gone stays. {_RIGHTS}"
     )
 

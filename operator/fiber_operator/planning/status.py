@@ -34,6 +34,7 @@ def describe(
     address: str | None,
     led: bool,
     credentials: bool | None,
+    idle_since: float | None,
     template_hash: str,
     now: float,
 ) -> FiberPoolStatus:
@@ -42,7 +43,7 @@ def describe(
     found = conditions(pool, outlook, now)
     epoch = master.epoch if master and led else 0
     leads_to = names.address_of(master.host, master.port) if master else None
-    secret = names.secret_name(pool.metadata.name) if credentials else None
+    secret = pool.credentials_secret if credentials else None
     return FiberPoolStatus(
         observed_generation=pool.metadata.generation,
         phase=phase(pool, found, outlook),
@@ -56,6 +57,7 @@ def describe(
         endpoint=names.endpoint_of(address) if address else before.endpoint,
         master=leads_to if led else before.master,
         master_epoch=max(epoch, before.master_epoch or 0) or None,
+        idle_since=idle_since,
         credentials_secret=before.credentials_secret if credentials is None else secret,
         template_hash=template_hash,
         proven_template_hash=record.proven,

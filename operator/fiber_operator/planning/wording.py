@@ -301,29 +301,30 @@ def master_lost(pool: FiberPool, since: float, lease: LeaseVerdict) -> str:
     """A Lease that is not renewed."""
     master = pool.spec.master
     assert master is not None
-    who = f" by {lease.holder}" if lease.holder else ""
-    what = f"was not renewed{who} for {master.lease_duration_seconds} s"
+    what = "was not there" if lease.missing else "was not renewed"
     end = format_time(since + master.lost_grace_seconds)
     return (
-        f"The Lease {master.lease_name} {'does not exist any more' if lease.missing else what}: "
+        f"The Lease {master.lease_name} {what} for {master.lease_duration_seconds} s: "
         f"the master at {_whereabouts(master)} has ended or cannot reach the API server. "
-        f"{_FATE[master.on_lost].format(end=end)} Start it again to go on with this pool."
+        f"{_FATE[pool.spec.on_lost].format(end=end)} Start it again to go on with this pool."
     )
 
 
 def no_lease(pool: FiberPool) -> str:
-    """A Lease that never was."""
+    """A Lease that is not there yet, or not any more."""
     master = pool.spec.master
     assert master is not None
     return (
         f"There is no Lease {master.lease_name} in this namespace, so nobody can tell whether the "
-        f"master at {_whereabouts(master)} is alive, and onLost does not apply. Create it and "
-        "renew it, or correct spec.master.leaseName; without leaseName the master is not checked."
+        f"master at {_whereabouts(master)} is alive. If it is not there for "
+        f"{master.lease_duration_seconds} s, that master counts as lost. Create it and renew it, "
+        "or correct spec.master.leaseName; without leaseName the master is not checked."
     )
 
 
 def _whereabouts(master: Master) -> str:
-    return f"{names.address_of(master.host, master.port)} (epoch {master.epoch})"
+    where = names.address_of(master.host, master.port)
+    return f"{where} ({master.identity}, epoch {master.epoch})"
 
 
 _FATE = {

@@ -14,13 +14,13 @@ from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
 from fiber_operator.cluster import PODS, Cluster, Unavailable
-from fiber_operator.lease import Guard, NotHolder
+from fiber_operator.leader_election import LeaderElector, NotLeader
 
 NAMESPACE, NAME, SECONDS = "fiber-system", "fiber-operator", 15
 
 
 class Operators:
-    """Guards of operators that share one Lease."""
+    """Electors of operators that share one Lease."""
 
     def __init__(self, api: KubernetesApi) -> None:
         self.api = api
@@ -31,10 +31,10 @@ class Operators:
 
     def start(
         self, identity: str, api: KubernetesApi | None = None, seconds: float = SECONDS
-    ) -> Guard:
+    ) -> LeaderElector:
         door = Cluster(configuration(api or self.api), connections=2)
         self._doors.append(door)
-        guard = Guard(
+        elector = LeaderElector(
             door,
             namespace=NAMESPACE,
             name=NAME,
@@ -43,8 +43,8 @@ class Operators:
             on_change=lambda held: self.told.append((identity, held)),
             wall_clock=self.store.unix_now,
         )
-        self._tasks[identity] = asyncio.ensure_future(guard.run())
-        return guard
+        self._tasks[identity] = asyncio.ensure_future(elector.run())
+        return elector
 
     async def kill(self, identity: str) -> None:
         task = self._tasks.pop(identity)
@@ -95,13 +95,13 @@ async def until(condition: Callable[[], bool], within: float = 120) -> float:
 
 @played
 async def test_the_first_one_acts_at_once_and_goes_on(found: Operators) -> None:
-    guard = found.start("a")
-    await until(lambda: guard.held, 1)
-    guard.require()
+    elector = found.start("a")
+    await until(lambda: elector.is_leader, 1)
+    elector.require()
     assert found.lease()["holderIdentity"] == "a"
     for _ in range(100):
         await asyncio.sleep(1)
-        assert guard.held
+        assert elector.is_leader
     assert found.told == [("a", True)]
     assert found.lease()["leaseTransitions"] == 0
 
@@ -109,58 +109,58 @@ async def test_the_first_one_acts_at_once_and_goes_on(found: Operators) -> None:
 @played
 async def test_before_it_is_known_nobody_acts(found: Operators) -> None:
     found.api.down = True
-    guard = found.start("a")
+    elector = found.start("a")
     await asyncio.sleep(60)
-    assert not guard.held
-    with pytest.raises(NotHolder, match="does not hold the Lease fiber-operator"):
-        guard.require()
+    assert not elector.is_leader
+    with pytest.raises(NotLeader, match="does not hold the Lease fiber-operator"):
+        elector.require()
 
 
 @played
 async def test_the_second_one_waits_for_ever(found: Operators) -> None:
     first = found.start("a")
-    await until(lambda: first.held)
+    await until(lambda: first.is_leader)
     second = found.start("b")
     for _ in range(100):
         await asyncio.sleep(1)
-        assert (first.held, second.held) == (True, False)
+        assert (first.is_leader, second.is_leader) == (True, False)
     assert second.why == "a holds it"
 
 
 @played
 async def test_a_lease_that_is_given_up_is_taken_at_once(found: Operators) -> None:
     first = found.start("a")
-    await until(lambda: first.held)
+    await until(lambda: first.is_leader)
     second = found.start("b")
     await asyncio.sleep(5)
     first.resign()
-    assert not first.held
+    assert not first.is_leader
     await found.kill("a")
     await first.release()
-    assert await until(lambda: second.held) < 3
+    assert await until(lambda: second.is_leader) < 3
     assert found.lease()["leaseTransitions"] == 1
 
 
 @played
 async def test_the_lease_of_one_that_died_is_taken_when_it_has_run_out(found: Operators) -> None:
     first = found.start("a")
-    await until(lambda: first.held)
+    await until(lambda: first.is_leader)
     second = found.start("b")
     await asyncio.sleep(7)
     await found.kill("a")
     died = now()
-    await until(lambda: second.held)
+    await until(lambda: second.is_leader)
     assert SECONDS - 5 <= now() - died <= SECONDS + 3
-    assert not first.held
+    assert not first.is_leader
 
 
 @played
 async def test_a_container_that_was_restarted_goes_on_at_once(found: Operators) -> None:
     first = found.start("pod-1")
-    await until(lambda: first.held)
+    await until(lambda: first.is_leader)
     await found.kill("pod-1")
     again = found.start("pod-1")
-    assert await until(lambda: again.held) < 1
+    assert await until(lambda: again.is_leader) < 1
 
 
 @played
@@ -169,52 +169,52 @@ async def test_who_is_cut_off_stops_before_another_begins(found: Operators) -> N
     way = KubernetesApi(found.store)
     async with way.serving():
         first = found.start("a", way)
-        await until(lambda: first.held)
+        await until(lambda: first.is_leader)
         second = found.start("b")
         await asyncio.sleep(20)
         way.down = True
-        while not second.held:
+        while not second.is_leader:
             assert now() < 100
             await asyncio.sleep(0.25)
-            assert not (first.held and second.held)
+            assert not (first.is_leader and second.is_leader)
         way.down = False
         await asyncio.sleep(30)
-        assert (first.held, second.held) == (False, True)
+        assert (first.is_leader, second.is_leader) == (False, True)
         assert found.told == [("a", True), ("a", False), ("b", True)]
         await found.kill("a")
 
 
 @played
 async def test_an_outage_of_the_api_server_stops_it_for_as_long(found: Operators) -> None:
-    guard = found.start("a")
-    await until(lambda: guard.held)
+    elector = found.start("a")
+    await until(lambda: elector.is_leader)
     found.api.down = True
-    assert SECONDS / 3 < await until(lambda: not guard.held) <= SECONDS * 2 / 3 + 0.5
+    assert SECONDS / 3 < await until(lambda: not elector.is_leader) <= SECONDS * 2 / 3 + 0.5
     await asyncio.sleep(60)
     found.api.down = False
-    assert await until(lambda: guard.held) < 5
+    assert await until(lambda: elector.is_leader) < 5
     assert found.told == [("a", True), ("a", False), ("a", True)]
 
 
 @played
 async def test_a_short_outage_goes_unnoticed(found: Operators) -> None:
-    guard = found.start("a")
-    await until(lambda: guard.held)
+    elector = found.start("a")
+    await until(lambda: elector.is_leader)
     found.api.faults.append(Fault("update", "leases", status=503, times=2))
     for _ in range(60):
         await asyncio.sleep(0.5)
-        assert guard.held
+        assert elector.is_leader
     assert found.told == [("a", True)]
 
 
 @played
 async def test_a_lease_that_another_took_is_lost_at_once(found: Operators) -> None:
-    guard = found.start("a")
-    await until(lambda: guard.held)
+    elector = found.start("a")
+    await until(lambda: elector.is_leader)
     stolen = found.lease() | {"holderIdentity": "thief", "leaseTransitions": 7}
     found.store.merge("leases", NAMESPACE, NAME, {"spec": stolen})
-    assert await until(lambda: not guard.held) <= SECONDS / 3 + 0.5
-    assert await until(lambda: guard.held) <= SECONDS + 3, "the thief never renews it"
+    assert await until(lambda: not elector.is_leader) <= SECONDS / 3 + 0.5
+    assert await until(lambda: elector.is_leader) <= SECONDS + 3, "the thief never renews it"
     assert found.lease()["leaseTransitions"] == 8
 
 
@@ -223,12 +223,12 @@ async def test_a_lease_that_another_took_is_lost_at_once(found: Operators) -> No
 def test_a_renewal_whose_answer_is_lost_is_still_ours(way: Body, times: int) -> None:
     @played
     async def test(found: Operators) -> None:
-        guard = found.start("a")
-        await until(lambda: guard.held)
+        elector = found.start("a")
+        await until(lambda: elector.is_leader)
         found.api.faults.append(Fault("update", "leases", carried_out=True, times=times, **way))
         for _ in range(400):
             await asyncio.sleep(0.1)
-            assert guard.held
+            assert elector.is_leader
         assert found.told == [("a", True)]
 
     test()
@@ -236,20 +236,20 @@ def test_a_renewal_whose_answer_is_lost_is_still_ours(way: Body, times: int) -> 
 
 @played
 async def test_two_that_ask_at_once_do_not_both_get_it(found: Operators) -> None:
-    guards = [found.start(name) for name in "abcd"]
+    electors = [found.start(name) for name in "abcd"]
     for _ in range(200):
         await asyncio.sleep(0.25)
-        assert sum(guard.held for guard in guards) <= 1
-    assert sum(guard.held for guard in guards) == 1
+        assert sum(elector.is_leader for elector in electors) <= 1
+    assert sum(elector.is_leader for elector in electors) == 1
 
 
 @played
 async def test_a_lease_that_is_deleted_is_made_again(found: Operators) -> None:
-    guard = found.start("a")
-    await until(lambda: guard.held)
+    elector = found.start("a")
+    await until(lambda: elector.is_leader)
     found.store.remove("leases", NAMESPACE, NAME)
     await asyncio.sleep(30)
-    assert guard.held
+    assert elector.is_leader
     assert found.lease()["holderIdentity"] == "a"
 
 
@@ -261,8 +261,8 @@ def test_a_lease_that_nobody_holds_is_taken(spec: Body | None) -> None:
     @played
     async def test(found: Operators) -> None:
         found.store.create("leases", NAMESPACE, {"metadata": {"name": NAME}, "spec": spec})
-        guard = found.start("a")
-        assert await until(lambda: guard.held) < 1
+        elector = found.start("a")
+        assert await until(lambda: elector.is_leader) < 1
 
     test()
 
@@ -273,8 +273,8 @@ def test_a_holder_that_says_no_duration_is_given_ours(duration: object) -> None:
     async def test(found: Operators) -> None:
         spec = {"holderIdentity": "other", "leaseDurationSeconds": duration}
         found.store.create("leases", NAMESPACE, {"metadata": {"name": NAME}, "spec": spec})
-        guard = found.start("a")
-        assert SECONDS <= await until(lambda: guard.held) <= SECONDS + 3
+        elector = found.start("a")
+        assert SECONDS <= await until(lambda: elector.is_leader) <= SECONDS + 3
 
     test()
 
@@ -294,24 +294,24 @@ async def test_the_clocks_of_others_do_not_count(found: Operators) -> None:
 
 @played
 async def test_giving_up_what_cannot_be_reached_is_no_error(found: Operators) -> None:
-    guard = found.start("a")
-    await until(lambda: guard.held)
-    guard.resign()
+    elector = found.start("a")
+    await until(lambda: elector.is_leader)
+    elector.resign()
     await found.kill("a")
     found.api.down = True
-    await guard.release()
+    await elector.release()
     found.api.down = False
     assert found.lease()["holderIdentity"] == "a"
 
 
 @played
 async def test_who_has_resigned_never_acts_again(found: Operators) -> None:
-    guard = found.start("a")
-    await until(lambda: guard.held)
-    guard.resign()
+    elector = found.start("a")
+    await until(lambda: elector.is_leader)
+    elector.resign()
     for _ in range(60):
         await asyncio.sleep(1)
-        assert not guard.held
+        assert not elector.is_leader
 
 
 # -- What was begun under a Lease ends before another may begin
@@ -324,11 +324,11 @@ def test_a_write_has_ended_when_another_may_begin(seconds: int) -> None:
     @played
     async def test(found: Operators) -> None:
         asked = now()
-        guard = found.start("a", seconds=seconds)
-        await until(lambda: guard.held, 1)
+        elector = found.start("a", seconds=seconds)
+        await until(lambda: elector.is_leader, 1)
         await found.kill("a")
-        while guard.held:
-            assert now() < now() + guard.require() < asked + seconds
+        while elector.is_leader:
+            assert now() < now() + elector.require() < asked + seconds
             await asyncio.sleep(seconds / 500)
         assert seconds / 2 < now() - asked < seconds
 
@@ -341,19 +341,19 @@ async def test_no_write_is_under_way_when_another_begins(found: Operators) -> No
     way = KubernetesApi(found.store)
     async with way.serving():
         first = found.start("a", way)
-        await until(lambda: first.held)
+        await until(lambda: first.is_leader)
         door = Cluster(configuration(way), connections=4, permit=lambda _: first.require())
         second = found.start("b")
         way.faults += [
             Fault("update", "leases", late=600, times=10**6),
             Fault("create", "pods", late=600, times=10**6),
         ]
-        while first.held:
+        while first.is_leader:
             with pytest.raises(Unavailable):
                 await door.create(PODS, NAMESPACE, {"metadata": {"name": "x"}})
         last = now()
-        assert not second.held
-        await until(lambda: second.held)
+        assert not second.is_leader
+        await until(lambda: second.is_leader)
         assert now() - last > 1
         await found.kill("a")
         await door.close()
@@ -361,41 +361,41 @@ async def test_no_write_is_under_way_when_another_begins(found: Operators) -> No
 
 @played
 async def test_an_answer_that_is_lost_is_no_other_operator(found: Operators) -> None:
-    guard = found.start("a")
-    await until(lambda: guard.held)
+    elector = found.start("a")
+    await until(lambda: elector.is_leader)
     found.api.faults.append(Fault("update", "leases", carried_out=True, times=3))
     for _ in range(120):
         await asyncio.sleep(0.5)
-        assert guard.held
+        assert elector.is_leader
     assert found.told == [("a", True)]
 
 
 @played
 async def test_one_that_lingers_is_waited_for_and_goes_on_at_once(found: Operators) -> None:
     first = found.start("a")
-    await until(lambda: first.held)
+    await until(lambda: first.is_leader)
     second = found.start("b")
     await asyncio.sleep(5)
     first.resign()
     await found.kill("a")
     await first.linger(60)
     again = found.start("a")
-    assert await until(lambda: again.held) < 1
+    assert await until(lambda: again.is_leader) < 1
     again.resign()
     await found.kill("a")
     found.api.faults.append(Fault("update", "leases", status=503))
     await again.linger(60)
-    assert 60 <= await until(lambda: second.held) < 65
+    assert 60 <= await until(lambda: second.is_leader) < 65
 
 
 @played
 async def test_one_that_lingers_takes_nothing_from_the_next_process(found: Operators) -> None:
     """Which counts on all of its time."""
     first = found.start("a")
-    await until(lambda: first.held)
+    await until(lambda: first.is_leader)
     first.resign()
     await found.kill("a")
     again = found.start("a")
-    await until(lambda: again.held)
+    await until(lambda: again.is_leader)
     await first.linger(1)
     assert found.lease()["leaseDurationSeconds"] == SECONDS

@@ -1,7 +1,8 @@
-"""What a pool has beside its pods: the Secret, the Service and its EndpointSlice.
+"""What a pool has beside its pods: the Service, its EndpointSlice, and the Secret.
 
 They are looked at when the operator meets a pool, again every ``LOOK_AGAIN`` seconds, and for as
-long as something is wrong with them; between that, only a new master causes a call.
+long as something is wrong with them; between that, only a new master causes a call.  A Secret that
+``spec.credentialsSecretName`` names is its maker's: the operator does not even read it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ LOOK_AGAIN = 50.0
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Dependents:
     """What was found or made."""
 
     address: str | None
@@ -49,7 +50,7 @@ class Surroundings:
     """Where the EndpointSlice leads."""
     looked: float
     credentials: bool
-    """The Secret is the pool's own and whole."""
+    """The Secret is the pool's own and whole, or it is not the operator's."""
     credentials_made: float = 0.0
     """When the Secret was, as the cluster says; 0.0 where that is not known."""
     failure: ApiError | None = None
@@ -75,14 +76,14 @@ class _Obstructed(Exception):
         self.obstacle = obstacle
 
 
-class Keeper:
+class DependentsReconciler:
     """Makes and mends them.  ``now`` gives unix seconds."""
 
     def __init__(self, cluster: Cluster, now: Callable[[], float]) -> None:
         self._cluster = cluster
         self._now = now
 
-    async def ensure(self, pool: FiberPool, known: Surroundings | None) -> Surroundings:
+    async def ensure(self, pool: FiberPool, known: Dependents | None) -> Dependents:
         """What there is now; ``known`` is what this returned for the pool last time.
 
         What fails is an obstacle and not raised, but for a Conflict: then the next look finds out
@@ -103,7 +104,7 @@ class Keeper:
             whole = False
             steps += [
                 (f"the Service {names.service_name(name)}", self._service),
-                (f"the Secret {names.secret_name(name)}", self._secret),
+                (f"the Secret {pool.credentials_secret}", self._secret),
             ]
         found = await _all(*(self._attempt(pool, *step) for step in steps))
         if len(found) > 1:
@@ -111,7 +112,7 @@ class Keeper:
             whole = found[2].obstacle is None
         led = found[0].obstacle is None
         before = known.master if known is not None else None
-        return Surroundings(
+        return Dependents(
             address,
             tuple(step.obstacle for step in found if step.obstacle is not None),
             pool.spec.master if led else before,
@@ -132,7 +133,9 @@ class Keeper:
             obstacle = setbacks.with_object(error, what)
             return _Found(None, obstacle, error if isinstance(error, Unavailable) else None)
 
-    async def _secret(self, pool: FiberPool) -> str:
+    async def _secret(self, pool: FiberPool) -> str | None:
+        if pool.spec.credentials_secret_name is not None:
+            return None
         now = datetime.datetime.fromtimestamp(self._now(), datetime.UTC)
         name, namespace = names.secret_name(pool.metadata.name), pool.metadata.namespace
 

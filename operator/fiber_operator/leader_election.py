@@ -1,4 +1,4 @@
-"""A Lease as a guard: of several that ask for it, at most one acts.
+"""Leader election by a Lease: of several that ask for it, at most one acts.
 
 Whether somebody else's Lease has run out is judged by this process's monotonic clock, from when it
 last saw the Lease change; clocks of different machines are never compared.  The holder counts its
@@ -36,11 +36,11 @@ TRIES = 2
 log = logging.getLogger(__name__)
 
 
-class NotHolder(Exception):
+class NotLeader(Exception):
     """This operator does not hold a Lease (any more) without which it may not change anything."""
 
 
-class Guard:
+class LeaderElector:
     """Gets and keeps the Lease.  ``on_change`` is called with whether this operator may act."""
 
     def __init__(
@@ -77,7 +77,7 @@ class Guard:
         """Who else holds the Lease, as far as is known."""
 
     @property
-    def held(self) -> bool:
+    def is_leader(self) -> bool:
         """Whether this operator may act now."""
         return self._clock() < self._until
 
@@ -86,10 +86,10 @@ class Guard:
         return self._asked + HELD_SHARE * self._seconds
 
     def require(self) -> float:
-        """The seconds that a write may last which begins now; NotHolder if none may begin."""
+        """The seconds that a write may last which begins now; NotLeader if none may begin."""
         now = self._clock()
         if now >= self._until:
-            raise NotHolder(f"this operator does not hold the Lease {self._name}: {self.why}")
+            raise NotLeader(f"this operator does not hold the Lease {self._name}: {self.why}")
         return self._asked + WRITTEN_SHARE * self._seconds - now
 
     async def run(self) -> None:
@@ -135,7 +135,7 @@ class Guard:
         """Ask for the Lease, or renew it; returns the seconds until the next step is due."""
         started = self._clock()
         try:
-            if self._lease is None or not self.held:
+            if self._lease is None or not self.is_leader:
                 self._lease = await self._read()
             try:
                 await self._ask(started)
@@ -147,7 +147,7 @@ class Guard:
         except Conflict:
             self._lose("another operator wrote the Lease")
         except ApiError as error:
-            # The time that the last renewal gave goes on; after that, ``held`` is false.
+            # The time that the last renewal gave goes on; after that, ``is_leader`` is false.
             self.why = str(error)
             self._failures += 1
         return self._pause()
@@ -162,13 +162,13 @@ class Guard:
                 self._asked, self.why = started, ""
 
     def _pause(self) -> float:
-        if self.held and not self.why:
+        if self.is_leader and not self.why:
             pause = RENEW_SHARE * self._seconds
         elif self._failures:
             pause = min(RETRY_SHARE * self._seconds, 2.0 ** min(self._failures - 1, 10))
         else:
             pause = min(RETRY_SHARE * self._seconds, LONGEST_RETRY)
-        if self.held:
+        if self.is_leader:
             # Not beyond the moment at which it lapses, so that it is told of in time.
             pause = min(pause, max(self._until - self._clock(), 0.0) + 0.001)
         return pause
@@ -228,9 +228,9 @@ class Guard:
         self._asked, self.why = float("-inf"), why
 
     def _tell(self) -> None:
-        if self.held == self._told:
+        if self.is_leader == self._told:
             return
-        self._told = self.held
+        self._told = self.is_leader
         if self._told:
             log.info("this operator acts now", extra=about(reason="LeaseHeld"))
         else:

@@ -1,0 +1,169 @@
+"""Whether the masters of the pools are alive, judged by their Leases.
+
+A master is alive while its Lease changes.  One watch hears of all of them, by the label that they
+carry (``handlers.py``); a Lease is read only when its master is new and twice before the master is
+called lost, since a watch may be late or broken.  So a thousand masters that are well cost no
+requests.
+
+Only this process's monotonic clock counts, and only time in which the Lease could be had: while
+the API server cannot be reached a master cannot renew its Lease either.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from fiber_operator.cluster import LEASES, ApiError, Cluster, Gone, Refused
+from fiber_operator.logs import about
+from fiber_operator.planning.documents import mapping, text
+from fiber_operator.planning.plans import LeaseVerdict
+from fiber_operator.turns import Key
+
+CONFIRMED_AFTER = 1 / 3
+"""Of the duration: how long a Lease that was read and had not changed may take to, before its
+master is lost.  The SDK renews as often, so that one that could not for a while has its turn."""
+RECHECK = 60.0
+"""Seconds after which the Lease of a lost master is read again."""
+AT_ONCE = 8
+"""Leases that are read at the same time."""
+
+log = logging.getLogger(__name__)
+
+
+class MasterLease(NamedTuple):
+    """What is watched: one master of a pool.  Another epoch is another master."""
+
+    name: str
+    epoch: int
+    seconds: float
+
+
+@dataclass
+class _Watched:
+    lease: MasterLease
+    changed: float
+    """When the Lease was first seen to be as it is."""
+    due: float
+    """When it is to be read."""
+    version: str | None = None
+    """Its resourceVersion; empty: there is no such Lease, None: nobody has looked."""
+    doubted: bool = False
+    """A read has found it unchanged for the whole duration."""
+    verdict: LeaseVerdict = field(default_factory=LeaseVerdict)
+
+    def begin_anew(self, now: float) -> None:
+        """The whole duration is the master's again."""
+        self.changed, self.due, self.doubted = now, now + self.lease.seconds, False
+
+
+class LeaseMonitor:
+    """Watches the Leases that pools name and tells when a verdict changes."""
+
+    def __init__(self, cluster: Cluster, on_change: Callable[[Key], None]) -> None:
+        self._cluster = cluster
+        self._on_change = on_change
+        self._watched: dict[Key, _Watched] = {}
+        self._pools: dict[tuple[str, str], set[Key]] = {}
+        """By the namespace and the name of the Lease."""
+        self._wake = asyncio.Event()
+
+    def follow(self, key: Key, lease: MasterLease | None) -> LeaseVerdict:
+        """Watch this master of the pool from now on (None: none) and say what is known of it."""
+        watched = self._watched.get(key)
+        if watched is not None and watched.lease == lease:
+            return watched.verdict
+        if watched is not None:
+            self._forget(key, watched)
+        if lease is not None:
+            self._watched[key] = _Watched(lease, self._now(), self._now())
+            self._pools.setdefault((key.namespace, lease.name), set()).add(key)
+            self._wake.set()
+        return LeaseVerdict()
+
+    def heard(self, namespace: str, name: str, version: str) -> None:
+        """The watch says what a Lease's resourceVersion is now; empty: it was deleted."""
+        for key in tuple(self._pools.get((namespace, name), ())):
+            self._see(key, self._watched[key], version)
+
+    async def run(self) -> None:
+        """Read the Leases of which nothing is heard, until cancelled."""
+        while True:
+            self._wake.clear()
+            due = [key for key, watched in self._watched.items() if watched.due <= self._now()]
+            for start in range(0, len(due), AT_ONCE):
+                await asyncio.gather(*(self._read(key) for key in due[start : start + AT_ONCE]))
+            soonest = min((watched.due for watched in self._watched.values()), default=None)
+            try:
+                async with asyncio.timeout_at(soonest):
+                    await self._wake.wait()
+            except TimeoutError:
+                pass  # one is due
+
+    def _forget(self, key: Key, watched: _Watched) -> None:
+        del self._watched[key]
+        place = key.namespace, watched.lease.name
+        self._pools[place].discard(key)
+        if not self._pools[place]:
+            del self._pools[place]
+
+    async def _read(self, key: Key) -> None:
+        watched = self._watched.get(key)
+        if watched is None:
+            return
+        late = self._now() - watched.due > watched.lease.seconds * CONFIRMED_AFTER
+        try:
+            lease = await self._cluster.read(LEASES, key.namespace, watched.lease.name)
+            version = text(mapping(lease, "metadata").get("resourceVersion"))
+        except Gone:
+            version = ""  # judged like one that does not change: it may be made yet
+        except ApiError as error:
+            log.warning("the master's Lease cannot be read: %s", error, extra=about(*key))
+            watched.begin_anew(self._now())
+            if isinstance(error, Refused):
+                watched.version = None
+                self._conclude(key, watched, LeaseVerdict(unreadable=error.message))
+            return
+        if self._watched.get(key) is not watched or self._see(key, watched, version):
+            return
+        if late and watched.verdict.alive is not False:
+            # This process was stopped, or busy: what did not reach it meanwhile says nothing.
+            watched.begin_anew(self._now())
+        else:
+            self._find_unchanged(key, watched)
+
+    def _see(self, key: Key, watched: _Watched, version: str) -> bool:
+        """Whether the Lease is not as it was.
+
+        To find it is no sign of life, for it may be that of a master that died long ago.
+        """
+        before, watched.version = watched.version, version
+        if version == before:
+            return False
+        alive = watched.verdict.alive
+        if before is None or version:
+            watched.begin_anew(self._now())
+            alive = None if before is None else True
+        self._conclude(key, watched, LeaseVerdict(alive, missing=not version))
+        return True
+
+    def _find_unchanged(self, key: Key, watched: _Watched) -> None:
+        now, seconds = self._now(), watched.lease.seconds
+        if now - watched.changed < seconds:
+            watched.due = watched.changed + seconds
+        elif not watched.doubted:
+            watched.doubted, watched.due = True, now + seconds * CONFIRMED_AFTER
+        else:
+            watched.due = now + max(RECHECK, seconds)
+            self._conclude(key, watched, LeaseVerdict(alive=False, missing=not watched.version))
+
+    def _conclude(self, key: Key, watched: _Watched, verdict: LeaseVerdict) -> None:
+        if watched.verdict != verdict:
+            watched.verdict = verdict
+            self._on_change(key)
+
+    def _now(self) -> float:
+        return asyncio.get_running_loop().time()
