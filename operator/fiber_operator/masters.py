@@ -16,7 +16,7 @@ from typing import NamedTuple
 from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Gone, Refused
 from fiber_operator.logs import about
 from fiber_operator.planning.plans import LeaseVerdict
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 LOOKS = 3
 """Looks within one duration; the SDK renews as often."""

@@ -16,7 +16,7 @@ from fakes.world import configuration
 from fiber_operator.cluster import Cluster
 from fiber_operator.masters import Masters, Term
 from fiber_operator.planning.plans import LeaseVerdict
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 ES = Key("team", "es")
 TERM = Term("lease", 1, 30.0)
