@@ -56,7 +56,9 @@ class Metrics:
         self.pools: dict[Key, PoolSample] = {}
         self.registry.register(_Pools(self.pools))
         ProcessCollector(registry=self.registry)
-        self._reconciles = self._counter("reconciles", "Reconciles of pools, by outcome.", "outcome")
+        self._reconciles = self._counter(
+            "reconciles", "Reconciles of pools, by outcome.", "outcome"
+        )
         self._reconcile_seconds = self._histogram("reconcile_duration", "Length of a reconcile.")
         self._requests = self._counter(
             "api_requests", "Calls of the API server.", "verb", "resource", "code"
