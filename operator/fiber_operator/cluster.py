@@ -19,7 +19,7 @@ from kubernetes.aio.client.configuration import Configuration
 from kubernetes.aio.client.rest import RESTClientObject
 
 from fiber_api import names
-from fiber_operator.answers import (
+from fiber_operator.api_errors import (
     ApiError,
     Body,
     Conflict,

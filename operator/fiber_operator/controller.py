@@ -1,8 +1,8 @@
-"""One look at one pool: read, plan, act.
+"""One reconcile of one pool: read, plan, act.
 
 Nothing that an event said is used: the pool and its pods are read anew, from the API server's own
-store.  Every step may be the last one before this process dies, and any may fail; the next look
-goes on from what there is.
+store.  Every step may be the last one before this process dies, and any may fail; the next
+reconcile goes on from what there is.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
-from fiber_operator import inspection
-from fiber_operator.acting import Actor, Look, State
+from fiber_operator import pod_events
+from fiber_operator.apply import Applier, State, Work
 from fiber_operator.cluster import PODS, POOLS, ApiError, Body, Cluster, Gone, TooMany, Unavailable
 from fiber_operator.creation import Creator
 from fiber_operator.dependents import DependentsReconciler
@@ -25,12 +25,12 @@ from fiber_operator.leader_election import NotLeader
 from fiber_operator.lease_monitor import LeaseMonitor, MasterLease
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics, PoolSample
-from fiber_operator.planning import reconcile, setbacks
+from fiber_operator.planning import error_conditions, reconcile
 from fiber_operator.planning.documents import mapping, text, whole
 from fiber_operator.planning.plans import Memory, Plan
 from fiber_operator.planning.pods import PodView, observe
 from fiber_operator.planning.pods import State as Life
-from fiber_operator.turns import Key, Turn
+from fiber_operator.workqueue import Key, Result
 
 LIST_SHARE = 2.0
 """A pool rests for this many times as long as the list of its pods took: what it does meanwhile
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 
 class Controller:
-    """Looks at pools.  One look at a pool at a time; different pools at the same time."""
+    """Reconciles pools.  One at a time of a pool; different pools at the same time."""
 
     def __init__(
         self,
@@ -59,12 +59,14 @@ class Controller:
         self._lease_monitor = lease_monitor
         self._metrics = metrics
         self._dependents = DependentsReconciler(cluster, now)
-        self._actor = Actor(cluster, creator=creator, recorder=recorder, metrics=metrics, now=now)
+        self._applier = Applier(
+            cluster, creator=creator, recorder=recorder, metrics=metrics, now=now
+        )
         self._now = now
         self._states: dict[Key, State] = {}
 
     def is_news(self, key: Key, uid: str, generation: int) -> bool:
-        """Whether a look would see a spec that the last one did not; our own status is none."""
+        """Whether a reconcile would see another spec than the last one; our own status is none."""
         state = self._states.get(key)
         return state is None or state.uid != uid or state.generation != generation
 
@@ -73,58 +75,58 @@ class Controller:
         for key in list(self._states):
             self._drop(key)
 
-    async def look(self, key: Key) -> Turn:
-        """Look at the pool and do what is to be done; never raises what the API server causes."""
+    async def reconcile(self, key: Key) -> Result:
+        """Work at the pool and do what is to be done; never raises what the API server causes."""
         started = time.perf_counter()
-        outcome, turn = "error", Turn(failed=True)
+        outcome, result = "error", Result(failed=True)
         try:
-            turn = await self._look(key)
-            outcome = "gone" if turn.forget else "incomplete" if turn.failed else "ok"
+            result = await self._reconcile(key)
+            outcome = "gone" if result.forget else "incomplete" if result.failed else "ok"
         except NotLeader:
             # Whoever acts now looks at every pool when it begins.
-            outcome, turn = "not_leader", Turn()
+            outcome, result = "not_leader", Result()
         except ApiError as error:
             outcome = type(error).__name__.lower()
             log.warning("%s", error, extra=about(*key, reason=error.reason or outcome))
             rest = error.retry_after if isinstance(error, TooMany) else 0.0
-            turn = Turn(failed=True, rest=rest)
+            result = Result(failed=True, rest=rest)
         finally:
             self._metrics.reconciled(outcome, time.perf_counter() - started)
-        return turn
+        return result
 
-    async def _look(self, key: Key) -> Turn:
+    async def _reconcile(self, key: Key) -> Result:
         try:
             document = await self._cluster.read(POOLS, *key)
         except Gone:
             self._drop(key)
-            return Turn(forget=True)
+            return Result(forget=True)
         uid = text(mapping(document, "metadata").get("uid"))
         if not uid:
             raise Unavailable("the answer has no uid", what=f"get fiberpools {key.name}")
         state = self._states.get(key)
         if state is None or state.uid != uid:
             state = self._states[key] = State(uid)
-        # Events about this very spec, our own status among them, are no news while this look lasts.
+        # Events about this very spec, our own status among them, are no news while this lasts.
         state.generation = whole(mapping(document, "metadata").get("generation"))
         try:
-            turn = await self._look_at(key, document, state)
+            result = await self._reconcile_document(key, document, state)
         except BaseException:
             state.generation = -1
             raise
-        if turn.failed:
+        if result.failed:
             state.generation = -1
-        return turn
+        return result
 
-    async def _look_at(self, key: Key, document: Body, state: State) -> Turn:
+    async def _reconcile_document(self, key: Key, document: Body, state: State) -> Result:
         try:
             pool = FiberPool.read(document)
         except InvalidPool as error:
-            return await self._look_at_unreadable(key, document, state, error)
-        return await self._look_at_readable(key, document, pool, state)
+            return await self._reconcile_unreadable(key, document, state, error)
+        return await self._reconcile_readable(key, document, pool, state)
 
-    async def _look_at_readable(
+    async def _reconcile_readable(
         self, key: Key, document: Body, pool: FiberPool, state: State
-    ) -> Turn:
+    ) -> Result:
         if pool.unread:
             complaint = "; ".join(pool.unread)
             log.warning("the status was damaged: %s", complaint, extra=about(*key, uid=state.uid))
@@ -136,23 +138,23 @@ class Controller:
         plan = self._plan(key, pool, pods, state)
         if plan.inspect:
             # Not added to: what is not asked about any more may be over.
-            state.warnings = await inspection.warnings(self._cluster, key, plan.inspect, pods)
+            state.warnings = await pod_events.warnings(self._cluster, key, plan.inspect, pods)
         if plan.dry_run:
-            failure = await self._actor.dry_run(pool, plan, state) or failure
+            failure = await self._applier.dry_run(pool, plan, state) or failure
         if plan.inspect or plan.dry_run:
             plan = self._plan(key, pool, pods, state)
-        turn = await self._act(Look(key, document, pool, state, plan, rested), pods)
+        result = await self._act(Work(key, document, pool, state, plan, rested), pods)
         if failure is not None:
             raise failure
-        return turn
+        return result
 
-    async def _look_at_unreadable(
+    async def _reconcile_unreadable(
         self, key: Key, document: Body, state: State, error: InvalidPool
-    ) -> Turn:
+    ) -> Result:
         container = text(mapping(document, "spec").get("workerContainer"))
         pods, rested = await self._pods(key, document, state, container or names.WORKER_CONTAINER)
         plan = reconcile.plan_unreadable(document, pods, error.errors, self._now())
-        return await self._act(Look(key, document, None, state, plan, rested), pods)
+        return await self._act(Work(key, document, None, state, plan, rested), pods)
 
     async def _pods(
         self, key: Key, document: Body, state: State, container: str
@@ -168,8 +170,8 @@ class Controller:
                 selector=f"{names.LABEL_POOL_UID}={state.uid}",
             )
         except ApiError as error:
-            plan = reconcile.plan_blind(document, setbacks.with_list(error), self._now())
-            await self._actor.act(Look(key, document, None, state, plan))
+            plan = reconcile.plan_blind(document, error_conditions.with_list(error), self._now())
+            await self._applier.apply(Work(key, document, None, state, plan))
             raise
         ended = clock()
         rested = ended + min(LIST_SHARE * (ended - started), LONGEST_REST)
@@ -195,18 +197,23 @@ class Controller:
         )
         return reconcile.plan(pool, pods, memory, self._now())
 
-    async def _act(self, look: Look, pods: Sequence[PodView]) -> Turn:
-        plan, dependents = look.plan, look.state.dependents
-        status = mapping(look.document, "status") if plan.status is None else plan.status
-        self._metrics.pools[look.key] = PoolSample.of(status, pods)
-        turn = await self._actor.act(look)
-        wishes = [turn.again, plan.again - self._now() if plan.again is not None else None]
+    async def _act(self, work: Work, pods: Sequence[PodView]) -> Result:
+        plan, dependents = work.plan, work.state.dependents
+        status = mapping(work.document, "status") if plan.status is None else plan.status
+        self._metrics.pools[work.key] = PoolSample.of(status, pods)
+        result = await self._applier.apply(work)
+        wishes = [
+            result.requeue_after,
+            plan.requeue_at - self._now() if plan.requeue_at is not None else None,
+        ]
         if dependents is not None and dependents.obstacles:
             wishes.append(OBSTRUCTED)
         again = min((max(wish, 0.0) for wish in wishes if wish is not None), default=None)
-        rest = look.rested - asyncio.get_running_loop().time()
+        rest = work.rested - asyncio.get_running_loop().time()
         lull = bool(plan.create or plan.delete) or any(pod.state is not Life.READY for pod in pods)
-        return dataclasses.replace(turn, again=again, rest=max(turn.rest, rest), lull=lull)
+        return dataclasses.replace(
+            result, requeue_after=again, rest=max(result.rest, rest), lull=lull
+        )
 
     def _drop(self, key: Key) -> None:
         self._states.pop(key, None)

@@ -32,7 +32,7 @@ from fiber_operator.cluster import (
     Resource,
     Unavailable,
 )
-from fiber_operator.planning import manifests, setbacks
+from fiber_operator.planning import error_conditions, manifests
 from fiber_operator.planning.documents import items, mapping, seconds, text
 from fiber_operator.planning.plans import Obstacle
 
@@ -130,7 +130,7 @@ class DependentsReconciler:
         except Conflict:
             raise
         except ApiError as error:
-            obstacle = setbacks.with_object(error, what)
+            obstacle = error_conditions.with_object(error, what)
             return _Found(None, obstacle, error if isinstance(error, Unavailable) else None)
 
     async def _secret(self, pool: FiberPool) -> str | None:

@@ -22,7 +22,7 @@ from fiber_operator.cluster import EVENTS, ApiError, Body, Cluster
 from fiber_operator.leader_election import NotLeader
 from fiber_operator.logs import about
 from fiber_operator.planning.plans import Event
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 WINDOW = 600.0
 PAUSE = 30.0

@@ -27,8 +27,8 @@ import kopf
 from fiber_api import names
 from fiber_operator.cluster import LEASES, Configuration, open_session
 from fiber_operator.planning.documents import mapping, text, whole
-from fiber_operator.turns import Key
 from fiber_operator.watches import Answered, tracing
+from fiber_operator.workqueue import Key
 
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 30.0

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 from fiber_operator.claims import Claims
 from fiber_operator.leader_election import LeaderElector
 from fiber_operator.resync import Resync
-from fiber_operator.turns import Queue
 from fiber_operator.watches import Watches
+from fiber_operator.workqueue import Queue
 
 LATE_TURN = 30.0
-"""Seconds that a pool may wait for its turn while the operator is ready."""
+"""Seconds that a pool may wait for its reconcile while the operator is ready."""
 STUCK_TURN = 600.0
-"""Longer than any turn takes whose every call ends by its timeout."""
+"""Longer than any reconcile takes whose every call ends by its timeout."""
 STUCK_QUEUE = 120.0
-"""Seconds without the end of any turn while a pool waits."""
+"""Seconds without the end of any reconcile while a pool waits."""
 MISSED_RESYNCS = 2.5
 
 
@@ -43,10 +43,10 @@ class Health:
         now, statistics = self.clock(), self.queue.statistics()
         wrong = []
         if statistics.longest_run > STUCK_TURN:
-            wrong.append(f"the turn of a pool takes {statistics.longest_run:.0f} s so far")
+            wrong.append(f"the reconcile of a pool takes {statistics.longest_run:.0f} s so far")
         if min(statistics.longest_wait, statistics.since_last_end) > STUCK_QUEUE:
             wrong.append(
-                f"no turn has ended for {statistics.since_last_end:.0f} s, and pools are waiting"
+                f"no reconcile has ended for {statistics.since_last_end:.0f} s, and pools wait"
             )
         tried = now - (self._began if self.resync.tried is None else self.resync.tried)
         # One list takes as long as its timeout where the API server is silent.
@@ -67,5 +67,5 @@ class Health:
             wrong.append(f"the pools were last listed {now - self.resync.succeeded:.0f} s ago")
         wrong += self.watches.wrong()
         if statistics.longest_wait > LATE_TURN:
-            wrong.append(f"a pool waits for its turn for {statistics.longest_wait:.0f} s")
+            wrong.append(f"a pool waits for its reconcile for {statistics.longest_wait:.0f} s")
         return wrong

@@ -21,7 +21,7 @@ from fiber_operator.cluster import LEASES, ApiError, Cluster, Gone, Refused
 from fiber_operator.logs import about
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.plans import LeaseVerdict
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 CONFIRMED_AFTER = 1 / 3
 """Of the duration: how long a Lease that was read and had not changed may take to, before its

@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Iterator
 
-from fiber_operator.answers import Body, Unavailable
+from fiber_operator.api_errors import Body, Unavailable
 
 _SPACE = re.compile(r"[ \t\n\r]*")
 _decode = json.JSONDecoder().raw_decode

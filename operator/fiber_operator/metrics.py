@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 
 from fiber_operator.planning.documents import items, mapping, text, whole
 from fiber_operator.planning.pods import PodView
-from fiber_operator.turns import Key, Statistics
+from fiber_operator.workqueue import Key, Statistics
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
@@ -22,7 +22,7 @@ _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 @dataclass(frozen=True)
 class PoolSample:
-    """What is shown of one pool, as of its last turn."""
+    """What is shown of one pool, as of its last reconcile."""
 
     desired: int = 0
     pods: Mapping[str, int] = field(default_factory=dict)
@@ -56,8 +56,10 @@ class Metrics:
         self.pools: dict[Key, PoolSample] = {}
         self.registry.register(_Pools(self.pools))
         ProcessCollector(registry=self.registry)
-        self._reconciles = self._counter("reconciles", "Turns of pools, by outcome.", "outcome")
-        self._reconcile_seconds = self._histogram("reconcile_duration", "Length of a turn.")
+        self._reconciles = self._counter(
+            "reconciles", "Reconciles of pools, by outcome.", "outcome"
+        )
+        self._reconcile_seconds = self._histogram("reconcile_duration", "Length of a reconcile.")
         self._requests = self._counter(
             "api_requests", "Calls of the API server.", "verb", "resource", "code"
         )
@@ -86,15 +88,15 @@ class Metrics:
         """Show the queue, and whether this operator acts, as they are when Prometheus asks."""
         gauges: dict[tuple[str, str], Callable[[], float]] = {
             ("pools", "Pools that the operator knows."): lambda: statistics().known,
-            ("queue_waiting", "Pools whose turn is due."): lambda: statistics().waiting,
-            ("queue_running", "Turns under way."): lambda: statistics().running,
+            ("queue_waiting", "Pools whose reconcile is due."): lambda: statistics().waiting,
+            ("queue_running", "Reconciles under way."): lambda: statistics().running,
             (
                 "queue_longest_wait_seconds",
-                "How long the turn is overdue that waits longest.",
+                "How long the reconcile is overdue that waits longest.",
             ): lambda: statistics().longest_wait,
             (
                 "queue_longest_run_seconds",
-                "Length so far of the longest turn under way.",
+                "Length so far of the longest reconcile under way.",
             ): lambda: statistics().longest_run,
             ("lease_held", "1 while this operator acts."): lambda: float(held()),
         }
@@ -102,7 +104,7 @@ class Metrics:
             Gauge(f"fiber_operator_{name}", meaning, registry=self.registry).set_function(value)
 
     def reconciled(self, outcome: str, seconds: float) -> None:
-        """A turn ended."""
+        """A reconcile ended."""
         self._reconciles.labels(outcome).inc()
         self._reconcile_seconds.observe(seconds)
 

@@ -40,8 +40,8 @@ from fiber_operator.metrics import Metrics
 from fiber_operator.resync import Resync
 from fiber_operator.server import serving
 from fiber_operator.settings import Settings
-from fiber_operator.turns import Key, Queue, Turn
 from fiber_operator.watches import Watches
+from fiber_operator.workqueue import Key, Queue, Result
 
 DRAIN = 5.0
 """Seconds that a call under way may take to end when the operator is to stop."""
@@ -130,7 +130,7 @@ class Program:
             on_change=self._lease_changed,
             wall_clock=self._now,
         )
-        self.queue = Queue(self._look, concurrency=settings.concurrency)
+        self.queue = Queue(self._reconcile, concurrency=settings.concurrency)
         self.claims = Claims(
             claim_cluster,
             release=f"{settings.namespace}/{settings.lease}",
@@ -216,12 +216,12 @@ class Program:
         self.metrics.watched("leases")
         self.lease_monitor.heard(namespace, lease, version)
 
-    async def _look(self, key: Key) -> Turn:
+    async def _reconcile(self, key: Key) -> Result:
         if not self.elector.is_leader:
-            return Turn()
+            return Result()
         if self.claims.holds(key.namespace):
-            return await self.controller.look(key)
-        return Turn(forget=self.claims.refused(key.namespace) and await self._is_gone(key))
+            return await self.controller.reconcile(key)
+        return Result(forget=self.claims.refused(key.namespace) and await self._is_gone(key))
 
     async def _is_gone(self, key: Key) -> bool:
         try:
@@ -229,7 +229,7 @@ class Program:
         except Gone:
             return True
         except ApiError:
-            pass  # the next turn finds it out
+            pass  # the next reconcile finds it out
         return False
 
     def _require(self, namespace: str) -> float:

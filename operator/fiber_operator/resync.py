@@ -1,4 +1,4 @@
-"""Every pool gets a turn at least this often, whatever the watches brought or did not bring."""
+"""Every pool is reconciled at least this often, whatever the watches bring or do not bring."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from fiber_operator.answers import complaint
+from fiber_operator.api_errors import complaint
 from fiber_operator.cluster import POOLS, ApiError, Body, Cluster
 from fiber_operator.logs import about
 from fiber_operator.planning.documents import mapping, text
-from fiber_operator.turns import Key, Queue
+from fiber_operator.workqueue import Key, Queue
 
 RETRY = 5.0
 """Seconds until the pools are listed again where that failed."""
@@ -86,7 +86,7 @@ class Resync:
             return
         self.failures.pop(where, None)
         self._answered.set()
-        # Those of which no event told that they are gone get a last turn that finds it out.
+        # Those of which no event told that they are gone get a last reconcile that finds it out.
         known = [key for key in self._queue.known() if namespace in (None, key.namespace)]
         for key in dict.fromkeys([key for key in found if key is not None] + known):
             self._queue.add(key)

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import aiohttp
 
-from fiber_operator.answers import ApiError, complaint, document_of
+from fiber_operator.api_errors import ApiError, complaint, document_of
 from fiber_operator.cluster import LEASES, PODS, POOLS
 
 Answered = Callable[[str, ApiError | None], None]

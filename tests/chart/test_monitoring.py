@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from chart.helm import CHART, NAMESPACE, Helm, Manifest, kinds, named
 from fiber_operator.metrics import Metrics, PoolSample
-from fiber_operator.turns import Key, Statistics
+from fiber_operator.workqueue import Key, Statistics
 
 ON: dict[str, Any] = {
     "metrics": {

@@ -21,7 +21,7 @@ from fiber_api.certificates import make_pool_certificates
 from fiber_operator.cluster import Configuration
 from fiber_operator.program import Program
 from fiber_operator.settings import Settings
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 NAMESPACE = "team"
 POLL = 0.5

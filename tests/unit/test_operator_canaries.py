@@ -41,11 +41,11 @@ def test_canaries_on_their_way_are_joined_by_as_many_again_and_again() -> None:
     pool = make_pool(replicas=20)
     three = pulling(range(3), age=29)
     made = plan_of(pool, *three)
-    assert (made.create, made.again) == (0, NOW + 1)
+    assert (made.create, made.requeue_at) == (0, NOW + 1)
     assert plan_of(pool, *three, now=NOW + 1).create == 3
     six = [*pulling(range(3), age=59), *pulling(range(3, 6), age=29)]
     made = plan_of(pool, *six)
-    assert (made.create, made.again) == (0, NOW + 1)
+    assert (made.create, made.requeue_at) == (0, NOW + 1)
     assert plan_of(pool, *six, now=NOW + 1).create == 6
     assert plan_of(pool, *pulling(range(12), age=31)).create == 8
 

@@ -13,7 +13,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Call
 from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, Test, World, a_world
-from fiber_operator.turns import LULL
+from fiber_operator.workqueue import LULL
 from unit.operator_objects import MASTER
 
 

@@ -11,7 +11,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Call, Fault
 from fakes.world import NAMESPACE, World, a_world, played
 from fiber_api import names
-from fiber_operator import acting
+from fiber_operator import apply
 from unit.operator_objects import MASTER
 
 OWN_LEASE = names.operator_lease_name("fiber-operator")
@@ -385,7 +385,7 @@ async def test_a_master_that_attaches_during_a_long_deletion_keeps_who_is_left(
     a_master_attaches_after("delete", "pods", world, replicas=200)
     world.edit(replicas=10)
     await world.settled(60)
-    assert 0 < len(world.deleted()) <= acting.DELETIONS
+    assert 0 < len(world.deleted()) <= apply.DELETIONS
 
 
 @played

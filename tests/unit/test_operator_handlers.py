@@ -23,7 +23,7 @@ from fiber_operator.cluster import ApiError, Configuration, load_configuration
 from fiber_operator.handlers import Watcher
 from fiber_operator.program import Program
 from fiber_operator.settings import Settings
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 ES = Key(NAMESPACE, "es")
 Notice = tuple[Key, str, int | None]

@@ -16,7 +16,7 @@ from fakes.world import configuration
 from fiber_operator.cluster import Cluster
 from fiber_operator.lease_monitor import LeaseMonitor, MasterLease
 from fiber_operator.planning.plans import LeaseVerdict
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 ES = Key("team", "es")
 LEASE = MasterLease("lease", 1, 30.0)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fiber_operator.answers import Unavailable
+from fiber_operator.api_errors import Unavailable
 from fiber_operator.listing import Listing
 
 Json = st.recursive(

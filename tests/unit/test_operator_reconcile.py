@@ -116,8 +116,8 @@ def test_a_refusal_is_tried_again_after_a_while() -> None:
     refused = Refusal(template_hash(pool), 403, "exceeded quota: q", NOW, count=4)
     first = plan_of(pool, refusal=refused)
     assert first.create == 0
-    assert first.again is not None
-    assert NOW + 25 < first.again <= NOW + 30
+    assert first.requeue_at is not None
+    assert NOW + 25 < first.requeue_at <= NOW + 30
     assert plan_of(pool, refusal=refused, now=NOW + 31).create == 3
     other = Refusal("an older template", 422, "no", NOW)
     assert plan_of(pool, refusal=other).create == 3
@@ -320,7 +320,7 @@ def test_what_is_too_much_for_the_status_is_deleted_in_rounds(
     pool = tried(replicas=12, update={"strategy": "Recreate"})
     old = outdated(*(running(number) for number in range(12)))
     made = plan_of(pool, *old)
-    assert (gone(made), made.create, made.again) == (names(*range(5)), 0, NOW + 1)
+    assert (gone(made), made.create, made.requeue_at) == (names(*range(5)), 0, NOW + 1)
     pool = with_plan(pool, made)
     assert pool.status.failures.deleting == tuple(f"-{number:010x}" for number in range(5))
     lingering = [terminating(pod) for pod in old[:5]]
@@ -393,7 +393,7 @@ def test_a_worker_that_does_not_get_ready_in_time_failed() -> None:
     pool = tried(replicas=1, failurePolicy=policy)
     late, in_time = running(1, age=61, ready=False), running(1, age=60, ready=False)
     early = plan_of(pool, in_time)
-    assert (early.delete, early.again) == ((), NOW + 1)
+    assert (early.delete, early.requeue_at) == ((), NOW + 1)
     made = plan_of(pool, late)
     assert gone(made) == names(1)
     assert made.delete[0].resource_version is not None
@@ -423,7 +423,7 @@ EXPIRED, UNKNOWN = plans.LeaseVerdict(alive=False), plans.LeaseVerdict(alive=Non
 def test_a_lost_master_keeps_its_workers_for_its_grace(on_lost: str) -> None:
     pool = tried(replicas=3, master=LEASED, onLost=on_lost)
     made = plan_of(pool, running(1), running(2), master=EXPIRED)
-    assert (made.delete, made.delete_pool, made.again) == ((), False, NOW + 60)
+    assert (made.delete, made.delete_pool, made.requeue_at) == ((), False, NOW + 60)
     assert made.create == (1 if on_lost == "Retain" else 0)
     status = with_plan(pool, made).status
     assert status.problems[0].reason == "MasterLost"
@@ -451,7 +451,7 @@ def test_a_loss_at_a_time_that_cannot_be_shortens_no_grace(ago: float) -> None:
     born = pool.metadata.model_copy(update={"creation_timestamp": NOW - 1000})
     pool = pool.model_copy(update={"metadata": born})
     made = plan_of(pool, running(1), master=EXPIRED)
-    assert (made.delete_pool, made.again) == (False, NOW + 60)
+    assert (made.delete_pool, made.requeue_at) == (False, NOW + 60)
     told = with_plan(pool, made)
     assert not plan_of(told, running(1), master=EXPIRED, now=NOW + 59).delete_pool
     assert plan_of(told, running(1), master=EXPIRED, now=NOW + 60).delete_pool
@@ -493,7 +493,7 @@ def test_a_new_master_that_is_lost_too_has_a_grace_of_its_own() -> None:
     newer = pool.spec.master.model_copy(update={"epoch": 2})
     pool = pool.model_copy(update={"spec": pool.spec.model_copy(update={"master": newer})})
     first = plan_of(pool, running(1), master=EXPIRED)
-    assert (first.delete_pool, first.again) == (False, NOW + 60)
+    assert (first.delete_pool, first.requeue_at) == (False, NOW + 60)
     pool = with_plan(pool, first)
     assert not plan_of(pool, running(1), master=EXPIRED, now=NOW + 59).delete_pool
     assert plan_of(pool, running(1), master=EXPIRED, now=NOW + 60).delete_pool
@@ -516,8 +516,8 @@ def test_events_are_asked_for_where_the_status_of_a_pod_is_silent() -> None:
     told = waiting(3, "ErrImagePull", age=9)
     assert plan_of(pool, young, told).inspect == ()
     made = plan_of(pool, young, old, told)
-    assert (made.inspect, made.again) == ((name_of(2),), NOW + 2)
-    assert plan_of(pool, old, now=NOW + 2).again == NOW + 12
+    assert (made.inspect, made.requeue_at) == ((name_of(2),), NOW + 2)
+    assert plan_of(pool, old, now=NOW + 2).requeue_at == NOW + 12
 
 
 def test_a_settled_pool_is_left_alone() -> None:

@@ -24,8 +24,8 @@ from fakes.world import NAMESPACE, Test, World, a_world
 from fiber_operator.health import Health
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.planning.pods import State
-from fiber_operator.turns import Statistics
 from fiber_operator.watches import Watches
+from fiber_operator.workqueue import Statistics
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -136,13 +136,13 @@ def test_all_is_well() -> None:
 
 def test_a_turn_that_hangs_is_a_reason_for_a_restart() -> None:
     assert Parts(longest_run=599.0).health.alive() == []
-    assert Parts(longest_run=601.0).health.alive() == ["the turn of a pool takes 601 s so far"]
+    assert Parts(longest_run=601.0).health.alive() == ["the reconcile of a pool takes 601 s so far"]
 
 
 def test_a_queue_that_stands_still_is() -> None:
     assert Parts(longest_wait=500.0, since_last_end=10.0).health.alive() == []
     (said,) = Parts(longest_wait=130.0, since_last_end=140.0).health.alive()
-    assert said == "no turn has ended for 140 s, and pools are waiting"
+    assert said == "no reconcile has ended for 140 s, and pools wait"
 
 
 def test_a_resync_that_stands_still_is() -> None:
@@ -163,7 +163,7 @@ def test_a_resync_that_never_began_is() -> None:
 
 
 def test_pools_that_wait_or_are_not_watched_are_not_served() -> None:
-    assert Parts(longest_wait=31.0).health.ready() == ["a pool waits for its turn for 31 s"]
+    assert Parts(longest_wait=31.0).health.ready() == ["a pool waits for its reconcile for 31 s"]
     parts = Parts()
     parts.watches.started(False)
     assert parts.health.ready() == ["nothing is watched: changes are seen late"]

@@ -163,5 +163,5 @@ class Plan:
     network that fails, a probe) stands in the pod's events alone: read those with its
     ``involvedObject.uid``.  If the newest is a Warning, it goes into ``Memory.warnings``; one that
     is followed by a Normal event, as when an image is being pulled at last, is over."""
-    again: float | None = None
+    requeue_at: float | None = None
     """Plan again at this time at the latest, though nothing has happened."""

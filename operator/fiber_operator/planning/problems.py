@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Problem
-from fiber_operator.planning import cut_off, setbacks, wording
+from fiber_operator.planning import cut_off, error_conditions, wording
 from fiber_operator.planning.failed_pods import completed_pods, failed_pods
 from fiber_operator.planning.plans import Refusal
 from fiber_operator.planning.situation import Situation
@@ -100,7 +100,7 @@ def _masters(situation: Situation) -> Iterator[Problem]:
         message = wording.no_lease(pool)
         yield situation.problem(Reason.LEASE_NOT_FOUND, message, severity=severity)
     if pool.spec.master and memory.master.unreadable:
-        message = setbacks.with_lease(pool, memory.master.unreadable)
+        message = error_conditions.with_lease(pool, memory.master.unreadable)
         yield situation.problem(Reason.FORBIDDEN, message, severity="Warning")
     if pool.spec.master and memory.address and _families_differ(pool, memory.address):
         message = wording.wrong_family(pool, memory.address)

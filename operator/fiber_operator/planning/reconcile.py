@@ -141,7 +141,7 @@ class _Planner:
             status=document,
             events=tuple(events(change, told=document is not None)),
             inspect=tuple(self._to_inspect())[:1],
-            again=self._again(found, trial_ends),
+            requeue_at=self._requeue_at(found, trial_ends),
         )
 
     def _delete_pool(self) -> Plan:
@@ -390,7 +390,7 @@ class _Planner:
             age *= 2
         return pod.created + age
 
-    def _again(self, found: Sequence[Problem], trial_ends: float | None) -> float | None:
+    def _requeue_at(self, found: Sequence[Problem], trial_ends: float | None) -> float | None:
         timeout = self._spec.failure_policy.startup_timeout_seconds
         times = [
             trial_ends,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from fiber_operator.cluster import EVENTS, ApiError, Body, Cluster
 from fiber_operator.planning.documents import mapping, seconds, text
 from fiber_operator.planning.pods import PodView
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 _NO_NEWS = frozenset(
     {

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.answers import ApiError, Invalid, Refused
+from fiber_operator.api_errors import ApiError, Invalid, Refused
 from fiber_operator.planning.plans import Obstacle
 from fiber_operator.planning.wording import quoted
 

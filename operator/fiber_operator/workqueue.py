@@ -1,20 +1,20 @@
-"""The queue between what happens and who looks at it: each pool at most once in it.
+"""The queue between what happens and who reconciles it: each pool at most once in it.
 
 However many events name a pool, it waits in the queue once and is worked on by one task at a time;
-what is added meanwhile makes one more turn afterwards.  Three things space the turns of one pool:
+what is added meanwhile makes one more reconcile afterwards.  Three things space those of one pool:
 
-* after a turn it rests as long as the turn's result says, whatever happens;
-* events of pods wait until ``GAP`` seconds after the last turn, so that a thousand events of a
-  pool that is growing are a few turns;
-* a turn that failed is repeated after a while that doubles each time.
+* after a reconcile it rests as long as the reconcile's result says, whatever happens;
+* events of pods wait until ``GAP`` seconds after the last reconcile, so that a thousand events of a
+  pool that is growing are a few reconciles;
+* a reconcile that failed is repeated after a while that doubles each time.
 
-While a pool changes it is also looked at when the events of its pods cease, though it has not
+While a pool changes it is also reconciled when the events of its pods cease, though it has not
 rested: what they led to is in the status at once, and not after a rest that began in the middle of
 it.  The next rest is longer by what this one lacked, and is not shortened.
 
-Pools that are in trouble do not hold up the others.  A turn that lasts, since a webhook hangs for
-instance, hands its place on to the next after ``LONG`` seconds; pools whose last turn failed let
-others go first and never take all places.
+Pools that are in trouble do not hold up the others.  A reconcile that lasts, since a
+webhook hangs for instance, hands its place on to the next after ``LONG`` seconds; pools whose last
+one failed let others go first and never take all places.
 
 Runs in one event loop and reads its clock; nothing here is called from another thread.
 """
@@ -32,8 +32,8 @@ from typing import NamedTuple
 from fiber_operator.logs import about
 
 GAP = 0.5
-"""Seconds between turns that only pods' events asked for: they show in the status within a second,
-and a pool that grows by fifty pods a second costs two lists a second."""
+"""Seconds between reconciles that only pods' events asked for: they show in the status within a
+second, and a pool that grows by fifty pods a second costs two lists a second."""
 LULL = 0.15
 """Seconds without an event after which the events of a pool have ceased."""
 FIRST_BACKOFF = 0.5
@@ -42,11 +42,11 @@ LONGEST_BLOCK = 1.0
 """Seconds for which a failure keeps even new events out."""
 
 LONG = 2.0
-"""Seconds after which a turn waits for somebody rather than works."""
+"""Seconds after which a reconcile waits for somebody rather than works."""
 YIELD = 10.0
-"""Seconds by which a pool whose last turn failed lets others go first."""
+"""Seconds by which a pool whose last reconcile failed lets others go first."""
 CROWD = 4
-"""Turns under way at most, those that wait included, for each that may work."""
+"""Reconciles under way at most, those that wait included, for each that may work."""
 
 log = logging.getLogger(__name__)
 
@@ -62,17 +62,17 @@ class Key(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Turn:
-    """What came out of one look at a pool."""
+class Result:
+    """What came out of one reconcile of a pool."""
 
-    again: float | None = None
-    """Look again after this many seconds though nothing happens."""
+    requeue_after: float | None = None
+    """Reconcile again after this many seconds though nothing happens."""
     rest: float = 0.0
-    """Do not look again for this many seconds whatever happens."""
+    """Do not reconcile again for this many seconds whatever happens."""
     lull: bool = False
-    """Look again, even before it has rested, when events of its pods have come and cease."""
+    """Reconcile again, even before it has rested, when events of its pods have come and cease."""
     failed: bool = False
-    """Look again soon, and later each time."""
+    """Reconcile again soon, and later each time."""
     forget: bool = False
     """There is no such pool."""
 
@@ -80,15 +80,15 @@ class Turn:
 @dataclass
 class _Entry:
     due: float | None = None
-    """When it wants its turn; None: it does not wait."""
+    """When it is due; None: it does not wait."""
     blocked: float = -1e9
-    """No turn before this time, unless events cease."""
+    """No reconcile before this time, unless events cease."""
     rested: float = -1e9
-    """When events of pods bring a turn, at the latest."""
+    """When events of pods bring a reconcile, at the latest."""
     lull: bool = False
     """Whether they bring one before that if they cease."""
     limit: float | None = None
-    """While it waits for that: when its turn comes though they do not cease."""
+    """While it waits for that: when its reconcile comes though they do not cease."""
     owed: float = 0.0
     """What its last rest was shortened by."""
     failures: int = 0
@@ -105,36 +105,36 @@ class Statistics:
     """The queue at one moment."""
 
     waiting: int
-    """Pools whose turn is due and that wait for a free task."""
+    """Pools that are due and wait for a free task."""
     running: int
     known: int
     longest_wait: float
     """Seconds that the one that waits longest is overdue."""
     longest_run: float
-    """Seconds that the longest turn takes so far."""
+    """Seconds that the longest reconcile takes so far."""
     since_last_end: float
-    """Seconds since a turn ended, or since the queue was made."""
+    """Seconds since a reconcile ended, or since the queue was made."""
 
 
 class Queue:
-    """Gives each pool its turns.  ``turn`` is awaited once at a time for a pool."""
+    """Reconciles each pool in its time.  ``reconcile`` is awaited once at a time for a pool."""
 
-    def __init__(self, turn: Callable[[Key], Awaitable[Turn]], *, concurrency: int) -> None:
-        self._turn = turn
+    def __init__(self, reconcile: Callable[[Key], Awaitable[Result]], *, concurrency: int) -> None:
+        self._reconcile = reconcile
         self._concurrency = concurrency
         self._entries: dict[Key, _Entry] = {}
         self._well: _Heap = []
         self._failing: _Heap = []
         self._orders = itertools.count()
         self._tasks: dict[asyncio.Task[None], float] = {}
-        """Turns under way, the oldest first, and since when."""
+        """Reconciles under way, the oldest first, and since when."""
         self._wake = asyncio.Event()
         self._last_end = self._now()
 
     def add(self, key: Key, *, delay: float = 0.0, urgent: bool = False) -> None:
-        """Give ``key`` a turn: after ``delay`` seconds, ``GAP`` after its last, or if urgent now.
+        """Reconcile ``key``: after ``delay`` seconds, ``GAP`` after its last, or if urgent now.
 
-        A turn that it waits for already is brought forward if need be, never put off.
+        A reconcile that it waits for already is brought forward if need be, never put off.
         """
         now = self._now()
         entry = self._entries.setdefault(key, _Entry())
@@ -152,7 +152,7 @@ class Queue:
             self._place(key, entry, due)
 
     async def run(self) -> None:
-        """Give turns until cancelled; then end those under way."""
+        """Reconcile what is due until cancelled; then end what is under way."""
         try:
             while True:
                 self._wake.clear()
@@ -164,7 +164,7 @@ class Queue:
             await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def drain(self, grace: float) -> None:
-        """Start no turn any more and give those under way ``grace`` seconds to end."""
+        """Begin no reconcile any more and give those under way ``grace`` seconds to end."""
         self._concurrency = 0
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=grace)
@@ -221,7 +221,7 @@ class Queue:
         return None
 
     def _open(self) -> list[_Heap]:
-        """From where a turn may begin now."""
+        """From where a reconcile may begin now."""
         now, most = self._now(), self._concurrency
         working = sum(started + LONG > now for started in self._tasks.values())
         if working >= most or len(self._tasks) >= CROWD * most:
@@ -231,7 +231,7 @@ class Queue:
         return [self._well, self._failing]
 
     def _next(self) -> _Heap | None:
-        """Where the one is whose turn it is."""
+        """Where the one is that is to be next."""
         now = self._now()
         due = {
             first[0] + (YIELD if heap is self._failing else 0.0): heap
@@ -247,7 +247,7 @@ class Queue:
             entry.owed = max(0.0, entry.rested - now) if entry.limit is not None else 0.0
             entry.due, entry.limit, entry.order = None, None, -1
             entry.running, entry.rush, entry.lull = now, False, False
-            task = asyncio.create_task(self._take(key, entry), name=f"turn of {key}")
+            task = asyncio.create_task(self._take(key, entry), name=f"reconcile of {key}")
             self._tasks[task] = now
             task.add_done_callback(self._done)
 
@@ -271,28 +271,28 @@ class Queue:
 
     async def _take(self, key: Key, entry: _Entry) -> None:
         try:
-            turn = await self._turn(key)
+            result = await self._reconcile(key)
         except Exception:
             # A fault of this program must not end it: other pools work, and this one may again.
-            log.exception("a turn failed", extra=about(*key, reason="InternalError"))
-            turn = Turn(failed=True)
+            log.exception("a reconcile failed", extra=about(*key, reason="InternalError"))
+            result = Result(failed=True)
         finally:
             entry.running, self._last_end = None, self._now()
-        self._settle(key, entry, turn, self._last_end)
+        self._settle(key, entry, result, self._last_end)
 
-    def _settle(self, key: Key, entry: _Entry, turn: Turn, now: float) -> None:
+    def _settle(self, key: Key, entry: _Entry, result: Result, now: float) -> None:
         wanted = entry.due is not None  # added while it ran
-        if turn.forget and not wanted:
+        if result.forget and not wanted:
             del self._entries[key]
             return
-        entry.failures = entry.failures + 1 if turn.failed else 0
-        entry.blocked = now + turn.rest
-        again = turn.again
-        if turn.failed:
+        entry.failures = entry.failures + 1 if result.failed else 0
+        entry.blocked = now + result.rest
+        again = result.requeue_after
+        if result.failed:
             again = min(LONGEST_BACKOFF, FIRST_BACKOFF * 2 ** min(entry.failures - 1, 10))
             entry.blocked = max(entry.blocked, now + min(again, LONGEST_BLOCK))
         entry.rested = max(now + GAP, entry.blocked) + entry.owed
-        entry.lull = turn.lull and not turn.failed and not entry.owed
+        entry.lull = result.lull and not result.failed and not entry.owed
         if entry.due is not None:
             due, entry.due = entry.due, None
             if entry.lull and not entry.rush:

@@ -26,10 +26,10 @@ from fiber_operator.dependents import Dependents
 from fiber_operator.events import Recorder
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics
-from fiber_operator.planning import manifests, setbacks
+from fiber_operator.planning import error_conditions, manifests
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.plans import Deletion, Event, Obstacle, Plan, Refusal
-from fiber_operator.turns import GAP, Key, Turn
+from fiber_operator.workqueue import GAP, Key, Result
 
 DELETIONS = 50
 """Pods that are deleted at once."""
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class State:
-    """What is remembered of one pool between looks, by uid.  Losing it costs only calls."""
+    """What is remembered of one pool between reconciles, by uid.  Losing it costs only calls."""
 
     uid: str
     dependents: Dependents | None = None
@@ -55,7 +55,7 @@ class State:
     warnings: dict[str, str] = field(default_factory=dict)
     pace: Pace = field(default_factory=Pace)
     generation: int = -1
-    """Of the pool at the last look that did not fail, the one under way included."""
+    """Of the pool at the last reconcile that did not fail, the one under way included."""
 
     @property
     def address(self) -> str | None:
@@ -74,12 +74,14 @@ class State:
     def not_created(self, error: ApiError) -> None:
         """It is not known whether a pod of this template is made."""
         # Of a quota that is counted at the same time, which is nobody's trouble, comes a Conflict.
-        self.creation = None if isinstance(error, Conflict) else setbacks.with_creation(error)
+        self.creation = (
+            None if isinstance(error, Conflict) else error_conditions.with_creation(error)
+        )
 
 
 @dataclass(frozen=True)
-class Look:
-    """One look at a pool, once it is planned what to do."""
+class Work:
+    """What one reconcile of a pool has to do, once it is planned."""
 
     key: Key
     document: Body
@@ -88,11 +90,11 @@ class Look:
     state: State
     plan: Plan
     rested: float = 0.0
-    """When the pool has rested from the list of its pods, by the loop's clock.  No look comes
+    """When the pool has rested from the list of its pods, by the loop's clock.  No reconcile comes
     before, so pods may be changed until then."""
 
 
-class Actor:
+class Applier:
     """Carries out plans.  ``now`` gives unix seconds."""
 
     def __init__(
@@ -128,64 +130,64 @@ class Actor:
             state.accepted, state.refusal, state.creation = plan.template_hash, None, None
         return None
 
-    async def act(self, look: Look) -> Turn:
+    async def apply(self, work: Work) -> Result:
         """Do what is planned; the first error that is not part of the game is raised."""
-        if look.plan.delete_pool:
+        if work.plan.delete_pool:
             try:
-                await self._delete_pool(look)
+                await self._delete_pool(work)
             except ApiError as error:
-                look.state.deletion = setbacks.with_deletion(error)
-                await self._write_status(look)
+                work.state.deletion = error_conditions.with_deletion(error)
+                await self._write_status(work)
                 raise
-            return Turn()
-        await self._write_status(look)
+            return Result()
+        await self._write_status(work)
         # The status says already what they tell of: they would not be planned again.
-        self._tell(look, look.plan.events)
-        return await self._change_pods(look)
+        self._tell(work, work.plan.events)
+        return await self._change_pods(work)
 
-    async def _write_status(self, look: Look) -> None:
-        if look.plan.status is None:
+    async def _write_status(self, work: Work) -> None:
+        if work.plan.status is None:
             return
         # The uid keeps it from a new pool of the same name.  What is written is true whatever has
         # been changed since the pool was read: it names the generation that it is of.
-        patch = {"metadata": {"uid": look.state.uid}, "status": dict(look.plan.status)}
+        patch = {"metadata": {"uid": work.state.uid}, "status": dict(work.plan.status)}
         try:
-            await self._cluster.patch(POOLS, *look.key, patch, "status")
+            await self._cluster.patch(POOLS, *work.key, patch, "status")
         except (Refused, Invalid) as error:
-            event = Event("Warning", Reason.FORBIDDEN, setbacks.with_status(error))
-            self._tell(look, [event])
+            event = Event("Warning", Reason.FORBIDDEN, error_conditions.with_status(error))
+            self._tell(work, [event])
             raise
 
-    async def _delete_pool(self, look: Look) -> None:
-        version = text(mapping(look.document, "metadata").get("resourceVersion"))
+    async def _delete_pool(self, work: Work) -> None:
+        version = text(mapping(work.document, "metadata").get("resourceVersion"))
         try:
             await self._cluster.delete(
-                POOLS, *look.key, uid=look.state.uid, resource_version=version
+                POOLS, *work.key, uid=work.state.uid, resource_version=version
             )
         except (Gone, Conflict):
-            return  # it was changed meanwhile, by its master perhaps; the next look sees
-        self._tell(look, look.plan.events)
+            return  # it was changed meanwhile, by its master perhaps; the next reconcile sees
+        self._tell(work, work.plan.events)
 
-    async def _change_pods(self, look: Look) -> Turn:
-        deleted, as_planned = await self._delete(look)
-        if deleted < len(look.plan.delete):
+    async def _change_pods(self, work: Work) -> Result:
+        deleted, as_planned = await self._delete(work)
+        if deleted < len(work.plan.delete):
             # Of a change an event tells; a pool that changes all the time is not looked at so.
-            return Turn(again=0.0 if as_planned else GAP)
-        turn = await self._create(look)
-        return turn if as_planned else dataclasses.replace(turn, again=0.0)
+            return Result(requeue_after=0.0 if as_planned else GAP)
+        result = await self._create(work)
+        return result if as_planned else dataclasses.replace(result, requeue_after=0.0)
 
-    async def _delete(self, look: Look) -> tuple[int, bool]:
+    async def _delete(self, work: Work) -> tuple[int, bool]:
         """How many of the pods were seen to, and whether each was as the plan had it.
 
         Like creation this stops after a while, so that the status is not out of date for long.
         """
-        key = look.key
-        deletions = sorted(look.plan.delete, key=lambda deletion: deletion.may_work)
+        key = work.key
+        deletions = sorted(work.plan.delete, key=lambda deletion: deletion.may_work)
         clock = asyncio.get_running_loop().time
-        enough, done, as_planned = clock() + _enough(look), 0, True
+        enough, done, as_planned = clock() + _enough(work), 0, True
         while done < len(deletions) and (not done or clock() < enough):
             batch = deletions[done : done + DELETIONS]
-            if batch[-1].may_work and await self._has_changed(look):
+            if batch[-1].may_work and await self._has_changed(work):
                 # A master may have attached since: what was free to go may be at work.
                 batch = [deletion for deletion in batch if not deletion.may_work]
                 deletions = deletions[:done] + batch
@@ -204,19 +206,21 @@ class Actor:
                     failure = failure or result
                 else:
                     self._metrics.deleted(str(deletion.reason))
-            look.state.deletion = None if failure is None else setbacks.with_deletion(failure)
+            work.state.deletion = (
+                None if failure is None else error_conditions.with_deletion(failure)
+            )
             if failure is not None:
                 raise failure
             done += len(batch)
         return done, as_planned
 
-    async def _has_changed(self, look: Look) -> bool:
+    async def _has_changed(self, work: Work) -> bool:
         """Whether the pool is not the one any more that this was planned for."""
         try:
-            document = await self._cluster.read(POOLS, *look.key)
+            document = await self._cluster.read(POOLS, *work.key)
         except Gone:
             return True
-        return _version(document) != _version(look.document)
+        return _version(document) != _version(work.document)
 
     async def _delete_pod(self, namespace: str, deletion: Deletion) -> None:
         await self._cluster.delete(
@@ -227,10 +231,10 @@ class Actor:
             resource_version=deletion.resource_version,
         )
 
-    async def _create(self, look: Look) -> Turn:
-        pool, state, plan, address = look.pool, look.state, look.plan, look.state.address
+    async def _create(self, work: Work) -> Result:
+        pool, state, plan, address = work.pool, work.state, work.plan, work.state.address
         if pool is None or address is None or not plan.create:
-            return Turn()
+            return Result()
         done = await self._creator.create(
             pool.metadata.name,
             pool.metadata.namespace,
@@ -238,24 +242,24 @@ class Actor:
             plan.create,
             plan.batch_limit,
             state.pace,
-            enough=_enough(look),
+            enough=_enough(work),
         )
         if done.names:
             self._metrics.created(len(done.names))
             state.refusal = state.creation = None
-            log.info("created %s", _some(done.names), extra=about(*look.key, uid=state.uid))
+            log.info("created %s", _some(done.names), extra=about(*work.key, uid=state.uid))
         if done.refusal is not None:
             state.refused(plan.template_hash, done.refusal, self._now())
-            return Turn(again=0.0)  # so that the status says it
+            return Result(requeue_after=0.0)  # so that the status says it
         if done.failure is not None:
             state.not_created(done.failure)
-            log.warning("%s", done.failure, extra=about(*look.key, uid=state.uid))
-            return Turn(failed=True, rest=done.wait)
-        return Turn(again=0.0) if len(done.names) < plan.create else Turn()
+            log.warning("%s", done.failure, extra=about(*work.key, uid=state.uid))
+            return Result(failed=True, rest=done.wait)
+        return Result(requeue_after=0.0) if len(done.names) < plan.create else Result()
 
-    def _tell(self, look: Look, events: Sequence[Event]) -> None:
+    def _tell(self, work: Work, events: Sequence[Event]) -> None:
         for event in events:
-            self._recorder.tell(look.key, look.state.uid, event)
+            self._recorder.tell(work.key, work.state.uid, event)
 
 
 def _version(document: Body) -> tuple[object, ...]:
@@ -264,9 +268,9 @@ def _version(document: Body) -> tuple[object, ...]:
     return tuple(metadata.get(key) for key in ("uid", "generation", "deletionTimestamp"))
 
 
-def _enough(look: Look) -> float:
-    """Seconds that may be spent on pods before the next look."""
-    return max(ENOUGH, look.rested - asyncio.get_running_loop().time())
+def _enough(work: Work) -> float:
+    """Seconds that may be spent on pods before the next reconcile."""
+    return max(ENOUGH, work.rested - asyncio.get_running_loop().time())
 
 
 def _some(pods: list[str]) -> str:

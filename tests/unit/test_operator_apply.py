@@ -1,4 +1,4 @@
-"""Pieces of acting that a whole operator shows too rarely: creation and events."""
+"""Pieces of apply that a whole operator shows too rarely: creation and events."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fiber_operator.creation import ENOUGH, Created, Creator, Pace, draw_suffix
 from fiber_operator.events import Recorder
 from fiber_operator.leader_election import NotLeader
 from fiber_operator.planning.plans import Event
-from fiber_operator.turns import Key
+from fiber_operator.workqueue import Key
 
 ES = Key("team", "es")
 
