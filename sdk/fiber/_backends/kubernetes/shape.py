@@ -162,6 +162,6 @@ def _words(resources: Resources) -> list[str]:
 
 
 def quantity(cpus: float) -> str:
-    """CPUs as Kubernetes writes them, to the thousandth above: ``2``, ``500m``."""
-    thousandths = -int(-cpus * 1000 // 1)
+    """CPUs as Kubernetes writes them, to the thousandth: ``2``, ``500m``."""
+    thousandths = max(1, round(cpus * 1000))
     return f"{thousandths}m" if thousandths % 1000 else str(thousandths // 1000)
