@@ -50,7 +50,7 @@ class TestWarnings:
     def test_say_pool_reason_number_and_message(self) -> None:
         (text,) = new_problems(POOL, {}, status(problem("ImagePullError", pods=3)))
         assert text == (
-            "FiberPool 'es-1a2b3c' (namespace team): ImagePullError (3 pods): "
+            "the FiberPool 'es-1a2b3c' in namespace 'team': ImagePullError (3 pods): "
             "what, why, what to do."
         )
 
@@ -87,7 +87,7 @@ class TestFailure:
         assert error is not None
         reason = hopeless["problems"][0]["reason"]
         assert (error.pool, error.namespace, error.reason) == ("es-1a2b3c", "team", reason)
-        assert f"(namespace team): {reason}: what, why, what to do." in str(error)
+        assert f"in namespace 'team': {reason}: what, why, what to do." in str(error)
         assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
     @pytest.mark.parametrize(

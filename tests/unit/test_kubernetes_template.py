@@ -249,29 +249,14 @@ class TestOwnContainer:
         assert own_container(pod, self.MOUNTINFO.replace("main", "gone")) == "proxy"
 
 
-def body() -> dict[str, Any]:
-    master = {
-        "host": "10.0.0.7",
-        "port": 4711,
-        "epoch": 1,
-        "identity": "laptop:12",
-        "leaseName": "fiber-es-1a2b3c",
-    }
-    config = Config(max_pods=50, processes_per_pod=8, idle_timeout=1.5)
-    return fiber_pool_body("es-1a2b3c", pod_template(Shape(), None, ""), config, master)
-
-
 def test_a_fiber_pool_is_one_that_the_operator_can_read() -> None:
-    pool = FiberPool.read(body())
+    config = Config(max_pods=50, processes_per_pod=8, idle_timeout=1.5)
+    body = fiber_pool_body("es-1a2b3c", pod_template(Shape(), None, ""), config)
+    pool = FiberPool.read(body)
+    assert body["metadata"]["labels"] == {names.LABEL_MANAGED_BY: names.SDK_MANAGER}
+    assert pool.metadata.name == "es-1a2b3c"
     assert pool.wanted == 0
     assert pool.spec.max_replicas == 50
     assert pool.spec.processes_per_pod == 8
     assert pool.spec.scale_down.idle_timeout_seconds == 2
-    assert pool.spec.master is not None
-    assert pool.spec.master.port == 4711
-
-
-def test_a_fiber_pool_of_the_programs_own_goes_with_it() -> None:
-    assert body()["metadata"]["labels"] == {names.LABEL_MANAGED_BY: names.SDK_MANAGER}
-    assert body()["spec"]["onLost"] == "Delete"
-    assert body()["spec"]["credentialsSecretName"] == names.secret_name("es-1a2b3c")
+    assert pool.spec.template == pod_template(Shape(), None, "")

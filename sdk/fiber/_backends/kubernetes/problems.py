@@ -21,7 +21,7 @@ class PoolName(NamedTuple):
     namespace: str
 
     def __str__(self) -> str:
-        return f"FiberPool {self.name!r} (namespace {self.namespace})"
+        return f"the FiberPool {self.name!r} in namespace {self.namespace!r}"
 
     def error(self, message: str, reason: str) -> FiberPoolError:
         """An error of this pool."""
