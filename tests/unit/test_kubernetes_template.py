@@ -97,8 +97,8 @@ def worker_of(template: dict[str, Any]) -> dict[str, Any]:
     return dict(worker)
 
 
-def like(shape: Shape = Shape(), pod: dict[str, Any] = POD) -> dict[str, Any]:
-    return pod_template(shape, pod, "main", PYTHON)
+def like(shape: Shape | None = None, pod: dict[str, Any] = POD) -> dict[str, Any]:
+    return pod_template(shape or Shape(), pod, "main", PYTHON)
 
 
 class TestElsewhere:
@@ -205,8 +205,9 @@ class TestResources:
 
 
 class TestTheUsersTemplate:
-    def template(self, spec: dict[str, Any], resources: Resources = Resources()) -> dict[str, Any]:
-        return like(Shape.of(Config(template={"spec": spec})).with_resources(resources))
+    def template(self, spec: dict[str, Any], **wishes: Any) -> dict[str, Any]:
+        shape = Shape.of(Config(template={"spec": spec}))
+        return like(shape.with_resources(Resources(**wishes)))
 
     def test_wins_over_all(self) -> None:
         limits = {"limits": {"memory": "1Gi"}, "requests": None}
@@ -214,7 +215,7 @@ class TestTheUsersTemplate:
             "nodeSelector": {"zone": "b"},
             "containers": [{"name": "worker", "image": "mine:1", "resources": limits}],
         }
-        template = self.template(spec, Resources(memory=512))
+        template = self.template(spec, memory=512)
         assert template["spec"]["nodeSelector"] == {"zone": "b"}
         worker = worker_of(template)
         assert worker["resources"] == {"limits": {"memory": "1Gi"}}
