@@ -135,9 +135,7 @@ class TestSources:
         environ = {"FIBER_TEMPLATE": "cpu.yaml"}
         assert load(environ=environ, directory=str(inner)).template == str(tmp_path / "cpu.yaml")
 
-    def test_a_template_stands_in_pyproject_itself(
-        self, pyproject: Callable[[str], Path]
-    ) -> None:
+    def test_a_template_stands_in_pyproject_itself(self, pyproject: Callable[[str], Path]) -> None:
         pyproject("[tool.fiber.template.spec]\npriorityClassName = 'low'")
         assert load().template == {"spec": {"priorityClassName": "low"}}
 

@@ -109,7 +109,7 @@ class TestElsewhere:
         }
 
     def test_it_is_named_as_charts_and_builds_name_it(self) -> None:
-        assert WORKER_IMAGE == images.WORKER.released(places.CHECKOUT)
+        assert images.WORKER.released(places.CHECKOUT) == WORKER_IMAGE
         values = Path(places.CHECKOUT, "charts/fiber-operator/values.yaml").read_text()
         found = re.search(r"^workerImage:\n(?:  #.*\n)*  repository: (\S+)$", values, re.MULTILINE)
         assert found is not None

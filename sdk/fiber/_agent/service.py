@@ -169,7 +169,8 @@ class _Observed:
     def exited(self, report: ExitReport) -> None:
         """Its last lines, then its end."""
         log = self._capture.finish() if self._capture is not None else ()
-        end = messages.Exited(self._number, self._delivered, *report._replace(log=log))
+        told = report._replace(log=log)[:-2]  # pod and node the master knows better
+        end = messages.Exited(self._number, self._delivered, *told)
         self._service.send(end)
         self._service.forget(self._number)
 
