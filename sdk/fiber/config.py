@@ -178,7 +178,7 @@ class Config:
     namespace: str | None = _key(None, _word("the name of a namespace", _LABEL), fixed=True)
     context: str | None = _key(None, _word("the name of a context", r"\S(.*\S)?"), fixed=True)
     image: str | None = _key(None, _word("the name of an image"), fixed=True)
-    template: str | dict[str, Any] | None = _key(None, _template(), fixed=True)
+    template: str | Mapping[str, Any] | None = _key(None, _template(), fixed=True)
     pool: str | None = _key(None, _pool(), fixed=True)
     processes_per_pod: int = _key(1, _whole(1, 1024), fixed=True)
     max_pods: int = _key(1000, _whole(1, 100_000), fixed=True)

@@ -44,7 +44,7 @@ def pyproject(tmp_path: Path) -> Callable[[str], Path]:
 class TestSources:
     def test_defaults(self) -> None:
         assert load() == Config()
-        assert Config().backend == "local"
+        assert Config().backend == "auto"
         assert Config().retries == 3
         assert Config().lost_after == 15
 
@@ -90,6 +90,14 @@ class TestSources:
             ("FIBER_AGENTS", "8", "agents", 8),
             ("FIBER_START_TIMEOUT", "2.5", "start_timeout", 2.5),
             ("FIBER_LISTEN_HOST", "::1", "listen_host", "::1"),
+            ("FIBER_BACKEND", "Kubernetes", "backend", "kubernetes"),
+            ("FIBER_NAMESPACE", "team-a", "namespace", "team-a"),
+            ("FIBER_IMAGE", "registry.example.com/es:1", "image", "registry.example.com/es:1"),
+            ("FIBER_POOL", "warm", "pool", "warm"),
+            ("FIBER_CONTEXT", "kind kind", "context", "kind kind"),
+            ("FIBER_PROCESSES_PER_POD", "8", "processes_per_pod", 8),
+            ("FIBER_MAX_PODS", "50", "max_pods", 50),
+            ("FIBER_IDLE_TIMEOUT", "5", "idle_timeout", 5.0),
             ("FIBER_LOG_LEVEL", "debug", "log_level", "DEBUG"),
         ],
     )
@@ -108,6 +116,39 @@ class TestSources:
         environ = {"FIBER_RUNTIME_DIRECTORY": str(tmp_path)}
         assert load(environ=environ).runtime_directory == str(tmp_path)
         assert load({"runtime_directory": tmp_path}).runtime_directory == str(tmp_path)
+
+    def test_a_template_is_a_dict_or_a_path(self, tmp_path: Path) -> None:
+        template = {"spec": {"priorityClassName": "low"}}
+        found = load({"template": template}).template
+        assert found == template
+        template["spec"]["priorityClassName"] = "high"
+        assert found == {"spec": {"priorityClassName": "low"}}
+        assert load({"template": tmp_path / "pod.yaml"}).template == str(tmp_path / "pod.yaml")
+
+    def test_a_relative_path_starts_where_it_is_written(
+        self, pyproject: Callable[[str], Path], tmp_path: Path
+    ) -> None:
+        pyproject("[tool.fiber]\ntemplate = 'pods/gpu.yaml'")
+        inner = tmp_path / "inner"
+        inner.mkdir()
+        assert load(directory=str(inner)).template == str(tmp_path / "pods" / "gpu.yaml")
+        environ = {"FIBER_TEMPLATE": "cpu.yaml"}
+        assert load(environ=environ, directory=str(inner)).template == str(tmp_path / "cpu.yaml")
+
+    def test_a_template_stands_in_pyproject_itself(self, pyproject: Callable[[str], Path]) -> None:
+        pyproject("[tool.fiber.template.spec]\npriorityClassName = 'low'")
+        assert load().template == {"spec": {"priorityClassName": "low"}}
+
+    @pytest.mark.parametrize(
+        "entry",
+        [entry for entry in dataclasses.fields(Config) if entry.default is None],
+        ids=lambda entry: entry.name,
+    )
+    def test_none_is_the_default_of_a_key_that_has_no_other(
+        self, entry: dataclasses.Field[object], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv(f"FIBER_{entry.name.upper()}", "/tmp")
+        assert load({entry.name: None}, environ={}) == Config()
 
     def test_what_an_agent_is_told_is_not_configuration(self) -> None:
         environ = dict.fromkeys(config.AGENT_VARIABLES, "x") | {"OTHER": "y"}
@@ -193,6 +234,23 @@ class TestBadValues:
             ("retries", -1, "a whole number of at least 0"),
             ("listen_port", 65536, "a whole number from 0 to 65535"),
             ("listen_host", " ", "a host name or address"),
+            ("listen_host", "two words", "a host name or address"),
+            ("backend", "k8s", "'kubernetes', 'auto'"),
+            ("agents", None, "a whole number of at least 1"),
+            ("namespace", "Team", "the name of a namespace"),
+            ("namespace", "a.b", "the name of a namespace"),
+            ("namespace", "a" * 64, "the name of a namespace"),
+            ("image", "", "the name of an image"),
+            ("image", "two words", "the name of an image"),
+            ("template", "", "the path of a YAML or JSON file with a pod template"),
+            ("template", 3, "or a dict of one"),
+            ("pool", "1st", "the name of a FiberPool"),
+            ("pool", "a" * 51, "the name of a FiberPool"),
+            ("pool", 3, "the name of a FiberPool"),
+            ("context", " ", "the name of a context"),
+            ("processes_per_pod", 0, "a whole number from 1 to 1024"),
+            ("max_pods", 0, "a whole number from 1 to 100000"),
+            ("idle_timeout", 0, "a number of seconds above 0"),
             ("start_timeout", 0, "a number of seconds above 0"),
             ("start_timeout", float("nan"), "a number of seconds above 0"),
             ("start_timeout", float("inf"), "a number of seconds above 0"),

@@ -43,6 +43,7 @@ EXAMPLES = [
     errors.ConfigError("unknown key 'agent'"),
     errors.ConnectionClosed(),
     errors.ConnectionClosed("Worker-1", "killed by SIGSEGV"),
+    errors.FiberPoolError("no quota", pool="es-1", namespace="team", reason="QuotaExceeded"),
     errors.NotInFiber("no Lock yet"),
     errors.StartError("worker 'Worker-1'", "its initializer raised", "ValueError: no", 3),
     errors.TooManyOpenFiles("starting process 'Worker-1'"),
@@ -137,6 +138,42 @@ def test_worker_died_keeps_its_facts() -> None:
 )
 def test_worker_died_gives_advice_by_exit_code(exitcode: int | None, hint: str) -> None:
     assert hint in str(worker_died(exitcode))
+
+
+def died_in_a_pod(reason: str, node: str | None = "node-2") -> errors.WorkerDied:
+    return errors.WorkerDied(
+        task="task 17 (train)",
+        worker="Worker-3",
+        host="es-1a2b3c-0011223344",
+        pid=12,
+        exitcode=-signal.SIGKILL,
+        reason=reason,
+        pod="es-1a2b3c-0011223344",
+        node=node,
+    )
+
+
+def test_worker_died_names_pod_and_node() -> None:
+    error = died_in_a_pod("OOMKilled: its memory limit is 512Mi")
+    assert (error.pod, error.node) == ("es-1a2b3c-0011223344", "node-2")
+    assert "(in pod 'es-1a2b3c-0011223344' on node 'node-2', pid 12)" in str(error)
+    assert "(in pod 'es-1a2b3c-0011223344', pid 12)" in str(died_in_a_pod("Deleted: it is", None))
+    assert (worker_died().pod, worker_died().node) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("reason", "hint"),
+    [
+        ("OOMKilled: its memory limit is 512Mi", "@fiber.meta(memory=)"),
+        ("Evicted: The node was low on resource: memory", "@fiber.meta(memory=, cpu=)"),
+        ("Preempted", "priorityClassName"),
+        ("NodeLost: node-2", "look at the node"),
+        ("Deleted: somebody deleted the pod", "who deletes the pods"),
+        ("killed by SIGKILL", "the kernel, out of memory"),
+    ],
+)
+def test_worker_died_gives_advice_by_the_reason_of_its_pod(reason: str, hint: str) -> None:
+    assert hint in str(died_in_a_pod(reason))
 
 
 def test_worker_died_at_the_only_attempt_does_not_speak_of_several() -> None:

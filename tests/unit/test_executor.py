@@ -301,15 +301,17 @@ def test_what_ran_when_its_worker_died_is_charged_an_attempt(rig: Rig) -> None:
 
 def test_a_task_that_kills_its_workers(rig: Rig) -> None:
     results = rig.call()
-    for _ in range(4):
+    for attempt in range(4):
         (handle,) = rig.busy
-        rig.lose(handle, running=(rig.child(handle).packets[-1][0], 0))
+        seq = rig.child(handle).packets[-1][0]
+        rig.lose(handle, running=(seq, 0), pod=f"es-{attempt}", node="node-2")
         rig.background.run()
         rig.all_ready()
     outcome = results.outcomes[0]
     assert type(outcome) is Failure
     assert isinstance(outcome.error, WorkerDied)
     assert "square" in outcome.error.task
+    assert (outcome.error.pod, outcome.error.node) == ("es-3", "node-2")
     assert results.done == 1
 
 

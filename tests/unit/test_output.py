@@ -96,3 +96,33 @@ def test_what_keeps_up_loses_nothing(stderr: Stuck, lines: Output) -> None:
         lines.write("w", f"line {number}")
         stderr.wait_for(f"line {number}\n")
     assert numbers(stderr) == list(range(1000))
+
+
+def test_a_line_stands_below_what_is_written(stderr: Stuck, lines: Output) -> None:
+    stderr.goes_on.set()
+    lines.show("1 of 2")
+    stderr.wait_for("1 of 2")
+    lines.write("w", "line 1")
+    stderr.wait_for("line 1")
+    lines.show("2 of 2")
+    stderr.wait_for("2 of 2")
+    lines.show("")
+    lines.close()
+    erase = output._ERASE
+    assert stderr.getvalue() == f"1 of 2{erase}[w] line 1\n1 of 2{erase}2 of 2{erase}"
+
+
+def test_a_line_that_stands_goes_at_the_end(stderr: Stuck, lines: Output) -> None:
+    stderr.goes_on.set()
+    lines.show("1 of 2")
+    lines.close()
+    assert stderr.getvalue() in (f"1 of 2{output._ERASE}", "")
+
+
+def test_a_stuck_stderr_gathers_no_lines_that_were_shown(stderr: Stuck, lines: Output) -> None:
+    for number in range(1000):
+        lines.show(f"{number} of 1000")
+    assert lines._lines.qsize() <= 2
+    stderr.goes_on.set()
+    stderr.wait_for("999 of 1000")
+    assert stderr.getvalue().count("of 1000") <= 3

@@ -466,7 +466,7 @@ def test_a_forked_process_leaves_it_to_its_parent() -> None:
     assert _run(script, expect=0) == ""
 
 
-@pytest.mark.parametrize(("backend", "zygotes"), [("local", 1), ("loopback", 0)])
+@pytest.mark.parametrize(("backend", "zygotes"), [("local", 1), ("auto", 1), ("loopback", 0)])
 def test_the_first_pool_starts_it_before_it_imports_the_rest(backend: str, zygotes: int) -> None:
     script = """
         import fiber, sys

@@ -117,7 +117,9 @@ class Recalled(NamedTuple):
 
 
 class Exited(NamedTuple):
-    """Agent to master: the child is gone.  The fields after ``delivered`` are an ExitReport's."""
+    """Agent to master: the child is gone.  The fields after ``delivered`` are an ExitReport's, as
+    far as an agent knows them.
+    """
 
     child: int
     delivered: int

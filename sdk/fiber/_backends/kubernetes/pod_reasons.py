@@ -49,14 +49,13 @@ def _ended(status: Mapping[str, Any], container: str) -> Mapping[str, Any]:
     return {}
 
 
-def _out_of_memory(
-    pod: Mapping[str, Any], worker: Mapping[str, Any], container: str
-) -> str | None:
+def _out_of_memory(pod: Mapping[str, Any], worker: Mapping[str, Any], container: str) -> str | None:
     if worker.get("reason") != "OOMKilled":
         return None
-    containers = (pod.get("spec") or {}).get("containers") or ()
-    own = next((c for c in containers if c.get("name") == container), {})
-    limit = ((own.get("resources") or {}).get("limits") or {}).get("memory")
+    limit = None
+    for found in (pod.get("spec") or {}).get("containers") or ():
+        if found.get("name") == container:
+            limit = ((found.get("resources") or {}).get("limits") or {}).get("memory")
     # Without a limit of its own it was the node that had no more.
     return f"OOMKilled: its memory limit is {limit}" if limit else "OOMKilled: it has no limit"
 

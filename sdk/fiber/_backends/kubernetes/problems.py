@@ -21,12 +21,12 @@ class PoolName(NamedTuple):
     namespace: str
 
     def __str__(self) -> str:
-        return f"FiberPool {self.name!r} (namespace {self.namespace})"
+        return f"the FiberPool {self.name!r} in namespace {self.namespace!r}"
 
     def error(self, message: str, reason: str) -> FiberPoolError:
         """An error of this pool."""
         return FiberPoolError(
-            f"{self}: {message}", pool=self.name, namespace=self.namespace, reason=reason
+            f"{self}: {message}", pool=self.name, namespace=self.namespace, reason=str(reason)
         )
 
 
@@ -78,7 +78,7 @@ def failure(
         )
     for problem in _problems(status):
         if problem.get("terminal") or _concerns_all(problem, status):
-            return pool.error(_told(problem), str(problem.get("reason")))
+            return pool.error(_told(problem), problem["reason"])
     return None
 
 
@@ -90,7 +90,7 @@ def overdue(pool: PoolName, status: Status, waited: float, now: float) -> FiberP
         f"no worker has joined after {waited:g} s: {summary(status, now)}. {why}".rstrip()
         + f" See kubectl describe fiberpool {pool.name} --namespace {pool.namespace}, or allow "
         "more time (start_timeout).",
-        "StartTimeout" if worst is None else str(worst.get("reason")),
+        "StartTimeout" if worst is None else worst["reason"],
     )
 
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 from fiber._backends.output import Output
-from fiber._transport.loop import Loop, Timer
+from fiber._transport.link import EventLoop, Timer
 
 _FIRST_SHOWN, _SHOWN_AGAIN = 1.0, 1.0
 """Seconds on a terminal, where each line takes the place of the one before."""
@@ -24,7 +24,7 @@ class Progress:
     On the loop's thread.
     """
 
-    def __init__(self, loop: Loop, output: Output, describe: Callable[[], str]) -> None:
+    def __init__(self, loop: EventLoop, output: Output, describe: Callable[[], str]) -> None:
         self._loop = loop
         self._output = output
         self._describe = describe

@@ -21,7 +21,7 @@ class Shape:
 
     image: str | None = None
     """None: that of the program's own pod, or of this version's worker."""
-    resources: Resources = Resources()
+    resources: Resources = field(default_factory=Resources)
     """What one process needs."""
     template: str = field(default="{}", repr=False)
     """The configured pod template, as JSON with sorted keys."""
@@ -77,9 +77,8 @@ def _parse_yaml(text: str) -> object:
     try:
         import yaml  # comes with the Kubernetes client
     except ModuleNotFoundError:
-        raise ConfigError(
-            "a pod template in YAML (key 'template') needs PyYAML, which is not installed: pip "
-            "install 'fiberpool[kubernetes]'"
+        raise ValueError(
+            "YAML needs PyYAML, which is not installed (pip install 'fiberpool[kubernetes]')"
         ) from None
     try:
         return yaml.safe_load(text)
@@ -162,6 +161,6 @@ def _words(resources: Resources) -> list[str]:
 
 
 def quantity(cpus: float) -> str:
-    """CPUs as Kubernetes writes them, to the thousandth above: ``2``, ``500m``."""
-    thousandths = -int(-cpus * 1000 // 1)
+    """CPUs as Kubernetes writes them, to the thousandth: ``2``, ``500m``."""
+    thousandths = max(1, round(cpus * 1000))
     return f"{thousandths}m" if thousandths % 1000 else str(thousandths // 1000)

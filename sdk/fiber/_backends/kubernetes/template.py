@@ -187,25 +187,16 @@ def own_container(pod: Mapping[str, Any], mountinfo: str) -> str:
 # ---- the FiberPool --------------------------------------------------------------------------
 
 
-def fiber_pool_body(
-    name: str, template: Mapping[str, Any], config: Config, master: Mapping[str, Any]
-) -> Document:
-    """A FiberPool that is the program's own: it goes with it, and wants no pod yet.
-
-    ``master`` is ``spec.master``, as whoever listens knows it.
-    """
+def fiber_pool_body(name: str, template: Mapping[str, Any], config: Config) -> Document:
+    """A FiberPool for the program's own use, without what ties it to its master."""
     return {
         "apiVersion": names.API_VERSION,
         "kind": names.KIND,
         "metadata": {"name": name, "labels": {names.LABEL_MANAGED_BY: names.SDK_MANAGER}},
         "spec": {
-            "replicas": 0,
             "maxReplicas": config.max_pods,
             "processesPerPod": config.processes_per_pod,
             "template": dict(template),
-            "master": dict(master),
-            "onLost": "Delete",
-            "credentialsSecretName": names.secret_name(name),
             "scaleDown": {"idleTimeoutSeconds": math.ceil(config.idle_timeout)},
         },
     }

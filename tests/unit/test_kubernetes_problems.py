@@ -1,0 +1,184 @@
+"""What a status means to the program: warnings, errors that end a wait, one line for people."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import pytest
+
+from fiber._backends.kubernetes.problems import (
+    PoolName,
+    failure,
+    new_problems,
+    overdue,
+    summary,
+)
+from fiber_api.times import parse_time
+
+POOL = PoolName("es-1a2b3c", "team")
+SINCE = "2026-11-21T14:56:13Z"
+NOW = parse_time(SINCE) + 14
+SCHEDULER = (
+    "0/3 nodes are available: 1 node(s) had untolerated taint {node.kubernetes.io/disk: }, "
+    "2 Insufficient cpu"
+)
+
+
+def problem(
+    reason: str, message: str = "what, why, what to do.", *, pods: int = 0, **more: Any
+) -> dict[str, Any]:
+    of_pods = {"pod": "es-1a2b3c-0011223344", "count": pods} if pods else {"count": 1}
+    told = {"reason": reason, "severity": "Error", "message": message, "since": SINCE}
+    return {**told, **of_pods, **more}
+
+
+def status(*problems: dict[str, Any], **counts: Any) -> dict[str, Any]:
+    return {"observedGeneration": 2, "problems": list(problems), **counts}
+
+
+UNSCHEDULABLE = problem(
+    "Unschedulable",
+    f"No node takes es-1a2b3c-0011223344: {SCHEDULER}. preemption: 0/3 nodes are available: 3 No "
+    "preemption victims found. Add nodes, or ask for less in spec.template.",
+    pods=30,
+    severity="Warning",
+)
+
+
+class TestWarnings:
+    def test_say_pool_reason_number_and_message(self) -> None:
+        (text,) = new_problems(POOL, {}, status(problem("ImagePullError", pods=3)))
+        assert text == (
+            "the FiberPool 'es-1a2b3c' in namespace 'team': ImagePullError (3 pods): "
+            "what, why, what to do."
+        )
+
+    def test_come_once(self) -> None:
+        first = status(problem("ImagePullError", pods=1))
+        second = status(problem("ImagePullError", "in other words", pods=3))
+        assert list(new_problems(POOL, first, second)) == []
+
+    def test_come_again_when_it_gets_worse_and_not_when_it_gets_better(self) -> None:
+        mild = status(problem("ImagePullError", severity="Warning"))
+        bad = status(problem("ImagePullError"))
+        assert len(list(new_problems(POOL, mild, bad))) == 1
+        assert list(new_problems(POOL, bad, mild)) == []
+
+    def test_there_are_none_without_problems(self) -> None:
+        assert list(new_problems(POOL, status(UNSCHEDULABLE), {})) == []
+
+
+class TestFailure:
+    @pytest.mark.parametrize(
+        "hopeless",
+        [
+            status(problem("InvalidTemplate", terminal=True), replicas=0),
+            status(problem("ErrImageNeverPull", pods=1, terminal=True), replicas=3),
+            status(problem("BackoffLimitExceeded", pods=1, terminal=True), replicas=0),
+            status(problem("QuotaExceeded"), replicas=0),
+            status(problem("ImagePullError", pods=3), replicas=3),
+            status(problem("CreateContainerConfigError", pods=3), replicas=3),
+        ],
+        ids=lambda one: str(one["problems"][0]["reason"]),
+    )
+    def test_what_cannot_come_ends_the_wait(self, hopeless: dict[str, Any]) -> None:
+        error = failure(POOL, hopeless, joined=0)
+        assert error is not None
+        reason = hopeless["problems"][0]["reason"]
+        assert (error.pool, error.namespace, error.reason) == ("es-1a2b3c", "team", reason)
+        assert f"in namespace 'team': {reason}: what, why, what to do." in str(error)
+        assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+    @pytest.mark.parametrize(
+        "hopeful",
+        [
+            {},
+            status(replicas=3),
+            status(UNSCHEDULABLE, replicas=30),
+            status(problem("ImagePullError", pods=3, severity="Warning"), replicas=3),
+            status(problem("ImagePullError", pods=2), replicas=3),
+            status(problem("QuotaExceeded"), replicas=2),
+            status(problem("OOMKilled", pods=1), replicas=0),
+            status(problem("ContainerFailed", pods=1), replicas=0),
+            status(problem("ApiUnavailable"), replicas=0),
+        ],
+        ids=lambda one: "-".join(p["reason"] for p in one.get("problems", ())) or "nothing",
+    )
+    def test_what_may_still_come_does_not(self, hopeful: dict[str, Any]) -> None:
+        assert failure(POOL, hopeful, joined=0) is None
+
+    def test_a_pool_with_workers_goes_on(self) -> None:
+        hopeless = status(problem("ErrImageNeverPull", pods=1, terminal=True), replicas=1)
+        assert failure(POOL, hopeless, joined=1) is None
+        assert failure(POOL, {**hopeless, "readyReplicas": 1}, joined=0) is None
+
+    def test_what_was_said_of_an_earlier_generation_does_not_count(self) -> None:
+        hopeless = status(problem("BackoffLimitExceeded", terminal=True))
+        assert failure(POOL, hopeless, joined=0, generation=3) is None
+        assert failure(POOL, hopeless, joined=0, generation=2) is not None
+
+    def test_a_suspended_pool_has_no_workers(self) -> None:
+        suspended = status(conditions=[{"type": "Suspended", "status": "True"}])
+        error = failure(POOL, suspended, joined=0)
+        assert error is not None
+        assert error.reason == "Suspended"
+        awake = status(conditions=[{"type": "Suspended", "status": "False"}])
+        assert failure(POOL, awake, joined=0) is None
+
+
+class TestOverdue:
+    def test_says_what_is_known(self) -> None:
+        late = status(UNSCHEDULABLE, desiredReplicas=30, pendingReplicas=30)
+        error = overdue(POOL, late, 60.0, NOW)
+        assert error.reason == "Unschedulable"
+        for part in ("after 60 s", "0 of 30 pods ready", SCHEDULER, "Add nodes", "start_timeout"):
+            assert part in str(error)
+        assert "kubectl describe fiberpool es-1a2b3c --namespace team" in str(error)
+
+    def test_says_that_nothing_is(self) -> None:
+        error = overdue(POOL, {}, 60.0, NOW)
+        assert error.reason == "StartTimeout"
+        assert "the operator has not looked at it yet. See kubectl describe" in str(error)
+
+    def test_workers_that_are_ready_and_did_not_join_cannot_reach_the_program(self) -> None:
+        error = overdue(POOL, status(desiredReplicas=2, readyReplicas=2), 60.0, NOW)
+        assert "2 of 2 pods ready" in str(error)
+        assert "listen_host" in str(error)
+
+
+class TestSummary:
+    def test_has_the_schedulers_words_and_for_how_long(self) -> None:
+        counts = {"desiredReplicas": 50, "readyReplicas": 12, "pendingReplicas": 30}
+        assert summary(status(UNSCHEDULABLE, **counts), NOW) == (
+            f"12 of 50 pods ready, 30 pending: {SCHEDULER} (for 14 s)"
+        )
+
+    def test_has_the_first_sentence_of_other_problems(self) -> None:
+        message = "es-1 cannot get its image: manifest unknown. If the image is wrong, correct it."
+        told = status(problem("ImagePullError", message, pods=1), desiredReplicas=1)
+        assert summary(told, NOW) == (
+            "0 of 1 pods ready: ImagePullError: es-1 cannot get its image: manifest unknown "
+            "(for 14 s)"
+        )
+
+    def test_is_one_line_and_a_short_one(self) -> None:
+        told = summary(status(problem("ContainerFailed", "x" * 500), problem("B")), NOW)
+        assert len(told) < 180
+        assert "..." in told
+        assert "\n" not in summary(status(problem("A", "first\nsecond")), NOW)
+
+    def test_without_problems_has_the_counts(self) -> None:
+        assert summary(status(desiredReplicas=2, readyReplicas=2), NOW) == "2 of 2 pods ready"
+
+    def test_of_nothing_says_so(self) -> None:
+        assert summary({}, NOW) == "the operator has not looked at it yet"
+
+    @pytest.mark.parametrize("since", [None, "yesterday"])
+    def test_a_time_that_is_none_is_left_out(self, since: str | None) -> None:
+        told = summary(status(problem("Forbidden", "no", since=since), desiredReplicas=1), NOW)
+        assert told == "0 of 1 pods ready: Forbidden: no"
+
+    def test_a_clock_that_is_behind_the_clusters_counts_from_now(self) -> None:
+        told = summary(status(problem("Forbidden", "no")), NOW - 100)
+        assert told.endswith("(for 0 s)")

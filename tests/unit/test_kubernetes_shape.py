@@ -1,0 +1,134 @@
+"""What tells FiberPools apart, what they are called, and templates that people write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fiber._backends.kubernetes.shape import Shape, pool_name, program_name, read_template
+from fiber.config import Config
+from fiber.errors import ConfigError
+from fiber.resources import Resources
+from fiber_api import names
+
+GPU = {"spec": {"nodeSelector": {"gpu": "yes"}}}
+
+
+def test_equal_shapes_are_one_key() -> None:
+    first = Shape.of(Config(image="es:1", template={"spec": {"a": 1, "b": 2}}))
+    second = Shape.of(Config(image="es:1", template={"spec": {"b": 2, "a": 1}}))
+    assert {first: "pool"}[second] == "pool"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        Shape.of(Config(image="es:2")),
+        Shape.of(Config(template=GPU)),
+        Shape.of(Config(processes_per_pod=8)),
+        Shape().with_resources(Resources(gpu=1)),
+    ],
+)
+def test_whatever_decides_what_a_pod_is_like_makes_another_shape(other: Shape) -> None:
+    assert other != Shape.of(Config())
+
+
+def test_what_a_pod_does_not_show_is_no_part_of_a_shape() -> None:
+    assert Shape.of(Config(idle_timeout=5, max_pods=3, retries=0)) == Shape.of(Config())
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("/home/me/train.py", "train"),
+        ("/repo/examples/02-es/main.py", "es"),
+        ("/venv/lib/Package_One/__main__.py", "package-one"),
+        ("/home/me/2048 (v2).py", "v2"),
+        ("/home/me/训练.py", "python"),
+        ("/main.py", "python"),
+        ("", "python"),
+        (None, "python"),
+    ],
+)
+def test_a_program_is_called_what_people_know_it_by(path: str | None, name: str) -> None:
+    assert program_name(path) == name
+
+
+@pytest.mark.parametrize(
+    ("resources", "name"),
+    [
+        (Resources(), "es-1a2b3c"),
+        (Resources(gpu=1), "es-gpu1-1a2b3c"),
+        (Resources(cpu=0.5, memory=2048), "es-cpu500m-mem2048mi-1a2b3c"),
+        (Resources(cpu=2.0), "es-cpu2-1a2b3c"),
+    ],
+)
+def test_a_pool_is_called_after_the_program_and_its_wishes(resources: Resources, name: str) -> None:
+    assert pool_name("es", Shape().with_resources(resources), "1a2b3c") == name
+
+
+@pytest.mark.parametrize("program", ["x" * 80, "a-" * 40, "Übung", "_", "9", "es"])
+@pytest.mark.parametrize("resources", [Resources(), Resources(cpu=0.0001, memory=10**9, gpu=1000)])
+def test_every_name_is_one_that_a_pool_may_have(program: str, resources: Resources) -> None:
+    name = pool_name(program, Shape().with_resources(resources), "1a2b3c")
+    assert names.check_pool_name(name) == name
+    assert name.endswith("-1a2b3c")
+
+
+class TestTemplates:
+    @pytest.mark.parametrize(
+        ("file", "text"),
+        [
+            ("pod.yaml", "spec:\n  nodeSelector: {gpu: 'yes'}\n"),
+            ("pod.json", '{"spec": {"nodeSelector": {"gpu": "yes"}}}'),
+            ("pod.yml", "apiVersion: v1\nkind: Pod\nspec:\n  nodeSelector: {gpu: 'yes'}\n"),
+        ],
+    )
+    def test_are_read_from_a_file(self, tmp_path: Path, file: str, text: str) -> None:
+        (tmp_path / file).write_text(text)
+        assert read_template(str(tmp_path / file)) == GPU
+
+    def test_there_is_none_by_itself(self) -> None:
+        assert read_template(None) == {}
+
+    @pytest.mark.parametrize(
+        ("file", "text"),
+        [("pod.yaml", "spec: ["), ("pod.json", "{"), ("pod.yaml", "\udcff"), ("none.yaml", None)],
+    )
+    def test_a_file_that_cannot_be_read_is_named(
+        self, tmp_path: Path, file: str, text: str | None
+    ) -> None:
+        path = tmp_path / file
+        if text is not None:
+            path.write_bytes(text.encode("utf-8", "surrogateescape"))
+        with pytest.raises(ConfigError, match="cannot read the pod template") as caught:
+            Shape.of(Config(template=str(path)))
+        assert str(path) in str(caught.value)
+
+    @pytest.mark.parametrize(
+        ("template", "complaint"),
+        [
+            ({"containers": []}, "has 'containers' beside metadata and spec. What belongs to the "),
+            ({"spec": {}, "Spec": {}}, "has 'Spec' beside metadata and spec$"),
+            ({"spec": []}, "has a spec that is no object"),
+            ({"spec": {"containers": [{"image": "x"}]}}, "a container without a name.*'worker'"),
+            ({"spec": {"containers": ["x"]}}, "a container without a name"),
+            (
+                {"spec": {"containers": [{"name": "main"}]}},
+                "'main' without an image. The one that runs the processes is called 'worker'",
+            ),
+            ({"spec": {"nodeSelector": {"since": Path()}}}, "not JSON serializable.*in quotes"),
+        ],
+    )
+    def test_what_is_none_is_refused_with_the_reason(
+        self, template: dict[str, Any], complaint: str
+    ) -> None:
+        with pytest.raises(ConfigError, match=complaint):
+            Shape.of(Config(template=template))
+
+    def test_a_list_is_none(self, tmp_path: Path) -> None:
+        (tmp_path / "pod.yaml").write_text("- spec: {}\n")
+        with pytest.raises(ConfigError, match=r"pod\.yaml is no object with metadata and spec"):
+            read_template(str(tmp_path / "pod.yaml"))
