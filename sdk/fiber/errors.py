@@ -10,6 +10,7 @@
     │       ├── AgentLost         an agent that is out of reach
     │       ├── ConfigError       a key or value that is wrong (also ValueError)
     │       ├── ConnectionClosed  the other end of a link is gone (also EOFError)
+    │       ├── FiberPoolError    a FiberPool on Kubernetes that cannot serve
     │       ├── LinkError         no way between program and agent, a port in use for instance
     │       ├── NotInFiber        a part of multiprocessing that Fiber has not (yet)
     │       ├── StartError        a process that does not start, an initializer that fails
@@ -42,6 +43,7 @@ __all__ = [
     "ConfigError",
     "ConnectionClosed",
     "FiberError",
+    "FiberPoolError",
     "LinkError",
     "MaybeEncodingError",
     "NotInFiber",
@@ -119,6 +121,20 @@ class ConnectionClosed(EOFError, FiberError):
             message += f" ({reason})"
         super().__init__(message)
         self.peer = peer
+        self.reason = reason
+
+
+class FiberPoolError(FiberError):
+    """A FiberPool that cannot be made, or that cannot give what was asked of it any more.
+
+    `reason` is one word: that of the problem in the pool's status (`ImagePullError`), or
+    Kubernetes' own for a call that it refuses (`Forbidden`).
+    """
+
+    def __init__(self, message: str, *, pool: str, namespace: str, reason: str) -> None:
+        super().__init__(message)
+        self.pool = pool
+        self.namespace = namespace
         self.reason = reason
 
 
