@@ -10,14 +10,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import ssl
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any
 
 from aiohttp import web
 
-from fakes import strict
-from fakes.store import KINDS, Body, Change, Failure, Store, has_fields, line, matches
+from fakes import server_side_apply, strict
+from fakes.store import KINDS, Body, Change, Failure, Place, Store, has_fields, line, matches
 
 BOOKMARK_SECONDS = 60.0
 
@@ -89,20 +90,24 @@ class KubernetesApi:
         """Watches that are open bring nothing any more, not even bookmarks, and do not end."""
         self.down = False
         """Every connection is reset, as with an API server that is gone."""
+        self.accepts: set[str] | None = None
+        """Values of Authorization that are let in; None: anybody."""
         self.port = 0
         self._watches: set[asyncio.Task[Any]] = set()
+        self._applied: dict[Place, Body] = {}
+        """What the one field manager that applies has applied last."""
 
     @property
     def url(self) -> str:
         return f"http://127.0.0.1:{self.port}"
 
     @contextlib.asynccontextmanager
-    async def serving(self) -> AsyncIterator[KubernetesApi]:
+    async def serving(self, tls: ssl.SSLContext | None = None) -> AsyncIterator[KubernetesApi]:
         application = web.Application(client_max_size=2**24)
         application.router.add_route("*", "/{path:.*}", self._serve)
         runner = web.AppRunner(application, access_log=None, shutdown_timeout=0.1)
         await runner.setup()
-        site = web.TCPSite(runner, "127.0.0.1", self.port)
+        site = web.TCPSite(runner, "127.0.0.1", self.port, ssl_context=tls)
         await site.start()
         self.port = runner.addresses[0][1]
         try:
@@ -130,6 +135,8 @@ class KubernetesApi:
             return web.Response(status=404, text="404 page not found")
         self.calls.append(call)
         self.tokens += request.headers.getall("Authorization", [])
+        if self.accepts is not None and request.headers.get("Authorization") not in self.accepts:
+            return _refused(Failure(401, "Unauthorized", "Unauthorized"))
         fault = next((fault for fault in self.faults if fault.strikes(call)), None)
         if fault is not None and fault.late:
             await asyncio.sleep(fault.late)
@@ -151,7 +158,7 @@ class KubernetesApi:
         try:
             return web.json_response(self._perform(request, call, body))
         except Failure as failure:
-            return web.json_response(failure.body(), status=failure.status)
+            return _refused(failure)
 
     def _perform(self, request: web.Request, call: Call, body: Body) -> Body:
         where = (call.plural, call.namespace or "", call.name)
@@ -165,10 +172,17 @@ class KubernetesApi:
             return self.store.create(*where[:2], body, dry_run=call.dry_run)
         if call.verb == "update":
             return self.store.update(*where, body)
+        if call.verb == "patch" and request.content_type == server_side_apply.CONTENT_TYPE:
+            return self._apply(where, body)
         if call.verb == "patch":
             return self.store.merge(*where, body, call.subresource)
         self.store.delete(*where, body)
         return {"kind": "Status", "apiVersion": "v1", "status": "Success"}
+
+    def _apply(self, where: Place, body: Body) -> Body:
+        answer = server_side_apply.apply(self.store, where, self._applied.get(where, {}), body)
+        self._applied[where] = body
+        return answer
 
     def _list(self, request: web.Request, call: Call) -> Body:
         items = [
@@ -214,10 +228,16 @@ class KubernetesApi:
             await response.write(line("ERROR", Failure(410, "Expired", "too old").body()))
             return
         selector = request.query.get("labelSelector", "")
+        fields = request.query.get("fieldSelector", "")
         while True:
             for change in [change for change in self.store.changes if change.version > seen]:
                 seen = change.version
-                if self._concerns(call, change) and matches(change.object, selector):
+                found = change.object
+                if (
+                    self._concerns(call, change)
+                    and matches(found, selector)
+                    and has_fields(found, fields)
+                ):
                     await response.write(line(change.type, change.object))
             if self.store.changes and self.store.changes[-1].version > seen:
                 continue  # it came while the last ones were written
@@ -288,6 +308,10 @@ def _group(version: str) -> Body:
     name, short = version.split("/")
     entry = {"groupVersion": version, "version": short}
     return {"name": name, "versions": [entry], "preferredVersion": entry}
+
+
+def _refused(failure: Failure) -> web.Response:
+    return web.json_response(failure.body(), status=failure.status)
 
 
 def _harmless(fault: Fault) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fiber.errors import AuthenticationError, ConfigError
-from fiber_api.certificates import RUN_VALIDITY, make_certificates
+from fiber_api.certificates import RUN_VALIDITY, Certificates, make_certificates
 from fiber_api.names import InvalidName
 
 _FILES = {
@@ -104,6 +104,16 @@ class MasterCredentials(Credentials):
 
     agent: Credentials = field(repr=False)
 
+    @classmethod
+    def of(cls, made: Certificates) -> MasterCredentials:
+        """The credentials that these certificates are."""
+        agent = Credentials(
+            made.server_name, made.authority, made.agent.certificate, made.agent.key
+        )
+        return cls(
+            made.server_name, made.authority, made.master.certificate, made.master.key, agent=agent
+        )
+
     def agent_half(self) -> Credentials:
         """What an agent gets: nothing in it lets its holder pose as the master."""
         return self.agent
@@ -124,10 +134,7 @@ def make_credentials(pool: str) -> MasterCredentials:
             f"{pool!r} cannot be the name of a pool: use up to 240 lower-case letters, digits, '-' "
             "and '.', with a letter or digit at both ends of each part"
         ) from None
-    agent = Credentials(made.server_name, made.authority, made.agent.certificate, made.agent.key)
-    return MasterCredentials(
-        made.server_name, made.authority, made.master.certificate, made.master.key, agent=agent
-    )
+    return MasterCredentials.of(made)
 
 
 def _write_private(path: Path, text: str) -> None:

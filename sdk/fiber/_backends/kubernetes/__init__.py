@@ -1,1 +1,1 @@
-"""Agents that are pods: FiberPools, which Fiber's operator turns into them."""
+"""Pods as processes: a FiberPool per program and shape, and what it takes to hold one."""

@@ -1,0 +1,93 @@
+"""The address of this machine that pods can reach, found without asking anybody to connect."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Iterator
+
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.api_errors import ApiError
+from fiber._backends.kubernetes.resources import NODES
+from fiber.errors import ConfigError, FiberPoolError
+
+_NODES = 10
+"""Nodes that are looked at: the way to one is mostly the way to all."""
+
+_ELSEWHERE = ("192.0.2.1", "2001:db8::1")
+"""Addresses that are nobody's (RFC 5737, RFC 3849): the way to them is the default route."""
+
+
+def reachable_address(api: Api, listen_host: str | None, *, pool: str, namespace: str) -> str:
+    """The IP address that pods reach this program at.
+
+    ``listen_host``, if it names one.  Else the local address on the way to the cluster's nodes, to
+    its API server, or out of this machine: of these the first that is no loopback.  In a pod that
+    is the pod's.  FiberPoolError if all are.
+    """
+    if listen_host is not None and not _is_unspecified(listen_host):
+        return _resolved(listen_host)
+    for target in _targets(api):
+        found = _local_address(target)
+        if found is not None and _is_reachable(found):
+            return found
+    raise FiberPoolError(
+        f"pods cannot reach this program: the only address of this machine on the way to the "
+        f"cluster at {api.server} is a loopback. Set listen_host (fiber.init(listen_host=) or "
+        "FIBER_LISTEN_HOST) to an address of this machine that pods can reach, or run the program "
+        "in a pod",
+        pool=pool,
+        namespace=namespace,
+        reason="NoAddress",
+    )
+
+
+def _targets(api: Api) -> Iterator[str]:
+    if not api.in_cluster:
+        yield from _node_addresses(api)
+    yield api.server
+    yield from _ELSEWHERE
+
+
+def _node_addresses(api: Api) -> Iterator[str]:
+    try:
+        nodes = api.list(NODES.path(), {"limit": str(_NODES)}, timeout=0.0)["items"]
+    except ApiError:
+        return  # few may list them; whoever else cannot be reached is told by the next call
+    for node in nodes:
+        for address in node.get("status", {}).get("addresses", ()):
+            if address.get("type") == "InternalIP":
+                yield address["address"]
+
+
+def _local_address(target: str) -> str | None:
+    """What this machine would send from; nothing is sent."""
+    try:
+        family, kind, _, _, where = socket.getaddrinfo(target, 9, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.connect(where)
+            return str(probe.getsockname()[0])
+    except OSError:
+        return None  # no such name, or no way there
+
+
+def _resolved(host: str) -> str:
+    try:
+        return str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+    except OSError as error:
+        raise ConfigError(
+            f"listen_host {host!r} is no address of this machine: {error}. Set it to one that "
+            "pods can reach, or leave it out"
+        ) from error
+
+
+def _is_unspecified(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_unspecified
+    except ValueError:
+        return False
+
+
+def _is_reachable(host: str) -> bool:
+    address = ipaddress.ip_address(host.partition("%")[0])
+    return not (address.is_loopback or address.is_link_local or address.is_unspecified)

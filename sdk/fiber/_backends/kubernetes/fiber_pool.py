@@ -1,0 +1,261 @@
+"""The life of one FiberPool, as the program that is its master sees it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+import threading
+import time
+from collections.abc import Iterable
+from functools import partial
+from typing import Protocol
+
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden, explain
+from fiber._backends.kubernetes.held_pool import HeldPool
+from fiber._backends.kubernetes.lease import LeaseRenewer
+from fiber._backends.kubernetes.resources import PODS, POOLS
+from fiber._backends.kubernetes.scaling import Scaling
+from fiber._backends.kubernetes.watches import ObjectWatch
+from fiber._transport.loop import Loop
+from fiber.errors import FiberPoolError
+from fiber_api import names
+
+OPERATOR_SLOW, OPERATOR_ABSENT = 5.0, 30.0
+"""Seconds without a word from the operator until that is said, and until it is an error."""
+
+CLOSE_TIMEOUT = 10.0
+"""Seconds that the API server may take to give a pool back."""
+
+
+class Tenure(Protocol):
+    """How a pool comes to have this program as its master, and how that ends."""
+
+    name: str
+    namespace: str
+    doing: str
+    """What ``begin`` does, in words that follow "cannot"."""
+
+    @property
+    def remedy(self) -> str:
+        """The command that does what ``end`` could not."""
+
+    def begin(self, cancel: threading.Event) -> HeldPool:
+        """Make this program the pool's master; ``ApiError``, FiberPoolError."""
+
+    def end(self, timeout: float) -> None:
+        """Undo it, whether or not ``begin`` succeeded; ``ApiError``."""
+
+
+class Observer(Protocol):
+    """Who is told, on the loop's thread."""
+
+    def on_status(self, status: Body) -> None:
+        """The pool's status, as it is now."""
+
+    def on_pod(self, name: str, pod: Body | None) -> None:
+        """A pod of the pool, as it is now; None once it is gone."""
+
+    def on_warning(self, message: str) -> None:
+        """Something that keeps the pool waiting, and may pass."""
+
+    def on_error(self, error: FiberPoolError) -> None:
+        """Once: nothing comes of the pool any more."""
+
+
+class FiberPoolClient:
+    """Holds one pool, on the thread ``fiber-kubernetes``; its methods return at once, but for
+    ``close``.  Any thread may call them.
+    """
+
+    def __init__(self, api: Api, loop: Loop, tenure: Tenure, observer: Observer) -> None:
+        self._api = api
+        self._loop = loop
+        self._tenure = tenure
+        self._observer = observer
+        self._scaling = Scaling(self._trouble)
+        self._wake = threading.Event()
+        self._closing = threading.Event()
+        self._close_timeout = CLOSE_TIMEOUT
+        self._failing = threading.Lock()
+        """Taken by whoever tells of the error; never given back: there is only one."""
+        self._over = threading.Event()
+        self._warned: set[str] = set()
+        self._observed = False
+        """The operator has seen the pool with this program as its master."""
+        self._began = 0.0
+        self._followers: list[ObjectWatch | LeaseRenewer] = []
+        self._thread = threading.Thread(target=self._run, name="fiber-kubernetes", daemon=True)
+
+    def start(self) -> None:
+        """Make the pool, or attach to it."""
+        self._thread.start()
+
+    def demand(self, replicas: int, release: Iterable[str] = ()) -> None:
+        """Have so many pods, and without those named in ``release``, which are fenced.
+
+        Only the newest ``replicas`` counts; a name to release is remembered until its pod is gone.
+        """
+        self._scaling.want(replicas, release)
+        self._wake.set()
+
+    def close(self, timeout: float = CLOSE_TIMEOUT) -> None:
+        """Delete the pool, or detach from it.  Raises nothing: what stays behind is said on stderr,
+        with the command that removes it.
+        """
+        self._close_timeout = timeout
+        self._closing.set()
+        self._wake.set()
+        if self._thread.ident is None:
+            return
+        self._thread.join(timeout + 1.0)
+        if self._thread.is_alive():
+            self._say_what_stays(f"the API server did not answer within {timeout:g} s")
+
+    # -- On the thread
+
+    def _run(self) -> None:
+        try:
+            self._serve(self._begin())
+        except FiberPoolError as error:
+            self._fail(error)
+        except ApiError as error:
+            self._fail(self._explained(error, self._tenure.doing))
+        except Exception as error:  # a fault of ours must not leave anybody waiting
+            failure = self._error("Internal", f"is given up after an unexpected {error!r}")
+            failure.__cause__ = error
+            self._fail(failure)
+        for follower in self._followers:
+            follower.stop()
+        self._closing.wait()
+        try:
+            self._tenure.end(self._close_timeout)
+        except Exception as error:  # the program ends whatever comes
+            self._say_what_stays(str(error))
+        for follower in self._followers:
+            follower.join(1.0)
+
+    def _begin(self) -> HeldPool:
+        held = self._tenure.begin(self._closing)
+        self._began = time.monotonic()
+        self._tenure.doing = f"scale the FiberPool {held.name!r}"
+        of_pool = {"fieldSelector": f"metadata.name={held.name}"}
+        of_pods = {"labelSelector": f"{names.LABEL_POOL_UID}={held.uid}"}
+        self._followers = [
+            LeaseRenewer(held, on_lost=self._fail, on_trouble=self._trouble),
+            ObjectWatch(
+                self._api,
+                POOLS.path(held.namespace),
+                of_pool,
+                on_change=partial(self._pool_changed, held),
+                on_trouble=self._pool_trouble,
+            ),
+            ObjectWatch(
+                self._api,
+                PODS.path(held.namespace),
+                of_pods,
+                on_change=self._pod_changed,
+                on_trouble=self._trouble,
+            ),
+        ]
+        for follower in self._followers:
+            follower.start()
+        return held
+
+    def _serve(self, held: HeldPool) -> None:
+        while not (self._closing.is_set() or self._over.is_set()):
+            pause = min(self._scaling.step(held), self._miss_operator())
+            self._wake.wait(None if pause == math.inf else pause)
+            self._wake.clear()
+
+    def _miss_operator(self) -> float:
+        """Seconds until the operator's silence means more than now."""
+        if self._observed:
+            return math.inf
+        silent = time.monotonic() - self._began
+        what = f"was not looked at by an operator for {silent:.0f} s"
+        advice = (
+            "Look whether one runs and serves this namespace (`kubectl get deployments -A -l "
+            "app.kubernetes.io/name=fiber-operator`), or install it: `helm install fiber-operator "
+            "charts/fiber-operator -n fiber-system --create-namespace`"
+        )
+        if silent >= OPERATOR_ABSENT:
+            raise self._error("NoOperator", f"{what}. {advice}")
+        if silent < OPERATOR_SLOW:
+            return OPERATOR_SLOW - silent
+        self._warn("no operator", f"{self._pool} {what}. {advice}")
+        return OPERATOR_ABSENT - silent
+
+    # -- On the threads that follow it
+
+    def _pool_changed(self, held: HeldPool, name: str, found: Body | None) -> None:
+        if loss := held.loss(found):
+            self._fail(loss)
+            return
+        assert found is not None
+        status = found.get("status") or {}
+        if not self._observed and status.get("observedGeneration", 0) >= held.generation:
+            self._observed = True
+            self._wake.set()
+        self._warned -= {"Unreachable", "Throttled"}
+        self._loop.call_soon(self._observer.on_status, status)
+
+    def _pool_trouble(self, error: ApiError) -> None:
+        if isinstance(error, Forbidden) and not self._observed:
+            # Its status would never be known, and silence be taken for the operator's.
+            self._fail(self._explained(error, f"follow {self._pool}"))
+        else:
+            self._trouble(error)
+
+    def _pod_changed(self, name: str, pod: Body | None) -> None:
+        if pod is None and self._scaling.gone(name):
+            self._wake.set()
+        self._loop.call_soon(self._observer.on_pod, name, pod)
+
+    # -- On any of them
+
+    def _trouble(self, error: ApiError) -> None:
+        if not self._closing.is_set():
+            self._warn(type(error).__name__, str(self._explained(error, "follow " + self._pool)))
+
+    def _warn(self, what: str, message: str) -> None:
+        """Once, until it has passed."""
+        if what not in self._warned:
+            self._warned.add(what)
+            self._loop.call_soon(self._observer.on_warning, message)
+
+    def _fail(self, error: FiberPoolError) -> None:
+        if self._closing.is_set() or not self._failing.acquire(blocking=False):
+            return
+        self._over.set()
+        self._wake.set()
+        self._loop.call_soon(self._observer.on_error, error)
+
+    @property
+    def _pool(self) -> str:
+        return f"the FiberPool {self._tenure.name!r} in namespace {self._tenure.namespace!r}"
+
+    def _error(self, reason: str, what: str) -> FiberPoolError:
+        return FiberPoolError(
+            f"{self._pool} {what}",
+            pool=self._tenure.name,
+            namespace=self._tenure.namespace,
+            reason=reason,
+        )
+
+    def _explained(self, error: ApiError, doing: str) -> FiberPoolError:
+        return explain(
+            error,
+            doing,
+            pool=self._tenure.name,
+            namespace=self._tenure.namespace,
+            server=self._api.server,
+        )
+
+    def _say_what_stays(self, why: str) -> None:
+        with contextlib.suppress(Exception):  # stderr may be closed
+            sys.stderr.write(
+                f"fiber: {self._pool} stays behind: {why}. The operator notices that this program "
+                f"is gone; to be quicker: {self._tenure.remedy}\n"
+            )

@@ -1,0 +1,170 @@
+"""A FiberPool whose master is this program."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.api_errors import Body, NotFound
+from fiber._backends.kubernetes.resources import LEASES, POOLS
+from fiber.errors import FiberPoolError
+from fiber_api import names
+
+
+@dataclass(frozen=True)
+class Master:
+    """This program, as ``spec.master`` says it."""
+
+    host: str
+    """The IP address that pods reach it at."""
+    port: int
+    identity: str
+    """Who it is, for people and for itself: no other program has the same."""
+    lease_duration: int = 30
+    lost_grace: int = 60
+
+    def spec(self, pool: str, epoch: int) -> Body:
+        """``spec.master`` of ``pool``."""
+        return {
+            "host": self.host,
+            "port": self.port,
+            "epoch": epoch,
+            "identity": self.identity,
+            "leaseName": names.master_lease_name(pool),
+            "leaseDurationSeconds": self.lease_duration,
+            "lostGraceSeconds": self.lost_grace,
+        }
+
+
+class HeldPool:
+    """One FiberPool and what its master may do with it.  Calls block and raise ``ApiError``."""
+
+    def __init__(self, api: Api, found: Body, master: Master, epoch: int) -> None:
+        self._api = api
+        self.master = master
+        self._epoch = epoch
+        metadata = found["metadata"]
+        self.name = str(metadata["name"])
+        self.namespace = str(metadata["namespace"])
+        self.uid = str(metadata["uid"])
+        self.path = POOLS.path(self.namespace, self.name)
+        self.lease_path = LEASES.path(self.namespace, names.master_lease_name(self.name))
+        self.generation = int(metadata["generation"])
+        """That of the spec as this program wrote it last."""
+
+    @property
+    def owner(self) -> Body:
+        """What an object names as its owner to go when the pool goes."""
+        return {
+            "apiVersion": names.API_VERSION,
+            "kind": names.KIND,
+            "name": self.name,
+            "uid": self.uid,
+        }
+
+    def apply(
+        self,
+        replicas: int,
+        release: Iterable[str] = (),
+        *,
+        master: bool = True,
+        resource_version: str | None = None,
+        **how: Any,
+    ) -> None:
+        """Write all that a program writes into a pool, in one document: what is left out goes.
+
+        Conflict if the pool is another by now, or not that of ``resource_version``.
+        """
+        metadata = {"name": self.name, "uid": self.uid}
+        if resource_version is not None:
+            metadata["resourceVersion"] = resource_version
+        spec: Body = {"replicas": replicas}
+        if names_to_release := list(release):
+            spec["scaleDown"] = {"release": names_to_release}
+        if master:
+            spec["master"] = self.master.spec(self.name, self._epoch)
+        body = {
+            "apiVersion": names.API_VERSION,
+            "kind": names.KIND,
+            "metadata": metadata,
+            "spec": spec,
+        }
+        self.generation = int(self._api.apply(self.path, body, **how)["metadata"]["generation"])
+
+    def loss(self, found: Body | None) -> FiberPoolError | None:
+        """Why the pool, which is as ``found`` now, is this program's no more, if that is so."""
+        metadata = {} if found is None else found["metadata"]
+        if found is None or metadata["uid"] != self.uid or "deletionTimestamp" in metadata:
+            return self.error("Deleted", "was deleted, and its processes with it")
+        holder = identity_in(found)
+        if holder == self.master.identity:
+            return None
+        if holder is None:
+            return self.error("Replaced", "has no master any more: somebody detached this program")
+        return self.error("Replaced", f"has another master now: {holder}")
+
+    def check(self) -> None:
+        """Raise FiberPoolError if the pool is this program's no more."""
+        try:
+            found = self._api.get(self.path, timeout=0.0)
+        except NotFound:
+            found = None
+        if loss := self.loss(found):
+            raise loss
+
+    def error(self, reason: str, what: str) -> FiberPoolError:
+        """An error that ends what was done with the pool."""
+        return FiberPoolError(
+            f"the FiberPool {self.name!r} in namespace {self.namespace!r} {what}. "
+            "Start the program again to go on",
+            pool=self.name,
+            namespace=self.namespace,
+            reason=reason,
+        )
+
+    # -- The Lease that says that the program lives
+
+    def renew_lease(self, **how: Any) -> None:
+        """NotFound if there is none."""
+        self._api.merge_patch(self.lease_path, {"spec": self._lease_spec(_micro_time())}, **how)
+
+    def make_lease(self, **how: Any) -> None:
+        """Conflict if there is one."""
+        now = _micro_time()
+        body = {
+            "apiVersion": LEASES.api_version,
+            "kind": LEASES.kind,
+            "metadata": {
+                "name": names.master_lease_name(self.name),
+                "ownerReferences": [self.owner],
+            },
+            "spec": {**self._lease_spec(now), "acquireTime": now},
+        }
+        self._api.create(LEASES.path(self.namespace), body, **how)
+
+    def free_lease(self, **how: Any) -> None:
+        """Let whoever comes next find that nobody holds it."""
+        with contextlib.suppress(NotFound):
+            self._api.merge_patch(self.lease_path, {"spec": {"holderIdentity": ""}}, **how)
+
+    def _lease_spec(self, now: str) -> Body:
+        return {
+            "holderIdentity": self.master.identity,
+            "leaseDurationSeconds": self.master.lease_duration,
+            "renewTime": now,
+        }
+
+
+def identity_in(pool: Body) -> str | None:
+    """Who the pool's master is; None if it has none."""
+    master = pool["spec"].get("master")
+    return None if master is None else str(master.get("identity", ""))
+
+
+def _micro_time() -> str:
+    now = datetime.datetime.now(datetime.UTC)
+    return now.isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -1,0 +1,96 @@
+"""A FiberPool that this program makes for itself, and deletes when it ends."""
+
+from __future__ import annotations
+
+import threading
+
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.api_errors import Body, Conflict, NotFound, Unreachable
+from fiber._backends.kubernetes.held_pool import HeldPool, Master, identity_in
+from fiber._backends.kubernetes.resources import POOLS, SECRETS
+from fiber._backends.kubernetes.secret import secret_body
+from fiber._transport.credentials import MasterCredentials
+from fiber_api import names
+
+_EPOCH = 1
+"""It never has another master."""
+
+
+class OwnPool:
+    """One pool, from before it is there to after it is gone.
+
+    Its name must never have been used before.
+    """
+
+    def __init__(
+        self,
+        api: Api,
+        namespace: str,
+        body: Body,
+        credentials: MasterCredentials,
+        master: Master,
+        owner: Body | None,
+    ) -> None:
+        self._api = api
+        self._body = body
+        self._credentials = credentials
+        self._master = master
+        self._owner = owner
+        self._held: HeldPool | None = None
+        self._may_exist = False
+        self.name = str(body["metadata"]["name"])
+        self.namespace = namespace
+        self.doing = f"make the FiberPool {self.name!r}"
+        self.remedy = f"kubectl delete fiberpool {self.name} -n {namespace}"
+        """What removes it when ``end`` does not."""
+
+    def begin(self, cancel: threading.Event) -> HeldPool:
+        """Make it, without pods; then its Secret and its Lease, which go when it goes.
+
+        It has its master from the first moment: whoever dies between two of these calls leaves a
+        pool whose master's Lease is absent or gets old, and that the operator deletes.
+        """
+        self._held = HeldPool(self._api, self._create(cancel), self._master, _EPOCH)
+        secret = secret_body(names.secret_name(self.name), self._credentials, self._held.owner)
+        try:
+            self._api.create(SECRETS.path(self.namespace), secret, cancel=cancel)
+        except Conflict:
+            pass  # made by an attempt whose answer was lost: no other pool had this name
+        try:
+            self._held.make_lease(cancel=cancel)
+        except Conflict:
+            pass  # likewise
+        return self._held
+
+    def end(self, timeout: float) -> None:
+        """Delete it, if it may be there."""
+        if self._held is None and not self._may_exist:
+            return
+        uid = None if self._held is None else self._held.uid
+        try:
+            self._api.delete(POOLS.path(self.namespace, self.name), uid=uid, timeout=timeout)
+        except (NotFound, Conflict):
+            pass  # it is gone, or even its name is another's
+
+    def _create(self, cancel: threading.Event) -> Body:
+        metadata = dict(self._body["metadata"])
+        if self._owner is not None:
+            metadata["ownerReferences"] = [self._owner]
+        spec = {
+            **self._body["spec"],
+            "replicas": 0,
+            "master": self._master.spec(self.name, _EPOCH),
+            "onLost": "Delete",
+            "credentialsSecretName": names.secret_name(self.name),
+        }
+        body = {**self._body, "metadata": metadata, "spec": spec}
+        try:
+            return self._api.create(POOLS.path(self.namespace), body, strict=True, cancel=cancel)
+        except Conflict:
+            found = self._api.get(POOLS.path(self.namespace, self.name), cancel=cancel)
+            if identity_in(found) != self._master.identity:
+                raise
+            return found  # made by an attempt whose answer was lost
+        except Unreachable:
+            self._may_exist = True
+            raise

@@ -1,0 +1,154 @@
+"""A FiberPool that somebody else keeps, which this program is the master of for a while."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+from fiber._backends.kubernetes.api import TIMEOUT, Api
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Conflict, NotFound
+from fiber._backends.kubernetes.held_pool import HeldPool, Master, identity_in
+from fiber._backends.kubernetes.resources import LEASES, POOLS, SECRETS
+from fiber._backends.kubernetes.secret import credentials_of
+from fiber._transport.credentials import MasterCredentials
+from fiber.errors import FiberPoolError
+from fiber_api import names
+from fiber_api.certificates import InvalidCertificates
+from fiber_api.names import ConditionType
+
+_PAUSE = 0.05
+"""Seconds until the next attempt after somebody else has written to the pool."""
+
+
+def read_credentials(api: Api, namespace: str, pool: str) -> MasterCredentials:
+    """Those of the pool, which the operator made.  Blocks; ``ApiError``, FiberPoolError."""
+    spec = api.get(POOLS.path(namespace, pool))["spec"]
+    name = spec.get("credentialsSecretName") or names.secret_name(pool)
+    try:
+        return credentials_of(api.get(SECRETS.path(namespace, name)), pool, namespace)
+    except InvalidCertificates as error:
+        raise FiberPoolError(
+            f"the Secret {name!r} of the FiberPool {pool!r} in namespace {namespace!r} cannot "
+            f"serve: {error}. If the operator made it, delete it: it makes a new one; then delete "
+            "the pool's pods, which hold the old one",
+            pool=pool,
+            namespace=namespace,
+            reason=names.Reason.INVALID_CREDENTIALS,
+        ) from None
+
+
+class WarmPool:
+    """One pool, from before this program is its master to after."""
+
+    def __init__(self, api: Api, namespace: str, name: str, master: Master) -> None:
+        self._api = api
+        self._master = master
+        self._held: HeldPool | None = None
+        self._replicas = 0
+        """What the pool had before, and has again after."""
+        self.name = name
+        self.namespace = namespace
+        self.doing = f"attach to the FiberPool {name!r}"
+
+    @property
+    def remedy(self) -> str:
+        """What detaches the program when ``end`` does not."""
+        patch = json.dumps({"spec": {"master": None, "replicas": self._replicas}})
+        where = f"fiberpool {self.name} -n {self.namespace}"
+        return f"kubectl patch {where} --type=merge -p '{patch}'"
+
+    def begin(self, cancel: threading.Event) -> HeldPool:
+        """Be its master from now on; FiberPoolError if it has one."""
+        deadline = time.monotonic() + TIMEOUT
+        while not self._attach(cancel):
+            # Its status was written meanwhile, or another program was faster.
+            if time.monotonic() > deadline or cancel.wait(_PAUSE):
+                raise Conflict("it changes faster than it can be attached to", status=409)
+        assert self._held is not None
+        try:
+            self._held.make_lease(cancel=cancel)
+        except Conflict:
+            self._held.renew_lease(cancel=cancel)  # the master before left it
+        return self._held
+
+    def end(self, timeout: float) -> None:
+        """Leave it as it was, if this program still is its master."""
+        held = self._held
+        if held is None:
+            return
+        deadline = time.monotonic() + timeout
+        while not self._detach(held, left := max(deadline - time.monotonic(), 0.0)):
+            if not left:
+                raise Conflict("it changes faster than it can be detached from", status=409)
+
+    def _detach(self, held: HeldPool, timeout: float) -> bool:
+        try:
+            found = self._api.get(held.path, timeout=timeout)
+        except NotFound:
+            return True
+        if held.loss(found) is not None:
+            return True
+        try:
+            # While it is ours: afterwards it may be the next master's.
+            held.free_lease(timeout=timeout)
+            version = found["metadata"]["resourceVersion"]
+            held.apply(self._replicas, master=False, resource_version=version, timeout=timeout)
+        except Conflict:
+            return False
+        return True
+
+    def _attach(self, cancel: threading.Event) -> bool:
+        found = self._api.get(POOLS.path(self.namespace, self.name), cancel=cancel)
+        there = found["spec"].get("master") or {}
+        epoch = int(there.get("epoch") or 0)
+        if there and identity_in(found) == self._master.identity:
+            self._held = HeldPool(self._api, found, self._master, epoch)
+            return True  # by an attempt whose answer was lost
+        if there:
+            self._check_lost(found, there)
+        held = HeldPool(
+            self._api,
+            found,
+            self._master,
+            1 + max(epoch, int((found.get("status") or {}).get("masterEpoch") or 0)),
+        )
+        self._replicas = 0 if there else int(found["spec"].get("replicas") or 0)
+        version = found["metadata"]["resourceVersion"]
+        self._held = held  # whatever becomes of the call, `end` looks whether the pool is ours
+        try:
+            held.apply(self._replicas, resource_version=version, cancel=cancel)
+        except Conflict:
+            return False
+        return True
+
+    def _check_lost(self, found: Body, there: Body) -> None:
+        """Raise unless the operator says that the master that is there is gone."""
+        status = found.get("status") or {}
+        known = {entry["type"]: entry["status"] for entry in status.get("conditions") or ()}
+        # A status of before may be about the master before.
+        current = status.get("observedGeneration", 0) >= found["metadata"]["generation"]
+        if current and known.get(ConditionType.MASTER_ALIVE) == "False":
+            return
+        lease = self._lease_of(there)
+        since = f" since {lease['acquireTime']}" if lease.get("acquireTime") else ""
+        sign = f", last heard of at {lease['renewTime']}" if lease.get("renewTime") else ""
+        raise FiberPoolError(
+            f"the FiberPool {self.name!r} in namespace {self.namespace!r} is in use: its master is "
+            f"{there.get('identity') or there.get('host')}{since}{sign}. Wait until that program "
+            "ends, or end it; one that was killed counts as gone "
+            f"{there.get('leaseDurationSeconds', 30)} s after its last sign of life",
+            pool=self.name,
+            namespace=self.namespace,
+            reason="InUse",
+        )
+
+    def _lease_of(self, master: Body) -> Body:
+        name = master.get("leaseName")
+        if not name:
+            return {}
+        try:
+            spec = self._api.get(LEASES.path(self.namespace, name), timeout=0.0).get("spec")
+        except ApiError:
+            return {}  # it only makes the message better
+        return spec or {}

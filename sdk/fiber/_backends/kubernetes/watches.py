@@ -1,0 +1,112 @@
+"""A thread that follows some objects of the API server: a pool, or its pods."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+from fiber._backends.kubernetes.api import Api, Watch
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Expired
+
+_PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
+"""Seconds before it goes on after an end that came early, growing."""
+
+_EARLY = 1.0
+"""A watch that ends sooner, in seconds, is not followed by the next one at once."""
+
+
+class ObjectWatch:
+    """Lists once, then watches; where a watch ends the next goes on, and where that cannot be it
+    lists again and tells what is different from before.
+    """
+
+    def __init__(
+        self,
+        api: Api,
+        path: str,
+        selector: Mapping[str, str],
+        *,
+        on_change: Callable[[str, Body | None], None],
+        on_trouble: Callable[[ApiError], None],
+    ) -> None:
+        """``on_change`` is told the name and the object as it is, or None once it is gone;
+        ``on_trouble`` what keeps the watch from going on, each time.  Both on the thread.
+        """
+        self._api = api
+        self._path = path
+        self._selector = selector
+        self._on_change = on_change
+        self._on_trouble = on_trouble
+        self._version: str | None = None
+        """Where the next watch goes on; None: with a list."""
+        self._known: set[str] = set()
+        self._lock = threading.Lock()
+        self._watch: Watch | None = None
+        self._stopped = threading.Event()
+        kind = path.rpartition("/")[2]
+        self._thread = threading.Thread(target=self._run, name=f"fiber-watch-{kind}", daemon=True)
+
+    def start(self) -> None:
+        """Begin, on a thread of its own."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Tell nothing more; returns at once."""
+        with self._lock:
+            self._stopped.set()
+            watch = self._watch
+        if watch is not None:
+            watch.stop()
+
+    def join(self, timeout: float) -> None:
+        """Wait for the thread's end after ``stop``."""
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        pause = _PAUSE_MIN
+        while not self._stopped.is_set():
+            started = time.monotonic()
+            try:
+                if self._version is None:
+                    self._version = self._list()
+                self._follow(self._version)
+            except Expired:
+                self._version = None
+            except ApiError as error:
+                if not self._stopped.is_set():
+                    self._on_trouble(error)
+            if time.monotonic() - started >= _EARLY:
+                pause = _PAUSE_MIN
+            else:
+                self._stopped.wait(pause * random.uniform(0.5, 1.0))
+                pause = min(2 * pause, _PAUSE_MAX)
+
+    def _list(self) -> str:
+        listing = self._api.list(self._path, self._selector, cancel=self._stopped)
+        found = {str(item["metadata"]["name"]): item for item in listing.get("items") or ()}
+        for name in sorted(self._known - found.keys()):
+            self._tell(name, None)
+        for name, item in found.items():
+            self._tell(name, item)
+        return str(listing["metadata"]["resourceVersion"])
+
+    def _follow(self, version: str) -> None:
+        watch = self._api.watch(self._path, self._selector, version)
+        with self._lock:
+            if self._stopped.is_set():
+                return
+            self._watch = watch
+        for event in watch:
+            found = event["object"]
+            if event["type"] != "BOOKMARK":
+                name = str(found["metadata"]["name"])
+                self._tell(name, None if event["type"] == "DELETED" else found)
+            self._version = str(found["metadata"]["resourceVersion"])
+
+    def _tell(self, name: str, found: Body | None) -> None:
+        if self._stopped.is_set():
+            return
+        (self._known.discard if found is None else self._known.add)(name)
+        self._on_change(name, found)

@@ -1,0 +1,185 @@
+"""A program's side of a FiberPool, against an API server in this process."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from fakes.kubernetes_api import Call
+from fakes.served import Served
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
+from fiber._backends.kubernetes.held_pool import Master
+from fiber._backends.kubernetes.own_pool import OwnPool
+from fiber._backends.kubernetes.secret import make_credentials
+from fiber._backends.kubernetes.warm_pool import WarmPool
+from fiber._transport.loop import Loop
+from fiber.errors import FiberPoolError
+from fiber_api import names
+
+NAMESPACE = "lab"
+MASTER = Master("10.0.0.7", 41337, "laptop-7:4711")
+OTHER = Master("10.0.0.8", 41338, "laptop-8:4712")
+Body = dict[str, Any]
+
+
+def kubeconfig(folder: Path, url: str, user: Body | None = None, **cluster: str) -> Path:
+    """A file for ``KUBECONFIG`` whose current context is ``here``, with the namespace lab."""
+    path = folder / "kubeconfig"
+    contexts = {"here": {"namespace": NAMESPACE}, "bare": {}}
+    document = {
+        "apiVersion": "v1",
+        "kind": "Config",
+        "current-context": "here",
+        "clusters": [{"name": "test", "cluster": {"server": url, **cluster}}],
+        "users": [{"name": "me", "user": user or {"token": "one"}}],
+        "contexts": [
+            {"name": name, "context": {"cluster": "test", "user": "me", **more}}
+            for name, more in contexts.items()
+        ],
+    }
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def pool_body(name: str = "es-1") -> Body:
+    """A FiberPool without what the master writes."""
+    template = {"spec": {"containers": [{"name": names.WORKER_CONTAINER, "image": "worker"}]}}
+    return {
+        "apiVersion": names.API_VERSION,
+        "kind": names.KIND,
+        "metadata": {"name": name},
+        "spec": {"template": template},
+    }
+
+
+@dataclass
+class Told:
+    """An observer that remembers."""
+
+    statuses: list[Body] = field(default_factory=list)
+    pods: list[tuple[str, Body | None]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    errors: list[FiberPoolError] = field(default_factory=list)
+    _changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def on_status(self, status: Body) -> None:
+        self._note(self.statuses, status)
+
+    def on_pod(self, name: str, pod: Body | None) -> None:
+        self._note(self.pods, (name, pod))
+
+    def on_warning(self, message: str) -> None:
+        self._note(self.warnings, message)
+
+    def on_error(self, error: FiberPoolError) -> None:
+        self._note(self.errors, error)
+
+    def wait(self, what: Callable[[], object], timeout: float = 20.0) -> None:
+        """Until it is so; it is asked after each thing that is told."""
+        with self._changed:
+            assert self._changed.wait_for(what, timeout), self
+
+    def error(self) -> FiberPoolError:
+        """The one that is told, waited for."""
+        self.wait(lambda: self.errors)
+        return self.errors[0]
+
+    def _note(self, where: list[Any], what: object) -> None:
+        with self._changed:
+            where.append(what)
+            self._changed.notify_all()
+
+
+class Operator:
+    """Does as much as a program waits for: it looks at each pool that is written to."""
+
+    def __init__(self, server: Served) -> None:
+        self._store = server.store
+        self.mute = False
+        server.api.after = self._after
+
+    def _after(self, call: Call) -> None:
+        if call.plural == names.PLURAL and call.verb in ("create", "patch") and not self.mute:
+            for pool in self._store.list(names.PLURAL, call.namespace):
+                self._look(pool)
+
+    def _look(self, pool: Body) -> None:
+        metadata = pool["metadata"]
+        status = {**(pool.get("status") or {}), "observedGeneration": metadata["generation"]}
+        if "master" in pool["spec"]:
+            status["masterEpoch"] = pool["spec"]["master"]["epoch"]
+        self._store.set_status(names.PLURAL, metadata["namespace"], metadata["name"], status)
+
+
+class Rig:
+    """A program, the API server that it uses, and what it was told."""
+
+    def __init__(self, server: Served, api: Api, loop: Loop) -> None:
+        self.server = server
+        self.api = api
+        self.loop = loop
+        self.operator = Operator(server)
+        self._clients: list[FiberPoolClient] = []
+
+    def own(self, told: Told, name: str = "es-1", owner: Body | None = None) -> FiberPoolClient:
+        """A client that makes a pool."""
+        credentials = make_credentials(name, NAMESPACE)
+        tenure = OwnPool(self.api, NAMESPACE, pool_body(name), credentials, MASTER, owner)
+        return self._client(tenure, told)
+
+    def warm(self, told: Told, master: Master = MASTER, name: str = "warm") -> FiberPoolClient:
+        """A client that attaches to one."""
+        return self._client(WarmPool(self.api, NAMESPACE, name, master), told)
+
+    def pool(self, name: str = "es-1") -> Body:
+        """The pool as it is now."""
+        return self.get(names.PLURAL, name)
+
+    def spec(self, name: str = "es-1") -> Body:
+        """Its spec, empty while there is none."""
+        pools = self.server.objects(names.PLURAL)
+        return next((pool["spec"] for pool in pools if pool["metadata"]["name"] == name), {})
+
+    def get(self, plural: str, name: str) -> Body:
+        """An object as it is now."""
+        return self.server.do(self.server.store.get, plural, NAMESPACE, name)
+
+    def add_pod(self, name: str, pool: str = "es-1") -> None:
+        labels = {names.LABEL_POOL_UID: self.pool(pool)["metadata"]["uid"]}
+        body = {"metadata": {"name": name, "labels": labels}, "spec": {}}
+        self.server.do(self.server.store.create, "pods", NAMESPACE, body)
+
+    def remove(self, plural: str, name: str) -> None:
+        self.server.do(self.server.store.remove, plural, NAMESPACE, name)
+
+    def close(self) -> None:
+        self.server.api.faults.clear()
+        self.server.api.down = False
+        for client in self._clients:
+            client.close()
+
+    def _client(self, tenure: OwnPool | WarmPool, told: Told) -> FiberPoolClient:
+        client = FiberPoolClient(self.api, self.loop, tenure, told)
+        self._clients.append(client)
+        client.start()
+        return client
+
+
+@contextlib.contextmanager
+def rig(server: Served, api: Api) -> Iterator[Rig]:
+    """One that ends with the test."""
+    loop = Loop()
+    loop.start_thread("test-io")
+    made = Rig(server, api, loop)
+    try:
+        yield made
+    finally:
+        made.close()
+        loop.stop()

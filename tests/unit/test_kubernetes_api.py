@@ -1,0 +1,370 @@
+"""The door to the Kubernetes API: logging in, calls, what goes wrong, watches."""
+
+from __future__ import annotations
+
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from kubernetes.config import incluster_config
+
+from fakes.kubernetes_api import Fault
+from fakes.served import Served, served
+from fiber._backends.kubernetes import api as door
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.api_errors import (
+    ApiError,
+    Conflict,
+    Expired,
+    Forbidden,
+    Invalid,
+    NotFound,
+    Throttled,
+    Unauthorized,
+    Unreachable,
+)
+from fiber._backends.kubernetes.resources import LEASES, NODES, PODS, POOLS
+from fiber.errors import ConfigError
+from fiber_api.certificates import RUN_VALIDITY, Certificates, make_certificates
+from unit.kubernetes_rig import NAMESPACE, kubeconfig
+
+POD = {"metadata": {"name": "a", "labels": {"app": "x"}}, "spec": {}}
+ONE = PODS.path(NAMESPACE, "a")
+ALL = PODS.path(NAMESPACE)
+
+
+@pytest.fixture
+def server() -> Iterator[Served]:
+    with served() as server:
+        yield server
+
+
+@pytest.fixture
+def api(server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Api:
+    monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
+    return Api.connect()
+
+
+# -- Paths
+
+
+def test_paths_are_the_apis() -> None:
+    assert PODS.path("lab", "a") == "/api/v1/namespaces/lab/pods/a"
+    assert NODES.path() == "/api/v1/nodes"
+    assert POOLS.path("lab") == "/apis/fiber.dev/v1alpha1/namespaces/lab/fiberpools"
+    assert LEASES.path("l", "n") == "/apis/coordination.k8s.io/v1/namespaces/l/leases/n"
+
+
+# -- Logging in
+
+
+def test_the_current_context_says_where_and_who(server: Served, api: Api) -> None:
+    assert (api.namespace, api.in_cluster, api.server) == (NAMESPACE, False, "127.0.0.1")
+    api.list(ALL)
+    assert server.api.tokens == ["Bearer one"]
+
+
+def test_a_context_without_a_namespace_has_the_default_one(api: Api) -> None:
+    assert Api.connect("bare").namespace == "default"
+
+
+def test_a_context_that_is_not_there(api: Api) -> None:
+    with pytest.raises(ConfigError, match=r"elsewhere.*get-contexts"):
+        Api.connect("elsewhere")
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "clusters: 3", "{", "current-context: here"])
+def test_a_kubeconfig_that_is_none(
+    content: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "kubeconfig"
+    if content is not None:
+        path.write_text(content)
+    monkeypatch.setenv("KUBECONFIG", str(path))
+    with pytest.raises(ConfigError, match=f"{path} cannot be used.*FIBER_BACKEND=local"):
+        Api.connect()
+
+
+def test_without_the_package_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "kubernetes", None)
+    with pytest.raises(ConfigError, match=r"pip install 'fiberpool\[kubernetes\]'"):
+        Api.connect()
+
+
+def test_the_package_is_imported_by_whoever_connects_alone() -> None:
+    program = (
+        "import sys, fiber._backends.kubernetes.fiber_pool, fiber._backends.kubernetes.address;"
+        "print([name for name in ('kubernetes', 'urllib3') if name in sys.modules])"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ran.stdout == "[]\n", ran.stderr
+
+
+def test_a_login_plugin_is_asked_again_when_its_token_is_not_accepted(
+    server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token = tmp_path / "token"
+    token.write_text("one")
+    credential = '{"apiVersion":"client.authentication.k8s.io/v1","kind":"ExecCredential",'
+    plugin = {
+        "apiVersion": "client.authentication.k8s.io/v1",
+        "command": "sh",
+        "args": ["-c", f'echo \'{credential}"status":{{"token":"\'$(cat {token})\'"}}}}\''],
+        "interactiveMode": "Never",
+    }
+    monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url, {"exec": plugin})))
+    api = Api.connect()
+    server.api.accepts = {"Bearer one"}
+    api.list(ALL)
+    server.api.accepts = {"Bearer two"}
+    token.write_text("two")
+    api.list(ALL)
+    server.api.accepts = set()
+    with pytest.raises(Unauthorized):
+        api.list(ALL)
+
+
+# -- The account of a pod
+
+
+@pytest.fixture
+def account(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Served, Path]]:
+    """An API server that knows the account's token, and the folder that the account is in."""
+    made = make_certificates("localhost", "nobody", valid_for=RUN_VALIDITY)
+    with served(_server_side(made, tmp_path)) as server:
+        (tmp_path / "ca.crt").write_text(made.authority)
+        (tmp_path / "namespace").write_text("lab\n")
+        (tmp_path / "token").write_text("one")
+        monkeypatch.delenv("KUBECONFIG", raising=False)
+        monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "localhost")
+        monkeypatch.setenv("KUBERNETES_SERVICE_PORT", str(server.api.port))
+        monkeypatch.setattr(door, "_ACCOUNT", str(tmp_path))
+        files = {"SERVICE_TOKEN_FILENAME": "token", "SERVICE_CERT_FILENAME": "ca.crt"}
+        for constant, file in files.items():
+            monkeypatch.setattr(incluster_config, constant, str(tmp_path / file))
+        yield server, tmp_path
+
+
+def _server_side(made: Certificates, folder: Path) -> ssl.SSLContext:
+    pem = folder / "server.pem"
+    pem.write_text(f"{made.master.certificate}\n{made.master.key}\n")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(pem)
+    return context
+
+
+def test_in_a_pod_its_account_is_used(account: tuple[Served, Path]) -> None:
+    server, _ = account
+    api = Api.connect()
+    assert (api.namespace, api.in_cluster, api.server) == ("lab", True, "localhost")
+    api.list(ALL)
+    assert [token.lower() for token in server.api.tokens] == ["bearer one"]
+
+
+def test_the_accounts_token_is_read_again_once_it_has_expired(
+    account: tuple[Served, Path],
+) -> None:
+    server, folder = account
+    api = Api.connect()
+    server.api.accepts = {"bearer two"}
+    (folder / "token").write_text("two")  # as the kubelet replaces it
+    api.list(ALL)
+    assert server.api.tokens[-1] == "bearer two"
+
+
+def test_an_account_whose_token_is_gone_is_unauthorized(account: tuple[Served, Path]) -> None:
+    server, folder = account
+    api = Api.connect()
+    server.api.accepts = set()
+    (folder / "token").unlink()
+    with pytest.raises(Unauthorized, match="token file"):
+        api.list(ALL)
+
+
+def test_a_pod_without_an_account_says_what_to_do(account: tuple[Served, Path]) -> None:
+    _, folder = account
+    (folder / "namespace").unlink()
+    with pytest.raises(ConfigError, match="automountServiceAccountToken"):
+        Api.connect()
+
+
+def test_a_watch_over_tls_is_stopped_from_another_thread(account: tuple[Served, Path]) -> None:
+    _watch_and_stop(Api.connect())
+
+
+def test_an_authority_that_signed_another_server_is_unreachable(
+    account: tuple[Served, Path],
+) -> None:
+    _, folder = account
+    strangers = make_certificates("localhost", "nobody", valid_for=RUN_VALIDITY)
+    (folder / "ca.crt").write_text(strangers.authority)
+    with pytest.raises(Unreachable, match=r"(?i)certificate"):
+        Api.connect().list(ALL, timeout=0)
+
+
+# -- Calls
+
+
+def test_objects_are_made_read_changed_and_deleted(server: Served, api: Api) -> None:
+    made = api.create(ALL, POD)
+    assert api.get(ONE) == made
+    assert api.merge_patch(ONE, {"spec": {"nodeName": "n"}})["spec"] == {"nodeName": "n"}
+    assert [pod["metadata"]["name"] for pod in api.list(ALL)["items"]] == ["a"]
+    assert api.list(ALL, {"labelSelector": "app=y"})["items"] == []
+    with pytest.raises(Conflict):
+        api.delete(ONE, uid="another")
+    api.delete(ONE, uid=made["metadata"]["uid"])
+    with pytest.raises(NotFound) as caught:
+        api.get(ONE)
+    assert (caught.value.status, caught.value.reason) == (404, "NotFound")
+
+
+@pytest.mark.parametrize(
+    ("status", "kind"),
+    [(401, Unauthorized), (403, Forbidden), (404, NotFound), (409, Conflict), (422, Invalid)],
+)
+def test_what_will_not_pass_is_raised_at_once(
+    server: Served, api: Api, status: int, kind: type[ApiError]
+) -> None:
+    server.api.faults.append(Fault("list", "pods", status=status, message="why", times=99))
+    with pytest.raises(kind, match="why") as caught:
+        api.list(ALL)
+    assert type(caught.value) is kind
+    assert server.api.count("list", "pods") == (2 if status == 401 else 1)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Fault(status=500),
+        Fault(status=503),
+        Fault(status=429, retry_after=0),
+        Fault(),
+        Fault(text="<html>"),
+    ],
+)
+def test_what_may_pass_is_tried_again(server: Served, api: Api, fault: Fault) -> None:
+    fault.verb, fault.times = "list", 2
+    server.api.faults.append(fault)
+    assert api.list(ALL)["items"] == []
+    assert server.api.count("list", "pods") == 3
+
+
+def test_with_timeout_0_there_is_one_attempt(server: Served, api: Api) -> None:
+    server.api.faults.append(Fault(status=503, times=9))
+    with pytest.raises(Unreachable):
+        api.list(ALL, timeout=0.0)
+    assert server.api.count("list", "pods") == 1
+
+
+def test_who_is_asked_to_come_back_later_than_there_is_time_does_not_wait(
+    server: Served, api: Api
+) -> None:
+    server.api.faults.append(Fault(status=429, retry_after=20, times=9))
+    started = time.monotonic()
+    with pytest.raises(Throttled) as caught:
+        api.list(ALL, timeout=5.0)
+    assert caught.value.retry_after == 20
+    assert time.monotonic() - started < 5.0
+
+
+def test_attempts_end_when_they_are_cancelled(server: Served, api: Api) -> None:
+    server.api.faults.append(Fault(status=503, times=float("inf")))
+    cancel = threading.Event()
+    server.api.after = lambda call: cancel.set()
+    server.api.faults.append(Fault(status=503, carried_out=True, times=float("inf")))
+    cancel.set()
+    with pytest.raises(Unreachable):
+        api.list(ALL, timeout=60.0, cancel=cancel)
+    assert server.api.count("list", "pods") == 1
+
+
+def test_nobody_who_answers_is_unreachable(api: Api, server: Served) -> None:
+    server.api.down = True
+    with pytest.raises(Unreachable):
+        api.list(ALL, timeout=0.0)
+
+
+def test_garbage_is_not_shown(server: Served, api: Api) -> None:
+    server.api.faults.append(Fault(text='["s3cret"', times=9))
+    with pytest.raises(Unreachable) as caught:
+        api.list(ALL, timeout=0.0)
+    assert "s3cret" not in str(caught.value)
+
+
+# -- Watches
+
+
+def test_a_watch_goes_on_from_a_version(server: Served, api: Api) -> None:
+    version = api.list(ALL)["metadata"]["resourceVersion"]
+    api.create(ALL, POD)
+    api.create(ALL, {"metadata": {"name": "b"}, "spec": {}})
+    api.delete(ONE)
+    watch = api.watch(ALL, {"labelSelector": "app=x"}, version)
+    events = iter(watch)
+    got = [next(events) for _ in range(2)]
+    assert [event["type"] for event in got] == ["ADDED", "DELETED"]
+    watch.stop()
+    assert list(events) == []
+
+
+def test_a_watch_is_stopped_in_the_middle_of_waiting(api: Api) -> None:
+    _watch_and_stop(api)
+
+
+def _watch_and_stop(api: Api) -> None:
+    version = api.list(ALL)["metadata"]["resourceVersion"]
+    watch = api.watch(ALL, {}, version)
+    first = threading.Event()
+    seen = []
+
+    def follow() -> None:
+        for event in watch:
+            seen.append(event["type"])
+            first.set()
+
+    thread = threading.Thread(target=follow)
+    thread.start()
+    api.create(ALL, POD)
+    assert first.wait(10)
+    watch.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert seen == ["ADDED"]
+
+
+def test_a_watch_that_was_stopped_before_brings_nothing(server: Served, api: Api) -> None:
+    version = api.list(ALL)["metadata"]["resourceVersion"]
+    api.create(ALL, POD)
+    watch = api.watch(ALL, {}, version)
+    watch.stop()
+    assert list(watch) == []
+
+
+def test_a_watch_from_a_version_that_is_forgotten(server: Served, api: Api) -> None:
+    version = api.list(ALL)["metadata"]["resourceVersion"]
+    api.create(ALL, POD)
+    server.do(server.store.forget_history)
+    with pytest.raises(Expired):
+        list(api.watch(ALL, {}, version))
+
+
+def test_a_watch_that_is_refused(server: Served, api: Api) -> None:
+    server.api.faults.append(Fault("watch", status=403))
+    with pytest.raises(Forbidden):
+        list(api.watch(ALL, {}, "1"))
+
+
+def test_a_watch_that_is_cut_off(server: Served, api: Api) -> None:
+    version = api.list(ALL)["metadata"]["resourceVersion"]
+    api.create(ALL, POD)
+    events = iter(api.watch(ALL, {}, version))
+    next(events)
+    server.do(server.api.drop_watches)
+    with pytest.raises(Unreachable):
+        next(events)

@@ -1,0 +1,376 @@
+"""A pool that a program makes: its birth, what is wanted of it, what goes wrong, its end."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fakes.kubernetes_api import Call, Fault
+from fakes.served import served
+from fakes.store import Failure
+from fiber._backends.kubernetes import fiber_pool
+from fiber._backends.kubernetes.api import Api
+from fiber._transport.credentials import MasterCredentials
+from fiber_api import names
+from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, kubeconfig
+from unit.kubernetes_rig import rig as make_rig
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    with served() as server:
+        monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
+        with make_rig(server, Api.connect()) as made:
+            yield made
+
+
+@pytest.fixture
+def told() -> Told:
+    return Told()
+
+
+def changes(rig: Rig) -> list[tuple[str, str]]:
+    """What was asked for that changes something."""
+    calls = (call for call in rig.server.api.calls if call.verb not in ("get", "list", "watch"))
+    return [(call.verb, call.plural) for call in calls]
+
+
+def on(rig: Rig, verb: str, plural: str, act: object) -> None:
+    """Call ``act`` on the server's thread after each such call."""
+    before = rig.server.api.after
+
+    def after(call: Call) -> None:
+        before(call)
+        if (call.verb, call.plural) == (verb, plural):
+            act()  # type: ignore[operator]
+
+    rig.server.api.after = after
+
+
+def replicas_become(rig: Rig, told: Told, number: int, name: str = "es-1") -> None:
+    """Wait; the operator's word of each change is what the observer is told."""
+    told.wait(lambda: rig.spec(name).get("replicas") == number)
+
+
+# -- Birth
+
+
+def test_a_pool_is_born_with_its_master_and_without_pods(rig: Rig, told: Told) -> None:
+    seen: list[Body] = []
+    on(rig, "create", names.PLURAL, lambda: seen.append(rig.server.store.list(names.PLURAL)[0]))
+    rig.own(told).demand(3)
+    replicas_become(rig, told, 3)
+    (born,) = seen
+    assert born["spec"]["replicas"] == 0
+    assert born["spec"]["onLost"] == "Delete"
+    assert born["spec"]["credentialsSecretName"] == names.secret_name("es-1")
+    assert born["spec"]["master"] == {
+        "host": "10.0.0.7",
+        "port": 41337,
+        "epoch": 1,
+        "identity": "laptop-7:4711",
+        "leaseName": names.master_lease_name("es-1"),
+        "leaseDurationSeconds": 30,
+        "lostGraceSeconds": 60,
+    }
+    assert changes(rig) == [
+        ("create", names.PLURAL),
+        ("create", "secrets"),
+        ("create", "leases"),
+        ("patch", names.PLURAL),
+    ]
+
+
+def test_what_belongs_to_a_pool_goes_with_it(rig: Rig, told: Told) -> None:
+    rig.own(told).demand(1)
+    replicas_become(rig, told, 1)
+    uid = rig.pool()["metadata"]["uid"]
+    for plural, name in (
+        ("secrets", names.secret_name("es-1")),
+        ("leases", names.master_lease_name("es-1")),
+    ):
+        (owner,) = rig.get(plural, name)["metadata"]["ownerReferences"]
+        assert owner == {
+            "apiVersion": names.API_VERSION,
+            "kind": names.KIND,
+            "name": "es-1",
+            "uid": uid,
+        }
+
+
+def test_the_secret_holds_the_agents_half_alone(rig: Rig, told: Told) -> None:
+    rig.own(told).demand(1)
+    replicas_become(rig, told, 1)
+    data = rig.get("secrets", names.secret_name("es-1"))["data"]
+    assert set(data) == set(names.AGENT_FILES)
+    server = base64.b64decode(data[names.KEY_SERVER_NAME]).decode()
+    assert server == names.server_name("es-1", NAMESPACE)
+
+
+def test_in_a_pod_the_pool_is_owned_by_it(rig: Rig, told: Told) -> None:
+    owner = {"apiVersion": "v1", "kind": "Pod", "name": "notebook", "uid": "123"}
+    rig.own(told, owner=owner).demand(1)
+    replicas_become(rig, told, 1)
+    assert rig.pool()["metadata"]["ownerReferences"] == [owner]
+
+
+@pytest.mark.parametrize("plural", [names.PLURAL, "secrets", "leases"])
+def test_an_answer_that_is_lost_while_it_is_born(rig: Rig, told: Told, plural: str) -> None:
+    rig.server.api.faults.append(Fault("create", plural, carried_out=True))
+    rig.own(told).demand(2)
+    replicas_become(rig, told, 2)
+    assert not told.errors
+
+
+def test_the_name_of_somebody_elses_pool(rig: Rig, told: Told) -> None:
+    other = {"metadata": {"name": "es-1"}, "spec": {"master": OTHER.spec("es-1", 1)}}
+    rig.server.do(rig.server.store.create, names.PLURAL, NAMESPACE, other)
+    client = rig.own(told)
+    assert told.error().reason == "AlreadyExists"
+    client.close()
+    assert rig.spec()["master"]["identity"] == OTHER.identity
+
+
+# -- What is wanted
+
+
+def test_only_the_newest_demand_is_written(rig: Rig, told: Told) -> None:
+    client = rig.own(told)
+    on(rig, "create", "leases", lambda: [client.demand(number) for number in (1, 2, 3)])
+    replicas_become(rig, told, 3)
+    assert rig.server.api.count("patch", names.PLURAL) == 1
+
+
+def test_a_demand_is_written_until_it_holds(rig: Rig, told: Told) -> None:
+    rig.server.api.faults.append(Fault("patch", names.PLURAL, status=503, times=3))
+    rig.own(told).demand(4)
+    replicas_become(rig, told, 4)
+    assert not told.errors
+    (warning,) = told.warnings
+    assert "kubectl cluster-info" in warning
+
+
+def test_names_to_release_are_written_until_their_pods_are_gone(rig: Rig, told: Told) -> None:
+    client = rig.own(told)
+    client.demand(2)
+    replicas_become(rig, told, 2)
+    rig.add_pod("es-1-a")
+    rig.add_pod("es-1-b")
+    told.wait(lambda: len(told.pods) == 2)
+    client.demand(1, ["es-1-a"])
+    replicas_become(rig, told, 1)
+    assert rig.spec()["scaleDown"]["release"] == ["es-1-a"]
+    rig.remove("pods", "es-1-a")
+    told.wait(lambda: ("es-1-a", None) in told.pods)
+    client.demand(0, ["es-1-b"])
+    replicas_become(rig, told, 0)
+    assert rig.spec()["scaleDown"]["release"] == ["es-1-b"]
+
+
+# -- What it hears
+
+
+def test_it_tells_status_and_pods(rig: Rig, told: Told) -> None:
+    rig.own(told).demand(1)
+    replicas_become(rig, told, 1)
+    status = {"observedGeneration": 9, "phase": "Ready"}
+    rig.server.do(rig.server.store.set_status, names.PLURAL, NAMESPACE, "es-1", status)
+    told.wait(lambda: status in told.statuses)
+    rig.add_pod("es-1-a")
+    told.wait(lambda: told.pods)
+    name, pod = told.pods[0]
+    assert (name, pod and pod["metadata"]["name"]) == ("es-1-a", "es-1-a")
+
+
+def test_pods_of_other_pools_are_none_of_its_business(rig: Rig, told: Told) -> None:
+    rig.own(told).demand(1)
+    replicas_become(rig, told, 1)
+    others = {"metadata": {"name": "x", "labels": {names.LABEL_POOL_UID: "another"}}, "spec": {}}
+    rig.server.do(rig.server.store.create, "pods", NAMESPACE, others)
+    rig.add_pod("es-1-a")
+    told.wait(lambda: told.pods)
+    assert [name for name, _ in told.pods] == ["es-1-a"]
+
+
+def test_a_pool_that_somebody_deletes_is_an_error(rig: Rig, told: Told) -> None:
+    rig.own(told).demand(1)
+    replicas_become(rig, told, 1)
+    rig.remove(names.PLURAL, "es-1")
+    error = told.error()
+    assert (error.reason, error.pool, error.namespace) == ("Deleted", "es-1", NAMESPACE)
+    assert "was deleted" in str(error)
+
+
+# -- What keeps it from being born
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason", "advice"),
+    [
+        (Fault(status=404, text="404 page not found"), "NotInstalled", "helm install"),
+        (
+            Fault(status=404, reason="NotFound", message='namespaces "lab" not found'),
+            "NamespaceNotFound",
+            "kubectl create namespace lab",
+        ),
+        (
+            Fault(status=403, reason="Forbidden", message="cannot create resource fiberpools"),
+            "Forbidden",
+            "kubectl create rolebinding .* -n lab --clusterrole=fiber-user",
+        ),
+        (
+            Fault(status=403, reason="Forbidden", message="exceeded quota: small"),
+            "QuotaExceeded",
+            "kubectl get resourcequota -n lab",
+        ),
+        (
+            Fault(status=400, reason="BadRequest", message='unknown field "spec.onLost"'),
+            "OutdatedDefinition",
+            "upgrade the operator",
+        ),
+        (Fault(status=401, reason="Unauthorized", times=9), "Unauthorized", "kubectl auth whoami"),
+        (Fault(status=422, reason="Invalid", message="spec.x: too big"), "Invalid", "spec.x"),
+    ],
+)
+def test_what_keeps_it_from_being_born_is_said_at_once(
+    rig: Rig, told: Told, fault: Fault, reason: str, advice: str
+) -> None:
+    fault.verb, fault.plural = "create", names.PLURAL
+    rig.server.api.faults.append(fault)
+    rig.own(told).demand(1)
+    error = told.error()
+    assert error.reason == reason
+    assert (error.pool, error.namespace) == ("es-1", NAMESPACE)
+    with pytest.raises(type(error), match=f"cannot make the FiberPool 'es-1'.*{advice}"):
+        raise error
+
+
+def test_a_pool_whose_secret_may_not_be_made_is_taken_back(rig: Rig, told: Told) -> None:
+    rig.server.api.faults.append(Fault("create", "secrets", status=403, message="no secrets"))
+    client = rig.own(told)
+    assert told.error().reason == "Forbidden"
+    client.close()
+    assert rig.server.objects(names.PLURAL) == []
+
+
+def test_a_watch_that_is_forbidden_is_not_taken_for_a_missing_operator(
+    rig: Rig, told: Told
+) -> None:
+    rig.operator.mute = True
+    rig.server.api.faults.append(Fault("list", names.PLURAL, status=403, times=99))
+    rig.own(told).demand(1)
+    assert told.error().reason == "Forbidden"
+
+
+def test_an_operator_that_is_silent(rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.05)
+    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.2)
+    rig.operator.mute = True
+    rig.own(told).demand(1)
+    error = told.error()
+    assert error.reason == "NoOperator"
+    assert "helm install fiber-operator" in str(error)
+    (warning,) = told.warnings
+    assert "was not looked at by an operator" in warning
+
+
+def test_an_operator_that_ends_later_is_waited_for(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 1.0)
+    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 1.0)
+    client = rig.own(told)
+    client.demand(1)
+    replicas_become(rig, told, 1)
+    told.wait(lambda: told.statuses)
+    rig.operator.mute = True
+    client.demand(2)
+    while rig.spec()["replicas"] != 2:
+        assert not told.errors
+
+
+# -- Its end
+
+
+def test_closing_deletes_the_pool_and_all_it_has(rig: Rig, told: Told) -> None:
+    client = rig.own(told)
+    client.demand(1)
+    replicas_become(rig, told, 1)
+    client.close()
+    for plural in (names.PLURAL, "secrets", "leases"):
+        assert rig.server.objects(plural) == []
+    assert not told.errors
+
+
+def test_closing_at_once_leaves_nothing(rig: Rig, told: Told) -> None:
+    rig.own(told).close()
+    for plural in (names.PLURAL, "secrets", "leases"):
+        assert rig.server.objects(plural) == []
+
+
+def test_a_pool_that_was_made_without_our_knowledge_is_deleted(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = rig.own(told)
+    on(rig, "create", names.PLURAL, lambda: None)
+    client.close()
+    assert rig.server.objects(names.PLURAL) == []
+
+
+def test_a_namesake_is_not_deleted(rig: Rig, told: Told) -> None:
+    client = rig.own(told)
+    client.demand(1)
+    replicas_become(rig, told, 1)
+    rig.remove(names.PLURAL, "es-1")
+    other = {"metadata": {"name": "es-1"}, "spec": {"replicas": 0}}
+    rig.server.do(rig.server.store.create, names.PLURAL, NAMESPACE, other)
+    client.close()
+    assert len(rig.server.objects(names.PLURAL)) == 1
+
+
+def test_what_stays_behind_is_said_with_the_command_that_removes_it(
+    rig: Rig, told: Told, capsys: pytest.CaptureFixture[str]
+) -> None:
+    client = rig.own(told)
+    client.demand(1)
+    replicas_become(rig, told, 1)
+    rig.server.api.down = True
+    client.close(timeout=0.5)
+    said = capsys.readouterr().err
+    assert "kubectl delete fiberpool es-1 -n lab" in said
+    assert "stays behind" in said
+
+
+def test_the_certificates_are_the_pools(rig: Rig) -> None:
+    from fiber._backends.kubernetes.secret import make_credentials
+
+    made = make_credentials("es-1", NAMESPACE)
+    assert isinstance(made, MasterCredentials)
+    assert made.server_name == names.server_name("es-1", NAMESPACE)
+    assert made.agent_half().server_name == made.server_name
+
+
+def test_no_fault_of_ours_leaves_anybody_waiting(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("a fault")
+
+    monkeypatch.setattr(fiber_pool, "LeaseRenewer", fail)
+    rig.own(told)
+    error = told.error()
+    assert error.reason == "Internal"
+    assert isinstance(error.__cause__, RuntimeError)
+
+
+def test_a_quota_on_pools(rig: Rig, told: Told) -> None:
+    def refuse(plural: str, body: Body) -> None:
+        raise Failure(403, "Forbidden", f'{plural} "es-1" is forbidden: exceeded quota: small')
+
+    rig.server.store.admit = refuse
+    rig.own(told)
+    assert told.error().reason == "QuotaExceeded"
+    assert MASTER.identity not in str(told.errors[0])

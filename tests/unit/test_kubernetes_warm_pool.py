@@ -1,0 +1,236 @@
+"""A pool that somebody else keeps: attaching, a second master, leaving it as it was."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fakes.kubernetes_api import Fault
+from fakes.served import served
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.warm_pool import read_credentials
+from fiber.errors import FiberPoolError
+from fiber_api import names
+from fiber_api.certificates import make_pool_certificates
+from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, kubeconfig, pool_body
+from unit.kubernetes_rig import rig as make_rig
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    with served() as server:
+        monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
+        with make_rig(server, Api.connect()) as made:
+            body = pool_body("warm")
+            body["spec"] |= {"minReplicas": 2, "replicas": 0, "scaleDown": {"policy": "Any"}}
+            server.do(server.store.create, names.PLURAL, NAMESPACE, body)
+            yield made
+
+
+@pytest.fixture
+def told() -> Told:
+    return Told()
+
+
+def spec(rig: Rig) -> Body:
+    return rig.pool("warm")["spec"]
+
+
+def has_master(rig: Rig, told: Told, epoch: int) -> None:
+    told.wait(lambda: spec(rig).get("master", {}).get("epoch") == epoch)
+
+
+def set_status(rig: Rig, **status: object) -> None:
+    rig.server.do(rig.server.store.set_status, names.PLURAL, NAMESPACE, "warm", status)
+
+
+def leave_master(rig: Rig, epoch: int = 4) -> None:
+    """Another program wrote itself into the pool."""
+    patch = {"spec": {"master": OTHER.spec("warm", epoch), "replicas": 9}}
+    rig.server.do(rig.server.store.merge, names.PLURAL, NAMESPACE, "warm", patch)
+
+
+def alive(value: str, since: str = "2026-01-01T00:00:00Z") -> list[Body]:
+    return [{"type": "MasterAlive", "status": value, "lastTransitionTime": since}]
+
+
+def test_attaching_and_leaving_it_as_it_was(rig: Rig, told: Told) -> None:
+    before = spec(rig)
+    client = rig.warm(told)
+    client.demand(3, ["warm-a"])
+    told.wait(lambda: spec(rig)["replicas"] == 3)
+    assert spec(rig)["master"] == MASTER.spec("warm", 1)
+    assert spec(rig)["scaleDown"] == {"policy": "Any", "release": ["warm-a"]}
+    client.close()
+    assert spec(rig) == before
+    assert not told.errors
+
+
+def test_the_lease_is_the_pools_and_nobodys_afterwards(rig: Rig, told: Told) -> None:
+    client = rig.warm(told)
+    client.demand(1)
+    told.wait(lambda: spec(rig)["replicas"] == 1)
+    lease = rig.get("leases", names.master_lease_name("warm"))
+    assert lease["spec"]["holderIdentity"] == MASTER.identity
+    (owner,) = lease["metadata"]["ownerReferences"]
+    assert owner["uid"] == rig.pool("warm")["metadata"]["uid"]
+    client.close()
+    left = rig.get("leases", names.master_lease_name("warm"))
+    assert left["spec"]["holderIdentity"] == ""
+
+
+def test_the_next_master_has_a_higher_epoch_and_the_same_lease(rig: Rig, told: Told) -> None:
+    first = rig.warm(told)
+    first.demand(1)
+    told.wait(lambda: spec(rig)["replicas"] == 1)
+    first.close()
+    again = Told()
+    second = rig.warm(again, OTHER)
+    second.demand(2)
+    again.wait(lambda: spec(rig)["replicas"] == 2)
+    assert spec(rig)["master"] == OTHER.spec("warm", 2)
+    lease = rig.get("leases", names.master_lease_name("warm"))
+    assert lease["spec"]["holderIdentity"] == OTHER.identity
+
+
+def test_a_second_master_is_told_who_is_there_and_since_when(rig: Rig, told: Told) -> None:
+    first = rig.warm(told)
+    first.demand(1)
+    told.wait(lambda: spec(rig)["replicas"] == 1)
+    lease = rig.get("leases", names.master_lease_name("warm"))
+    second = Told()
+    rig.warm(second, OTHER)
+    error = second.error()
+    assert error.reason == "InUse"
+    assert MASTER.identity in str(error)
+    assert f"since {lease['spec']['acquireTime']}" in str(error)
+    assert spec(rig)["master"]["identity"] == MASTER.identity
+
+
+def test_a_second_master_that_was_refused_leaves_the_first_alone(rig: Rig, told: Told) -> None:
+    leave_master(rig)
+    client = rig.warm(told)
+    assert told.error().reason == "InUse"
+    client.close()
+    assert spec(rig)["master"]["identity"] == OTHER.identity
+
+
+def test_a_master_that_is_lost_is_replaced_and_its_demand_forgotten(rig: Rig, told: Told) -> None:
+    leave_master(rig)
+    generation = rig.pool("warm")["metadata"]["generation"]
+    set_status(rig, observedGeneration=generation, conditions=alive("False"), masterEpoch=4)
+    client = rig.warm(told)
+    has_master(rig, told, 5)
+    client.close()
+    assert spec(rig)["replicas"] == 0
+
+
+def test_what_the_operator_said_of_an_earlier_master_does_not_count(rig: Rig, told: Told) -> None:
+    set_status(rig, observedGeneration=1, conditions=alive("False"))
+    leave_master(rig)
+    rig.warm(told)
+    assert told.error().reason == "InUse"
+
+
+def test_the_epoch_is_above_that_of_all_masters_before(rig: Rig, told: Told) -> None:
+    set_status(rig, observedGeneration=1, masterEpoch=7)
+    rig.warm(told)
+    has_master(rig, told, 8)
+
+
+def test_of_two_that_attach_at_the_same_time_one_is_refused(rig: Rig, told: Told) -> None:
+    reads = 0
+
+    def other_is_faster(call: object) -> None:
+        nonlocal reads
+        if getattr(call, "verb", "") == "get" and not reads:
+            reads += 1
+            patch = {"spec": {"master": OTHER.spec("warm", 1)}}
+            rig.server.store.merge(names.PLURAL, NAMESPACE, "warm", patch)
+
+    rig.server.api.after = other_is_faster
+    rig.warm(told)
+    assert told.error().reason == "InUse"
+    assert spec(rig)["master"]["identity"] == OTHER.identity
+
+
+def test_a_status_that_is_written_meanwhile_does_not_keep_it_out(rig: Rig, told: Told) -> None:
+    looks = iter(range(3))
+
+    def status_changes(call: object) -> None:
+        if getattr(call, "verb", "") == "get" and (number := next(looks, None)) is not None:
+            rig.server.store.set_status(names.PLURAL, NAMESPACE, "warm", {"replicas": number})
+
+    rig.server.api.after = status_changes
+    rig.warm(told)
+    has_master(rig, told, 1)
+
+
+def test_an_answer_to_attaching_that_is_lost(rig: Rig, told: Told) -> None:
+    rig.server.api.faults.append(Fault("patch", names.PLURAL, carried_out=True))
+    client = rig.warm(told)
+    client.demand(2)
+    told.wait(lambda: spec(rig)["replicas"] == 2)
+    assert spec(rig)["master"]["epoch"] == 1
+    client.close()
+    assert "master" not in spec(rig)
+
+
+def test_being_replaced_is_an_error_and_the_successor_is_left_alone(rig: Rig, told: Told) -> None:
+    client = rig.warm(told)
+    has_master(rig, told, 1)
+    told.wait(lambda: told.statuses)
+    leave_master(rig)
+    error = told.error()
+    assert error.reason == "Replaced"
+    assert OTHER.identity in str(error)
+    client.close()
+    assert spec(rig)["master"]["identity"] == OTHER.identity
+
+
+def test_no_such_pool(rig: Rig, told: Told) -> None:
+    rig.warm(told, name="cold")
+    error = told.error()
+    assert error.reason == "NotFound"
+    assert "kubectl get fiberpools -n lab" in str(error)
+
+
+def test_what_stays_behind_is_said_with_the_command_that_detaches(
+    rig: Rig, told: Told, capsys: pytest.CaptureFixture[str]
+) -> None:
+    client = rig.warm(told)
+    has_master(rig, told, 1)
+    told.wait(lambda: told.statuses)
+    rig.server.api.down = True
+    client.close(timeout=0.5)
+    said = capsys.readouterr().err
+    assert "kubectl patch fiberpool warm -n lab --type=merge" in said
+    assert '{"spec": {"master": null, "replicas": 0}}' in said
+
+
+# -- Its credentials
+
+
+def make_secret(rig: Rig, **changed: str) -> None:
+    texts = make_pool_certificates("warm", NAMESPACE).texts() | changed
+    data = {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()}
+    body = {"metadata": {"name": names.secret_name("warm")}, "data": data}
+    rig.server.do(rig.server.store.create, "secrets", NAMESPACE, body)
+
+
+def test_the_credentials_that_the_operator_made_are_read(rig: Rig) -> None:
+    make_secret(rig)
+    read = read_credentials(rig.api, NAMESPACE, "warm")
+    assert read.server_name == names.server_name("warm", NAMESPACE)
+    assert read.key != read.agent_half().key
+
+
+def test_credentials_that_cannot_serve(rig: Rig) -> None:
+    make_secret(rig, **{names.KEY_MASTER_KEY: "damaged"})
+    with pytest.raises(FiberPoolError, match=r"master\.key.*delete it") as caught:
+        read_credentials(rig.api, NAMESPACE, "warm")
+    assert caught.value.reason == "InvalidCredentials"
+    assert "damaged" not in str(caught.value)
