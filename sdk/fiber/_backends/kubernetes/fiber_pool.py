@@ -199,7 +199,8 @@ class FiberPoolClient:
             self._observed = True
             self._wake.set()
         self._warned -= {"Unreachable", "Throttled"}
-        self._loop.call_soon(self._observer.on_status, status)
+        if self._observed:  # else it may be about the master before
+            self._loop.call_soon(self._observer.on_status, status)
 
     def _pool_trouble(self, error: ApiError) -> None:
         if isinstance(error, Forbidden) and not self._observed:

@@ -1,4 +1,4 @@
-"""The pods of one FiberPool as hosts for children: as many as these need, for as long as they do."""
+"""The pods of one FiberPool as hosts for children: as many as these need, while they do."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fiber._backends.kubernetes.address import reachable_address
 from fiber._backends.kubernetes.api import Api
@@ -27,6 +27,7 @@ from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber.config import Config
+from fiber.errors import FiberPoolError
 from fiber_api import names
 
 _SUFFIX_BYTES = 4
@@ -69,7 +70,7 @@ class Program:
         own = self._find_own_pod()
         container = own_container(own, _mountinfo()) if own is not None else ""
         template = pod_template(shape, own, container, sys.executable)
-        body = fiber_pool_body(name, template, self._config, master.spec(name, 1))
+        body = fiber_pool_body(name, template, self._config)
         tenure = OwnPool(self._api, self.namespace, body, credentials, master, self._owner(own))
         slots = self._config.processes_per_pod
         return Opened(listener, tenure, slots, 0, self._config.max_pods)
@@ -80,9 +81,7 @@ class Program:
             spec = self._api.get(POOLS.path(self.namespace, name))["spec"]
             credentials = read_credentials(self._api, self.namespace, name)
         except ApiError as error:
-            raise explain(
-                error, self._api, f"attach to the FiberPool {name!r}", name, self.namespace
-            ) from error
+            raise self._explained(error, f"attach to the FiberPool {name!r}", name) from error
         host, listener = self._listen(name, credentials, loop, serve)
         tenure = WarmPool(self._api, self.namespace, name, self._master(host, listener))
         return Opened(
@@ -97,9 +96,7 @@ class Program:
         self, pool: str, credentials: MasterCredentials, loop: Loop, serve: Serve
     ) -> tuple[str, MasterListener]:
         config = self._config
-        host = reachable_address(
-            self._api, config.listen_host, pool=pool, namespace=self.namespace
-        )
+        host = reachable_address(self._api, config.listen_host, pool=pool, namespace=self.namespace)
         listener = MasterListener(
             loop,
             names.address_of(config.listen_host or host, config.listen_port),
@@ -126,10 +123,11 @@ class Program:
                 try:
                     self._own_pod = self._api.get(PODS.path(self._api.namespace, name))
                 except ApiError as error:
-                    raise explain(
-                        error, self._api, f"read this program's own pod {name!r}", "", self.namespace
-                    ) from error
+                    raise self._explained(error, f"read this program's pod {name!r}", "") from error
             return self._own_pod
+
+    def _explained(self, error: ApiError, doing: str, pool: str) -> FiberPoolError:
+        return explain(error, doing, pool=pool, namespace=self.namespace, server=self._api.server)
 
     def _owner(self, pod: Body | None) -> Body | None:
         """What the pool names as its owner, to go with it; owners are of the same namespace."""
