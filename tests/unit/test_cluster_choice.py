@@ -13,7 +13,11 @@ from cluster import ability, packages, places
 from cluster.shell import ClusterError
 from e2e.clusters import Cluster, Given, Kind, NoCluster, Own, choose
 
-IMAGES = {"FIBER_E2E_OPERATOR_IMAGE": "example/operator:1", "FIBER_E2E_WORKER_IMAGE": "example/w:1"}
+IMAGES = {
+    "FIBER_E2E_OPERATOR_IMAGE": "example/operator:1",
+    "FIBER_E2E_WORKER_IMAGE": "example/w:1",
+    "FIBER_E2E_WORKER_RL_IMAGE": "example/w-rl:1",
+}
 
 
 @pytest.fixture(autouse=True)
