@@ -10,12 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from e2e.accounts import ACCOUNT
 from e2e.kube import Body, Stream, environment
 from e2e.pools import Pool
-from e2e.scene import Scene
 
 PROGRAM = Path(__file__).with_name("master.py")
-ACCOUNT = "master"
 
 
 class Master:
@@ -136,18 +135,6 @@ def outside(pool: Pool, host: str, lost_grace: int | None = None) -> Iterator[Ou
         yield master
     finally:
         master.kill()
-
-
-def may_use_pools(scene: Scene) -> None:
-    """Give the namespace an account with the role fiber-user, for masters inside."""
-    kube, group = scene.kube, "rbac.authorization.k8s.io"
-    kube.create(scene.path("serviceaccounts"), {"metadata": {"name": ACCOUNT}})
-    binding = {
-        "metadata": {"name": ACCOUNT},
-        "roleRef": {"apiGroup": group, "kind": "ClusterRole", "name": "fiber-user"},
-        "subjects": [{"kind": "ServiceAccount", "name": ACCOUNT, "namespace": scene.namespace}],
-    }
-    kube.create(scene.path("rolebindings"), binding)
 
 
 def _pod(pool: Pool, image: str) -> Body:

@@ -14,7 +14,6 @@ import pytest
 from e2e.clusters import Cluster, Own, find_program
 from e2e.kube import Kube, path_of
 from e2e.release import Release
-from fiber_api import names
 
 ROOT = Path(__file__).resolve().parents[2]
 CONSOLE = re.compile(r"^```console\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -97,26 +96,16 @@ def shell(cluster: Cluster, tmp_path: Path) -> Iterator[Shell]:
 
 
 @pytest.fixture
-def without_operator(cluster: Cluster, release: Release, kube: Kube) -> Iterator[None]:
-    """A cluster that has the images and nothing else of Fiber; then the operator of all tests."""
-    if not cluster.by_version:
-        pytest.skip(f"{cluster.description}: its nodes have no images under the chart's version")
-    release.uninstall()
-    _remove_type(kube)
+def after(bare_cluster: None, release: Release, kube: Kube) -> Iterator[None]:
+    """What the pages install is removed."""
     yield
     kube.kubectl("delete", "--ignore-not-found", "fiberpool", "minimal", "--namespace", "default")
     release.helm("uninstall", "fiber-operator", "--namespace", "fiber-system", "--ignore-not-found")
-    _remove_type(kube)
     kube.delete(path_of("namespaces", name="fiber-system"))
-    release.install()
-
-
-def _remove_type(kube: Kube) -> None:
-    kube.kubectl("delete", "--ignore-not-found", "customresourcedefinition", names.CRD_NAME)
 
 
 @pytest.mark.timeout(600, func_only=True)  # `helm test` has five minutes of its own
-@pytest.mark.usefixtures("without_operator")
+@pytest.mark.usefixtures("after")
 @pytest.mark.parametrize("page", SHOWN)
 def test_every_command_does_what_its_page_says(page: str, shell: Shell) -> None:
     assert commands(page)[0] == CLUSTER
