@@ -95,9 +95,7 @@ OPERATOR = Image(
 )
 _WORKER_SOURCES = ("crds/fiber_api", "sdk/fiber")
 WORKER = Image("fiber-worker", "sdk/Dockerfile", _WORKER_SOURCES)
-WORKER_RL = Image(
-    "fiber-worker-rl", "sdk/Dockerfile", _WORKER_SOURCES, {"EXTRAS": "kubernetes,rl"}
-)
+WORKER_RL = Image("fiber-worker-rl", "sdk/Dockerfile", _WORKER_SOURCES, {"EXTRAS": "kubernetes,rl"})
 """What the examples import is in it."""
 IMAGES = (OPERATOR, WORKER, WORKER_RL)
 

@@ -60,13 +60,13 @@ class Program:
         """Wait until it has said this, which must be before it ends."""
 
         def heard() -> Body | None:
+            has_ended = self.status is not None  # looked at first: what is said later is not missed
             if found := [said for said in self.said if said["event"] == event]:
                 return found[-1]
-            assert self.status is None, f"ended with {self.status}:\n{self.output}"
+            assert not has_ended, f"ended with {self.status}:\n{self.output}"
             return None
 
-        said = self._wait(f"it says {event}", heard, seconds)
-        assert said is not None
+        said: Body = self._wait(f"it says {event}", heard, seconds)
         return said
 
     def prints(self, words: str, seconds: float = 60.0) -> None:

@@ -123,9 +123,7 @@ def after(bare_cluster: None, release: Release, kube: Kube) -> Iterator[None]:
 @pytest.mark.parametrize("page", SHOWN)
 def test_every_command_does_what_its_page_says(page: str, shell: Shell) -> None:
     assert commands(page)[0] == CLUSTER
-    said = {
-        command: shell.run(command) for command in commands(page)[1:] if command not in NOT_RUN
-    }
+    said = {command: shell.run(command) for command in commands(page)[1:] if command not in NOT_RUN}
     for command, pattern in SHOWN[page].items():
         assert re.search(pattern, said[command]), said[command]
 

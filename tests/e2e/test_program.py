@@ -158,9 +158,7 @@ def test_each_shape_has_pods_of_its_own(programs: Programs, scene: Scene) -> Non
     leaves_nothing(program)
 
 
-def test_a_warm_pool_is_given_back_as_it_was(
-    programs: Programs, scene: Scene, agent: Body
-) -> None:
+def test_a_warm_pool_is_given_back_as_it_was(programs: Programs, scene: Scene, agent: Body) -> None:
     warm = Pool(scene, "warm").apply(agent, minReplicas=2)
     there = warm.ready(2)
     program = programs.start("outside", "mapping.py", "--workers", 2, pool="warm")

@@ -33,9 +33,7 @@ OUTAGE = 60
 class Site:
     """Where a fault strikes: the cluster, what is installed on it, and a program that runs."""
 
-    def __init__(
-        self, cluster: Cluster, release: Release, scene: Scene, program: Program
-    ) -> None:
+    def __init__(self, cluster: Cluster, release: Release, scene: Scene, program: Program) -> None:
         self.cluster = cluster
         self.release = release
         self.scene = scene
@@ -158,9 +156,7 @@ def test_a_program_that_is_killed_leaves_nothing_after_its_grace(
     leaves_nothing(program, seconds=LOST + 30)
 
 
-def test_a_program_whose_pod_is_deleted_takes_all_with_it(
-    programs: Programs, scene: Scene
-) -> None:
+def test_a_program_whose_pod_is_deleted_takes_all_with_it(programs: Programs, scene: Scene) -> None:
     program = programs.start("inside", "mapping.py", *RUNNING)
     program.says("first")
     assert program.pod is not None
@@ -186,9 +182,7 @@ def test_an_interpreter_that_is_held_goes_on(place: str, programs: Programs) -> 
     leaves_nothing(program)
 
 
-def test_a_program_that_is_stopped_and_continued_goes_on(
-    programs: Programs, scene: Scene
-) -> None:
+def test_a_program_that_is_stopped_and_continued_goes_on(programs: Programs, scene: Scene) -> None:
     program = programs.outside("mapping.py", *RUNNING)
     program.says("first")
     program.pause()
@@ -230,9 +224,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_come_is_an_error_at_once(
-    case: str, programs: Programs, scene: Scene
-) -> None:
+def test_what_cannot_come_is_an_error_at_once(case: str, programs: Programs, scene: Scene) -> None:
     prepare, settings, words, seconds = REFUSED[case]
     prepare(scene)
     program = programs.start("outside", "mapping.py", **settings)

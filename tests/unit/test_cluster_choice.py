@@ -58,7 +58,11 @@ def test_a_given_cluster_comes_first(
     monkeypatch.setattr(ability, "obstacles", list)
     chosen = choose({"KUBECONFIG": kubeconfig, **IMAGES})
     assert isinstance(chosen, Given)
-    assert chosen.images == {"fiber-operator": "example/operator:1", "fiber-worker": "example/w:1"}
+    assert chosen.images == {
+        "fiber-operator": "example/operator:1",
+        "fiber-worker": "example/w:1",
+        "fiber-worker-rl": "example/w-rl:1",
+    }
 
 
 def test_a_given_kind_cluster_is_known_as_one(

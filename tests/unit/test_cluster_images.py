@@ -169,9 +169,7 @@ class FakeNode:
         self.names[other] = reference
 
 
-def test_what_all_nodes_have_is_known(
-    builder: Notebook, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_all_nodes_have_is_known(builder: Notebook, monkeypatch: pytest.MonkeyPatch) -> None:
     nodes = {index: FakeNode() for index in (1, 2)}
     monkeypatch.setattr(places, "nodes", lambda: list(nodes))
     monkeypatch.setattr(images, "Containerd", lambda index: nodes[index])
