@@ -72,13 +72,14 @@ conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
 crds: $(VENV)/.with-dev
 	$(BIN)/python -m fiber_api.schema
 
-## make images        the operator's and the worker's image, by docker or buildah, into build/images
+## make images        the operator's image and the workers', by docker or buildah, into build/images
 images: $(VENV)/.made
 	$(CLUSTER) images
 
-## make cluster       a Kubernetes cluster on this machine, with the images; prints KUBECONFIG (root, Go)
+## make cluster       a Kubernetes cluster on this machine, with the images (root, Go), and what a shell
+##                    needs to use it: eval "$(make -s cluster)" has KUBECONFIG, PATH and FIBER_IMAGE
 cluster: $(VENV)/.made
-	$(CLUSTER) up --images
+	@$(CLUSTER) up --images
 
 ## make cluster-down  stops it and deletes what it was
 cluster-down: $(VENV)/.made

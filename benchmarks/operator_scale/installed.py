@@ -85,14 +85,14 @@ def find_operator(kube: Kube) -> Operator:
     if kube.get(path_of("customresourcedefinitions", name=names.CRD_NAME)) is None:
         raise CannotMeasure(
             f"the cluster does not know FiberPools (no {names.CRD_NAME}): install the chart "
-            "(helm install fiber charts/fiber-operator), or let --set-up do it"
+            "(helm install fiber-operator charts/fiber-operator), or let --set-up do it"
         )
     pods = [pod for pod in kube.items("/api/v1/pods", labelSelector=_SELECTOR) if is_ready(pod)]
     if not pods:
         raise CannotMeasure(
             f"no ready pod of the operator is in the cluster (labels {_SELECTOR}): install the "
-            "chart (helm install fiber charts/fiber-operator), or let --set-up do it; where it is "
-            "installed, its pod's log says why it is not ready"
+            "chart (helm install fiber-operator charts/fiber-operator), or let --set-up do it; "
+            "where it is installed, its pod's log says why it is not ready"
         )
     if len(pods) > 1:
         places = ", ".join(f"{p['metadata']['namespace']}/{p['metadata']['name']}" for p in pods)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from cluster import build, fake_nodes, faults, images, lifecycle, network, places, preparation
 from cluster.daemons import all_daemons
+from cluster.shell import say
 
 if TYPE_CHECKING:
     _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -35,7 +35,7 @@ def _add_lifecycle(commands: _Commands) -> None:
     status = commands.add_parser("status", help="which cluster is up, and what of it runs")
     status.set_defaults(run=_status)
     environment = commands.add_parser("env", help="print how to use it")
-    environment.set_defaults(run=lambda _: _print_environment())
+    environment.set_defaults(run=lambda _: _print_environment(images.brought(images.WORKER_RL)))
     fakes = commands.add_parser(
         "fake-nodes", help="have this many nodes that only pretend to run pods"
     )
@@ -49,7 +49,7 @@ def _add_images(commands: _Commands) -> None:
     ahead = commands.add_parser("prepare", help="do ahead of the tests what takes them minutes")
     ahead.set_defaults(run=lambda _: preparation.prepare())
     ours = commands.add_parser("images", help="build Fiber's images where their inputs changed")
-    ours.set_defaults(run=lambda _: _print_images(images.build_images()))
+    ours.set_defaults(run=lambda _: print(*images.build_images().values(), sep="\n"))
     load = commands.add_parser("load", help="import an archive of images into every node")
     load.add_argument("archive", type=Path)
     load.set_defaults(run=lambda given: images.load(given.archive))
@@ -69,21 +69,23 @@ def _add_faults(commands: _Commands) -> None:
 
 def _up(given: argparse.Namespace) -> None:
     lifecycle.up(given.nodes)
-    if given.images:
-        _print_images(images.bring_images())
-        for image in images.IMAGES:
-            print(f"# image {image.released(places.CHECKOUT)}, the same")
-    _print_environment()
+    _print_environment(_bring_images() if given.images else images.brought(images.WORKER_RL))
 
 
-def _print_images(references: Mapping[str, str]) -> None:
-    for reference in references.values():  # as comments: a shell reads the rest
-        print(f"# image {reference}")
+def _bring_images() -> str:
+    """Bring them to the nodes and say their names; the one that programs of the examples need."""
+    references = images.bring_images()
+    for image in images.IMAGES:
+        say(f"the nodes have {references[image.name]}, also as {image.released(places.CHECKOUT)}")
+    return references[images.WORKER_RL.name]
 
 
-def _print_environment() -> None:
+def _print_environment(image: str | None) -> None:
+    """Lines for a shell, and nothing else: people evaluate what this prints."""
     print(f"export KUBECONFIG={places.KUBECONFIG}")
     print(f"export PATH={places.programs()}:$PATH")
+    if image is not None:
+        print(f"export FIBER_IMAGE={image}")
 
 
 def _status(_: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""Fiber's two images: built where their inputs changed, and brought to the nodes.
+"""Fiber's images: built where their inputs changed, and brought to the nodes.
 
 An image's tag is a digest of all that it is made of. So a tag never means two things, nodes that
 have it need not load it again, and checkouts that share a cluster do not get in each other's way.
@@ -15,10 +15,10 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -38,6 +38,8 @@ class Image:
     name: str
     dockerfile: str
     sources: tuple[str, ...]
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    """Of the Dockerfile, beside those that every build is told."""
 
     @property
     def archive(self) -> Path:
@@ -71,8 +73,10 @@ class Image:
             shutil.copy2(file, copy)
 
     def reference(self, checkout: Path, base: str) -> str:
-        """The name with its tag: a digest of the inputs and of the name of the base image."""
+        """The name with its tag: a digest of the inputs, the arguments and the base's name."""
         digest = hashlib.sha256(base.encode())
+        for argument in sorted(self.arguments.items()):
+            digest.update(f"\0{'='.join(argument)}".encode())
         for file in self.inputs(checkout):
             content = file.read_bytes()
             digest.update(f"\0{file.relative_to(checkout)}\0{len(content)}\0".encode())
@@ -89,8 +93,11 @@ OPERATOR = Image(
     "operator/Dockerfile",
     ("crds/fiber_api", "operator/fiber_operator", VERSION_FILE),
 )
-WORKER = Image("fiber-worker", "sdk/Dockerfile", ("crds/fiber_api", "sdk/fiber"))
-IMAGES = (OPERATOR, WORKER)
+_WORKER_SOURCES = ("crds/fiber_api", "sdk/fiber")
+WORKER = Image("fiber-worker", "sdk/Dockerfile", _WORKER_SOURCES)
+WORKER_RL = Image("fiber-worker-rl", "sdk/Dockerfile", _WORKER_SOURCES, {"EXTRAS": "kubernetes,rl"})
+"""What the examples import is in it."""
+IMAGES = (OPERATOR, WORKER, WORKER_RL)
 
 
 def _is_cache(file: Path) -> bool:
@@ -124,6 +131,15 @@ def bring_images() -> dict[str, str]:
         return references
 
 
+def brought(image: Image) -> str | None:
+    """The reference of what was built last, if all nodes of our cluster have it."""
+    reference = image.archived()
+    if reference is None:
+        return None
+    nodes = [Containerd(index) for index in places.nodes()]
+    return reference if nodes and all(node.has(full_name(reference)) for node in nodes) else None
+
+
 def _locked() -> AbstractContextManager[None]:
     return locked(FOLDER / "lock", "builds the images")
 
@@ -145,7 +161,7 @@ def _build(image: Image, reference: str, context: Path) -> None:
     began = time.monotonic()
     previous = image.archived()
     image.record.unlink(missing_ok=True)
-    arguments = {"BASE_IMAGE": base, "VERSION": _version(context)}
+    arguments = {"BASE_IMAGE": base, "VERSION": _version(context), **image.arguments}
     builder.build(reference, context, image.dockerfile, arguments, image.archive)
     image.record.write_text(json.dumps({"reference": reference, "base": base}), encoding="utf-8")
     if previous not in (None, reference):

@@ -16,6 +16,7 @@ from fiber_api.schema import schema
 from fiber_api.v1alpha1 import FiberPool
 
 ROOT = Path(__file__).resolve().parents[2]
+JOB = ROOT / "examples/01-pi/job.yaml"
 MANIFESTS = sorted((ROOT / "examples/manifests").glob("*.yaml"))
 
 
@@ -53,7 +54,7 @@ def test_a_manifest_is_a_pool_called_like_its_file(path: Path) -> None:
     assert not {"replicas", "master"} & set(document["spec"])
 
 
-@pytest.mark.parametrize("path", MANIFESTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [*MANIFESTS, JOB], ids=lambda path: path.stem)
 def test_the_workers_image_is_the_projects_or_yours(path: Path) -> None:
     image_of_this_release = f"fiber-worker:{fiber.__version__}"
     for image in re.findall(r"^ *image: (\S+)$", path.read_text(), re.MULTILINE):

@@ -52,7 +52,7 @@ class Cluster:
     description: str
     kubeconfig: Path
     images: Mapping[str, str]
-    """References of fiber-operator and fiber-worker, as a pod names them."""
+    """The reference of each of images.IMAGES, as a pod names it."""
     by_version: bool = False
     """Whether its nodes have these images under the version too, as chart and manifests name it."""
     outside: str | None = None
@@ -278,8 +278,8 @@ def _given_images(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def _variable(image: str) -> str:
-    """fiber-operator: FIBER_E2E_OPERATOR_IMAGE."""
-    return f"FIBER_E2E_{image.removeprefix('fiber-').upper()}_IMAGE"
+    """fiber-worker-rl: FIBER_E2E_WORKER_RL_IMAGE."""
+    return f"FIBER_E2E_{image.removeprefix('fiber-').replace('-', '_').upper()}_IMAGE"
 
 
 def _gateway() -> str:

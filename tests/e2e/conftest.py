@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from e2e.accounts import may_use_pools
 from e2e.clusters import Cluster, NoCluster, choose
 from e2e.delays import complaint, measured
 from e2e.kube import Body, Kube, path_of
 from e2e.pools import Pool, template
+from e2e.program import Programs
 from e2e.release import Release, crd_owner
 from e2e.scene import Scene
 from fiber_api import names
@@ -130,6 +132,28 @@ def scene(make_scene: MakeScene, request: pytest.FixtureRequest) -> Iterator[Sce
 def pool(scene: Scene) -> Pool:
     """The name of a pool that is not made yet."""
     return Pool(scene, "es")
+
+
+@pytest.fixture
+def bare_cluster(cluster: Cluster, release: Release, kube: Kube) -> Iterator[None]:
+    """A cluster that has the images and nothing else of Fiber; then the operator of all tests."""
+    if not cluster.by_version:
+        pytest.skip(f"{cluster.description}: its nodes have no images under the chart's version")
+    remove_type = ("delete", "--ignore-not-found", "customresourcedefinition", names.CRD_NAME)
+    release.uninstall()
+    kube.kubectl(*remove_type)
+    yield
+    kube.kubectl(*remove_type)
+    release.install()
+
+
+@pytest.fixture
+def programs(scene: Scene, cluster: Cluster, tmp_path: Path) -> Iterator[Programs]:
+    """Starts programs that use Fiber, in a namespace where they may use pools."""
+    may_use_pools(scene)
+    programs = Programs(scene, cluster, tmp_path)
+    yield programs
+    programs.close()
 
 
 @pytest.fixture(scope="session")

@@ -10,12 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from e2e.accounts import ACCOUNT
 from e2e.kube import Body, Stream, environment
 from e2e.pools import Pool
-from fiber_api import names
 
 PROGRAM = Path(__file__).with_name("master.py")
-ACCOUNT = "master"
 
 
 class Master:
@@ -136,21 +135,6 @@ def outside(pool: Pool, host: str, lost_grace: int | None = None) -> Iterator[Ou
         yield master
     finally:
         master.kill()
-
-
-def may_use_pools(warm: Pool) -> None:
-    """Give the namespace an account for masters inside: the role fiber-user, and what the warm pool
-    needs beyond it, as the chart's README has it."""
-    scene = warm.scene
-    account = f"--serviceaccount={scene.namespace}:{ACCOUNT}"
-    secret = f"--resource-name={names.secret_name(warm.name)}"
-    for arguments in (
-        ("serviceaccount", ACCOUNT),
-        ("rolebinding", "fiber-user", "--clusterrole=fiber-user", account),
-        ("role", "warm-credentials", "--verb=get", "--resource=secrets", secret),
-        ("rolebinding", "warm-credentials", "--role=warm-credentials", account),
-    ):
-        warm.kubectl("create", *arguments)
 
 
 def _pod(pool: Pool, image: str) -> Body:

@@ -1,89 +1,145 @@
-"""The commands of docs/fiberpools.md, as they are printed, on a cluster without an operator."""
+"""The commands of the guides, as they are printed, on a cluster without an operator."""
 
 from __future__ import annotations
 
 import os
 import re
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from e2e.clusters import Cluster, find_program
-from e2e.kube import Kube, environment, path_of
+from e2e.clusters import Cluster, Own, find_program
+from e2e.kube import Kube, path_of
 from e2e.release import Release
-from fiber_api import names
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "fiberpools.md"
 CONSOLE = re.compile(r"^```console\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"^\$ (.+?)(?: +# .*)?$", re.MULTILINE)
+CLUSTER = 'eval "$(make -s cluster)"'
+_OURS = re.compile(r"FIBER_|KUBECONFIG$|MAKE|MFLAGS$")
+
+SHOWN = {
+    "fiberpools.md": {
+        "helm test fiber-operator --namespace fiber-system": r"Succeeded",
+        "kubectl get fiberpools": r"(?m)^minimal\s.*\b2\b",
+        "kubectl explain fiberpool.spec": r"minReplicas",
+    },
+    "kubernetes.md": {
+        "FIBER_BACKEND=kubernetes FIBER_NAMESPACE=default "
+        "python examples/02-es/main.py --workers 4": r"(?m)^  trained +-[12]\d\d\.\d ",
+        "kubectl get fiberpools": r"No resources found",
+        "kubectl logs job/pi": r"Pi is roughly 3\.1[34]",
+    },
+}
+"""What some commands of a page print."""
 NOT_RUN = {
-    'eval "$(make --silent cluster)"': "the tests' cluster is up, with what this brings to it",
+    ". .venv/bin/activate && pip install --quiet --editable '.[kubernetes,rl]'": (
+        "the tests' own environment, whose Python the shell has"
+    ),
 }
 
 
-def commands() -> list[str]:
+def commands(page: str) -> list[str]:
     """What a reader types after each prompt, without the comments."""
-    blocks = CONSOLE.findall(PAGE.read_text(encoding="utf-8"))
+    blocks = CONSOLE.findall((ROOT / "docs" / page).read_text(encoding="utf-8"))
     return [command for block in blocks for command in COMMAND.findall(block)]
 
 
+class Shell:
+    """A reader's: what one command exports is there for the next."""
+
+    _END = "[the command has ended]"
+
+    def __init__(self, environment: dict[str, str]) -> None:
+        self._process = subprocess.Popen(
+            ["bash", "--noprofile", "--norc"],
+            cwd=ROOT,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def run(self, command: str) -> str:
+        """What it prints; it must end with status 0."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{{ {command}\n}} </dev/null; echo '{self._END}' $?\n")
+        self._process.stdin.flush()
+        said = "".join(self._until_end())
+        said, _, status = said.partition(self._END)
+        assert status.strip() == "0", f"$ {command}\n{said}"
+        return said
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def _until_end(self) -> Iterator[str]:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            yield line
+            if self._END in line:
+                return
+
+
 @pytest.fixture
-def without_operator(cluster: Cluster, release: Release, kube: Kube) -> Iterator[None]:
-    """A cluster that has the images and nothing else of Fiber; then the operator of all tests."""
-    if not cluster.by_version:
-        pytest.skip(f"{cluster.description}: its nodes have no images under the chart's version")
-    release.uninstall()
-    _remove_type(kube)
+def shell(cluster: Cluster, tmp_path: Path) -> Iterator[Shell]:
+    """In the repository, with the Python of these tests, and with what `make cluster` exports."""
+    python = str(Path(sys.executable).parent)
+    given = {name: value for name, value in os.environ.items() if not _OURS.match(name)}
+    homes = {f"HELM_{kind}_HOME": str(tmp_path) for kind in ("CACHE", "CONFIG", "DATA")}
+    shell = Shell({**given, **homes, "PATH": os.pathsep.join([python, given["PATH"]])})
+    try:
+        if isinstance(cluster, Own):
+            shell.run(CLUSTER)
+        else:  # what a reader has done who has a cluster
+            folders = {str(Path(find_program(program)).parent) for program in ("kubectl", "helm")}
+            shell.run(f"export KUBECONFIG={cluster.kubeconfig}")
+            shell.run(f"export PATH={os.pathsep.join(folders)}:$PATH")
+            shell.run(f"export FIBER_IMAGE={cluster.images['fiber-worker-rl']}")
+        yield shell
+    finally:
+        shell.close()
+
+
+@pytest.fixture
+def after(bare_cluster: None, release: Release, kube: Kube) -> Iterator[None]:
+    """What the pages install is removed."""
     yield
-    kube.kubectl("delete", "--ignore-not-found", "fiberpool", "minimal", "--namespace", "default")
-    release.helm("uninstall", "fiber", "--namespace", "fiber-system", "--ignore-not-found")
-    _remove_type(kube)
+    delete = ("delete", "--ignore-not-found", "--namespace", "default")
+    kube.kubectl(*delete, "fiberpool", "minimal")
+    kube.kubectl(*delete, "configmap", "pi")
+    kube.kubectl(*delete, "--filename", str(ROOT / "examples" / "01-pi" / "job.yaml"))
+    release.helm("uninstall", "fiber-operator", "--namespace", "fiber-system", "--ignore-not-found")
     kube.delete(path_of("namespaces", name="fiber-system"))
-    release.install()
-
-
-def _remove_type(kube: Kube) -> None:
-    kube.kubectl("delete", "--ignore-not-found", "customresourcedefinition", names.CRD_NAME)
 
 
 @pytest.mark.timeout(600, func_only=True)  # `helm test` has five minutes of its own
-@pytest.mark.usefixtures("without_operator")
-def test_every_command_does_what_its_page_says(cluster: Cluster, tmp_path: Path) -> None:
-    said = {command: _run(command, cluster, tmp_path) for command in commands() if _is_run(command)}
-    assert "Succeeded" in said["helm test fiber --namespace fiber-system"]
-    assert re.search(r"^minimal\s.*\b2\b", said["kubectl get fiberpools"], re.MULTILINE)
-    assert "minReplicas" in said["kubectl explain fiberpool.spec"]
+@pytest.mark.usefixtures("after")
+@pytest.mark.parametrize("page", SHOWN)
+def test_every_command_does_what_its_page_says(page: str, shell: Shell) -> None:
+    assert commands(page)[0] == CLUSTER
+    said = {command: shell.run(command) for command in commands(page)[1:] if command not in NOT_RUN}
+    for command, pattern in SHOWN[page].items():
+        assert re.search(pattern, said[command]), said[command]
 
 
-def test_only_what_is_shown_is_left_out() -> None:
-    assert set(NOT_RUN) < set(commands())
+def test_what_is_left_out_is_shown() -> None:
+    assert set(NOT_RUN) < {command for page in SHOWN for command in commands(page)}
 
 
-def _is_run(command: str) -> bool:
-    return command not in NOT_RUN
-
-
-def _run(command: str, cluster: Cluster, home: Path) -> str:
-    """What a shell prints that has this cluster and these programs."""
-    folders = {str(Path(find_program(program)).parent) for program in ("kubectl", "helm")}
-    done = subprocess.run(
-        command,
-        shell=True,
-        cwd=ROOT,
-        env=environment(
-            KUBECONFIG=str(cluster.kubeconfig),
-            PATH=os.pathsep.join([*folders, os.environ["PATH"]]),
-            HELM_CACHE_HOME=str(home),
-            HELM_CONFIG_HOME=str(home),
-            HELM_DATA_HOME=str(home),
-        ),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
+def test_only_shell_lines_are_printed_by_make_cluster(cluster: Cluster) -> None:
+    """So that a shell may evaluate it: the rest is for people, on standard error."""
+    if not isinstance(cluster, Own):
+        pytest.skip(f"{cluster.description} is not made by make cluster")
+    done = subprocess.run(["make", "-s", "cluster"], cwd=ROOT, capture_output=True, text=True)
+    exported = re.fullmatch(
+        r"export KUBECONFIG=(\S+)\nexport PATH=\S+:\$PATH\nexport FIBER_IMAGE=(\S+)\n", done.stdout
     )
-    assert done.returncode == 0, f"$ {command}\n{done.stdout}"
-    return done.stdout
+    assert exported, done
+    assert Path(exported[1]) == cluster.kubeconfig
+    assert exported[2] == cluster.images["fiber-worker-rl"]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from e2e.accounts import may_use_pools
 from e2e.clusters import Cluster
 from e2e.delays import prompt
 from e2e.kube import Body
-from e2e.masters import Inside, Master, may_use_pools, outside
+from e2e.masters import Inside, Master, outside
 from e2e.pools import Pool, is_ready, template
 from e2e.scene import Scene
 from e2e.test_apply import SOMEWHERE

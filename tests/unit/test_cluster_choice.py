@@ -13,7 +13,11 @@ from cluster import ability, packages, places
 from cluster.shell import ClusterError
 from e2e.clusters import Cluster, Given, Kind, NoCluster, Own, choose
 
-IMAGES = {"FIBER_E2E_OPERATOR_IMAGE": "example/operator:1", "FIBER_E2E_WORKER_IMAGE": "example/w:1"}
+IMAGES = {
+    "FIBER_E2E_OPERATOR_IMAGE": "example/operator:1",
+    "FIBER_E2E_WORKER_IMAGE": "example/w:1",
+    "FIBER_E2E_WORKER_RL_IMAGE": "example/w-rl:1",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -54,7 +58,11 @@ def test_a_given_cluster_comes_first(
     monkeypatch.setattr(ability, "obstacles", list)
     chosen = choose({"KUBECONFIG": kubeconfig, **IMAGES})
     assert isinstance(chosen, Given)
-    assert chosen.images == {"fiber-operator": "example/operator:1", "fiber-worker": "example/w:1"}
+    assert chosen.images == {
+        "fiber-operator": "example/operator:1",
+        "fiber-worker": "example/w:1",
+        "fiber-worker-rl": "example/w-rl:1",
+    }
 
 
 def test_a_given_kind_cluster_is_known_as_one(

@@ -31,26 +31,48 @@ def test_the_readme_has_every_command() -> None:
     assert sorted(names) == sorted(re.findall(r"`([a-z-]+)`", first_column))
 
 
+@pytest.fixture
+def shell_lines(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is exported where no image was brought."""
+    monkeypatch.setattr(lifecycle, "up", lambda _: None)
+    monkeypatch.setattr(images, "brought", lambda _: None)
+    return [f"export KUBECONFIG={places.KUBECONFIG}", f"export PATH={places.programs()}:$PATH"]
+
+
 def test_up_prints_lines_for_a_shell(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, shell_lines: list[str]
 ) -> None:
     asked: list[object] = []
     monkeypatch.setattr(lifecycle, "up", asked.append)
-    out = printed(capsys, "up", "--nodes", "3")
+    assert printed(capsys, "up", "--nodes", "3").splitlines() == shell_lines
     assert asked == [3]
-    assert out.splitlines() == [
-        f"export KUBECONFIG={places.KUBECONFIG}",
-        f"export PATH={places.programs()}:$PATH",
-    ]
 
 
-def test_up_with_images_names_them(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_up_with_images_exports_the_one_for_the_examples(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, shell_lines: list[str]
 ) -> None:
-    monkeypatch.setattr(lifecycle, "up", lambda _: None)
-    monkeypatch.setattr(images, "bring_images", lambda: {"fiber-worker": "fiber-worker:1"})
-    out = printed(capsys, "up", "--images")
-    assert "# image fiber-worker:1" in out.splitlines()
+    references = {image.name: f"{image.name}:1" for image in images.IMAGES}
+    monkeypatch.setattr(images, "bring_images", lambda: references)
+    given = commands.parser().parse_args(["up", "--images"])
+    given.run(given)
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [*shell_lines, "export FIBER_IMAGE=fiber-worker-rl:1"]
+    assert all(reference in said.err for reference in references.values())
+
+
+@pytest.mark.parametrize("command", ["up", "env"])
+def test_what_the_nodes_have_already_is_exported(
+    command: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    shell_lines: list[str],
+) -> None:
+    assert printed(capsys, command).splitlines() == shell_lines
+    monkeypatch.setattr(images, "brought", lambda image: f"{image.name}:1")
+    assert printed(capsys, command).splitlines() == [
+        *shell_lines,
+        "export FIBER_IMAGE=fiber-worker-rl:1",
+    ]
 
 
 def test_status_tells_what_does_not_run(

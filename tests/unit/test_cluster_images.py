@@ -10,7 +10,7 @@ import pytest
 
 from cluster import builders, images, places
 from cluster.builders import Builder
-from cluster.images import IMAGES, OPERATOR, WORKER, Image
+from cluster.images import IMAGES, OPERATOR, WORKER, WORKER_RL, Image
 from cluster.shell import ClusterError
 
 BASE = "python:3.11-slim"
@@ -107,11 +107,12 @@ def test_neither_image_depends_on_the_other_side(
 
 def test_only_what_has_changed_is_built(builder: Notebook, checkout: Path) -> None:
     first = images.build_images()
-    assert builder.asked == [first["fiber-operator"], first["fiber-worker"]]
+    assert builder.asked == list(first.values())
+    assert list(first) == ["fiber-operator", "fiber-worker", "fiber-worker-rl"]
     assert images.build_images() == first
     write(checkout / OPERATOR_MODULE, "something else")
     second = images.build_images()
-    assert builder.asked[2:] == [second["fiber-operator"]]
+    assert builder.asked[3:] == [second["fiber-operator"]]
     assert builder.removed == [first["fiber-operator"]]
     assert second["fiber-worker"] == first["fiber-worker"]
 
@@ -120,7 +121,7 @@ def test_a_missing_archive_is_made_again(builder: Notebook) -> None:
     first = images.build_images()
     WORKER.archive.unlink()
     assert images.build_images() == first
-    assert builder.asked[2:] == [first["fiber-worker"]]
+    assert builder.asked[3:] == [first["fiber-worker"]]
 
 
 def test_an_archive_holds_what_its_record_says(builder: Notebook) -> None:
@@ -143,8 +144,9 @@ def test_nodes_get_what_they_do_not_have_and_know_it_by_its_version(
             f"docker.io/library/{name}:1.2.3": images.full_name(reference)
             for name, reference in references.items()
         }
-    assert nodes[1].loaded == [OPERATOR.archive, WORKER.archive]
-    assert nodes[2].loaded == [OPERATOR.archive, WORKER.archive, WORKER.archive]
+    archives = [image.archive for image in IMAGES]
+    assert nodes[1].loaded == archives
+    assert nodes[2].loaded == [*archives, WORKER.archive]
 
 
 class FakeNode:
@@ -167,6 +169,24 @@ class FakeNode:
         self.names[other] = reference
 
 
+def test_what_all_nodes_have_is_known(builder: Notebook, monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = {index: FakeNode() for index in (1, 2)}
+    monkeypatch.setattr(places, "nodes", lambda: list(nodes))
+    monkeypatch.setattr(images, "Containerd", lambda index: nodes[index])
+    assert images.brought(WORKER_RL) is None
+    references = images.bring_images()
+    assert images.brought(WORKER_RL) == references["fiber-worker-rl"]
+    nodes[2].there.clear()
+    assert images.brought(WORKER_RL) is None
+
+
+def test_workers_differ_by_their_extras(builder: Notebook, checkout: Path) -> None:
+    references = images.build_images()
+    assert "EXTRAS=kubernetes,rl" in builder.options  # the last that is built
+    tags = {name: reference.partition(":")[2] for name, reference in references.items()}
+    assert tags["fiber-worker"] != tags["fiber-worker-rl"]
+
+
 def test_a_build_that_fails_is_done_again(builder: Notebook, checkout: Path) -> None:
     images.build_images()
     write(checkout / SDK_MODULE, "something else")
@@ -176,7 +196,7 @@ def test_a_build_that_fails_is_done_again(builder: Notebook, checkout: Path) -> 
     assert WORKER.archived() is None
     builder.fails = False
     references = images.build_images()
-    assert builder.asked[2:] == [references["fiber-worker"]]
+    assert builder.asked[3:] == [references["fiber-worker"], references["fiber-worker-rl"]]
 
 
 def test_a_build_sees_the_inputs_and_nothing_else(builder: Notebook, checkout: Path) -> None:

@@ -1,0 +1,46 @@
+"""Accounts with the rights of people who use pools, and kubeconfigs that log in as one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from e2e.kube import Body
+from e2e.scene import Scene
+
+ACCOUNT = "master"
+
+
+def may_use_pools(scene: Scene) -> None:
+    """Give the namespace an account with the role fiber-user, and no other right."""
+    group = "rbac.authorization.k8s.io"
+    make_account(scene, ACCOUNT)
+    binding = {
+        "metadata": {"name": ACCOUNT},
+        "roleRef": {"apiGroup": group, "kind": "ClusterRole", "name": "fiber-user"},
+        "subjects": [{"kind": "ServiceAccount", "name": ACCOUNT, "namespace": scene.namespace}],
+    }
+    scene.kube.create(scene.path("rolebindings"), binding)
+
+
+def make_account(scene: Scene, name: str) -> None:
+    """An account that may do nothing."""
+    scene.kube.create(scene.path("serviceaccounts"), {"metadata": {"name": name}})
+
+
+def kubeconfig_of(scene: Scene, folder: Path, account: str = ACCOUNT) -> Path:
+    """A kubeconfig whose user is an account of the scene's namespace."""
+    token = scene.kube.kubectl("--namespace", scene.namespace, "create", "token", account)
+    return write_kubeconfig(scene, folder / f"{account}.kubeconfig", token.strip())
+
+
+def write_kubeconfig(scene: Scene, path: Path, token: str) -> Path:
+    """The same cluster, and a user who has this token."""
+    view = ("config", "view", "--raw", "--minify", "--flatten", "--output", "json")
+    config: Body = json.loads(scene.kube.kubectl(*view))
+    (context,) = config["contexts"]
+    context["context"] = {"cluster": context["context"]["cluster"], "user": "user"}
+    config["users"] = [{"name": "user", "user": {"token": token}}]
+    path.touch(mode=0o600)
+    path.write_text(json.dumps(config), encoding="utf-8")
+    return path

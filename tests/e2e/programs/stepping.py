@@ -1,0 +1,75 @@
+"""Steps counters, each in a process of its own, as a vector of environments is stepped.
+
+Says in JSON, a line each: ``stepping`` after some steps, with the hosts of the processes, and at
+the end ``done`` with the sum of the counters, or ``lost`` with the error that a lost one gives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import time
+from typing import Any
+
+import fiber
+
+
+def count(connection: Any, mine: Any) -> None:
+    """The child: adds what it gets, until the other end goes."""
+    mine.close()  # or this copy would keep the pipe open
+    connection.send(socket.gethostname())
+    total = 0
+    try:
+        while True:
+            total += connection.recv()
+            connection.send(total)
+    except EOFError:
+        pass
+
+
+def main() -> None:
+    """As the arguments say; status 0 also where a process is lost: that is what is looked at."""
+    options = _parse()
+    pipes, processes = [], []
+    for _ in range(options.envs):
+        here, there = fiber.Pipe()
+        process = fiber.Process(target=count, args=(there, here), daemon=True)
+        process.start()
+        there.close()
+        pipes.append(here)
+        processes.append(process)
+    hosts = [pipe.recv() for pipe in pipes]
+    try:
+        for step in range(options.steps):
+            for pipe in pipes:
+                pipe.send(step)
+            totals = [pipe.recv() for pipe in pipes]
+            if step == 10:
+                say("stepping", hosts=hosts)
+            time.sleep(options.seconds)
+        say("done", total=sum(totals))
+    except EOFError as error:
+        say("lost", kind=type(error).__name__, text=str(error))
+    for pipe in pipes:
+        pipe.close()
+    for process in processes:
+        process.join()
+    say("left", exitcodes=[process.exitcode for process in processes])
+
+
+def say(event: str, **facts: object) -> None:
+    """A line for the test."""
+    print(json.dumps({"event": event, "at": time.monotonic(), **facts}), flush=True)
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--envs", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=0.01)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""Programs run on pods as they run on one machine, from within the cluster and from beside it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from e2e.delays import prompt
+from e2e.kube import Body
+from e2e.leftovers import leaves_nothing
+from e2e.pools import Pool, is_live, is_ready
+from e2e.program import PLACES, Program, Programs, local
+from e2e.scene import Scene
+from fiber_api import names
+
+pytestmark = pytest.mark.timeout(240, func_only=True)
+
+SQUARES = sum(number * number for number in range(1000))
+ES = ("--env", "CartPole-v1", "--generations", 3, "--population", 16, "--seed", 1, "--workers", 3)
+ENVS = ("--envs", 3, "--steps", 40, "--ms", 0.2)
+WARM = 0.3
+"""Seconds, at most, to the first result of a pool whose pods are there."""
+BEYOND_READY = 0.5
+"""Seconds, at most, to the first result once as many pods as that takes are Ready."""
+
+
+def workers(scene: Scene) -> list[Body]:
+    """The pods of pools that are there."""
+    return [pod for pod in scene.now["pods"].values() if is_worker(pod)]
+
+
+def is_worker(pod: Body) -> bool:
+    return names.LABEL_POOL in pod["metadata"].get("labels", {})
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_map_from_no_pods_to_none(place: str, programs: Programs, scene: Scene) -> None:
+    program = programs.start(place, "mapping.py")
+    done = program.says("done")
+    assert done["total"] == SQUARES
+    assert set(done["hosts"]) <= {pod["metadata"]["name"] for pod in workers(scene)}
+    (pool,) = scene.now["fiberpools"].values()
+    assert (pool["spec"]["minReplicas"], pool["status"]["replicas"]) == (0, 3)
+    program.ends()
+    leaves_nothing(program)
+    assert scene.most_at_once(lambda pod: is_worker(pod) and is_live(pod)) == 3
+
+
+def es_lines(lines: Sequence[str]) -> list[str]:
+    return [line for line in lines if re.match(r"generation|  random|  trained", line)]
+
+
+def episodes(lines: Sequence[str]) -> list[str]:
+    return [line for line in lines if "episodes ended" in line]
+
+
+def sameness(lines: Sequence[str]) -> list[str]:
+    return [line for line in lines if line == "observations: the same"]
+
+
+def pi(lines: Sequence[str]) -> list[str]:
+    """Pi to one place: what is random has no seed here."""
+    return [line[: len("Pi is roughly 3.1")] for line in lines if line.startswith("Pi is")]
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    ("script", "arguments", "results"),
+    [
+        ("01-pi/pi.py", ("1e5",), pi),
+        ("02-es/main.py", (*ES, "--out", "/tmp/learning-curve.png"), es_lines),
+        ("03-vector-env/piped.py", ENVS, episodes),
+        ("03-vector-env/adopted.py", ENVS, sameness),
+    ],
+    ids=["pi", "es", "piped", "adopted"],
+)
+def test_an_example_gives_what_it_gives_on_one_machine(
+    place: str,
+    script: str,
+    arguments: tuple[object, ...],
+    results: Callable[[Sequence[str]], list[str]],
+    programs: Programs,
+) -> None:
+    program = programs.start(place, script, *arguments)
+    output = program.ends(seconds=120)
+    expected = results(local(script, *arguments))
+    assert expected
+    assert results(output.splitlines()) == expected
+    leaves_nothing(program)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_processes_in_pods_keep_their_state(place: str, programs: Programs) -> None:
+    program = programs.start(place, "stepping.py", "--envs", 4, "--steps", 100)
+    assert program.says("done")["total"] == 4 * sum(range(100))
+    assert program.says("left")["exitcodes"] == [0] * 4
+    program.ends()
+    leaves_nothing(program)
+
+
+def test_output_has_the_pods_names_in_front(programs: Programs) -> None:
+    program = programs.start("outside", "mapping.py", "--task", "loud", "--tasks", 60)
+    program.ends()
+    hosts = program.says("done")["hosts"]
+    printed = [line for line in program.lines if re.search(r"task \d+ runs", line)]
+    assert all(any(host in line for host in hosts) for line in printed), printed
+    assert sorted(ran(program)) == list(range(60))
+
+
+def test_the_first_pool_waits_for_pods_and_the_next_for_nothing(
+    programs: Programs, scene: Scene
+) -> None:
+    program = programs.start("outside", "pools.py", 4)
+    program.ends(seconds=120)
+    first, *others = (said for said in program.said if said["event"] == "first")
+    ready = scene.first("pods", lambda pod: is_worker(pod) and is_ready(pod))
+    beyond = first["asked"] + first["took"] - ready
+    prompt("a first result follows the first Ready worker", beyond)
+    assert beyond < BEYOND_READY
+    assert max(said["took"] for said in others) < WARM
+    assert len(list(filter(is_worker, ever(scene, "pods").values()))) == 8
+    leaves_nothing(program)
+
+
+def test_pods_follow_the_work(programs: Programs, scene: Scene) -> None:
+    """From none to fifty and back while the program goes on, and no task runs twice."""
+    arguments = ("--task", "loud", "--tasks", 400, "--seconds", 1, "--most", 50, "--stay")
+    program = programs.start("outside", "mapping.py", *arguments, idle_timeout=2)
+    scene.wait("fifty workers", lambda: len(list(filter(is_ready, workers(scene)))) == 50, 180)
+    program.says("done", seconds=120)
+    assert sorted(ran(program)) == list(range(400))
+    scene.wait("no worker", lambda: not workers(scene))
+    assert all(ended_well(pool) for pool in scene.now["fiberpools"].values())
+    program.interrupt()
+    program.prints("KeyboardInterrupt")
+    leaves_nothing(program)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_two_programs_in_one_namespace(place: str, programs: Programs, scene: Scene) -> None:
+    both = [programs.start(place, "mapping.py", "--workers", 2) for _ in range(2)]
+    for program in both:
+        assert program.says("done")["total"] == SQUARES
+    for program in both:
+        program.ends()
+    scene.wait("no pool is left", lambda: not scene.now["fiberpools"])
+    assert len(ever(scene, "fiberpools")) == 2
+
+
+def test_each_shape_has_pods_of_its_own(programs: Programs, scene: Scene) -> None:
+    program = programs.start("outside", "shapes.py")
+    program.ends()
+    pods = [body for body in ever(scene, "pods").values() if is_worker(body)]
+    limits = {pod["spec"]["containers"][0]["resources"]["limits"]["memory"] for pod in pods}
+    assert limits == {"160Mi", "192Mi"}
+    leaves_nothing(program)
+
+
+def test_a_warm_pool_is_given_back_as_it_was(programs: Programs, scene: Scene, agent: Body) -> None:
+    warm = Pool(scene, "warm").apply(agent, minReplicas=2)
+    there = warm.ready(2)
+    program = programs.start("outside", "mapping.py", "--workers", 2, pool="warm")
+    assert program.says("done")["hosts"] == there
+    program.ends()
+    warm.wait("no master", lambda: "master" not in warm.body["spec"])
+    assert warm.ready(2) == there
+
+
+def ever(scene: Scene, resource: str) -> dict[str, Body]:
+    """All objects of a kind that there were, as they were last seen."""
+    moments = [moment for moment in list(scene.moments) if moment.resource == resource]
+    return {moment.name: moment.object for moment in moments}
+
+
+def ran(program: Program) -> list[int]:
+    """The tasks that said that they run."""
+    return [int(number) for number in re.findall(r"task (\d+) runs", program.output)]
+
+
+def ended_well(pool: Body) -> bool:
+    """Whether no worker of the pool ever failed, or was lost."""
+    failures = pool["status"].get("failures", {})
+    return not failures.get("total", 0) and not failures.get("disrupted", 0)
