@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from e2e.accounts import may_use_pools
+from e2e.accounts import may_read_credentials, may_use_pools
 from e2e.clusters import Cluster
 from e2e.delays import prompt
 from e2e.kube import Body
@@ -77,7 +77,8 @@ def test_a_worker_that_comes_later_joins_too(pool: Pool, agent: Body, host: str)
 
 
 def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
-    may_use_pools(pool)
+    may_use_pools(pool.scene)
+    may_read_credentials(pool.scene, pool.name)
     pool.apply(agent, minReplicas=2)
     workers = pool.ready(2)
     first = Inside(pool, image)
