@@ -1,0 +1,156 @@
+"""Nodes that run the worker container of each pod as a process of this machine: a real agent."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+from fakes.store import Body, Store
+from fiber_api import names
+
+GRACE = 2.0
+"""Seconds that an agent has to end once its pod is deleted."""
+
+
+class AgentKubelet:
+    """Runs what ``store`` says; the agents dial their pool's master directly.
+
+    A pod waits for its Secret, as mounting does, and for a master: no Service is there to dial.
+    """
+
+    def __init__(self, store: Store, folder: Path) -> None:
+        self._store = store
+        self._folder = folder
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self.processes: dict[str, asyncio.subprocess.Process] = {}
+        """By the names of their pods."""
+        store.pods_linger = True
+        store.created = self._created
+
+    def kill(self, pod: str, signum: int = signal.SIGKILL) -> None:
+        """As the kernel does, for want of memory."""
+        self.processes[pod].send_signal(signum)
+
+    async def close(self) -> None:
+        """End all of them."""
+        for task in self._tasks.values():
+            task.cancel()
+        await asyncio.gather(*self._tasks.values(), return_exceptions=True)
+
+    def _created(self, plural: str, pod: Body) -> None:
+        if plural == "pods":
+            name = pod["metadata"]["name"]
+            self._tasks[name] = asyncio.ensure_future(self._run(pod["metadata"]["namespace"], name))
+
+    async def _run(self, namespace: str, name: str) -> None:
+        try:
+            process = await self._start(namespace, name)
+            if process is not None:
+                await self._watch(namespace, name, process)
+            self._store.remove("pods", namespace, name)
+        finally:
+            process = self.processes.pop(name, None)
+            if process is not None and process.returncode is None:
+                process.kill()
+                await process.wait()
+
+    async def _start(self, namespace: str, name: str) -> asyncio.subprocess.Process | None:
+        """The agent's process; None if the pod was deleted before."""
+        while True:
+            pod = self._store.get("pods", namespace, name)
+            if "deletionTimestamp" in pod["metadata"]:
+                return None
+            pool = self._store.get(
+                "fiberpools", namespace, pod["metadata"]["labels"][names.LABEL_POOL]
+            )
+            mounted = _credentials(pod)
+            secrets = self._store.list("secrets", namespace)
+            secret = next((s for s in secrets if s["metadata"]["name"] == mounted["name"]), None)
+            master = pool["spec"].get("master")
+            if secret is not None and master is not None:
+                break
+            await self._store.changed()
+        folder = self._mount(name, mounted["items"], secret["data"])
+        environment = {
+            **{key: value for key, value in os.environ.items() if not key.startswith("FIBER_")},
+            **_environment(pod),
+            names.ENV_ADDRESS: names.address_of(master["host"], master["port"]),
+            names.ENV_CREDENTIALS: str(folder),
+        }
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "fiber.agent", env=environment, cwd=folder, process_group=0
+        )
+        self.processes[name] = process
+        self._set(namespace, name, "Running", {"running": {"startedAt": self._store.now()}})
+        return process
+
+    def _mount(self, pod: str, items: list[Body], data: Body) -> Path:
+        folder = self._folder / pod
+        folder.mkdir(parents=True)
+        for item in items:
+            (folder / item["path"]).write_bytes(base64.b64decode(data[item["key"]]))
+        return folder
+
+    async def _watch(self, namespace: str, name: str, process: asyncio.subprocess.Process) -> None:
+        """Until the pod is to be gone."""
+        ended = asyncio.ensure_future(process.wait())
+        told = False
+        while "deletionTimestamp" not in self._store.get("pods", namespace, name)["metadata"]:
+            if ended.done() and not told:
+                told = True
+                code = ended.result() if ended.result() >= 0 else 128 - ended.result()
+                state = {
+                    "exitCode": code,
+                    "reason": "OOMKilled" if code == 128 + signal.SIGKILL else "Error",
+                    "startedAt": self._store.now(),
+                    "finishedAt": self._store.now(),
+                }
+                phase = "Failed" if code else "Succeeded"
+                self._set(namespace, name, phase, {"terminated": state})
+            change = asyncio.ensure_future(self._store.changed())
+            await asyncio.wait(
+                [change, *(() if told else (ended,))], return_when=asyncio.FIRST_COMPLETED
+            )
+            change.cancel()
+        if not ended.done():
+            process.terminate()
+            await asyncio.wait([ended], timeout=GRACE)
+
+    def _set(self, namespace: str, name: str, phase: str, state: Body) -> None:
+        if "nodeName" not in self._store.get("pods", namespace, name)["spec"]:
+            self._store.merge("pods", namespace, name, {"spec": {"nodeName": "node-1"}})
+        now, ready = self._store.now(), "running" in state
+        condition = {
+            "type": "Ready",
+            "status": "True" if ready else "False",
+            "lastTransitionTime": now,
+        }
+        container = {
+            "name": names.WORKER_CONTAINER,
+            "ready": ready,
+            "restartCount": 0,
+            "state": state,
+        }
+        status = {"phase": phase, "conditions": [condition], "containerStatuses": [container]}
+        self._store.set_status("pods", namespace, name, status)
+
+
+def _credentials(pod: Body) -> Body:
+    """The Secret that it mounts, and what of it."""
+    volumes = pod["spec"]["volumes"]
+    volume = next(v for v in volumes if v["name"] == names.CREDENTIALS_VOLUME)
+    found: Body = volume["projected"]["sources"][0]["secret"]
+    return found
+
+
+def _environment(pod: Body) -> dict[str, str]:
+    container: Any = next(
+        c for c in pod["spec"]["containers"] if c["name"] == names.WORKER_CONTAINER
+    )
+    values = {names.ENV_UID: pod["metadata"]["uid"]}
+    return values | {v["name"]: v["value"] for v in container["env"] if "value" in v}

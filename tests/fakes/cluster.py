@@ -1,0 +1,72 @@
+"""A cluster in this process, in real time: the API, the operator, and nodes that run real agents."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from fakes.agent_kubelet import AgentKubelet
+from fakes.store import Body
+from fakes.world import World, a_world
+
+T = TypeVar("T")
+
+PATIENCE = 30.0
+
+
+class FakeCluster:
+    """``world`` and ``nodes``, which only ``do`` may touch."""
+
+    def __init__(self, world: World, nodes: AgentKubelet, loop: asyncio.AbstractEventLoop) -> None:
+        self.world = world
+        self.nodes = nodes
+        self._loop = loop
+
+    @property
+    def url(self) -> str:
+        return self.world.api.url
+
+    def do(self, function: Callable[..., T], *arguments: object) -> T:
+        """Call it on the cluster's thread."""
+
+        async def call() -> T:
+            return function(*arguments)
+
+        return asyncio.run_coroutine_threadsafe(call(), self._loop).result(PATIENCE)
+
+    def objects(self, plural: str) -> list[Body]:
+        """Those that are there, in all namespaces."""
+        return self.do(self.world.store.list, plural)
+
+    def wait(self, condition: Callable[[], object]) -> None:
+        """Wait until it holds on the cluster's thread."""
+        until = self.world.until(lambda: bool(condition()), PATIENCE)
+        asyncio.run_coroutine_threadsafe(until, self._loop).result(2 * PATIENCE)
+
+
+@contextlib.contextmanager
+def fake_cluster(folder: Path) -> Iterator[FakeCluster]:
+    """A new one with nothing in it but an operator; ``folder`` is for what nodes mount."""
+    started: concurrent.futures.Future[FakeCluster] = concurrent.futures.Future()
+    end = asyncio.Event()
+
+    async def serve() -> None:
+        async with a_world() as world:
+            nodes = AgentKubelet(world.store, folder)
+            started.set_result(FakeCluster(world, nodes, asyncio.get_running_loop()))
+            await end.wait()
+            await nodes.close()
+
+    thread = threading.Thread(target=asyncio.run, args=(serve(),), name="fake cluster")
+    thread.start()
+    try:
+        cluster = started.result(PATIENCE)
+        yield cluster
+    finally:
+        cluster.do(end.set)
+        thread.join()
