@@ -77,15 +77,17 @@ class Main:
     def run(self) -> int:
         """Serve until the end; the exit status."""
         self._dialer = self._dial()
-        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # the program may have blocked some
         signal.signal(signal.SIGTERM, self._on_sigterm)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # what an earlier life, or who began it, did
         self._end_with_parent()
         self._loop.run()
         self._dialer.close()
         self._agent.close()
         self._hub.close()
-        if self._again:
+        # From here on it is for the next life, which hears of it when it is ready to.
+        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
+        if self._again and not self._told_to_end:
             # Nothing of what the last master did or left may reach the next one.
             self._hand_on_credentials()
             os.execve(sys.executable, sys.orig_argv, self._environment)
@@ -149,10 +151,10 @@ class Main:
         self._link.close("the agent ended", then=self._loop.stop)
 
     def _on_sigterm(self, *_: object) -> None:
+        self._told_to_end = True
         self._loop.call_soon(self._drain)
 
     def _drain(self) -> None:
-        self._told_to_end = True
         if self._service is None:
             self._loop.stop()
         else:

@@ -148,6 +148,7 @@ class BaseContext:
         error_handling: bool = False,
         task_timeout: float | None = None,
         idle_timeout: float | None = 60.0,
+        pool: str | None = None,
     ) -> Pool:
         """A pool of workers; ``fiber.pool.Pool`` says what the options mean."""
         early.start_zygote()
@@ -166,6 +167,7 @@ class BaseContext:
             error_handling=error_handling,
             task_timeout=task_timeout,
             idle_timeout=idle_timeout,
+            pool=pool,
         )
 
     # Settings

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import os
 import signal
 import sys
@@ -13,7 +14,7 @@ from typing import Any
 from fakes.store import Body, Store
 from fiber_api import names
 
-GRACE = 2.0
+GRACE = 5.0
 """Seconds that an agent has to end once its pod is deleted."""
 
 
@@ -27,6 +28,10 @@ class AgentKubelet:
         self._store = store
         self._folder = folder
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self.forced: list[str] = []
+        """Pods whose agents did not end when they were told to."""
+        self.fails_with: tuple[str, str] | None = None
+        """Reason and message of a container that cannot start, from now on."""
         self.processes: dict[str, asyncio.subprocess.Process] = {}
         """By the names of their pods."""
         store.pods_linger = True
@@ -37,10 +42,12 @@ class AgentKubelet:
         self.processes[pod].send_signal(signum)
 
     async def close(self) -> None:
-        """End all of them."""
-        for task in self._tasks.values():
-            task.cancel()
-        await asyncio.gather(*self._tasks.values(), return_exceptions=True)
+        """Wait for the end of those whose pods are gone, and end the others."""
+        for name in list(self._tasks):
+            for pod in self._store.list("pods"):
+                if pod["metadata"]["name"] == name:
+                    self._store.remove("pods", pod["metadata"]["namespace"], name)
+        await asyncio.gather(*self._tasks.values())
 
     def _created(self, plural: str, pod: Body) -> None:
         if plural == "pods":
@@ -52,7 +59,8 @@ class AgentKubelet:
             process = await self._start(namespace, name)
             if process is not None:
                 await self._watch(namespace, name, process)
-            self._store.remove("pods", namespace, name)
+            with contextlib.suppress(KeyError):  # its pool took it along
+                self._store.remove("pods", namespace, name)
         finally:
             process = self.processes.pop(name, None)
             if process is not None and process.returncode is None:
@@ -61,10 +69,14 @@ class AgentKubelet:
 
     async def _start(self, namespace: str, name: str) -> asyncio.subprocess.Process | None:
         """The agent's process; None if the pod was deleted before."""
+        if self.fails_with is not None:
+            reason, message = self.fails_with
+            state = {"waiting": {"reason": reason, "message": message}}
+            self._set(namespace, name, "Pending", state)
         while True:
-            pod = self._store.get("pods", namespace, name)
-            if "deletionTimestamp" in pod["metadata"]:
+            if self._is_deleted(namespace, name):
                 return None
+            pod = self._store.get("pods", namespace, name)
             pool = self._store.get(
                 "fiberpools", namespace, pod["metadata"]["labels"][names.LABEL_POOL]
             )
@@ -72,7 +84,7 @@ class AgentKubelet:
             secrets = self._store.list("secrets", namespace)
             secret = next((s for s in secrets if s["metadata"]["name"] == mounted["name"]), None)
             master = pool["spec"].get("master")
-            if secret is not None and master is not None:
+            if secret is not None and master is not None and self.fails_with is None:
                 break
             await self._store.changed()
         folder = self._mount(name, mounted["items"], secret["data"])
@@ -100,7 +112,7 @@ class AgentKubelet:
         """Until the pod is to be gone."""
         ended = asyncio.ensure_future(process.wait())
         told = False
-        while "deletionTimestamp" not in self._store.get("pods", namespace, name)["metadata"]:
+        while not self._is_deleted(namespace, name):
             if ended.done() and not told:
                 told = True
                 code = ended.result() if ended.result() >= 0 else 128 - ended.result()
@@ -120,6 +132,13 @@ class AgentKubelet:
         if not ended.done():
             process.terminate()
             await asyncio.wait([ended], timeout=GRACE)
+            if not ended.done():
+                self.forced.append(name)
+
+    def _is_deleted(self, namespace: str, name: str) -> bool:
+        """By somebody, or together with its pool."""
+        pods = {pod["metadata"]["name"]: pod for pod in self._store.list("pods", namespace)}
+        return name not in pods or "deletionTimestamp" in pods[name]["metadata"]
 
     def _set(self, namespace: str, name: str, phase: str, state: Body) -> None:
         if "nodeName" not in self._store.get("pods", namespace, name)["spec"]:

@@ -1,4 +1,4 @@
-"""A cluster in this process, in real time: the API, the operator, and nodes that run real agents."""
+"""A cluster in this process, in real time: the API, the operator, nodes that run real agents."""
 
 from __future__ import annotations
 

@@ -1,0 +1,227 @@
+"""A program whose processes are pods: the whole way, on a cluster played in this process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+import fiber
+from fakes.cluster import FakeCluster, fake_cluster
+from faults.runtime import running
+from fiber.errors import FiberPoolError, WorkerDied
+from fiber_api import names
+from unit.kubernetes_rig import kubeconfig
+
+KEPT = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
+OPERATORS = {names.operator_lease_name("fiber-operator"), "fiberpools.fiber.dev"}
+"""Leases that stay."""
+
+PATIENCE = 30
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeCluster]:
+    folder = tmp_path_factory.mktemp("cluster")
+    with fake_cluster(folder) as cluster, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KUBECONFIG", str(kubeconfig(folder, cluster.url)))
+        yield cluster
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left(cluster: FakeCluster) -> Iterator[None]:
+    yield
+    cluster.nodes.fails_with = None
+
+    def left() -> set[str]:
+        found = [object_ for plural in KEPT for object_ in cluster.world.store.list(plural)]
+        return {object_["metadata"]["name"] for object_ in found} - OPERATORS
+
+    cluster.wait(lambda: not left())
+    assert cluster.nodes.forced == []
+
+
+def pods_of(cluster: FakeCluster) -> list[str]:
+    return [pod["metadata"]["name"] for pod in cluster.objects("pods")]
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def own_pod(_: object = None) -> str:
+    return os.environ[names.ENV_NAME]
+
+
+def slow_square(number: int) -> int:
+    time.sleep(0.02)
+    return number * number
+
+
+def die(how: int) -> None:
+    os.kill(os.getpid(), how)
+
+
+def say(word: str) -> None:
+    print(word, flush=True)
+
+
+def send(channel: Any, word: str) -> None:
+    channel.send(word)
+
+
+def test_a_pool_is_pods_that_come_with_the_work_and_go_with_the_program(
+    cluster: FakeCluster,
+) -> None:
+    with running(backend="kubernetes"), fiber.Pool(2) as pool:
+        assert pods_of(cluster) == []
+        assert pool.map(square, range(100)) == [n * n for n in range(100)]
+        pool.wait_until_workers_up(PATIENCE)
+        assert sorted(info.host for info in pool.workers()) == pods_of(cluster)
+        assert {info.node for info in pool.workers()} == {"node-1"}
+        assert sum(info.tasks for info in pool.workers()) == 100
+
+
+def test_the_next_pool_begins_on_pods_that_are_there(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"):
+        with fiber.Pool(2) as pool:
+            first = set(pool.map(own_pod, range(20), chunksize=1))
+        before = pods_of(cluster)
+        with fiber.Pool(2) as pool:
+            second = set(pool.map(own_pod, range(20), chunksize=1))
+        assert pods_of(cluster) == before
+        assert first | second <= set(before)
+        assert len(cluster.objects("fiberpools")) == 1
+
+
+def test_pods_that_nothing_runs_on_are_released_by_name(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes", idle_timeout=0.2):
+        with fiber.Pool(2) as pool:
+            pool.map(square, range(10))
+        cluster.wait(lambda: not cluster.world.pods("lab"))
+        (fiber_pool,) = cluster.objects("fiberpools")
+        assert fiber_pool["spec"]["replicas"] == 0
+        with fiber.Pool(1) as pool:  # and others come when there is work again
+            assert pool.apply(square, (3,)) == 9
+
+
+def test_functions_that_wish_for_more_run_in_pods_of_their_own(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"):
+        large = fiber.meta(cpu=0.5, memory=64)(square)
+        with fiber.Pool(1) as pool, fiber.Pool(1) as other:
+            assert pool.apply(square, (2,)) == other.apply(large, (2,)) == 4
+            with pytest.raises(ValueError, match="Make another pool"):
+                pool.apply(large, (2,))
+        templates = [pool["spec"]["template"] for pool in cluster.objects("fiberpools")]
+        workers = [template["spec"]["containers"][0] for template in templates]
+        assert {str(worker.get("resources", {}).get("limits")) for worker in workers} == {
+            "None",
+            "{'cpu': '500m', 'memory': '64Mi'}",
+        }
+
+
+def test_processes_and_pipes(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes", processes_per_pod=2):
+        ours, theirs = fiber.Pipe()
+        children = [fiber.Process(target=send, args=(theirs, word)) for word in "abc"]
+        for child in children:
+            child.start()  # which waits for no pod
+        theirs.close()
+        assert sorted(ours.recv() for _ in children) == ["a", "b", "c"]
+        for child in children:
+            child.join(PATIENCE)
+            assert child.exitcode == 0
+        assert len(pods_of(cluster)) == 2
+        ours.close()
+
+
+def test_a_child_that_is_killed_before_it_has_a_pod_is_gone_and_its_pod_not_wanted(
+    cluster: FakeCluster,
+) -> None:
+    cluster.nodes.fails_with = ("ContainerCreating", "")
+    with running(backend="kubernetes"):
+        child = fiber.Process(target=time.sleep, args=(PATIENCE,))
+        child.start()
+        cluster.wait(lambda: cluster.world.pods("lab"))
+        child.kill()
+        child.join(PATIENCE)
+        assert child.exitcode == -signal.SIGKILL
+        cluster.wait(lambda: not cluster.world.pods("lab"))
+
+
+def test_a_killed_pod_costs_its_tasks_another_run(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"), fiber.Pool(2) as pool:
+        result = pool.map_async(slow_square, range(200), chunksize=1)
+        pool.wait_until_workers_up(PATIENCE)
+        victim = pool.workers()[0].host
+        cluster.do(cluster.nodes.kill, victim)
+        assert result.get(PATIENCE) == [n * n for n in range(200)]
+        cluster.wait(lambda: len(cluster.world.pods("lab")) >= 2)
+
+
+def test_a_task_that_dies_with_its_pod_says_so(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"), fiber.Pool(1, retries=0) as pool:
+        result = pool.apply_async(time.sleep, (PATIENCE,))
+        pool.wait_until_workers_up(PATIENCE)
+        (worker,) = pool.workers()
+        cluster.do(cluster.nodes.kill, worker.host)
+        with pytest.raises(WorkerDied, match="OOMKilled") as caught:
+            result.get(PATIENCE)
+        assert (caught.value.pod, caught.value.node) == (worker.host, "node-1")
+        assert "@fiber.meta(memory=)" in str(caught.value)
+
+
+def test_a_deleted_pod_costs_its_tasks_another_run(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"), fiber.Pool(2) as pool:
+        result = pool.map_async(slow_square, range(200), chunksize=1)
+        pool.wait_until_workers_up(PATIENCE)
+        victim = pool.workers()[0].host
+        cluster.do(cluster.world.store.delete, "pods", "lab", victim)
+        assert result.get(PATIENCE) == [n * n for n in range(200)]
+
+
+def test_what_workers_print_comes_with_their_pods_names(
+    cluster: FakeCluster, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with running(backend="kubernetes"), fiber.Pool(1) as pool:
+        pool.apply(say, ("a word",))
+        (worker,) = pool.workers()
+    assert f"[{worker.name}@{worker.host}] a word" in capfd.readouterr().err
+
+
+def test_an_image_that_cannot_be_had_is_an_error_within_seconds(
+    cluster: FakeCluster, capfd: pytest.CaptureFixture[str]
+) -> None:
+    cluster.nodes.fails_with = ("ErrImageNeverPull", "image is not present")
+    with (
+        running(backend="kubernetes", image="nobody/nothing"),
+        fiber.Pool(2) as pool,
+        pytest.raises(FiberPoolError, match="ErrImageNeverPull") as caught,
+    ):
+        pool.map(square, range(3))
+    assert caught.value.reason == "ErrImageNeverPull"
+    with running(backend="kubernetes", image="nobody/nothing"):
+        child = fiber.Process(target=square, args=(1,))
+        child.start()
+        child.join(PATIENCE)
+        assert child.exitcode == 1
+    assert "ErrImageNeverPull" in capfd.readouterr().err
+
+
+def test_a_pool_on_somebody_elses_pods_leaves_them_as_they_were(cluster: FakeCluster) -> None:
+    template = {"spec": {"containers": [{"name": "worker", "image": "worker"}]}}
+    cluster.do(lambda: cluster.world.make_pool("warm", "lab", minReplicas=2, template=template))
+    cluster.wait(lambda: len(cluster.world.pods("lab")) == 2)
+    before = pods_of(cluster)
+    with running(backend="kubernetes"), fiber.Pool(2, pool="warm") as pool:
+        assert set(pool.map(own_pod, range(20), chunksize=1)) <= set(before)
+        (held,) = cluster.objects("fiberpools")
+        assert held["spec"]["master"]["identity"]
+    (left,) = cluster.objects("fiberpools")
+    assert "master" not in left["spec"]
+    assert pods_of(cluster) == before
+    cluster.do(cluster.world.store.delete, "fiberpools", "lab", "warm")
