@@ -274,6 +274,10 @@ class Executor:
         """Whether this is the loop's thread, which must not wait."""
         return self._loop.on_thread()
 
+    def pickles_here(self) -> bool:
+        """Whether this is the thread that pickles its tasks, which must not wait for it."""
+        return self._background.runs_here()
+
     def processes(self) -> list[BaseProcess]:
         """The processes of the workers that are there."""
         handles: list[Any] = list(self._scheduler.workers.members)
