@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
+from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike, Message
 
 UNKNOWN = 255
@@ -48,7 +49,7 @@ class ExitReport(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ChildSpec:
-    """What to start.  Whoever gets it owns ``fds``."""
+    """What to start."""
 
     name: str
     method: str
@@ -57,13 +58,19 @@ class ChildSpec:
     """Pickled dict: what a child sets up before it unpickles anything of the user's."""
     payload: bytes
     """The pickled Process object."""
-    fds: tuple[int, ...] = ()
-    """Descriptors that the payload refers to by index; only for an agent on the same host."""
+    fds: tuple[Descriptor, ...] = ()
+    """What the payload refers to by index, closed once the child has its own or will never be; only
+    for an agent on the same host."""
     tasks: bool = False
     """Whether it is a pool worker, with a channel for tasks."""
     executable: str | None = None
     stdio: tuple[int, int] | None = field(default=None)
     """Descriptors for its stdout and stderr; None: those of the agent's process."""
+
+    def close(self) -> None:
+        """Close ``fds``."""
+        for owner in self.fds:
+            owner.close()
 
 
 class ChildObserver(Protocol):

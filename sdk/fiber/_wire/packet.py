@@ -23,11 +23,12 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Sequence
+from itertools import starmap
 from typing import Any, TypeAlias
 
 from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, release
 from fiber._wire.descriptor import Descriptor, own
-from fiber.errors import ConnectionClosed, TooManyOpenFiles
+from fiber.errors import ConnectionClosed, FileTooLarge, TooManyOpenFiles
 
 BytesLike: TypeAlias = bytes | bytearray | memoryview
 
@@ -66,7 +67,8 @@ _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
 _Ancillary: TypeAlias = list[tuple[int, int, bytes]]
-_Received: TypeAlias = tuple[int, _Ancillary, int, Descriptor | None]
+_Received: TypeAlias = tuple[int, list[int], int, Descriptor | None]
+"""Bytes, descriptors, flags, and that of the memory of a large message."""
 
 
 class _FreeBuffers(threading.local):
@@ -177,6 +179,8 @@ def send(
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE, errno.ETOOMANYREFS):
             raise TooManyOpenFiles("sending a message") from error
+        if error.errno == errno.EFBIG:
+            raise FileTooLarge("sending a message") from error
         raise
     return False
 
@@ -207,13 +211,14 @@ def _send_parts(
     offsets, total = _offsets([size, *sizes])
     head = _PARTS.pack(PARTS_IN_MEMFD, len(sizes), size) + table
     block = _arena.claim(total)
-    sent = False
     try:
         fill(block, [memoryview(payload).cast("B"), *buffers], offsets)
         _sendmsg(sock, [head, ballast], [block.fd, *fds])
-        sent = True
-    finally:
-        _arena.settle(block, sent=sent)
+    except BlockingIOError:
+        _arena.settle(block, sent=False)
+        raise
+    # What else is raised may be a signal's handler's, after it was sent: the block is forgotten.
+    _arena.settle(block, sent=True)
 
 
 def _sendmsg(sock: socket.socket, parts: Sequence[BytesLike], fds: Sequence[int]) -> None:
@@ -240,14 +245,14 @@ def receive_object(sock: socket.socket) -> Any:
     buffer = free.pop() if free else bytearray(_RECEIVE)
     ours = True
     try:
-        size, ancillary, flags, memory = _recvmsg(sock, buffer, _ANCILLARY_ONE, _CLOEXEC)
+        size, fds, flags, memory = _recvmsg(sock, buffer, _ANCILLARY_ONE, _CLOEXEC)
         if size and not buffer[0]:
             return pickle.loads(memoryview(buffer)[1:size])
         ours = False
     finally:
         if ours:
             free.append(buffer)
-    return loads(_receive_parts(memoryview(buffer), buffer, size, ancillary, flags, memory))
+    return loads(_receive_parts(memoryview(buffer), buffer, size, fds, flags, memory))
 
 
 def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True) -> Message:
@@ -261,48 +266,61 @@ def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True
     free = _buffers.free
     buffer = free.pop() if free else bytearray(_RECEIVE)
     try:
-        size, ancillary, flags, memory = _recvmsg(
-            sock, buffer, space, _CLOEXEC if wait else _DONTWAIT
-        )
+        size, fds, flags, memory = _recvmsg(sock, buffer, space, _CLOEXEC if wait else _DONTWAIT)
     except BaseException:
         free.append(buffer)
         raise
     view = memoryview(buffer)
     if size and not buffer[0]:
         return Message(view[1:size], [], [], buffer)
-    return _receive_parts(view, buffer, size, ancillary, flags, memory)
+    return _receive_parts(view, buffer, size, fds, flags, memory)
 
 
 def _recvmsg(sock: socket.socket, buffer: bytearray, space: int, flags: int) -> _Received:
+    call = (((buffer,), space, flags),)
+    answer: list[tuple[int, _Ancillary, int, Any]] = []
+    memory: list[Descriptor] = []
     try:
-        size, ancillary, flags_there, _ = sock.recvmsg_into((buffer,), space, flags)
-    except ConnectionResetError:
-        # The peer closed with packets of ours unread.  The kernel says so once, ahead of what the
-        # peer sent before; the next call delivers that, or the end.
-        size, ancillary, flags_there, _ = sock.recvmsg_into((buffer,), space, flags)
-    memory = None
-    if ancillary and buffer[0] == PARTS_IN_MEMFD:
-        # Here and now: until then the descriptor is a number, which an exception would lose.
-        memory = own(*_FD.unpack_from(ancillary[0][2]))
-    return size, ancillary, flags_there, memory
+        # Received and noted in one step: in between a signal's handler could lose descriptors.
+        try:
+            answer.extend(starmap(sock.recvmsg_into, call))
+        except ConnectionResetError:
+            # The peer closed with packets of ours unread.  The kernel says so once, ahead of what
+            # the peer sent before; the next call delivers that, or the end.
+            answer.extend(starmap(sock.recvmsg_into, call))
+        size, ancillary, flags_there, _ = answer[0]
+        if not ancillary:
+            return size, [], flags_there, None
+        fds = _rights(ancillary)
+        if buffer[0] != PARTS_IN_MEMFD:
+            return size, fds, flags_there, None
+        memory.extend(map(own, fds[:1]))
+        return size, fds[1:], flags_there, memory[0] if memory else None
+    except BaseException:
+        for _, ancillary, _, _ in answer:
+            for fd in _rights(ancillary)[len(memory) :]:
+                os.close(fd)
+        raise
+
+
+def _rights(ancillary: _Ancillary) -> list[int]:
+    """The descriptors that came along."""
+    return [
+        fd
+        for level, kind, data in ancillary
+        if kind == socket.SCM_RIGHTS and level == socket.SOL_SOCKET
+        for (fd,) in _FD.iter_unpack(data[: len(data) // _FD.size * _FD.size])
+    ]
 
 
 def _receive_parts(
     view: memoryview,
     buffer: bytearray,
     size: int,
-    ancillary: _Ancillary,
+    fds: list[int],
     flags: int,
     memory: Descriptor | None,
 ) -> Message:
-    fds = [
-        fd
-        for level, kind, data in ancillary
-        if kind == socket.SCM_RIGHTS and level == socket.SOL_SOCKET
-        for (fd,) in _FD.iter_unpack(data[: len(data) // _FD.size * _FD.size])
-    ]
-    if memory is not None:
-        del fds[0]
     lent = Message(view[:0], [], fds, buffer)
     try:
         if not size:
