@@ -504,6 +504,8 @@ def test_whatever_interrupts_a_large_message_none_is_damaged_and_no_descriptor_l
                 while True:
                     came.append(receive())
             assert came in ([first, second], [second]), f"damaged at step {step}"
+        free = packet._buffers.free
+        assert len(set(map(id, free))) == len(free), f"one is free twice after step {step}"
         packet._arena._forget()
         return interrupted
 

@@ -104,9 +104,9 @@ class Message:
 
     def release(self) -> None:
         """Give the borrowed memory back to this thread; the payload must not be used after it."""
-        if self._lent is not None:
-            _buffers.free.append(self._lent)
-            self._lent = None
+        lent, self._lent = self._lent, None  # first: interrupted, it must not be given back twice
+        if lent is not None:
+            _buffers.free.append(lent)
 
     def tobytes(self) -> bytes:
         """Copy the payload out and release the message."""
