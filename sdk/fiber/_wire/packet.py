@@ -27,7 +27,7 @@ from itertools import starmap
 from typing import Any, TypeAlias
 
 from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, release
-from fiber._wire.descriptor import Descriptor, own
+from fiber._wire.descriptor import own
 from fiber.errors import ConnectionClosed, FileTooLarge, TooManyOpenFiles
 
 BytesLike: TypeAlias = bytes | bytearray | memoryview
@@ -67,15 +67,27 @@ _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
 _Ancillary: TypeAlias = list[tuple[int, int, bytes]]
-_Received: TypeAlias = tuple[int, list[int], int, Descriptor | None]
-"""Bytes, descriptors, flags, and that of the memory of a large message."""
+_Call: TypeAlias = tuple[tuple[tuple[bytearray], int, int]]
+_Received: TypeAlias = list[Any]
+"""What ``recvmsg_into`` returned; then, of a large message, the owner of its memory."""
+
+
+class _Buffer:
+    """Memory to receive into, and the arguments of ``recvmsg_into`` for it."""
+
+    __slots__ = ("call", "data", "view")
+
+    def __init__(self) -> None:
+        self.data = bytearray(_RECEIVE)
+        self.view = memoryview(self.data)
+        self.call = (((self.data,), _ANCILLARY_ONE, _CLOEXEC),)
 
 
 class _FreeBuffers(threading.local):
     """Receive buffers of this thread that no message is using."""
 
     def __init__(self) -> None:
-        self.free: list[bytearray] = []
+        self.free: list[_Buffer] = []
 
 
 _buffers = _FreeBuffers()
@@ -95,7 +107,7 @@ class Message:
         payload: memoryview,
         buffers: list[memoryview],
         fds: list[int],
-        lent: bytearray | None = None,
+        lent: _Buffer | None = None,
     ) -> None:
         self.payload = payload
         self.buffers = buffers
@@ -242,17 +254,18 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
 def receive_object(sock: socket.socket) -> Any:
     """``loads(receive(sock))``, without a Message between them where the packet is a small one."""
     free = _buffers.free
-    buffer = free.pop() if free else bytearray(_RECEIVE)
+    buffer = free.pop() if free else _Buffer()
     ours = True
     try:
-        size, fds, flags, memory = _recvmsg(sock, buffer, _ANCILLARY_ONE, _CLOEXEC)
-        if size and not buffer[0]:
-            return pickle.loads(memoryview(buffer)[1:size])
+        received = _recvmsg(sock, buffer.data, buffer.call)
+        size = received[0][0]
+        if size and not buffer.data[0]:
+            return pickle.loads(buffer.view[1:size])
         ours = False
     finally:
         if ours:
             free.append(buffer)
-    return loads(_receive_parts(memoryview(buffer), buffer, size, fds, flags, memory))
+    return loads(_receive_parts(buffer, received))
 
 
 def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True) -> Message:
@@ -264,42 +277,36 @@ def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
-    buffer = free.pop() if free else bytearray(_RECEIVE)
+    buffer = free.pop() if free else _Buffer()
     try:
-        size, fds, flags, memory = _recvmsg(sock, buffer, space, _CLOEXEC if wait else _DONTWAIT)
+        call = (((buffer.data,), space, _CLOEXEC if wait else _DONTWAIT),)
+        received = _recvmsg(sock, buffer.data, call)
     except BaseException:
         free.append(buffer)
         raise
-    view = memoryview(buffer)
-    if size and not buffer[0]:
-        return Message(view[1:size], [], [], buffer)
-    return _receive_parts(view, buffer, size, fds, flags, memory)
+    size = received[0][0]
+    if size and not buffer.data[0]:
+        return Message(buffer.view[1:size], [], [], buffer)
+    return _receive_parts(buffer, received)
 
 
-def _recvmsg(sock: socket.socket, buffer: bytearray, space: int, flags: int) -> _Received:
-    call = (((buffer,), space, flags),)
-    answer: list[tuple[int, _Ancillary, int, Any]] = []
-    memory: list[Descriptor] = []
+def _recvmsg(sock: socket.socket, data: bytearray, call: _Call) -> _Received:
+    received: _Received = []
     try:
         # Received and noted in one step: in between a signal's handler could lose descriptors.
         try:
-            answer.extend(starmap(sock.recvmsg_into, call))
+            received.extend(starmap(sock.recvmsg_into, call))
         except ConnectionResetError:
             # The peer closed with packets of ours unread.  The kernel says so once, ahead of what
             # the peer sent before; the next call delivers that, or the end.
-            answer.extend(starmap(sock.recvmsg_into, call))
-        size, ancillary, flags_there, _ = answer[0]
-        if not ancillary:
-            return size, [], flags_there, None
-        fds = _rights(ancillary)
-        if buffer[0] != PARTS_IN_MEMFD:
-            return size, fds, flags_there, None
-        memory.extend(map(own, fds[:1]))
-        return size, fds[1:], flags_there, memory[0] if memory else None
+            received.extend(starmap(sock.recvmsg_into, call))
+        ancillary = received[0][1]
+        if ancillary and data[0] == PARTS_IN_MEMFD:
+            received.extend(map(own, _rights(ancillary)[:1]))
+        return received
     except BaseException:
-        for _, ancillary, _, _ in answer:
-            for fd in _rights(ancillary)[len(memory) :]:
-                os.close(fd)
+        for fd in _rights(received[0][1])[len(received) - 1 :] if received else ():
+            os.close(fd)
         raise
 
 
@@ -313,15 +320,10 @@ def _rights(ancillary: _Ancillary) -> list[int]:
     ]
 
 
-def _receive_parts(
-    view: memoryview,
-    buffer: bytearray,
-    size: int,
-    fds: list[int],
-    flags: int,
-    memory: Descriptor | None,
-) -> Message:
-    lent = Message(view[:0], [], fds, buffer)
+def _receive_parts(buffer: _Buffer, received: _Received) -> Message:
+    (size, ancillary, flags, _), *memory = received
+    view = buffer.view
+    lent = Message(view[:0], [], _rights(ancillary)[len(memory) :], buffer)
     try:
         if not size:
             raise ConnectionClosed()
@@ -333,9 +335,9 @@ def _receive_parts(
         sizes = [length, *(n for (n,) in _SIZE.iter_unpack(view[_PARTS.size : offset]))]
         if kind == PARTS:
             return _inline_parts(view[offset:size], sizes, lent)
-        if memory is None:
+        if not memory:
             raise ValueError("a large message without its memory")
-        return _memory_parts(sizes, lent, memory.fileno())
+        return _memory_parts(sizes, lent, memory[0].fileno())
     except BaseException:
         lent.close_descriptors()
         lent.release()
