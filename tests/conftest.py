@@ -9,11 +9,15 @@ import tempfile
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 
 from leaks import Snapshot, Watch, shut_down_runtime
+
+if TYPE_CHECKING:
+    from fiber.connection import Connection
 
 # Seconds for one test, by folder; a test with its own timeout marker keeps that. They are there to
 # end a hang: about ten times what the slowest needs alone on a machine, as it may have company.
@@ -55,6 +59,16 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     if call.when == "call":
         item.stash[_CALL] = call
     return (yield)
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[Connection, Connection]]:
+    """Both ends of a pipe, closed after the test."""
+    import fiber  # not for the operator's tests
+
+    one, other = fiber.Pipe()
+    with one, other:
+        yield one, other
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from fiber.errors import ConnectionClosed as ConnectionClosed
     from fiber.errors import FiberError as FiberError
     from fiber.errors import FiberPoolError as FiberPoolError
+    from fiber.errors import FileTooLarge as FileTooLarge
     from fiber.errors import LinkError as LinkError
     from fiber.errors import NotInFiber as NotInFiber
     from fiber.errors import ProcessError as ProcessError
@@ -109,6 +110,7 @@ _HOMES = {
     "ConnectionClosed": "errors",
     "FiberError": "errors",
     "FiberPoolError": "errors",
+    "FileTooLarge": "errors",
     "LinkError": "errors",
     "NotInFiber": "errors",
     "Process": "process",

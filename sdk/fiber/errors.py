@@ -11,6 +11,7 @@
     │       ├── ConfigError       a key or value that is wrong (also ValueError)
     │       ├── ConnectionClosed  the other end of a link is gone (also EOFError)
     │       ├── FiberPoolError    a FiberPool on Kubernetes that cannot serve
+    │       ├── FileTooLarge      a message, or shared memory, above the limit (also OSError)
     │       ├── LinkError         no way between program and agent, a port in use for instance
     │       ├── NotInFiber        a part of multiprocessing that Fiber has not (yet)
     │       ├── StartError        a process that does not start, an initializer that fails
@@ -44,6 +45,7 @@ __all__ = [
     "ConnectionClosed",
     "FiberError",
     "FiberPoolError",
+    "FileTooLarge",
     "LinkError",
     "MaybeEncodingError",
     "NotInFiber",
@@ -136,6 +138,22 @@ class FiberPoolError(FiberError):
         self.pool = pool
         self.namespace = namespace
         self.reason = reason
+
+
+class FileTooLarge(FiberError, OSError):
+    """Shared memory would be larger than a file may be (errno EFBIG); says the limit."""
+
+    def __init__(self, doing: str) -> None:
+        soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+        super().__init__(
+            errno.EFBIG,
+            f"file too large while {doing}: large messages travel in shared memory, which is a "
+            f"file to the system, and this process may write files of {soft} bytes. Raise that "
+            "with `ulimit -f` in the shell that starts the program, LimitFSIZE= in its systemd "
+            "unit, or resource.setrlimit() in the program; or send less at a time",
+        )
+        self.doing = doing
+        self.limit = soft
 
 
 class LinkError(FiberError):

@@ -149,6 +149,7 @@ class Pool:
         stands for the pool's ``task_timeout``, infinity for no limit.
         """
         self._check_running(func)
+        self._check_may_wait()
         result = AsyncResult(self)
         return self._executor.call_and_wait(result, func, args, kwds, self._limit(timeout))
 
@@ -175,6 +176,7 @@ class Pool:
     def broadcast(self, func: _Function, *args: Any) -> list[Any]:
         """Call ``func(*args)`` once in every worker, and return the results of all."""
         self._check_running(func)
+        self._check_may_wait()
         result = MapResult(self)
         self._executor.broadcast(result, func, args)
         values: list[Any] = result.get()
@@ -309,6 +311,7 @@ class Pool:
         chunksize: int | None,
         timeout: float | None,
     ) -> list[Any]:
+        self._check_may_wait()
         result = MapResult(self)
         item = self._item(kind, func, result, chunksize, timeout)
         if item is not None:
@@ -419,6 +422,13 @@ class Pool:
             sys.excepthook(*sys.exc_info())  # nobody else would hear of it
             return False
 
+    def _check_may_wait(self) -> None:
+        if self._executor.pickles_here():
+            raise RuntimeError(
+                "what a pool pickles for its workers cannot wait for the same pool, which would "
+                "wait for the pickle: get the result before the map, or in the task"
+            )
+
     # The pool itself
 
     @property
@@ -471,6 +481,7 @@ class Pool:
             raise ValueError("Pool is still running")
         if self._state not in (CLOSE, TERMINATE):
             raise ValueError("In unknown state")
+        self._check_may_wait()
         self._executor.join()
         self._terminate.cancel()
 
@@ -496,7 +507,7 @@ class Pool:
 
 def _end(executor: Executor) -> None:
     executor.terminate(_terminated())
-    if not executor.on_loop():
+    if not (executor.on_loop() or executor.pickles_here()):
         executor.ended.wait()
 
 

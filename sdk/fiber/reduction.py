@@ -34,6 +34,7 @@ from typing import Any, ClassVar, cast
 from fiber._agent import child
 from fiber._hub import handles
 from fiber._wire import packet
+from fiber._wire.descriptor import Descriptor, opened
 from fiber.errors import UnpicklableError
 
 __all__ = [
@@ -79,18 +80,12 @@ class Spawning:
 
     def __init__(self, process: Any) -> None:
         self.process = process
-        self.fds: list[int] = []
+        self.fds: list[Descriptor] = []
 
     def duplicate_for_child(self, fd: int) -> int:
         """Send ``fd`` along; the index under which the child finds it."""
-        self.fds.append(os.dup(fd))
+        self.fds.append(opened(os.dup, fd))
         return len(self.fds) - 1
-
-    def reset(self) -> None:
-        """Forget what was collected."""
-        for fd in self.fds:
-            os.close(fd)
-        self.fds.clear()
 
 
 def spawning() -> Any:
@@ -98,25 +93,28 @@ def spawning() -> Any:
     return mp_context.get_spawning_popen()
 
 
-def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
-    """Pickle a Process that is being started; on the same host its descriptors go along.
-
-    The caller owns the returned descriptors.
-    """
-    attempt = Spawning(process)
-    mp_context.set_spawning_popen(cast("Any", attempt if same_host else RemoteSpawning(process)))
+def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[Descriptor]]:
+    """Pickle a Process that is being started; on the same host its descriptors go along."""
     try:
-        payload = dumps(process, before_retry=attempt.reset)
+        return _dump_process(process, Spawning(process) if same_host else RemoteSpawning(process))
+    finally:
+        mp_context.set_spawning_popen(None)  # again: the first time may have been interrupted
+
+
+def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
+    fds: list[Descriptor] = popen.fds
+    try:
+        mp_context.set_spawning_popen(popen)
+        return dumps(process, before_retry=fds.clear), fds
     except (*REFUSALS, AttributeError) as error:
         culprit = _blame_process(process, error)
-        attempt.reset()
+        fds.clear()
         raise culprit from error
     except BaseException:
-        attempt.reset()
+        fds.clear()  # now: the traceback, which holds them, may be kept for long
         raise
     finally:
         mp_context.set_spawning_popen(None)
-    return payload, attempt.fds
 
 
 def _blame_process(process: Any, reason: Exception) -> UnpicklableError:
@@ -194,6 +192,7 @@ class RemoteSpawning:
 
     def __init__(self, process: Any) -> None:
         self.process = process
+        self.fds: list[Descriptor] = []
 
     def duplicate_for_child(self, fd: int) -> int:
         """Refuse."""

@@ -30,6 +30,9 @@ class Owner(Protocol):
     def _call_back(self, action: Callable[[], None]) -> bool:
         """Have a callback run; False if none runs any more."""
 
+    def _check_may_wait(self) -> None:
+        """RuntimeError where a result would wait for whoever waits for it."""
+
 
 class ApplyResult:
     """The result of one call, as ``apply_async`` returns it."""
@@ -62,7 +65,9 @@ class ApplyResult:
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the result is there or ``timeout`` seconds are over."""
-        self._done.wait(timeout)
+        if not self._done.is_set():
+            _check_may_wait(self._pool, timeout)
+            self._done.wait(timeout)
 
     def get(self, timeout: float | None = None) -> Any:
         """The result, or the exception that the call raised; TimeoutError if there is neither."""
@@ -132,6 +137,11 @@ class ApplyResult:
 
 
 AsyncResult = ApplyResult
+
+
+def _check_may_wait(pool: Owner | None, timeout: float | None) -> None:
+    if pool is not None and (timeout is None or timeout > 0):
+        pool._check_may_wait()
 
 
 def _too_late(timeout: float | None) -> TimeoutError:
@@ -207,6 +217,7 @@ class _Buffer:
         self.resume: Callable[[], None] | None = None
         """Has the executor look whether there is room, after ``add_results`` asked for no more."""
         self._waiters = Waiters()
+        self._abandoned = False
         self._bounded = True
         self._passed = 0  # results that were put into ``items``
         self._held = 0  # bytes, of which some may have been taken since it was last looked
@@ -216,6 +227,8 @@ class _Buffer:
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take outcomes."""
+        if self._abandoned:
+            return False
         self._held += size
         self._keep(start, outcomes, size)
         self._waiters.wake()
@@ -251,8 +264,10 @@ class _Buffer:
         return self._held >= HELD
 
     def has_room(self) -> bool:
-        """Whether half of what was held back for is read."""
-        if self._resume_at < len(self.items):
+        """Whether half of what was held back for is read, or nobody will read it."""
+        if self._abandoned:
+            self._drop()
+        elif self._resume_at < len(self.items):
             return False
         self._resume_at = -1
         return True
@@ -261,6 +276,16 @@ class _Buffer:
         """Take all that comes."""
         self._bounded = False
         self._resume_at = -1
+
+    def abandon(self) -> None:
+        """Nobody will read results: keep none, and hold back no task for them.  From anywhere."""
+        self._abandoned = True
+        if self.resume is not None:
+            self.resume()
+
+    def _drop(self) -> None:
+        self.items.clear()
+        self._sizes.clear()
 
     def ask(self) -> None:
         """Have the executor go on, if it waits until results are read.
@@ -301,6 +326,7 @@ class _Buffer:
                 raise StopIteration
             self.ask()
             left = None if deadline is None else deadline - time.monotonic()
+            _check_may_wait(self.pool, left)
             if not acquire(waiter, left):
                 self._waiters.leave(waiter)
                 raise _too_late(timeout)
@@ -316,6 +342,10 @@ class _OrderedBuffer(_Buffer):
         self._early[start] = outcomes, size
         while (ready := self._early.pop(self._passed, None)) is not None:
             self._pass_on(*ready)
+
+    def _drop(self) -> None:
+        super()._drop()
+        self._early.clear()
 
 
 class IMapIterator:
@@ -347,10 +377,14 @@ class IMapIterator:
     __next__ = next
 
     def __del__(self) -> None:
-        # Nobody can make room any more for what was not read yet.
-        if self._cancel is not None and not self._buffer.finished:
+        buffer: _Buffer | None = getattr(self, "_buffer", None)
+        if buffer is None or buffer.finished:  # None: ``__init__`` was interrupted
+            return
+        if self._cancel is None:
+            buffer.abandon()
+        else:  # nobody can make room any more for what was not read yet
             self._cancel()
-            self._buffer.stream = None
+            buffer.stream = None
 
 
 class IMapUnorderedIterator(IMapIterator):

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-import fiber
 from faults.program import LOOPBACK, Program, wait_for
 from faults.runtime import running
 
@@ -45,15 +44,6 @@ def launch_on(
         return launch(script, *arguments, env=env, **options)
 
     return start
-
-
-@pytest.fixture
-def pipe() -> Iterator[tuple[Any, Any]]:
-    """Both ends of a pipe, closed after the test."""
-    ends = fiber.Pipe()
-    yield ends
-    for end in ends:
-        end.close()
 
 
 @pytest.fixture(scope="module", params=BACKENDS)

@@ -105,7 +105,7 @@ class Audit:
                 batch.stop,
             )
             self._check_tasks(batch, batch.job)
-            back = batch.start < reached.get(batch.job, batch.stop)
+            back = batch.stop <= reached.get(batch.job, batch.stop)
             require(back or batch.pin, "a task is begun though nobody reads results")
             require(worker in self._ledger.workers, "a worker that is gone is given a batch")
             require(not worker.leaving, "a worker that leaves is given a batch")

@@ -18,12 +18,15 @@ if TYPE_CHECKING:
     from unit.link_site import Site
 
 
-@pytest.fixture
-def loop() -> Iterator[Loop]:
+def _running_loop() -> Iterator[Loop]:
     running = Loop()
     running.start_thread("loop under test")
     yield running
     running.stop()
+
+
+loop = pytest.fixture(_running_loop, name="loop")
+module_loop = pytest.fixture(_running_loop, scope="module", name="module_loop")
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +69,7 @@ def far(hosts: Hosts, wires: tuple[Wire, Wire]) -> Iterator[Far]:
 
 
 @pytest.fixture
-def pipe(far: Far) -> Iterator[tuple[Connection, Connection]]:
+def far_pipe(far: Far) -> Iterator[tuple[Connection, Connection]]:
     """An end of a pipe on its host, and the other end on another."""
     here, there = fiber.Pipe()
     remote = far(there)

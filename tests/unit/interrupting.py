@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import threading
 from collections.abc import Callable
@@ -41,7 +42,8 @@ def is_interrupted(
                 raise KeyboardInterrupt
         return trace
 
-    before = sys.gettrace()
+    before, collects = sys.gettrace(), gc.isenabled()
+    gc.disable()  # a finalizer of other tests' garbage would be struck, and shown
     sys.settrace(trace)
     try:
         action()
@@ -49,4 +51,6 @@ def is_interrupted(
         pass
     finally:
         sys.settrace(before)
+        if collects:
+            gc.enable()
     return step >= stop

@@ -22,6 +22,7 @@ from fiber._agent.agent import Agent
 from fiber._agent.interface import ChildSpec
 from fiber._agent.local_child import LocalChild
 from fiber._transport.loop import Loop
+from fiber._wire import descriptor
 from fiber.errors import TooManyOpenFiles
 from fiber.process import Process
 from unit.agent_children import (
@@ -39,28 +40,20 @@ Start = Callable[..., tuple[LocalChild, Recorder]]
 
 
 @pytest.fixture(scope="module")
-def loop() -> Iterator[Loop]:
-    running = Loop()
-    running.start_thread("loop under test")
-    yield running
-    running.stop()
-
-
-@pytest.fixture(scope="module")
-def shared(loop: Loop) -> Iterator[Agent]:
+def shared(module_loop: Loop) -> Iterator[Agent]:
     """An agent for tests that do not break it."""
-    made = Agent(loop, "here")
+    made = Agent(module_loop, "here")
     yield made
     made.close()
 
 
 @pytest.fixture
-def own(loop: Loop) -> Iterator[Agent]:
+def own(module_loop: Loop) -> Iterator[Agent]:
     """An agent for one test."""
-    made = Agent(loop, "here")
+    made = Agent(module_loop, "here")
     yield made
     made.close()
-    settled(loop)
+    settled(module_loop)
 
 
 def settled(loop: Loop) -> None:
@@ -156,7 +149,7 @@ def test_what_a_dead_worker_never_read_is_named(shared: Agent) -> None:
 
 
 def test_an_answer_that_nobody_can_handle_ends_its_worker(
-    shared: Agent, loop: Loop, capsys: pytest.CaptureFixture[str]
+    shared: Agent, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The master must not wait for it."""
     child, observer = begin(shared, answer_sums, tasks=True)
@@ -169,7 +162,7 @@ def test_an_answer_that_nobody_can_handle_ends_its_worker(
     child.deliver(1, pickle.dumps(7))
     report = observer.wait_for_exit()
     assert report.reason == "killed by its agent: not this one"
-    settled(loop)
+    settled(shared.loop)
     assert "ValueError: not this one" in capsys.readouterr().err
 
 
@@ -228,7 +221,7 @@ def test_its_last_words_come_before_its_end(shared: Agent) -> None:
 def test_descriptors_travel_however_many_and_none_stays(shared: Agent) -> None:
     before = len(os.listdir("/proc/self/fd"))
     pipes = [os.pipe() for _ in range(300)]
-    fds = tuple(writer for _, writer in pipes)
+    fds = tuple(descriptor.own(writer) for _, writer in pipes)
     handles = [Handle(index) for index in range(200)]  # a hundred are taken by nobody
     _, observer = begin(shared, write_own_index, handles, fds=fds)
     assert observer.wait_for_exit().exitcode == 0
@@ -315,7 +308,7 @@ def test_a_zygote_that_cannot_be_launched_is_an_error_of_the_start(
     with monkeypatch.context() as broken:
         broken.setattr(zygote_process, "launch", refuse)
         with pytest.raises(FileNotFoundError, match="no interpreter"):
-            begin(own, os._exit, 0, tasks=True, fds=(os.dup(1),))
+            begin(own, os._exit, 0, tasks=True, fds=(descriptor.opened(os.dup, 1),))
     settled(own.loop)
     assert len(os.listdir("/proc/self/fd")) == before
     _, observer = begin(own, os._exit, 0)
@@ -325,7 +318,7 @@ def test_a_zygote_that_cannot_be_launched_is_an_error_of_the_start(
 @pytest.mark.parametrize("spare", range(6))
 def test_no_descriptor_left_is_a_clear_error_and_leaks_none(shared: Agent, spare: int) -> None:
     begin(shared, os._exit, 0)[1].wait_for_exit()  # its zygote runs
-    handed = os.dup(1)
+    handed = descriptor.opened(os.dup, 1)
     before = len(os.listdir("/proc/self/fd"))
     slots = len(shared.progress_table._free)
     with few_descriptors(spare), pytest.raises(TooManyOpenFiles, match="ulimit -n"):

@@ -8,7 +8,7 @@ import pickle
 import signal
 import threading
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from multiprocessing.connection import wait
 from typing import Any
 
@@ -30,13 +30,6 @@ def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
     process = fiber.Process(target=target, args=args, daemon=True)
     process.start()
     return process
-
-
-@pytest.fixture
-def pipe() -> Iterator[tuple[Connection, Connection]]:
-    one, other = Pipe()
-    with one, other:
-        yield one, other
 
 
 # Objects and bytes

@@ -44,6 +44,7 @@ EXAMPLES = [
     errors.ConnectionClosed(),
     errors.ConnectionClosed("Worker-1", "killed by SIGSEGV"),
     errors.FiberPoolError("no quota", pool="es-1", namespace="team", reason="QuotaExceeded"),
+    errors.FileTooLarge("sending a message"),
     errors.NotInFiber("no Lock yet"),
     errors.StartError("worker 'Worker-1'", "its initializer raised", "ValueError: no", 3),
     errors.TooManyOpenFiles("starting process 'Worker-1'"),
@@ -97,6 +98,7 @@ def test_unknown_names_of_the_module_are_attribute_errors() -> None:
         (errors.FiberError, multiprocessing.ProcessError),
         (errors.ConfigError, ValueError),
         (errors.ConnectionClosed, EOFError),
+        (errors.FileTooLarge, OSError),
         (errors.NotInFiber, NotImplementedError),
         (errors.TooManyOpenFiles, OSError),
         (errors.UnpicklableError, TypeError),
@@ -203,6 +205,14 @@ def test_too_many_open_files_names_the_limit_and_what_to_set() -> None:
     assert pickle.loads(pickle.dumps(error)).errno == errno.EMFILE
     assert (error.limit, error.hard_limit) == (soft, hard)
     for part in ("making a pipe", str(soft), "ulimit -n", "LimitNOFILE"):
+        assert part in str(error)
+
+
+def test_file_too_large_names_the_limit_and_what_to_set() -> None:
+    soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    error = errors.FileTooLarge("sending a message")
+    assert (error.errno, error.limit) == (errno.EFBIG, soft)
+    for part in ("sending a message", f"{soft} bytes", "ulimit -f", "LimitFSIZE"):
         assert part in str(error)
 
 

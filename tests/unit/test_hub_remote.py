@@ -28,8 +28,8 @@ from hosts import PATIENCE, Far, Hosts, background, objects_kept
 # Channels
 
 
-def test_messages_go_both_ways(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_messages_go_both_ways(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     assert isinstance(there._channel, RemoteChannel)
     there.send({"to": ["home"]})
     assert here.recv() == {"to": ["home"]}
@@ -41,8 +41,8 @@ def test_messages_go_both_ways(pipe: tuple[Connection, Connection]) -> None:
     assert there.recv_bytes() == b""
 
 
-def test_boundaries_are_kept(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_boundaries_are_kept(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     sizes = [0, 1, 70_000, 5, 131_071, 131_072, 131_073, 3]
     for size in sizes:
         there.send_bytes(bytes(size))
@@ -52,8 +52,8 @@ def test_boundaries_are_kept(pipe: tuple[Connection, Connection]) -> None:
     sender.join()
 
 
-def test_large_messages_and_arrays_pass(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_large_messages_and_arrays_pass(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     item = {"text": "x" * 5_000_000, "arrays": [np.arange(500_000), np.zeros(0), np.ones(9_000)]}
     for source, sink in ((here, there), (there, here)):
         sender = background(source.send, item)
@@ -65,8 +65,8 @@ def test_large_messages_and_arrays_pass(pipe: tuple[Connection, Connection]) -> 
             assert copy.flags.writeable
 
 
-def test_poll(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_poll(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     assert not there.poll()
     assert not there.poll(0.01)
     assert not there.poll(-1)
@@ -90,8 +90,8 @@ def test_one_ended_pipes_stay_so(far: Far) -> None:
     assert reader.recv() == 1
 
 
-def test_the_end_comes_when_the_far_holder_closes(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_the_end_comes_when_the_far_holder_closes(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     there.send("last words")
     there.close()
     assert here.recv() == "last words"
@@ -101,15 +101,15 @@ def test_the_end_comes_when_the_far_holder_closes(pipe: tuple[Connection, Connec
         there.recv()
 
 
-def test_sending_to_nobody_fails(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_sending_to_nobody_fails(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     here.close()
     with pytest.raises(BrokenPipeError):
         there.send(1)
 
 
-def test_a_blocked_receiver_hears_of_the_end(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_a_blocked_receiver_hears_of_the_end(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     ends: list[type[BaseException]] = []
 
     def receive() -> None:
@@ -124,8 +124,8 @@ def test_a_blocked_receiver_hears_of_the_end(pipe: tuple[Connection, Connection]
     assert ends == [ConnectionClosed]
 
 
-def test_a_full_pipe_makes_the_sender_wait(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_a_full_pipe_makes_the_sender_wait(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     sent: list[int] = []
 
     def send_all() -> None:
@@ -212,8 +212,8 @@ def test_a_handle_used_twice_says_so(hosts: Hosts, far: Far) -> None:
 # Waiting for several
 
 
-def test_wait_is_right_before_and_after_receiving(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_wait_is_right_before_and_after_receiving(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     for _ in range(3):
         assert wait([there], 0) == []
         here.send(1)
@@ -240,8 +240,8 @@ def test_wait_mixes_near_and_far(far: Far) -> None:
         reader.close()
 
 
-def test_a_kept_descriptor_stays_right(pipe: tuple[Connection, Connection]) -> None:
-    here, there = pipe
+def test_a_kept_descriptor_stays_right(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
     poller = select.poll()
     poller.register(there.fileno(), select.POLLIN)
     for number in range(20):

@@ -164,9 +164,9 @@ def interruptible() -> Iterator[None]:
 
 @pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_receive_loses_nothing(
-    hosts: Hosts, pipe: tuple[Connection, Connection]
+    hosts: Hosts, far_pipe: tuple[Connection, Connection]
 ) -> None:
-    here, there = pipe
+    here, there = far_pipe
     there.poll(0)
     asked = lambda: any(session.waiting for session in hosts["a"]._handlers)  # noqa: E731
     interrupter = background(interrupt_main_thread, asked)
@@ -180,9 +180,9 @@ def test_an_interrupted_receive_loses_nothing(
 
 @pytest.mark.usefixtures("interruptible")
 def test_what_was_on_its_way_to_an_interrupted_receive_is_kept(
-    pipe: tuple[Connection, Connection], wires: tuple[Wire, Wire]
+    far_pipe: tuple[Connection, Connection], wires: tuple[Wire, Wire]
 ) -> None:
-    here, there = pipe
+    here, there = far_pipe
     _, down = wires
     there.poll(0)
     down.hold()

@@ -6,6 +6,7 @@ deadlock fails it.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import itertools
 import os
@@ -14,20 +15,27 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
-from types import FrameType
+from functools import partial
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
 
 import fiber
 from fiber import queues, reduction
+from fiber._agent.agent import Agent
 from fiber._hub import feeder, handles, hub, registry, remote
 from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.handles import GrantSet
 from fiber._hub.local import LocalChannel, QuietSocket
 from fiber._hub.protocol import ONE, Op
+from fiber._runtime import state
 from fiber._transport import unix
+from fiber._transport.loop import Wakeup
+from fiber._wire import arena, descriptor, packet
 from fiber._wire.arena import Arena, Block
 from fiber.connection import Connection, wait
+from fiber.results import IMapIterator
 from hosts import PATIENCE, Hosts, objects_kept
 from unit.interrupting import INSTRUCTIONS, is_interrupted
 from unit.pool_programs import run_program
@@ -358,9 +366,9 @@ def test_a_task_is_reusable_whatever_was_sent_while_it_was_pickled(hosts: Hosts)
 
 
 def test_asking_within_asking_for_the_descriptor_of_a_far_pipe(
-    pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
+    far_pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here, far = pipe
+    here, far = far_pipe
     monkeypatch.setattr(HubStream, "ask", once(far.fileno, HubStream.ask))
     without_deadlock(far.fileno)
     assert wait([far], 0) == []
@@ -371,9 +379,9 @@ def test_asking_within_asking_for_the_descriptor_of_a_far_pipe(
 
 
 def test_receiving_within_receiving_from_a_far_pipe(
-    pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
+    far_pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here, far = pipe
+    here, far = far_pipe
     here.send(1)
     here.send(2)
     got: list[int] = []
@@ -383,9 +391,9 @@ def test_receiving_within_receiving_from_a_far_pipe(
 
 
 def test_a_far_pipe_is_there_whatever_interrupts_its_use(
-    pipe: tuple[Connection, Connection],
+    far_pipe: tuple[Connection, Connection],
 ) -> None:
-    here, far = pipe
+    here, far = far_pipe
     step = 0
     files = {remote.__file__}
 
@@ -430,13 +438,82 @@ def test_whatever_interrupts_making_or_dropping_something_no_descriptor_is_left(
     assert step > 10, "it was hardly interrupted"
 
 
-def test_a_socket_whose_making_was_interrupted_ends_in_silence(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("kind", [QuietSocket, GrantSet, Wakeup, IMapIterator])
+def test_what_was_interrupted_as_it_was_made_ends_in_silence(
+    kind: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Any] = []
     monkeypatch.setattr(sys, "unraisablehook", told.append)
-    QuietSocket.__new__(QuietSocket)
+    kind.__new__(kind)
     assert told == []
+
+
+def test_whatever_interrupts_a_start_no_descriptor_that_it_passes_is_left(
+    pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = state.runtime()
+    monkeypatch.setattr(Agent, "child", lambda _agent, spec, _observer: spec)
+    owner: Any = SimpleNamespace(begin=lambda _spec: None)
+    process = fiber.Process(target=print, args=pipe)
+
+    def begin() -> None:
+        site.start(process, owner)
+
+    def settled() -> list[str]:
+        done = threading.Event()
+        site.loop.call_soon(done.set)
+        assert done.wait(PATIENCE)
+        return os.listdir("/proc/self/fd")
+
+    begin()
+    before = settled()
+    step = 0
+    files = {state.__file__, reduction.__file__, descriptor.__file__}
+    while is_interrupted(begin, step, files, steps=INSTRUCTIONS):
+        assert settled() == before, f"left at step {step}"
+        assert reduction.spawning() is None, f"still starting after step {step}"
+        step += 1
+    assert step > 10, "it was hardly interrupted"
+
+
+@pytest.mark.parametrize("side", ["send", "receive"])
+def test_whatever_interrupts_a_large_message_none_is_damaged_and_no_descriptor_left(
+    side: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = {packet.__file__, arena.__file__, descriptor.__file__}
+    first, second = b"1" * packet.INLINE_LIMIT * 2, b"2" * packet.INLINE_LIMIT * 2
+    before = os.listdir("/proc/self/fd")
+
+    def strike(step: int) -> bool:
+        """Whether the exchange was interrupted, at this step."""
+        monkeypatch.setattr(packet, "_arena", Arena())
+        pair = unix.socketpair("testing")
+        with pair[0] as here, pair[1] as there:
+            send, receive = partial(packet.send, here), partial(packet.receive_object, there)
+            one, two = pickle.dumps(first), pickle.dumps(second)
+            if side == "send":
+                interrupted = is_interrupted(lambda: send(one), step, files, steps=INSTRUCTIONS)
+                send(two)
+            else:
+                send(one)
+                send(two)
+                interrupted = is_interrupted(receive, step, files, steps=INSTRUCTIONS)
+            here.close()
+            came = []
+            with contextlib.suppress(EOFError):
+                while True:
+                    came.append(receive())
+            assert came in ([first, second], [second]), f"damaged at step {step}"
+        free = packet._buffers.free
+        assert len(set(map(id, free))) == len(free), f"one is free twice after step {step}"
+        packet._arena._forget()
+        return interrupted
+
+    step = 0
+    while strike(step):
+        assert os.listdir("/proc/self/fd") == before, f"left at step {step}"
+        step += 1
+    assert step > 10, "it was hardly interrupted"
 
 
 # Memory for large messages

@@ -291,3 +291,16 @@ def test_demand_counts_no_tasks_that_wait_until_results_are_read() -> None:
     ledger.pause(job, True)
     ledger.cancel(job)
     assert ledger.demand() == 0
+
+
+def test_tasks_that_come_back_to_a_paused_job_take_none_along_that_nobody_was_given() -> None:
+    ledger, _ = ledger_with(2)
+    job = ledger.open(pace=known(SLOW / 10))
+    ledger.feed(job, ["a", "b"])
+    given = assign_all(ledger)
+    ledger.pause(job, True)
+    for batch in reversed(given):
+        ledger.put_back(batch.worker, [batch.seq], 0.0)
+    ledger.feed(job, ["c"] * 100)
+    again = assign_all(ledger)
+    assert [item for batch in again for item in batch.items] == ["a", "b"]

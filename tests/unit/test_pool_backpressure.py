@@ -108,3 +108,15 @@ def test_small_results_are_never_held_back(pool: Pool) -> None:
     pool.close()
     wait_until(lambda: _unread(iterator) == 100_000, "all results are there")
     assert next(iterator) == 0
+
+
+@pytest.mark.parametrize("method", ["imap", "imap_unordered"])
+def test_an_iterator_that_is_dropped_keeps_no_results_and_holds_back_no_task(
+    pool: Pool, method: str
+) -> None:
+    iterator: Any = getattr(pool, method)(bytearray, [RESULT] * MANY)
+    wait_until(lambda: _is_held_back(pool), "it is held back")
+    buffer = iterator._buffer
+    iterator = None
+    wait_until(lambda: buffer.finished, "its tasks are run")
+    assert not buffer.items

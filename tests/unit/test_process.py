@@ -30,14 +30,6 @@ def runtime() -> Iterator[state.Runtime]:
     state.shutdown()
 
 
-@pytest.fixture
-def pipe() -> Iterator[tuple[Any, Any]]:
-    ends = fiber.Pipe()
-    yield ends
-    for end in ends:
-        end.close()
-
-
 def open_files() -> int:
     return len(os.listdir("/proc/self/fd"))
 
@@ -177,9 +169,11 @@ def test_a_start_asks_no_other_child(monkeypatch: pytest.MonkeyPatch) -> None:
     second.join()
 
 
-def test_a_start_drops_the_children_that_ended() -> None:
-    ended = fiber.Process(target=os.getpid)
+def test_a_start_drops_the_children_that_ended(pipe: tuple[Any, Any]) -> None:
+    here, there = pipe
+    ended = fiber.Process(target=there.recv)
     ended.start()
+    here.send("end")  # not before: one that ends within its start is dropped by that
     ended._popen.wait(PATIENCE)
     assert ended in multiprocessing.process._children
     reference = weakref.ref(ended)

@@ -9,7 +9,6 @@ import pickle
 import socket
 import sys
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -18,6 +17,7 @@ from fiber import reduction
 from fiber._agent import child
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
+from fiber._wire.descriptor import Descriptor
 from fiber.connection import Pipe
 from fiber.errors import UnpicklableError
 from fiber.process import Process
@@ -30,14 +30,6 @@ class Point:
     @classmethod
     def origin(cls) -> Point:
         return cls(0)
-
-
-@pytest.fixture
-def pipe() -> Iterator[tuple[Any, Any]]:
-    ends = Pipe()
-    yield ends
-    for end in ends:
-        end.close()
 
 
 def open_files() -> int:
@@ -104,15 +96,15 @@ def test_encode_falls_back_to_cloudpickle() -> None:
 # Descriptors that travel with a start
 
 
-def test_descriptors_of_a_process_are_duplicated_and_owned_by_the_caller(
+def test_descriptors_of_a_process_are_duplicated_for_as_long_as_they_are_kept(
     pipe: tuple[Any, Any],
 ) -> None:
     before = open_files()
     _, fds = reduction.dump_process(Process(target=print, args=pipe), same_host=True)
     assert len(fds) == 2
     assert open_files() == before + 2
-    for fd in fds:
-        os.close(fd)
+    fds.clear()
+    assert open_files() == before
 
 
 def test_a_second_try_does_not_keep_the_descriptors_of_the_first(pipe: tuple[Any, Any]) -> None:
@@ -124,8 +116,6 @@ def test_a_second_try_does_not_keep_the_descriptors_of_the_first(pipe: tuple[Any
     assert len(fds) == 2
     assert open_files() == before + 2
     assert payload
-    for fd in fds:
-        os.close(fd)
 
 
 def test_a_failed_start_keeps_none(pipe: tuple[Any, Any]) -> None:
@@ -139,7 +129,7 @@ def test_a_failed_start_keeps_none(pipe: tuple[Any, Any]) -> None:
 
 
 def test_a_start_within_a_start_does_not_mix_them_up(pipe: tuple[Any, Any]) -> None:
-    threads_fds: list[int] = []
+    threads_fds: list[Descriptor] = []
 
     class Nested:
         def __reduce__(self) -> Any:
@@ -154,8 +144,6 @@ def test_a_start_within_a_start_does_not_mix_them_up(pipe: tuple[Any, Any]) -> N
 
     _, fds = reduction.dump_process(Process(target=print, args=(Nested(), pipe[1])), same_host=True)
     assert (len(fds), len(threads_fds)) == (1, 1)
-    for fd in (*fds, *threads_fds):
-        os.close(fd)
 
 
 def test_a_descriptor_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,7 +161,6 @@ def test_a_socket_goes_along_on_the_same_host_only() -> None:
     process = Process(target=print, args=(ours,))
     _, fds = reduction.dump_process(process, same_host=True)
     assert len(fds) == 1
-    os.close(fds[0])
     with pytest.raises(RuntimeError, match="cannot go to a process on another host"):
         reduction.dump_process(process, same_host=False)
     ours.close()

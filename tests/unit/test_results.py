@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import sys
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -254,3 +255,18 @@ def test_what_unpickles_to_an_error_is_raised_and_the_next_is_there() -> None:
     with pytest.raises(KeyError):
         next(found)
     assert next(found) == 2
+
+
+def test_an_iterator_that_is_dropped_lets_go_of_results_that_wait_for_an_earlier_one() -> None:
+    pool: Any = None
+    iterator = IMapIterator(pool)
+    buffer = iterator._buffer
+    buffer.resume = buffer.has_room  # as the executor would, later
+    outcome = Pickled(work.VALUE, b"", [])
+    holders = sys.getrefcount(outcome)
+    buffer.add_results(1, [outcome], True)
+    assert sys.getrefcount(outcome) > holders
+    del iterator
+    assert sys.getrefcount(outcome) == holders
+    buffer.add_results(2, [outcome], True)
+    assert sys.getrefcount(outcome) == holders

@@ -19,7 +19,7 @@ from fiber._agent import zygote
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
 from fiber._agent.progress import ProgressTable
-from fiber._agent.zygote_link import ZygoteLink, close_all
+from fiber._agent.zygote_link import ZygoteLink
 from fiber._hub import client as hub_client
 from fiber._hub.hub import Hub
 from fiber._hub.protocol import HubAddress
@@ -51,7 +51,7 @@ class Agent:
         What keeps it from starting is its ``exited``, but for what can be seen here and now.
         """
         if self._closed:
-            close_all(spec.fds)
+            spec.close()
             raise RuntimeError(_ENDING)
         return LocalChild(self, next(self._ids), spec, observer)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
+from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike, Message
 from fiber.resources import Resources
 
@@ -53,7 +54,7 @@ class ExitReport(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ChildSpec:
-    """What to start.  Whoever gets it owns ``fds``."""
+    """What to start."""
 
     name: str
     method: str
@@ -62,8 +63,9 @@ class ChildSpec:
     """Pickled dict: what a child sets up before it unpickles anything of the user's."""
     payload: bytes
     """The pickled Process object."""
-    fds: tuple[int, ...] = ()
-    """Descriptors that the payload refers to by index; only for an agent on the same host."""
+    fds: tuple[Descriptor, ...] = ()
+    """What the payload refers to by index, closed once the child has its own or will never be; only
+    for an agent on the same host."""
     tasks: bool = False
     """Whether it is a pool worker, with a channel for tasks."""
     executable: str | None = None
@@ -71,6 +73,11 @@ class ChildSpec:
     """Descriptors for its stdout and stderr; None: those of the agent's process."""
     resources: Resources = field(default=Resources())
     """What it wishes of its host, heeded where hosts are made for children."""
+
+    def close(self) -> None:
+        """Close ``fds``."""
+        for owner in self.fds:
+            owner.close()
 
 
 class ChildObserver(Protocol):

@@ -61,7 +61,6 @@ class LocalChild:
         self.zygote: ZygoteLink | None = None
         self.observer = observer
         self._spec = spec
-        self._fds = spec.fds
         self._owner = owner
         self._loop = owner.loop
         self._ours: socket.socket | None = None
@@ -128,7 +127,8 @@ class LocalChild:
             with naming_the_limit("starting a process"):
                 if self._spec.stdio is None:
                     fds += map(dup_or_null, (1, 2))
-                fds += map(os.dup, [*(self._spec.stdio or ()), *ours, *self._fds])
+                handed = [owner.fileno() for owner in self._spec.fds]
+                fds += map(os.dup, [*(self._spec.stdio or ()), *ours, *handed])
         except BaseException:
             close_all(fds)
             raise
@@ -136,8 +136,7 @@ class LocalChild:
 
     def release_descriptors(self) -> None:
         """It has its own now: the other end must see EOF when the child lets go."""
-        fds, self._fds = self._fds, ()
-        close_all(fds)
+        self._spec.close()
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to the worker; False if it is gone."""

@@ -297,6 +297,8 @@ class Ledger:
         if waiting > 1:
             workers = len(self.workers) + self.starting
             size = job.pace.batch_size(waiting, workers, job.unit, job.target)
+        if job.paused:  # what follows what came back may have grown together with it
+            size = min(size, job.reached - job.waiting.first())
         if worker.left is not None:
             size = min(size, worker.left * job.unit)
         return self._send(job, worker, job.waiting.take(size), now)

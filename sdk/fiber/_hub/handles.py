@@ -152,7 +152,8 @@ class GrantSet:
             stream.close()  # a hub takes back what was granted on a stream when it ends
 
     def __del__(self) -> None:
-        self.release()
+        if hasattr(self, "_streams"):  # else ``__init__`` was interrupted
+            self.release()
 
     def _flags(self) -> GrantFlags:
         flags = GrantFlags.ENDS_WITH_STREAM

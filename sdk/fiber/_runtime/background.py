@@ -38,6 +38,10 @@ class BackgroundThread:
         self._queue.put((action, args))
         return True
 
+    def runs_here(self) -> bool:
+        """Whether it runs the caller, who then must not wait for what it would do next."""
+        return threading.current_thread() is self._thread
+
     def stop(self) -> None:
         """End once everything submitted is done."""
         self._stopped = True
@@ -46,7 +50,7 @@ class BackgroundThread:
     def join(self) -> None:
         """Wait until it has ended; nothing when called by what it is doing."""
         thread = self._thread
-        if thread is not None and thread is not threading.current_thread():
+        if thread is not None and not self.runs_here():
             thread.join()
 
     def _run(self) -> None:

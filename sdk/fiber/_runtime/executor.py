@@ -289,6 +289,10 @@ class Executor:
         """Whether this is the loop's thread, which must not wait."""
         return self._loop.on_thread()
 
+    def pickles_here(self) -> bool:
+        """Whether this is the thread that pickles its tasks, which must not wait for it."""
+        return self._background.runs_here()
+
     def _check(self) -> None:
         """Refuse at once what can be seen from here to be of no use."""
         error = self._refusal()

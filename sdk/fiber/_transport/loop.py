@@ -20,6 +20,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
 
+from fiber._wire.descriptor import opened
 from fiber.errors import FiberError
 
 Callback = Callable[[], object]
@@ -68,19 +69,15 @@ class Timer:
 class Wakeup:
     """An eventfd that lives for as long as somebody could write to it."""
 
-    __slots__ = ("fd",)
+    __slots__ = ("_owner", "fd")
 
     def __init__(self) -> None:
-        self.fd = -1
-        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._owner = opened(os.eventfd, 0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self.fd = self._owner.fileno()
 
     def set(self) -> None:
         """Make it readable."""
         os.eventfd_write(self.fd, 1)
-
-    def __del__(self) -> None:
-        if self.fd >= 0:
-            os.close(self.fd)
 
 
 class Loop:

@@ -15,11 +15,12 @@ from fiber._transport.loop import LONGEST_POLL
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor, opened, opened_pair, own
 from fiber._wire.packet import BytesLike, Message
-from fiber.errors import TooManyOpenFiles
+from fiber.errors import FiberError, FileTooLarge, TooManyOpenFiles
 
 
 class naming_the_limit:
-    """In the block, "no more descriptors" becomes the error that says the limit and what to set."""
+    """In the block, "no more descriptors" and "too large" become errors that say the limit and what
+    to set."""
 
     # Not a generator: contextlib leaves frames that translate errors in a cycle, and with them
     # whatever descriptors the program had on its stack, until some garbage collection.
@@ -31,10 +32,12 @@ class naming_the_limit:
         pass
 
     def __exit__(self, _kind: Any, error: BaseException | None, _trace: Any) -> None:
-        if not isinstance(error, OSError) or isinstance(error, TooManyOpenFiles):
+        if not isinstance(error, OSError) or isinstance(error, FiberError):
             return
         if error.errno in (errno.EMFILE, errno.ENFILE):
             raise TooManyOpenFiles(self._doing) from error
+        if error.errno == errno.EFBIG:
+            raise FileTooLarge(self._doing) from error
 
 
 def socketpair(doing: str) -> tuple[socket.socket, socket.socket]:

@@ -23,11 +23,12 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Sequence
+from itertools import starmap
 from typing import Any, TypeAlias
 
 from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, release
-from fiber._wire.descriptor import Descriptor, own
-from fiber.errors import ConnectionClosed, TooManyOpenFiles
+from fiber._wire.descriptor import own
+from fiber.errors import ConnectionClosed, FileTooLarge, TooManyOpenFiles
 
 BytesLike: TypeAlias = bytes | bytearray | memoryview
 
@@ -66,14 +67,27 @@ _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
 _Ancillary: TypeAlias = list[tuple[int, int, bytes]]
-_Received: TypeAlias = tuple[int, _Ancillary, int, Descriptor | None]
+_Call: TypeAlias = tuple[tuple[tuple[bytearray], int, int]]
+_Received: TypeAlias = list[Any]
+"""What ``recvmsg_into`` returned; then, of a large message, the owner of its memory."""
+
+
+class _Buffer:
+    """Memory to receive into, and the arguments of ``recvmsg_into`` for it."""
+
+    __slots__ = ("call", "data", "view")
+
+    def __init__(self) -> None:
+        self.data = bytearray(_RECEIVE)
+        self.view = memoryview(self.data)
+        self.call = (((self.data,), _ANCILLARY_ONE, _CLOEXEC),)
 
 
 class _FreeBuffers(threading.local):
     """Receive buffers of this thread that no message is using."""
 
     def __init__(self) -> None:
-        self.free: list[bytearray] = []
+        self.free: list[_Buffer] = []
 
 
 _buffers = _FreeBuffers()
@@ -93,7 +107,7 @@ class Message:
         payload: memoryview,
         buffers: list[memoryview],
         fds: list[int],
-        lent: bytearray | None = None,
+        lent: _Buffer | None = None,
     ) -> None:
         self.payload = payload
         self.buffers = buffers
@@ -102,9 +116,9 @@ class Message:
 
     def release(self) -> None:
         """Give the borrowed memory back to this thread; the payload must not be used after it."""
-        if self._lent is not None:
-            _buffers.free.append(self._lent)
-            self._lent = None
+        lent, self._lent = self._lent, None  # first: interrupted, it must not be given back twice
+        if lent is not None:
+            _buffers.free.append(lent)
 
     def tobytes(self) -> bytes:
         """Copy the payload out and release the message."""
@@ -177,6 +191,8 @@ def send(
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE, errno.ETOOMANYREFS):
             raise TooManyOpenFiles("sending a message") from error
+        if error.errno == errno.EFBIG:
+            raise FileTooLarge("sending a message") from error
         raise
     return False
 
@@ -207,13 +223,14 @@ def _send_parts(
     offsets, total = _offsets([size, *sizes])
     head = _PARTS.pack(PARTS_IN_MEMFD, len(sizes), size) + table
     block = _arena.claim(total)
-    sent = False
     try:
         fill(block, [memoryview(payload).cast("B"), *buffers], offsets)
         _sendmsg(sock, [head, ballast], [block.fd, *fds])
-        sent = True
-    finally:
-        _arena.settle(block, sent=sent)
+    except BlockingIOError:
+        _arena.settle(block, sent=False)
+        raise
+    # What else is raised may be a signal's handler's, after it was sent: the block is forgotten.
+    _arena.settle(block, sent=True)
 
 
 def _sendmsg(sock: socket.socket, parts: Sequence[BytesLike], fds: Sequence[int]) -> None:
@@ -237,17 +254,18 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
 def receive_object(sock: socket.socket) -> Any:
     """``loads(receive(sock))``, without a Message between them where the packet is a small one."""
     free = _buffers.free
-    buffer = free.pop() if free else bytearray(_RECEIVE)
+    buffer = free.pop() if free else _Buffer()
     ours = True
     try:
-        size, ancillary, flags, memory = _recvmsg(sock, buffer, _ANCILLARY_ONE, _CLOEXEC)
-        if size and not buffer[0]:
-            return pickle.loads(memoryview(buffer)[1:size])
+        received = _recvmsg(sock, buffer.data, buffer.call)
+        size = received[0][0]
+        if size and not buffer.data[0]:
+            return pickle.loads(buffer.view[1:size])
         ours = False
     finally:
         if ours:
             free.append(buffer)
-    return loads(_receive_parts(memoryview(buffer), buffer, size, ancillary, flags, memory))
+    return loads(_receive_parts(buffer, received))
 
 
 def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True) -> Message:
@@ -259,51 +277,53 @@ def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
-    buffer = free.pop() if free else bytearray(_RECEIVE)
+    buffer = free.pop() if free else _Buffer()
     try:
-        size, ancillary, flags, memory = _recvmsg(
-            sock, buffer, space, _CLOEXEC if wait else _DONTWAIT
-        )
+        call = (((buffer.data,), space, _CLOEXEC if wait else _DONTWAIT),)
+        received = _recvmsg(sock, buffer.data, call)
     except BaseException:
         free.append(buffer)
         raise
-    view = memoryview(buffer)
-    if size and not buffer[0]:
-        return Message(view[1:size], [], [], buffer)
-    return _receive_parts(view, buffer, size, ancillary, flags, memory)
+    size = received[0][0]
+    if size and not buffer.data[0]:
+        return Message(buffer.view[1:size], [], [], buffer)
+    return _receive_parts(buffer, received)
 
 
-def _recvmsg(sock: socket.socket, buffer: bytearray, space: int, flags: int) -> _Received:
+def _recvmsg(sock: socket.socket, data: bytearray, call: _Call) -> _Received:
+    received: _Received = []
     try:
-        size, ancillary, flags_there, _ = sock.recvmsg_into((buffer,), space, flags)
-    except ConnectionResetError:
-        # The peer closed with packets of ours unread.  The kernel says so once, ahead of what the
-        # peer sent before; the next call delivers that, or the end.
-        size, ancillary, flags_there, _ = sock.recvmsg_into((buffer,), space, flags)
-    memory = None
-    if ancillary and buffer[0] == PARTS_IN_MEMFD:
-        # Here and now: until then the descriptor is a number, which an exception would lose.
-        memory = own(*_FD.unpack_from(ancillary[0][2]))
-    return size, ancillary, flags_there, memory
+        # Received and noted in one step: in between a signal's handler could lose descriptors.
+        try:
+            received.extend(starmap(sock.recvmsg_into, call))
+        except ConnectionResetError:
+            # The peer closed with packets of ours unread.  The kernel says so once, ahead of what
+            # the peer sent before; the next call delivers that, or the end.
+            received.extend(starmap(sock.recvmsg_into, call))
+        ancillary = received[0][1]
+        if ancillary and data[0] == PARTS_IN_MEMFD:
+            received.extend(map(own, _rights(ancillary)[:1]))
+        return received
+    except BaseException:
+        for fd in _rights(received[0][1])[len(received) - 1 :] if received else ():
+            os.close(fd)
+        raise
 
 
-def _receive_parts(
-    view: memoryview,
-    buffer: bytearray,
-    size: int,
-    ancillary: _Ancillary,
-    flags: int,
-    memory: Descriptor | None,
-) -> Message:
-    fds = [
+def _rights(ancillary: _Ancillary) -> list[int]:
+    """The descriptors that came along."""
+    return [
         fd
         for level, kind, data in ancillary
         if kind == socket.SCM_RIGHTS and level == socket.SOL_SOCKET
         for (fd,) in _FD.iter_unpack(data[: len(data) // _FD.size * _FD.size])
     ]
-    if memory is not None:
-        del fds[0]
-    lent = Message(view[:0], [], fds, buffer)
+
+
+def _receive_parts(buffer: _Buffer, received: _Received) -> Message:
+    (size, ancillary, flags, _), *memory = received
+    view = buffer.view
+    lent = Message(view[:0], [], _rights(ancillary)[len(memory) :], buffer)
     try:
         if not size:
             raise ConnectionClosed()
@@ -315,9 +335,9 @@ def _receive_parts(
         sizes = [length, *(n for (n,) in _SIZE.iter_unpack(view[_PARTS.size : offset]))]
         if kind == PARTS:
             return _inline_parts(view[offset:size], sizes, lent)
-        if memory is None:
+        if not memory:
             raise ValueError("a large message without its memory")
-        return _memory_parts(sizes, lent, memory.fileno())
+        return _memory_parts(sizes, lent, memory[0].fileno())
     except BaseException:
         lent.close_descriptors()
         lent.release()

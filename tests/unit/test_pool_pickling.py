@@ -1,0 +1,79 @@
+"""Items whose pickling, on a thread of their pool's, waits for something."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+import fiber
+from fiber.errors import FiberError
+from fiber.pool import Pool
+from unit.pool_programs import wait_until
+from unit.pool_tasks import PATIENCE
+
+
+class Asking:
+    """Travels as the number that it asks for as it is pickled."""
+
+    def __init__(self, ask: Callable[[], Any]) -> None:
+        self._ask = ask
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return int, (self._ask(),)
+
+
+def end(pool: Pool) -> None:
+    pool.close()
+    pool.join()
+
+
+WAITS: dict[str, Callable[[Pool], Any]] = {
+    "apply": lambda pool: pool.apply(abs, (-1,)),
+    "apply_async": lambda pool: pool.apply_async(abs, (-1,)).get(),
+    "broadcast": lambda pool: pool.broadcast(abs, -1),
+    "map": lambda pool: pool.map(abs, [-1]),
+    "map an iterator": lambda pool: pool.map(abs, iter([-1])),
+    "imap": lambda pool: next(pool.imap(abs, [-1])),
+    "join": end,
+}
+
+
+@pytest.mark.parametrize("ask", WAITS.values(), ids=WAITS.keys())
+def test_who_waits_for_the_same_pool_is_refused(ask: Callable[[Pool], Any]) -> None:
+    with fiber.Pool(1) as pool:
+        found = pool.map_async(abs, [Asking(lambda: ask(pool))])
+        with pytest.raises(RuntimeError, match="cannot wait for the same pool"):
+            found.get(PATIENCE)
+    pool.join()
+
+
+def test_what_is_there_already_may_be_asked_for() -> None:
+    with fiber.Pool(1) as pool:
+        result = pool.apply_async(abs, (-1,))
+        result.wait(PATIENCE)
+        assert pool.map_async(abs, [Asking(result.get)]).get(PATIENCE) == [1]
+    pool.join()
+
+
+def test_another_pool_may_be_waited_for() -> None:
+    with fiber.Pool(1) as pool, fiber.Pool(1) as other:
+        found = pool.map_async(abs, [Asking(lambda: other.apply(abs, (-1,)))])
+        assert found.get(PATIENCE) == [1]
+    pool.join()
+    other.join()
+
+
+def test_a_pool_may_be_terminated_while_another_worker_waits_to_be_started() -> None:
+    with fiber.Pool(min_workers=1, max_workers=2) as pool:
+
+        def terminate() -> None:
+            members = pool._executor._scheduler.workers.members
+            wait_until(lambda: len(members) == 2, "another worker is wanted")
+            pool.terminate()
+
+        found = pool.map_async(abs, [Asking(terminate), 1])
+        with pytest.raises(FiberError, match="terminated"):
+            found.get(PATIENCE)
+    pool.join()
