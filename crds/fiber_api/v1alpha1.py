@@ -71,6 +71,15 @@ def _is_reachable(host: str) -> bool:
     )
 
 
+def _unchanged(field: str) -> str:
+    """CEL: an optional field is as it was.  ``self.?field`` would be shorter; the API server takes
+    it for too expensive."""
+    return (
+        f"has(self.{field}) == has(oldSelf.{field})"
+        f" && (!has(self.{field}) || self.{field} == oldSelf.{field})"
+    )
+
+
 class Master(Model):
     """The program that uses the pool. Written by the SDK when it attaches; absent in a warm pool
     that waits for one."""
@@ -94,8 +103,7 @@ class Master(Model):
         Rule(
             "epoch",
             "self.epoch > oldSelf.epoch || (self.host == oldSelf.host && self.port == oldSelf.port"
-            " && self.identity == oldSelf.identity"
-            " && self.?leaseName.orValue('') == oldSelf.?leaseName.orValue(''))",
+            f" && self.identity == oldSelf.identity && {_unchanged('leaseName')})",
             "must rise where host, port, identity or leaseName change: that is another master, "
             "and one that is there would be replaced unseen. Take an epoch above the one that "
             "is there.",
@@ -227,7 +235,7 @@ class FiberPoolSpec(Model):
         ),
         Rule(
             "credentialsSecretName",
-            "self.?credentialsSecretName.orValue('') == oldSelf.?credentialsSecretName.orValue('')",
+            _unchanged("credentialsSecretName"),
             "cannot be changed: the pods that run hold the credentials of the old one. Make a new "
             "FiberPool.",
             None,

@@ -3,7 +3,8 @@
 Each namespace that is served has a Lease of one name, whatever the releases are called and whatever
 else they watch.  A release holds it, not a process: which process acts for a release is decided by
 the release's own Lease (leader_election.py).  So the one of the namespace may last long, a thousand
-of them cost a few requests a second, and a restart of the operator goes on at once.
+of them cost a few requests a second, and a restart of the operator goes on at once.  Why a warning
+would not do is in docs/decisions/0012.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ class LeaseMonitor:
                 watched.version = None
                 self._conclude(key, watched, LeaseVerdict(unreadable=error.message))
             return
-        if self._watched.get(key) is not watched or self._see(key, watched, version):
+        if self._see(key, watched, version):
             return
         if late and watched.verdict.alive is not False:
             # This process was stopped, or busy: what did not reach it meanwhile says nothing.
@@ -161,8 +161,8 @@ class LeaseMonitor:
             self._conclude(key, watched, LeaseVerdict(alive=False, missing=not watched.version))
 
     def _conclude(self, key: Key, watched: _Watched, verdict: LeaseVerdict) -> None:
-        if watched.verdict != verdict:
-            watched.verdict = verdict
+        before, watched.verdict = watched.verdict, verdict
+        if verdict != before and self._watched.get(key) is watched:
             self._on_change(key)
 
     def _now(self) -> float:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fiber_api import names
@@ -81,6 +81,8 @@ def test_pools_of_different_names_share_no_object() -> None:
 
 @settings(deadline=None)
 @given(POOLS, POOLS)
+@example("operator", "fiber-operator")
+@example("fiber-operator", "fiber-fiber-operator")
 def test_no_masters_lease_is_an_operators(pool: str, release: str) -> None:
     operators = {names.operator_lease_name(release), names.CRD_NAME}
     assert names.master_lease_name(pool) not in operators

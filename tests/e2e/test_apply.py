@@ -41,6 +41,10 @@ def test_the_minimal_example_gives_workers(scene: Scene, image: str) -> None:
     pool = Pool(scene, "minimal")
     scene.kube.apply(example("minimal", image), "--namespace", scene.namespace)
     pool.ready(2)
+    # Of a pool that says nothing of replicas too, or no autoscaler could read it.
+    scale = pool.scene.kube.get(pool.scene.path("fiberpools", pool.name, "scale"))
+    assert scale is not None
+    assert scale["status"]["replicas"] == 2
     row = table(pool)
     assert row.pop("AGE").endswith("s")
     assert row == {
@@ -94,7 +98,8 @@ def test_kubectl_scales_a_warm_pool_between_its_bounds(pool: Pool, agent: Body) 
     assert says(limited["message"], "9", "maxReplicas", "3")
     pool.scale(0)
     assert set(pool.ready(1)) < {*two, *pool.ever}
-    assert pool.condition("ScalingLimited")["reason"] == "BelowMinimum"
+    # As if nobody had said anything: the minimum is no limit to that.
+    assert pool.condition("ScalingLimited")["reason"] == "WithinBounds"
     assert pool.scene.most_at_once(is_live) == 3
 
 

@@ -17,6 +17,7 @@ from fakes import virtual_time
 from fakes.kubelet import Kubelet
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Failure, Store
+from fiber_api import names
 from fiber_api.certificates import make_pool_certificates
 from fiber_operator.cluster import Configuration
 from fiber_operator.program import Program
@@ -24,6 +25,7 @@ from fiber_operator.settings import Settings
 from fiber_operator.workqueue import Key
 
 NAMESPACE = "team"
+OWN_LEASE = names.operator_lease_name(Settings.lease)
 POLL = 0.5
 TEMPLATE = {"spec": {"containers": [{"name": "worker", "image": "registry/worker:1"}]}}
 

@@ -159,6 +159,6 @@ class Model:
         if spec["update"]["strategy"] == "OnDelete":
             outdated = []
         current = [pod.name for pod in ready if pod.name not in outdated]
-        excess = len(self.live) - len(outdated) - self.pool.wanted
+        excess = len(self.live) - len(outdated) - (self.pool.status.desired_replicas or 0)
         names = outdated[:5] + current[: max(0, excess)]
         spec["scaleDown"] = {**spec["scaleDown"], "release": names[:100]}

@@ -266,7 +266,7 @@ async def test_a_new_master_is_dialled_within_a_second(world: World) -> None:
         1,
     ):
         await world.settled(3)
-        world.edit(master={"host": host, "port": port, "epoch": epoch})
+        world.edit(master={**MASTER, "host": host, "port": port, "epoch": epoch})
         took = await world.until(
             lambda f=family, h=host, p=port: (
                 len(world.store.list("endpointslices")) == 1  # type: ignore[misc]

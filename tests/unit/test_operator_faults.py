@@ -9,12 +9,10 @@ import pytest
 
 from fakes import virtual_time
 from fakes.kubernetes_api import Call, Fault
-from fakes.world import NAMESPACE, World, a_world, played
-from fiber_api import names
+from fakes.world import NAMESPACE, OWN_LEASE, World, a_world, played
 from fiber_operator import apply
 from unit.operator_objects import MASTER
 
-OWN_LEASE = names.operator_lease_name("fiber-operator")
 CALLS = [
     ("get", "fiberpools"),
     ("list", "fiberpools"),

@@ -100,7 +100,6 @@ SPEC: Body = {
     "master": {**MASTER, "leaseName": "es"},
     "onLost": "Delete",
     "idle": {"timeoutSeconds": 60},
-    "credentialsSecretName": "mine",
     "scaleDown": {"policy": "ReleasedOnly", "release": [name_of(77)], "idleTimeoutSeconds": 5},
     "scaleUp": {"maxInFlight": 3},
     "failurePolicy": {

@@ -20,7 +20,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
-from fakes.world import NAMESPACE, Test, World, a_world
+from fakes.world import NAMESPACE, OWN_LEASE, Test, World, a_world
 from fiber_operator.health import Health
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.planning.pods import State
@@ -69,7 +69,7 @@ async def test_an_operator_at_work_is_alive_and_ready(world: World) -> None:
 async def test_one_that_waits_for_the_lease_is_alive_and_not_ready(world: World) -> None:
     await world.settled()
     spec = {"holderIdentity": "another", "leaseDurationSeconds": 1000}
-    world.store.merge("leases", "fiber-system", "fiber-operator", {"spec": spec})
+    world.store.merge("leases", "fiber-system", OWN_LEASE, {"spec": spec})
     await world.settled(20)
     assert await ask(world, "/healthz") == (200, "ok")
     status, text = await ask(world, "/readyz")
@@ -119,8 +119,9 @@ class Parts:
         self.watches.started(True)
         self.watches.answered("watch fiberpools", None)
         self.watches.answered("watch pods", None)
+        self.watches.answered("watch leases", None)
         self.health = Health(
-            SimpleNamespace(held=True, why=""),  # type: ignore[arg-type]
+            SimpleNamespace(is_leader=True, why=""),  # type: ignore[arg-type]
             SimpleNamespace(wrong=list),  # type: ignore[arg-type]
             SimpleNamespace(statistics=lambda: found),  # type: ignore[arg-type]
             self.resync,  # type: ignore[arg-type]
@@ -272,7 +273,7 @@ def test_the_process_works_until_sigterm(tmp_path: Path) -> None:
                 _, said = await asyncio.wait_for(process.communicate(), 10)
             assert process.returncode == 0, said
             assert b'"message": "stopped"' in said
-            lease = world.store.get("leases", "fiber-system", "fiber-operator")
+            lease = world.store.get("leases", "fiber-system", OWN_LEASE)
             assert lease["spec"]["holderIdentity"] == ""
 
     asyncio.run(main())
