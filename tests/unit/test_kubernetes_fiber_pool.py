@@ -9,22 +9,18 @@ from pathlib import Path
 import pytest
 
 from fakes.kubernetes_api import Call, Fault
-from fakes.served import served
 from fakes.store import Failure
 from fiber._backends.kubernetes import fiber_pool
-from fiber._backends.kubernetes.api import Api
 from fiber._transport.credentials import MasterCredentials
 from fiber_api import names
-from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, kubeconfig
+from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told
 from unit.kubernetes_rig import rig as make_rig
 
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    with served() as server:
-        monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
-        with make_rig(server, Api.connect()) as made:
-            yield made
+    with make_rig(tmp_path, monkeypatch) as made:
+        yield made
 
 
 @pytest.fixture

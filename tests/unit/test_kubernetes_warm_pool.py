@@ -9,25 +9,21 @@ from pathlib import Path
 import pytest
 
 from fakes.kubernetes_api import Fault
-from fakes.served import served
-from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.warm_pool import read_credentials
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from fiber_api.certificates import make_pool_certificates
-from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, kubeconfig, pool_body
+from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
 from unit.kubernetes_rig import rig as make_rig
 
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    with served() as server:
-        monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
-        with make_rig(server, Api.connect()) as made:
-            body = pool_body("warm")
-            body["spec"] |= {"minReplicas": 2, "replicas": 0, "scaleDown": {"policy": "Any"}}
-            server.do(server.store.create, names.PLURAL, NAMESPACE, body)
-            yield made
+    with make_rig(tmp_path, monkeypatch) as made:
+        body = pool_body("warm")
+        body["spec"] |= {"minReplicas": 2, "replicas": 0, "scaleDown": {"policy": "Any"}}
+        made.server.do(made.server.store.create, names.PLURAL, NAMESPACE, body)
+        yield made
 
 
 @pytest.fixture
