@@ -239,6 +239,8 @@ class Watch:
             if not self._stopped:
                 raise
         finally:
+            with self._lock:
+                self._response = None
             response.close()
 
     def _events(self, response: BaseHTTPResponse) -> Iterator[Body]:
