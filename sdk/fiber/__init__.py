@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from fiber.errors import ConfigError as ConfigError
     from fiber.errors import ConnectionClosed as ConnectionClosed
     from fiber.errors import FiberError as FiberError
+    from fiber.errors import FiberPoolError as FiberPoolError
     from fiber.errors import LinkError as LinkError
     from fiber.errors import NotInFiber as NotInFiber
     from fiber.errors import ProcessError as ProcessError
@@ -107,6 +108,7 @@ _HOMES = {
     "ConfigError": "errors",
     "ConnectionClosed": "errors",
     "FiberError": "errors",
+    "FiberPoolError": "errors",
     "LinkError": "errors",
     "NotInFiber": "errors",
     "Process": "process",
