@@ -43,7 +43,6 @@ EXAMPLES = [
     errors.ConfigError("unknown key 'agent'"),
     errors.ConnectionClosed(),
     errors.ConnectionClosed("Worker-1", "killed by SIGSEGV"),
-    errors.FiberPoolError("es-1 was deleted", pool="es-1", namespace="lab", reason="Deleted"),
     errors.NotInFiber("no Lock yet"),
     errors.StartError("worker 'Worker-1'", "its initializer raised", "ValueError: no", 3),
     errors.TooManyOpenFiles("starting process 'Worker-1'"),

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from fakes.kubernetes_api import Fault
+from fiber._backends.kubernetes import lease
 from fiber._backends.kubernetes.held_pool import HeldPool
 from fiber._backends.kubernetes.lease import LeaseRenewer
 from fiber.errors import FiberPoolError
@@ -28,6 +29,7 @@ class Case:
         self.now = 100.0
         self.lost: queue.Queue[FiberPoolError] = queue.Queue()
         self.troubles: queue.Queue[Exception] = queue.Queue()
+        self.refusals: queue.Queue[Exception] = queue.Queue()
         self.faults: queue.Queue[Exception] = queue.Queue()
         master = dataclasses.replace(MASTER, lease_duration=duration)
         body = pool_body()
@@ -39,6 +41,7 @@ class Case:
             self.pool,
             on_lost=self.lost.put,
             on_trouble=self.troubles.put,
+            on_refused=self.refusals.put,
             on_fault=self.faults.put,
             now=lambda: self.now,
         )
@@ -160,6 +163,20 @@ def test_the_thread_tells_what_keeps_it_from_renewing(rig: Rig) -> None:
     case.renewer.start()
     assert "this is a test" in str(case.troubles.get(timeout=10))
     case.renewer.stop()
+    case.renewer.join(10)
+
+
+@pytest.mark.parametrize("status", [401, 403])
+def test_a_login_or_right_that_stays_away_ends_the_thread(
+    rig: Rig, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lease, "_RETRY", 0.01)
+    case = Case(rig, duration=0)
+    rig.server.api.faults.append(Fault("patch", "leases", status=status, times=9))
+    case.renewer.start()
+    assert "this is a test" in str(case.troubles.get(timeout=10))
+    case.now += 1
+    assert "this is a test" in str(case.refusals.get(timeout=10))
     case.renewer.join(10)
 
 

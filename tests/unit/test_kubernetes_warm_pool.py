@@ -35,6 +35,10 @@ def spec(rig: Rig) -> Body:
     return rig.pool("warm")["spec"]
 
 
+def owner_uid(rig: Rig) -> str:
+    return str(rig.pool("warm")["metadata"]["uid"])
+
+
 def has_master(rig: Rig, told: Told, epoch: int) -> None:
     told.wait(lambda: spec(rig).get("master", {}).get("epoch") == epoch)
 
@@ -71,8 +75,9 @@ def test_the_lease_is_the_pools_and_nobodys_afterwards(rig: Rig, told: Told) -> 
     told.wait(lambda: spec(rig)["replicas"] == 1)
     lease = rig.get("leases", names.master_lease_name("warm"))
     assert lease["spec"]["holderIdentity"] == MASTER.identity
+    assert lease["metadata"]["labels"][names.LABEL_POOL_UID] == owner_uid(rig)
     (owner,) = lease["metadata"]["ownerReferences"]
-    assert owner["uid"] == rig.pool("warm")["metadata"]["uid"]
+    assert owner["uid"] == owner_uid(rig)
     client.close()
     left = rig.get("leases", names.master_lease_name("warm"))
     assert left["spec"]["holderIdentity"] == ""
@@ -88,8 +93,20 @@ def test_the_next_master_has_a_higher_epoch_and_the_same_lease(rig: Rig, told: T
     second.demand(2)
     again.wait(lambda: spec(rig)["replicas"] == 2)
     assert spec(rig)["master"] == OTHER.spec("warm", 2)
-    lease = rig.get("leases", names.master_lease_name("warm"))
-    assert lease["spec"]["holderIdentity"] == OTHER.identity
+    taken = rig.get("leases", names.master_lease_name("warm"))
+    assert taken["spec"]["holderIdentity"] == OTHER.identity
+    assert taken["spec"]["acquireTime"] == taken["spec"]["renewTime"]
+
+
+def test_a_lease_without_the_label_gets_it(rig: Rig, told: Told) -> None:
+    name = names.master_lease_name("warm")
+    rig.server.do(rig.server.store.create, "leases", NAMESPACE, {"metadata": {"name": name}})
+    client = rig.warm(told)
+    client.demand(1)
+    told.wait(lambda: spec(rig)["replicas"] == 1)
+    lease = rig.get("leases", name)
+    assert lease["metadata"]["labels"][names.LABEL_POOL_UID] == owner_uid(rig)
+    assert lease["spec"]["holderIdentity"] == MASTER.identity
 
 
 def test_a_second_master_is_told_who_is_there_and_since_when(rig: Rig, told: Told) -> None:
@@ -210,10 +227,10 @@ def test_what_stays_behind_is_said_with_the_command_that_detaches(
 # -- Its credentials
 
 
-def make_secret(rig: Rig, **changed: str) -> None:
+def make_secret(rig: Rig, name: str = names.secret_name("warm"), **changed: str) -> None:
     texts = make_pool_certificates("warm", NAMESPACE).texts() | changed
     data = {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()}
-    body = {"metadata": {"name": names.secret_name("warm")}, "data": data}
+    body = {"metadata": {"name": name}, "data": data}
     rig.server.do(rig.server.store.create, "secrets", NAMESPACE, body)
 
 
@@ -230,3 +247,17 @@ def test_credentials_that_cannot_serve(rig: Rig) -> None:
         read_credentials(rig.api, NAMESPACE, "warm")
     assert caught.value.reason == "InvalidCredentials"
     assert "damaged" not in str(caught.value)
+
+
+def test_credentials_that_this_program_may_not_read(rig: Rig) -> None:
+    rig.server.api.faults.append(Fault("get", "secrets", status=403, message="no secrets"))
+    with pytest.raises(FiberPoolError, match=r"no secrets.*--resource-name=warm-") as caught:
+        read_credentials(rig.api, NAMESPACE, "warm")
+    assert caught.value.reason == "Forbidden"
+
+
+def test_credentials_that_the_pools_owner_brought(rig: Rig) -> None:
+    make_secret(rig, "brought")
+    patch = {"spec": {"credentialsSecretName": "brought"}}
+    rig.server.do(rig.server.store.merge, names.PLURAL, NAMESPACE, "warm", patch)
+    assert read_credentials(rig.api, NAMESPACE, "warm").key

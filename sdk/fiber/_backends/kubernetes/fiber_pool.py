@@ -139,7 +139,11 @@ class FiberPoolClient:
         self._began = time.monotonic()
         self._tenure.doing = f"scale the FiberPool {held.name!r}"
         renewer = LeaseRenewer(
-            held, on_lost=self._fail, on_trouble=self._trouble, on_fault=self._fault
+            held,
+            on_lost=self._fail,
+            on_trouble=self._trouble,
+            on_refused=self._refused,
+            on_fault=self._fault,
         )
         pool = ObjectWatch(
             self._api,
@@ -205,7 +209,7 @@ class FiberPoolClient:
     def _pool_trouble(self, error: ApiError) -> None:
         if isinstance(error, Forbidden) and not self._observed:
             # Its status would never be known, and silence be taken for the operator's.
-            self._fail(self._explained(error, self._following))
+            self._refused(error)
         else:
             self._trouble(error)
 
@@ -225,6 +229,9 @@ class FiberPoolClient:
         if what not in self._warned:
             self._warned.add(what)
             self._loop.call_soon(self._observer.on_warning, message)
+
+    def _refused(self, error: ApiError) -> None:
+        self._fail(self._explained(error, self._following))
 
     def _fault(self, error: Exception) -> None:
         """A fault of ours must not leave anybody waiting."""

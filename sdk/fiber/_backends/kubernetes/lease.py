@@ -6,7 +6,13 @@ import threading
 import time
 from collections.abc import Callable
 
-from fiber._backends.kubernetes.api_errors import ApiError, Conflict, NotFound
+from fiber._backends.kubernetes.api_errors import (
+    ApiError,
+    Conflict,
+    Forbidden,
+    NotFound,
+    Unauthorized,
+)
 from fiber._backends.kubernetes.held_pool import HeldPool
 from fiber.errors import FiberPoolError
 
@@ -31,16 +37,19 @@ class LeaseRenewer:
         *,
         on_lost: Callable[[FiberPoolError], None],
         on_trouble: Callable[[ApiError], None],
+        on_refused: Callable[[ApiError], None],
         on_fault: Callable[[Exception], None],
         now: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
     ) -> None:
-        """The Lease is fresh.  ``on_lost`` is told that the pool is this program's no more,
-        ``on_trouble`` what keeps it from being renewed, each time, and ``on_fault`` of a fault of
-        ours; on the thread.  ``now`` counts seconds, those of a machine's sleep as well.
+        """The Lease is fresh.  Told on the thread: ``on_trouble`` what keeps it from being renewed,
+        each time.  And once, which ends the thread: ``on_lost`` that the pool is this program's no
+        more, ``on_refused`` that a login or a right has been missing for a whole duration,
+        ``on_fault`` of a fault of ours.  ``now`` counts seconds, a machine's sleep among them.
         """
         self._pool = pool
         self._on_lost = on_lost
         self._on_trouble = on_trouble
+        self._on_refused = on_refused
         self._on_fault = on_fault
         self._now = now
         self._renewed = now()
@@ -92,6 +101,8 @@ class LeaseRenewer:
                 pause = self._attempt()
         except FiberPoolError as error:
             self._on_lost(self.explain(error))
+        except ApiError as error:
+            self._on_refused(error)
         except Exception as error:
             self._on_fault(error)
 
@@ -100,6 +111,9 @@ class LeaseRenewer:
         try:
             self.renew()
         except ApiError as error:
+            refused = isinstance(error, Forbidden | Unauthorized)
+            if refused and self._late() > self._pool.master.lease_duration:
+                raise
             self._on_trouble(error)
             return _RETRY
         return self._pool.master.lease_duration / RENEWALS
