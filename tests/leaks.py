@@ -126,8 +126,14 @@ def _runtime() -> object | None:
 
 
 def _nng_runs() -> bool:
-    names = (Path(task, "comm") for task in Path("/proc/self/task").iterdir())
-    return any(name.read_text().startswith(_NNG_THREAD) for name in names if name.exists())
+    return any(_name(task).startswith(_NNG_THREAD) for task in Path("/proc/self/task").iterdir())
+
+
+def _name(task: Path) -> str:
+    try:
+        return (task / "comm").read_text()
+    except OSError:
+        return ""  # it has just ended
 
 
 def _opened(before: Snapshot, now: Snapshot) -> list[str]:

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 from fakes.kubernetes_api import Call
-from fakes.served import Served
+from fakes.served import Served, served
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._backends.kubernetes.held_pool import Master
@@ -164,6 +165,7 @@ class Rig:
         self.server.api.down = False
         for client in self._clients:
             client.close()
+        self.api.close()
 
     def _client(self, tenure: OwnPool | WarmPool, told: Told) -> FiberPoolClient:
         client = FiberPoolClient(self.api, self.loop, tenure, told)
@@ -173,13 +175,15 @@ class Rig:
 
 
 @contextlib.contextmanager
-def rig(server: Served, api: Api) -> Iterator[Rig]:
+def rig(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     """One that ends with the test."""
-    loop = Loop()
-    loop.start_thread("test-io")
-    made = Rig(server, api, loop)
-    try:
-        yield made
-    finally:
-        made.close()
-        loop.stop()
+    with served() as server:
+        monkeypatch.setenv("KUBECONFIG", str(kubeconfig(folder, server.api.url)))
+        loop = Loop()
+        loop.start_thread("test-io")
+        made = Rig(server, Api.connect(), loop)
+        try:
+            yield made
+        finally:
+            made.close()
+            loop.stop()

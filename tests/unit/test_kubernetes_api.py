@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import ssl
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -45,9 +46,22 @@ def server() -> Iterator[Served]:
 
 
 @pytest.fixture
-def api(server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Api:
+def connect() -> Iterator[Callable[..., Api]]:
+    """``Api.connect``; what it makes is closed with the test."""
+    with contextlib.ExitStack() as ends:
+
+        def connect(context: str | None = None) -> Api:
+            return ends.enter_context(contextlib.closing(Api.connect(context)))
+
+        yield connect
+
+
+@pytest.fixture
+def api(
+    server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, connect: Callable[..., Api]
+) -> Api:
     monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
-    return Api.connect()
+    return connect()
 
 
 # -- Paths
@@ -106,7 +120,7 @@ def test_the_package_is_imported_by_whoever_connects_alone() -> None:
 
 
 def test_a_login_plugin_is_asked_again_when_its_token_is_not_accepted(
-    server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, connect: Callable[..., Api]
 ) -> None:
     token = tmp_path / "token"
     token.write_text("one")
@@ -118,7 +132,7 @@ def test_a_login_plugin_is_asked_again_when_its_token_is_not_accepted(
         "interactiveMode": "Never",
     }
     monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url, {"exec": plugin})))
-    api = Api.connect()
+    api = connect()
     server.api.accepts = {"Bearer one"}
     api.list(ALL)
     server.api.accepts = {"Bearer two"}
@@ -158,28 +172,32 @@ def _server_side(made: Certificates, folder: Path) -> ssl.SSLContext:
     return context
 
 
-def test_in_a_pod_its_account_is_used(account: tuple[Served, Path]) -> None:
+def test_in_a_pod_its_account_is_used(
+    account: tuple[Served, Path], connect: Callable[..., Api]
+) -> None:
     server, _ = account
-    api = Api.connect()
+    api = connect()
     assert (api.namespace, api.in_cluster, api.server) == ("lab", True, "localhost")
     api.list(ALL)
     assert [token.lower() for token in server.api.tokens] == ["bearer one"]
 
 
 def test_the_accounts_token_is_read_again_once_it_has_expired(
-    account: tuple[Served, Path],
+    account: tuple[Served, Path], connect: Callable[..., Api]
 ) -> None:
     server, folder = account
-    api = Api.connect()
+    api = connect()
     server.api.accepts = {"bearer two"}
     (folder / "token").write_text("two")  # as the kubelet replaces it
     api.list(ALL)
     assert server.api.tokens[-1] == "bearer two"
 
 
-def test_an_account_whose_token_is_gone_is_unauthorized(account: tuple[Served, Path]) -> None:
+def test_an_account_whose_token_is_gone_is_unauthorized(
+    account: tuple[Served, Path], connect: Callable[..., Api]
+) -> None:
     server, folder = account
-    api = Api.connect()
+    api = connect()
     server.api.accepts = set()
     (folder / "token").unlink()
     with pytest.raises(Unauthorized, match="token file"):
@@ -193,18 +211,21 @@ def test_a_pod_without_an_account_says_what_to_do(account: tuple[Served, Path]) 
         Api.connect()
 
 
-def test_a_watch_over_tls_is_stopped_from_another_thread(account: tuple[Served, Path]) -> None:
-    _watch_and_stop(Api.connect())
+def test_a_watch_over_tls_is_stopped_from_another_thread(
+    account: tuple[Served, Path], connect: Callable[..., Api]
+) -> None:
+    _watch_and_stop(connect())
 
 
 def test_an_authority_that_signed_another_server_is_unreachable(
-    account: tuple[Served, Path],
+    account: tuple[Served, Path], connect: Callable[..., Api]
 ) -> None:
     _, folder = account
     strangers = make_certificates("localhost", "nobody", valid_for=RUN_VALIDITY)
     (folder / "ca.crt").write_text(strangers.authority)
+    api = connect()
     with pytest.raises(Unreachable, match=r"(?i)certificate"):
-        Api.connect().list(ALL, timeout=0)
+        api.list(ALL, timeout=0)
 
 
 # -- Calls

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import base64
+import math
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from fakes.kubernetes_api import Call, Fault
-from fakes.served import served
 from fakes.store import Failure
-from fiber._backends.kubernetes import fiber_pool
-from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes import fiber_pool, scaling
 from fiber._transport.credentials import MasterCredentials
 from fiber_api import names
-from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, kubeconfig
+from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told
 from unit.kubernetes_rig import rig as make_rig
 
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    with served() as server:
-        monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
-        with make_rig(server, Api.connect()) as made:
-            yield made
+    with make_rig(tmp_path, monkeypatch) as made:
+        yield made
 
 
 @pytest.fixture
@@ -153,7 +151,10 @@ def test_a_demand_is_written_until_it_holds(rig: Rig, told: Told) -> None:
     assert "kubectl cluster-info" in warning
 
 
-def test_names_to_release_are_written_until_their_pods_are_gone(rig: Rig, told: Told) -> None:
+def test_names_to_release_are_written_until_their_pods_are_gone(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scaling, "PATCH_INTERVAL", 0.01)
     client = rig.own(told)
     client.demand(2)
     replicas_become(rig, told, 2)
@@ -280,16 +281,16 @@ def test_an_operator_that_is_silent(rig: Rig, told: Told, monkeypatch: pytest.Mo
 def test_an_operator_that_ends_later_is_waited_for(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 1.0)
-    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 1.0)
+    monkeypatch.setattr(scaling, "PATCH_INTERVAL", 0.01)
     client = rig.own(told)
     client.demand(1)
-    replicas_become(rig, told, 1)
-    told.wait(lambda: told.statuses)
+    told.wait(lambda: any("observedGeneration" in status for status in told.statuses))
     rig.operator.mute = True
-    client.demand(2)
-    while rig.spec()["replicas"] != 2:
-        assert not told.errors
+    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.0)
+    for number in (2, 3):
+        client.demand(number)
+        replicas_become(rig, told, number)
+    assert not told.errors
 
 
 # -- Its end
@@ -311,11 +312,13 @@ def test_closing_at_once_leaves_nothing(rig: Rig, told: Told) -> None:
         assert rig.server.objects(plural) == []
 
 
-def test_a_pool_that_was_made_without_our_knowledge_is_deleted(
-    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pool_that_was_made_without_our_knowledge_is_deleted(rig: Rig, told: Told) -> None:
+    made = threading.Event()
+    on(rig, "create", names.PLURAL, made.set)
+    never_answered = Fault("create", names.PLURAL, carried_out=True, times=math.inf)
+    rig.server.api.faults.append(never_answered)
     client = rig.own(told)
-    on(rig, "create", names.PLURAL, lambda: None)
+    assert made.wait(10)
     client.close()
     assert rig.server.objects(names.PLURAL) == []
 

@@ -9,25 +9,21 @@ from pathlib import Path
 import pytest
 
 from fakes.kubernetes_api import Fault
-from fakes.served import served
-from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.warm_pool import read_credentials
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from fiber_api.certificates import make_pool_certificates
-from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, kubeconfig, pool_body
+from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
 from unit.kubernetes_rig import rig as make_rig
 
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    with served() as server:
-        monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
-        with make_rig(server, Api.connect()) as made:
-            body = pool_body("warm")
-            body["spec"] |= {"minReplicas": 2, "replicas": 0, "scaleDown": {"policy": "Any"}}
-            server.do(server.store.create, names.PLURAL, NAMESPACE, body)
-            yield made
+    with make_rig(tmp_path, monkeypatch) as made:
+        body = pool_body("warm")
+        body["spec"] |= {"minReplicas": 2, "replicas": 0, "scaleDown": {"policy": "Any"}}
+        made.server.do(made.server.store.create, names.PLURAL, NAMESPACE, body)
+        yield made
 
 
 @pytest.fixture
@@ -37,6 +33,10 @@ def told() -> Told:
 
 def spec(rig: Rig) -> Body:
     return rig.pool("warm")["spec"]
+
+
+def owner_uid(rig: Rig) -> str:
+    return str(rig.pool("warm")["metadata"]["uid"])
 
 
 def has_master(rig: Rig, told: Told, epoch: int) -> None:
@@ -75,8 +75,9 @@ def test_the_lease_is_the_pools_and_nobodys_afterwards(rig: Rig, told: Told) -> 
     told.wait(lambda: spec(rig)["replicas"] == 1)
     lease = rig.get("leases", names.master_lease_name("warm"))
     assert lease["spec"]["holderIdentity"] == MASTER.identity
+    assert lease["metadata"]["labels"][names.LABEL_POOL_UID] == owner_uid(rig)
     (owner,) = lease["metadata"]["ownerReferences"]
-    assert owner["uid"] == rig.pool("warm")["metadata"]["uid"]
+    assert owner["uid"] == owner_uid(rig)
     client.close()
     left = rig.get("leases", names.master_lease_name("warm"))
     assert left["spec"]["holderIdentity"] == ""
@@ -92,8 +93,20 @@ def test_the_next_master_has_a_higher_epoch_and_the_same_lease(rig: Rig, told: T
     second.demand(2)
     again.wait(lambda: spec(rig)["replicas"] == 2)
     assert spec(rig)["master"] == OTHER.spec("warm", 2)
-    lease = rig.get("leases", names.master_lease_name("warm"))
-    assert lease["spec"]["holderIdentity"] == OTHER.identity
+    taken = rig.get("leases", names.master_lease_name("warm"))
+    assert taken["spec"]["holderIdentity"] == OTHER.identity
+    assert taken["spec"]["acquireTime"] == taken["spec"]["renewTime"]
+
+
+def test_a_lease_without_the_label_gets_it(rig: Rig, told: Told) -> None:
+    name = names.master_lease_name("warm")
+    rig.server.do(rig.server.store.create, "leases", NAMESPACE, {"metadata": {"name": name}})
+    client = rig.warm(told)
+    client.demand(1)
+    told.wait(lambda: spec(rig)["replicas"] == 1)
+    lease = rig.get("leases", name)
+    assert lease["metadata"]["labels"][names.LABEL_POOL_UID] == owner_uid(rig)
+    assert lease["spec"]["holderIdentity"] == MASTER.identity
 
 
 def test_a_second_master_is_told_who_is_there_and_since_when(rig: Rig, told: Told) -> None:
@@ -214,10 +227,10 @@ def test_what_stays_behind_is_said_with_the_command_that_detaches(
 # -- Its credentials
 
 
-def make_secret(rig: Rig, **changed: str) -> None:
+def make_secret(rig: Rig, name: str = names.secret_name("warm"), **changed: str) -> None:
     texts = make_pool_certificates("warm", NAMESPACE).texts() | changed
     data = {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()}
-    body = {"metadata": {"name": names.secret_name("warm")}, "data": data}
+    body = {"metadata": {"name": name}, "data": data}
     rig.server.do(rig.server.store.create, "secrets", NAMESPACE, body)
 
 
@@ -234,3 +247,17 @@ def test_credentials_that_cannot_serve(rig: Rig) -> None:
         read_credentials(rig.api, NAMESPACE, "warm")
     assert caught.value.reason == "InvalidCredentials"
     assert "damaged" not in str(caught.value)
+
+
+def test_credentials_that_this_program_may_not_read(rig: Rig) -> None:
+    rig.server.api.faults.append(Fault("get", "secrets", status=403, message="no secrets"))
+    with pytest.raises(FiberPoolError, match=r"no secrets.*--resource-name=warm-") as caught:
+        read_credentials(rig.api, NAMESPACE, "warm")
+    assert caught.value.reason == "Forbidden"
+
+
+def test_credentials_that_the_pools_owner_brought(rig: Rig) -> None:
+    make_secret(rig, "brought")
+    patch = {"spec": {"credentialsSecretName": "brought"}}
+    rig.server.do(rig.server.store.merge, names.PLURAL, NAMESPACE, "warm", patch)
+    assert read_credentials(rig.api, NAMESPACE, "warm").key

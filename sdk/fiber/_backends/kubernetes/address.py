@@ -73,12 +73,19 @@ def _local_address(target: str) -> str | None:
 
 def _resolved(host: str) -> str:
     try:
-        return str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+        found = str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
     except OSError as error:
-        raise ConfigError(
-            f"listen_host {host!r} is no address of this machine: {error}. Set it to one that "
-            "pods can reach, or leave it out"
-        ) from error
+        raise _useless(host, f"has no address ({error})") from error
+    if not _is_reachable(found):
+        raise _useless(host, f"is {found}, which is another machine in each pod")
+    return found
+
+
+def _useless(host: str, why: str) -> ConfigError:
+    return ConfigError(
+        f"pods cannot reach this program: listen_host {host!r} {why}. Set it to an address of this "
+        "machine that pods can reach, or leave it out"
+    )
 
 
 def _is_unspecified(host: str) -> bool:

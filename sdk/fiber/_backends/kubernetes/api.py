@@ -87,6 +87,10 @@ class Api:
         """The API server's host name or address."""
         return urllib.parse.urlsplit(self._client.configuration.host).hostname or ""
 
+    def close(self) -> None:
+        """Close the connections; one that is in use is closed after that."""
+        self._client.close()
+
     def get(self, path: str, **how: Unpack[_How]) -> Body:
         """The object at ``path``."""
         return self._call(_Request("GET", path), **how)
@@ -171,6 +175,7 @@ class Api:
             if self._client is client:
                 with _login_errors():
                     self._client = self._login.client()
+                client.close()
         return self._send_by(self._client, request, read_timeout)
 
     def _send_by(
@@ -234,6 +239,8 @@ class Watch:
             if not self._stopped:
                 raise
         finally:
+            with self._lock:
+                self._response = None
             response.close()
 
     def _events(self, response: BaseHTTPResponse) -> Iterator[Body]:
@@ -316,8 +323,9 @@ class Login(NamedTuple):
             chosen = package.config.kube_config.KubeConfigLoader(merged, active_context=context)
             namespace = chosen.current_context["context"].get("namespace") or "default"
         except Exception as error:  # whatever a file may hold
+            reason = " ".join(str(error).split())
             raise ConfigError(
-                f"no cluster to run processes on: {file} cannot be used: {error}. Let KUBECONFIG "
+                f"no cluster to run processes on: {file} cannot be used: {reason}. Let KUBECONFIG "
                 "name a kubeconfig and fiber.init(context=) a context in it (`kubectl config "
                 "get-contexts`), or choose another backend with FIBER_BACKEND=local"
             ) from error

@@ -122,10 +122,8 @@ class FiberPoolClient:
             self._fail(error)
         except ApiError as error:
             self._fail(self._explained(error, self._tenure.doing))
-        except Exception as error:  # a fault of ours must not leave anybody waiting
-            failure = self._error("Internal", f"is given up after an unexpected {error!r}")
-            failure.__cause__ = error
-            self._fail(failure)
+        except Exception as error:
+            self._fault(error)
         for follower in self._followers:
             follower.stop()
         self._closing.wait()
@@ -140,25 +138,30 @@ class FiberPoolClient:
         held = self._tenure.begin(self._closing)
         self._began = time.monotonic()
         self._tenure.doing = f"scale the FiberPool {held.name!r}"
-        of_pool = {"fieldSelector": f"metadata.name={held.name}"}
-        of_pods = {"labelSelector": f"{names.LABEL_POOL_UID}={held.uid}"}
-        self._followers = [
-            LeaseRenewer(held, on_lost=self._fail, on_trouble=self._trouble),
-            ObjectWatch(
-                self._api,
-                POOLS.path(held.namespace),
-                of_pool,
-                on_change=partial(self._pool_changed, held),
-                on_trouble=self._pool_trouble,
-            ),
-            ObjectWatch(
-                self._api,
-                PODS.path(held.namespace),
-                of_pods,
-                on_change=self._pod_changed,
-                on_trouble=self._trouble,
-            ),
-        ]
+        renewer = LeaseRenewer(
+            held,
+            on_lost=self._fail,
+            on_trouble=self._trouble,
+            on_refused=self._refused,
+            on_fault=self._fault,
+        )
+        pool = ObjectWatch(
+            self._api,
+            POOLS.path(held.namespace),
+            {"fieldSelector": f"metadata.name={held.name}"},
+            on_change=partial(self._pool_changed, held, renewer),
+            on_trouble=self._pool_trouble,
+            on_fault=self._fault,
+        )
+        pods = ObjectWatch(
+            self._api,
+            PODS.path(held.namespace),
+            {"labelSelector": f"{names.LABEL_POOL_UID}={held.uid}"},
+            on_change=self._pod_changed,
+            on_trouble=self._trouble,
+            on_fault=self._fault,
+        )
+        self._followers = [renewer, pool, pods]
         for follower in self._followers:
             follower.start()
         return held
@@ -189,9 +192,11 @@ class FiberPoolClient:
 
     # -- On the threads that follow it
 
-    def _pool_changed(self, held: HeldPool, name: str, found: Body | None) -> None:
+    def _pool_changed(
+        self, held: HeldPool, renewer: LeaseRenewer, name: str, found: Body | None
+    ) -> None:
         if loss := held.loss(found):
-            self._fail(loss)
+            self._fail(renewer.explain(loss))
             return
         assert found is not None
         status = found.get("status") or {}
@@ -205,7 +210,7 @@ class FiberPoolClient:
     def _pool_trouble(self, error: ApiError) -> None:
         if isinstance(error, Forbidden) and not self._observed:
             # Its status would never be known, and silence be taken for the operator's.
-            self._fail(self._explained(error, f"follow {self._pool}"))
+            self._refused(error)
         else:
             self._trouble(error)
 
@@ -218,7 +223,7 @@ class FiberPoolClient:
 
     def _trouble(self, error: ApiError) -> None:
         if not self._closing.is_set():
-            self._warn(type(error).__name__, str(self._explained(error, "follow " + self._pool)))
+            self._warn(type(error).__name__, str(self._explained(error, self._following)))
 
     def _warn(self, what: str, message: str) -> None:
         """Once, until it has passed."""
@@ -226,12 +231,25 @@ class FiberPoolClient:
             self._warned.add(what)
             self._loop.call_soon(self._observer.on_warning, message)
 
+    def _refused(self, error: ApiError) -> None:
+        self._fail(self._explained(error, self._following))
+
+    def _fault(self, error: Exception) -> None:
+        """A fault of ours must not leave anybody waiting."""
+        failure = self._error("Internal", f"is given up after an unexpected {error!r}")
+        failure.__cause__ = error
+        self._fail(failure)
+
     def _fail(self, error: FiberPoolError) -> None:
         if self._closing.is_set() or not self._failing.acquire(blocking=False):
             return
         self._over.set()
         self._wake.set()
         self._loop.call_soon(self._observer.on_error, error)
+
+    @property
+    def _following(self) -> str:
+        return f"follow the FiberPool {self._tenure.name!r}"
 
     @property
     def _pool(self) -> str:

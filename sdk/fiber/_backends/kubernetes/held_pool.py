@@ -52,7 +52,7 @@ class HeldPool:
         self.namespace = str(metadata["namespace"])
         self.uid = str(metadata["uid"])
         self.path = POOLS.path(self.namespace, self.name)
-        self.lease_path = LEASES.path(self.namespace, names.master_lease_name(self.name))
+        self._lease_path = LEASES.path(self.namespace, names.master_lease_name(self.name))
         self.generation = int(metadata["generation"])
         """That of the spec as this program wrote it last."""
 
@@ -130,7 +130,12 @@ class HeldPool:
 
     def renew_lease(self, **how: Any) -> None:
         """NotFound if there is none."""
-        self._api.merge_patch(self.lease_path, {"spec": self._lease_spec(_micro_time())}, **how)
+        self._patch_lease(self._lease_spec(_micro_time()), **how)
+
+    def take_lease(self, **how: Any) -> None:
+        """Be the holder of the one that is there; NotFound if there is none."""
+        now = _micro_time()
+        self._patch_lease({**self._lease_spec(now), "acquireTime": now}, **how)
 
     def make_lease(self, **how: Any) -> None:
         """Conflict if there is one."""
@@ -140,6 +145,7 @@ class HeldPool:
             "kind": LEASES.kind,
             "metadata": {
                 "name": names.master_lease_name(self.name),
+                "labels": self._lease_labels,
                 "ownerReferences": [self.owner],
             },
             "spec": {**self._lease_spec(now), "acquireTime": now},
@@ -149,7 +155,16 @@ class HeldPool:
     def free_lease(self, **how: Any) -> None:
         """Let whoever comes next find that nobody holds it."""
         with contextlib.suppress(NotFound):
-            self._api.merge_patch(self.lease_path, {"spec": {"holderIdentity": ""}}, **how)
+            self._patch_lease({"holderIdentity": ""}, **how)
+
+    def _patch_lease(self, spec: Body, **how: Any) -> None:
+        patch = {"metadata": {"labels": self._lease_labels}, "spec": spec}
+        self._api.merge_patch(self._lease_path, patch, **how)
+
+    @property
+    def _lease_labels(self) -> dict[str, str]:
+        """By the first the operator hears of renewals: it watches such Leases alone."""
+        return {names.LABEL_POOL_UID: self.uid, names.LABEL_POOL: self.name}
 
     def _lease_spec(self, now: str) -> Body:
         return {

@@ -6,7 +6,13 @@ import threading
 import time
 from collections.abc import Callable
 
-from fiber._backends.kubernetes.api_errors import ApiError, Conflict, NotFound
+from fiber._backends.kubernetes.api_errors import (
+    ApiError,
+    Conflict,
+    Forbidden,
+    NotFound,
+    Unauthorized,
+)
 from fiber._backends.kubernetes.held_pool import HeldPool
 from fiber.errors import FiberPoolError
 
@@ -31,12 +37,20 @@ class LeaseRenewer:
         *,
         on_lost: Callable[[FiberPoolError], None],
         on_trouble: Callable[[ApiError], None],
+        on_refused: Callable[[ApiError], None],
+        on_fault: Callable[[Exception], None],
         now: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
     ) -> None:
-        """The Lease is fresh.  ``now`` counts seconds, those of a machine's sleep as well."""
+        """The Lease is fresh.  Told on the thread: ``on_trouble`` what keeps it from being renewed,
+        each time.  And once, which ends the thread: ``on_lost`` that the pool is this program's no
+        more, ``on_refused`` that a login or a right has been missing for a whole duration,
+        ``on_fault`` of a fault of ours.  ``now`` counts seconds, a machine's sleep among them.
+        """
         self._pool = pool
         self._on_lost = on_lost
         self._on_trouble = on_trouble
+        self._on_refused = on_refused
+        self._on_fault = on_fault
         self._now = now
         self._renewed = now()
         self._stopped = threading.Event()
@@ -52,32 +66,60 @@ class LeaseRenewer:
 
     def join(self, timeout: float) -> None:
         """Wait for the thread's end after ``stop``."""
-        self._thread.join(timeout)
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
 
-    def _run(self) -> None:
-        pause = self._pool.master.lease_duration / RENEWALS
-        while not self._stopped.wait(pause):
-            try:
-                self.renew()
-                pause = self._pool.master.lease_duration / RENEWALS
-            except ApiError as error:
-                self._on_trouble(error)
-                pause = _RETRY
-            except FiberPoolError as error:
-                self._on_lost(error)
-                return
+    def explain(self, error: FiberPoolError) -> FiberPoolError:
+        """``error``, which says that the pool is this program's no more, and why that may be."""
+        late = self._late()
+        if late <= self._pool.master.lease_duration:
+            return error
+        return FiberPoolError(
+            f"{error}. This program did not renew its Lease for {late:.0f} s, and counts as gone "
+            f"after {self._pool.master.lease_duration} s: it was stopped, native code held its "
+            "interpreter, or the API server could not be reached",
+            pool=error.pool,
+            namespace=error.namespace,
+            reason=error.reason,
+        )
 
     def renew(self) -> None:
         """Once; FiberPoolError if the pool is this program's no more."""
         now = self._now()
-        late = now - self._renewed
-        if late > self._pool.master.lease_duration:
-            self._check(late)
+        if self._late() > self._pool.master.lease_duration:
+            self._pool.check()
         try:
             self._pool.renew_lease(timeout=0.0)
         except NotFound:
             self._make()
         self._renewed = now
+
+    def _run(self) -> None:
+        pause = self._pool.master.lease_duration / RENEWALS
+        try:
+            while not self._stopped.wait(pause):
+                pause = self._attempt()
+        except FiberPoolError as error:
+            self._on_lost(self.explain(error))
+        except ApiError as error:
+            self._on_refused(error)
+        except Exception as error:
+            self._on_fault(error)
+
+    def _attempt(self) -> float:
+        """Seconds until the next one."""
+        try:
+            self.renew()
+        except ApiError as error:
+            refused = isinstance(error, Forbidden | Unauthorized)
+            if refused and self._late() > self._pool.master.lease_duration:
+                raise
+            self._on_trouble(error)
+            return _RETRY
+        return self._pool.master.lease_duration / RENEWALS
+
+    def _late(self) -> float:
+        return self._now() - self._renewed
 
     def _make(self) -> None:
         """Somebody deleted it, or all of the pool."""
@@ -86,16 +128,3 @@ class LeaseRenewer:
             self._pool.make_lease(timeout=0.0)
         except Conflict:
             pass  # it is there again
-
-    def _check(self, late: float) -> None:
-        try:
-            self._pool.check()
-        except FiberPoolError as error:
-            raise FiberPoolError(
-                f"{error}. This program did not renew its Lease for {late:.0f} s: it was stopped, "
-                "native code held the interpreter, or the API server was out of reach; and after "
-                f"{self._pool.master.lease_duration} s it counts as gone",
-                pool=error.pool,
-                namespace=error.namespace,
-                reason=error.reason,
-            ) from None

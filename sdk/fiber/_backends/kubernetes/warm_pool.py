@@ -7,7 +7,7 @@ import threading
 import time
 
 from fiber._backends.kubernetes.api import TIMEOUT, Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body, Conflict, NotFound
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Conflict, Forbidden, NotFound
 from fiber._backends.kubernetes.held_pool import HeldPool, Master, identity_in
 from fiber._backends.kubernetes.resources import LEASES, POOLS, SECRETS
 from fiber._backends.kubernetes.secret import credentials_of
@@ -22,19 +22,28 @@ _PAUSE = 0.05
 
 
 def read_credentials(api: Api, namespace: str, pool: str) -> MasterCredentials:
-    """Those of the pool, which the operator made.  Blocks; ``ApiError``, FiberPoolError."""
+    """Those of the pool, from its Secret.  Blocks; ``ApiError``, FiberPoolError."""
     spec = api.get(POOLS.path(namespace, pool))["spec"]
     name = spec.get("credentialsSecretName") or names.secret_name(pool)
+    what = f"the Secret {name!r} of the FiberPool {pool!r} in namespace {namespace!r}"
     try:
         return credentials_of(api.get(SECRETS.path(namespace, name)), pool, namespace)
     except InvalidCertificates as error:
         raise FiberPoolError(
-            f"the Secret {name!r} of the FiberPool {pool!r} in namespace {namespace!r} cannot "
-            f"serve: {error}. If the operator made it, delete it: it makes a new one; then delete "
-            "the pool's pods, which hold the old one",
+            f"{what} cannot serve: {error}. If the operator made it, delete it: it makes a new "
+            "one; then delete the pool's pods, which hold the old one",
             pool=pool,
             namespace=namespace,
             reason=names.Reason.INVALID_CREDENTIALS,
+        ) from None
+    except Forbidden as error:
+        raise FiberPoolError(
+            f"cannot read {what}, whose credentials its master needs: {error.message}. The role "
+            f"fiber-user reads no Secret; give this one: `kubectl create role NAME -n {namespace} "
+            f"--verb=get --resource=secrets --resource-name={name}`, and bind it",
+            pool=pool,
+            namespace=namespace,
+            reason=names.Reason.FORBIDDEN,
         ) from None
 
 
@@ -69,7 +78,7 @@ class WarmPool:
         try:
             self._held.make_lease(cancel=cancel)
         except Conflict:
-            self._held.renew_lease(cancel=cancel)  # the master before left it
+            self._held.take_lease(cancel=cancel)  # the master before left it
         return self._held
 
     def end(self, timeout: float) -> None:

@@ -30,15 +30,18 @@ class ObjectWatch:
         *,
         on_change: Callable[[str, Body | None], None],
         on_trouble: Callable[[ApiError], None],
+        on_fault: Callable[[Exception], None],
     ) -> None:
         """``on_change`` is told the name and the object as it is, or None once it is gone;
-        ``on_trouble`` what keeps the watch from going on, each time.  Both on the thread.
+        ``on_trouble`` what keeps the watch from going on, each time; ``on_fault`` of a fault of
+        ours, which ends it.  All on the thread.
         """
         self._api = api
         self._path = path
         self._selector = selector
         self._on_change = on_change
         self._on_trouble = on_trouble
+        self._on_fault = on_fault
         self._version: str | None = None
         """Where the next watch goes on; None: with a list."""
         self._known: set[str] = set()
@@ -62,26 +65,34 @@ class ObjectWatch:
 
     def join(self, timeout: float) -> None:
         """Wait for the thread's end after ``stop``."""
-        self._thread.join(timeout)
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
 
     def _run(self) -> None:
         pause = _PAUSE_MIN
-        while not self._stopped.is_set():
-            started = time.monotonic()
-            try:
-                if self._version is None:
-                    self._version = self._list()
-                self._follow(self._version)
-            except Expired:
-                self._version = None
-            except ApiError as error:
-                if not self._stopped.is_set():
-                    self._on_trouble(error)
-            if time.monotonic() - started >= _EARLY:
-                pause = _PAUSE_MIN
-            else:
-                self._stopped.wait(pause * random.uniform(0.5, 1.0))
-                pause = min(2 * pause, _PAUSE_MAX)
+        try:
+            while not self._stopped.is_set():
+                started = time.monotonic()
+                self._attempt()
+                if time.monotonic() - started >= _EARLY:
+                    pause = _PAUSE_MIN
+                else:
+                    self._stopped.wait(pause * random.uniform(0.5, 1.0))
+                    pause = min(2 * pause, _PAUSE_MAX)
+        except Exception as error:
+            self._on_fault(error)
+
+    def _attempt(self) -> None:
+        """Go on for as long as it goes."""
+        try:
+            if self._version is None:
+                self._version = self._list()
+            self._follow(self._version)
+        except Expired:
+            self._version = None
+        except ApiError as error:
+            if not self._stopped.is_set():
+                self._on_trouble(error)
 
     def _list(self) -> str:
         listing = self._api.list(self._path, self._selector, cancel=self._stopped)

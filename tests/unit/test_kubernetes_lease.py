@@ -1,0 +1,188 @@
+"""The master's Lease: renewed, late, lost."""
+
+from __future__ import annotations
+
+import dataclasses
+import queue
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fakes.kubernetes_api import Fault
+from fiber._backends.kubernetes import lease
+from fiber._backends.kubernetes.held_pool import HeldPool
+from fiber._backends.kubernetes.lease import LeaseRenewer
+from fiber.errors import FiberPoolError
+from fiber_api import names
+from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, pool_body
+from unit.kubernetes_rig import rig as make_rig
+
+LEASE = names.master_lease_name("es-1")
+
+
+class Case:
+    """A renewer whose time is ``now``."""
+
+    def __init__(self, rig: Rig, duration: int = 30) -> None:
+        self.rig = rig
+        self.now = 100.0
+        self.lost: queue.Queue[FiberPoolError] = queue.Queue()
+        self.troubles: queue.Queue[Exception] = queue.Queue()
+        self.refusals: queue.Queue[Exception] = queue.Queue()
+        self.faults: queue.Queue[Exception] = queue.Queue()
+        master = dataclasses.replace(MASTER, lease_duration=duration)
+        body = pool_body()
+        body["spec"]["master"] = master.spec("es-1", 1)
+        made = rig.server.do(rig.server.store.create, names.PLURAL, NAMESPACE, body)
+        self.pool = HeldPool(rig.api, made, master, 1)
+        self.pool.make_lease()
+        self.renewer = LeaseRenewer(
+            self.pool,
+            on_lost=self.lost.put,
+            on_trouble=self.troubles.put,
+            on_refused=self.refusals.put,
+            on_fault=self.faults.put,
+            now=lambda: self.now,
+        )
+
+    def lease(self) -> Body:
+        return self.rig.get("leases", LEASE)["spec"]
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    with make_rig(tmp_path, monkeypatch) as made:
+        yield made
+
+
+@pytest.fixture
+def case(rig: Rig) -> Case:
+    return Case(rig)
+
+
+def test_it_says_who_lives_since_when_and_for_how_long(case: Case) -> None:
+    before = case.lease()
+    assert before["holderIdentity"] == MASTER.identity
+    assert before["leaseDurationSeconds"] == 30
+    assert before["acquireTime"] == before["renewTime"]
+    case.renewer.renew()
+    after = case.lease()
+    assert after["renewTime"] > before["renewTime"]
+    assert {**after, "renewTime": ""} == {**before, "renewTime": ""}
+
+
+def test_in_time_it_is_one_call(case: Case) -> None:
+    case.rig.server.api.calls.clear()
+    case.now += 30
+    case.renewer.renew()
+    assert [(call.verb, call.plural) for call in case.rig.server.api.calls] == [("patch", "leases")]
+
+
+def test_one_that_somebody_deleted_is_made_again(case: Case) -> None:
+    case.rig.remove("leases", LEASE)
+    case.renewer.renew()
+    assert case.lease()["holderIdentity"] == MASTER.identity
+
+
+def test_none_is_made_for_a_pool_that_is_gone(case: Case) -> None:
+    case.rig.remove(names.PLURAL, "es-1")
+    case.rig.server.api.calls.clear()
+    with pytest.raises(FiberPoolError) as caught:
+        case.renewer.renew()
+    assert caught.value.reason == "Deleted"
+    assert case.rig.server.api.count("create", "leases") == 0
+
+
+def test_who_was_held_or_stopped_goes_on_where_the_pool_waited(case: Case) -> None:
+    case.now += 45
+    case.renewer.renew()
+    case.rig.server.api.calls.clear()
+    case.now += 10
+    case.renewer.renew()
+    assert case.rig.server.api.count("get", names.PLURAL) == 0  # it is in time again
+
+
+def test_who_was_held_or_stopped_does_not_renew_anothers(case: Case) -> None:
+    patch = {"spec": {"master": OTHER.spec("es-1", 2)}}
+    case.rig.server.do(case.rig.server.store.merge, names.PLURAL, NAMESPACE, "es-1", patch)
+    before = case.lease()
+    case.now += 45
+    with pytest.raises(FiberPoolError, match="has another master now: laptop-8:4712"):
+        case.renewer.renew()
+    assert case.lease() == before
+
+
+def test_a_loss_that_came_of_being_late_says_so(case: Case) -> None:
+    loss = case.pool.loss(None)
+    assert loss is not None
+    assert case.renewer.explain(loss) is loss
+    case.now += 45
+    explained = case.renewer.explain(loss)
+    assert "did not renew its Lease for 45 s" in str(explained)
+    assert (explained.reason, explained.pool) == ("Deleted", "es-1")
+
+
+def test_what_failed_does_not_count_as_renewed(case: Case) -> None:
+    case.rig.server.api.faults.append(Fault("patch", "leases", status=503))
+    case.now += 20
+    with pytest.raises(Exception, match="this is a test"):
+        case.renewer.renew()
+    case.now += 20
+    case.rig.server.api.calls.clear()
+    case.renewer.renew()
+    assert case.rig.server.api.count("get", names.PLURAL) == 1
+
+
+# -- The thread
+
+
+def test_the_thread_renews_until_it_is_stopped(rig: Rig) -> None:
+    case = Case(rig, duration=0)
+    renewed: queue.Queue[str] = queue.Queue()
+    rig.server.api.after = lambda call: renewed.put(call.plural)
+    case.renewer.start()
+    assert [renewed.get(timeout=10) for _ in range(3)] == ["leases"] * 3
+    case.renewer.stop()
+    case.renewer.join(10)
+    assert case.troubles.empty()
+
+
+def test_the_thread_ends_when_the_pool_is_lost(rig: Rig) -> None:
+    case = Case(rig, duration=0)
+    rig.remove(names.PLURAL, "es-1")
+    case.now += 7
+    case.renewer.start()
+    assert "did not renew its Lease for 7 s" in str(case.lost.get(timeout=10))
+    case.renewer.join(10)
+
+
+def test_the_thread_tells_what_keeps_it_from_renewing(rig: Rig) -> None:
+    case = Case(rig, duration=0)
+    rig.server.api.faults.append(Fault("patch", "leases", status=503))
+    case.renewer.start()
+    assert "this is a test" in str(case.troubles.get(timeout=10))
+    case.renewer.stop()
+    case.renewer.join(10)
+
+
+@pytest.mark.parametrize("status", [401, 403])
+def test_a_login_or_right_that_stays_away_ends_the_thread(
+    rig: Rig, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lease, "_RETRY", 0.01)
+    case = Case(rig, duration=0)
+    rig.server.api.faults.append(Fault("patch", "leases", status=status, times=9))
+    case.renewer.start()
+    assert "this is a test" in str(case.troubles.get(timeout=10))
+    case.now += 1
+    assert "this is a test" in str(case.refusals.get(timeout=10))
+    case.renewer.join(10)
+
+
+def test_a_fault_of_ours_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(rig, duration=0)
+    monkeypatch.setattr(case.renewer, "renew", lambda: 1 / 0)
+    case.renewer.start()
+    assert isinstance(case.faults.get(timeout=10), ZeroDivisionError)
+    case.renewer.join(10)

@@ -1,0 +1,141 @@
+"""Following objects: what is there, what changes, and every way in which a watch ends."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fakes.kubernetes_api import Fault
+from fiber._backends.kubernetes import watches
+from fiber._backends.kubernetes.resources import PODS
+from fiber._backends.kubernetes.watches import ObjectWatch
+from unit.kubernetes_rig import NAMESPACE, Rig
+from unit.kubernetes_rig import rig as make_rig
+
+
+class Case:
+    """A watch on the pods with the label app=x, and what it tells: ``+a``, ``-a``."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.server = rig.server
+        self.told: queue.Queue[str] = queue.Queue()
+        self.troubles: queue.Queue[Exception] = queue.Queue()
+        self.faults: queue.Queue[Exception] = queue.Queue()
+        self.watch = ObjectWatch(
+            rig.api,
+            PODS.path(NAMESPACE),
+            {"labelSelector": "app=x"},
+            on_change=lambda name, found: self.told.put(f"{'-' if found is None else '+'}{name}"),
+            on_trouble=self.troubles.put,
+            on_fault=self.faults.put,
+        )
+
+    def add(self, name: str) -> None:
+        body = {"metadata": {"name": name, "labels": {"app": "x"}}, "spec": {}}
+        self.server.do(self.server.store.create, "pods", NAMESPACE, body)
+
+    def remove(self, name: str) -> None:
+        self.rig.remove("pods", name)
+
+    def next(self, number: int = 1) -> list[str]:
+        return [self.told.get(timeout=20) for _ in range(number)]
+
+    def end(self) -> None:
+        self.watch.stop()
+        self.watch.join(10)
+
+
+@pytest.fixture
+def case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Case]:
+    with make_rig(tmp_path, monkeypatch) as rig:
+        case = Case(rig)
+        yield case
+        case.end()
+
+
+def test_it_tells_what_is_there_and_what_changes(case: Case) -> None:
+    case.add("a")
+    case.watch.start()
+    assert case.next() == ["+a"]
+    case.add("b")
+    assert case.next() == ["+b"]
+    case.remove("a")
+    assert case.next() == ["-a"]
+
+
+@pytest.mark.parametrize("how", ["cut off", "refused once", "listed too late"])
+def test_nothing_is_lost_where_a_watch_ends(case: Case, how: str) -> None:
+    case.add("a")
+    case.add("b")
+    case.watch.start()
+    assert case.next(2) == ["+a", "+b"]
+
+    def change_meanwhile() -> None:
+        if how == "refused once":
+            case.server.api.faults.append(Fault("watch", "pods", status=503))
+        case.server.store.remove("pods", NAMESPACE, "a")
+        case.server.api.drop_watches()
+        if how == "listed too late":
+            case.server.store.forget_history()
+
+    case.server.do(change_meanwhile)
+    case.add("c")
+    told = []
+    while told[-1:] != ["+c"]:
+        told += case.next()
+    assert "-a" in told
+    assert "-b" not in told
+
+
+def test_after_an_end_it_goes_on_without_a_list(case: Case) -> None:
+    case.add("a")
+    case.watch.start()
+    case.next()
+    case.server.do(case.server.api.drop_watches)
+    case.add("b")
+    assert case.next() == ["+b"]
+    assert case.server.api.count("list", "pods") == 1
+
+
+def test_what_keeps_it_from_going_on_is_told_until_it_passes(case: Case) -> None:
+    case.server.api.faults.append(Fault("list", "pods", status=403, message="no right", times=2))
+    case.watch.start()
+    assert [str(case.troubles.get(timeout=10)) for _ in range(2)] == ["no right"] * 2
+    case.add("a")
+    assert case.next() == ["+a"]
+
+
+def test_an_api_that_ends_every_watch_at_once_is_not_flooded(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: queue.Queue[float] = queue.Queue()
+
+    def wait(seconds: float) -> bool:
+        pauses.put(seconds)
+        return pauses.qsize() >= 4 and case.watch._stopped.set() is None
+
+    monkeypatch.setattr(watches, "_EARLY", float("inf"))
+    monkeypatch.setattr(case.watch._stopped, "wait", wait)
+    case.server.api.faults.append(Fault("watch", "pods", text="", times=99))
+    case.watch.start()
+    case.watch.join(10)
+    drawn = [pauses.get_nowait() for _ in range(4)]
+    assert drawn[0] <= watches._PAUSE_MIN
+    assert drawn[-1] >= 4 * watches._PAUSE_MIN
+
+
+def test_an_event_that_no_api_server_sends_is_a_fault_and_not_a_silence(case: Case) -> None:
+    case.server.api.faults.append(
+        Fault("watch", "pods", text='{"type": "ADDED", "object": {"metadata": {}}}\n')
+    )
+    case.watch.start()
+    assert isinstance(case.faults.get(timeout=10), KeyError)
+
+
+def test_one_that_was_never_started_is_stopped(case: Case) -> None:
+    case.end()
+    assert case.told.empty()
