@@ -22,10 +22,10 @@ from fiber_operator.cluster import (
     Refused,
 )
 from fiber_operator.creation import ENOUGH, Creator, Pace
-from fiber_operator.events import Recorder
+from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics
-from fiber_operator.planning import error_conditions, manifests
+from fiber_operator.planning import error_conditions, manifests, problems
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.plans import Deletion, Event, Obstacle, Plan, Refusal
 from fiber_operator.surroundings import Surroundings
@@ -34,8 +34,8 @@ from fiber_operator.workqueue import GAP, Key, Result
 DELETIONS = 50
 """Pods that are deleted at once."""
 
-_NO_DRY_RUN = "does not support dry run"
-"""What the API server says of an admission webhook."""
+_NO_VERDICTS = ("does not support dry run", problems.QUOTA_IS_FULL)
+"""Refusals of a dry run that say nothing about the template: a webhook's fault, a full quota."""
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ class Applier:
         cluster: Cluster,
         *,
         creator: Creator,
-        recorder: Recorder,
+        recorder: EventRecorder,
         metrics: Metrics,
         now: Callable[[], float],
     ) -> None:
@@ -118,8 +118,8 @@ class Applier:
         try:
             await self._cluster.create(PODS, pool.metadata.namespace, body, dry_run=True)
         except (Refused, Invalid) as error:
-            if _NO_DRY_RUN in error.message:
-                # A webhook's fault and no verdict; the first pods will show.
+            if any(words in error.message for words in _NO_VERDICTS):
+                # The first pods will show.
                 state.accepted, state.creation = plan.template_hash, None
                 return None
             state.refused(plan.template_hash, error, self._now(), dry_run=True)

@@ -19,7 +19,7 @@ from fiber_operator import pod_events
 from fiber_operator.apply import Applier, State, Work
 from fiber_operator.cluster import PODS, POOLS, ApiError, Body, Cluster, Gone, TooMany, Unavailable
 from fiber_operator.creation import Creator
-from fiber_operator.events import Recorder
+from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.lease import NotHolder
 from fiber_operator.logs import about
 from fiber_operator.masters import Masters, Term
@@ -50,7 +50,7 @@ class Controller:
         cluster: Cluster,
         *,
         masters: Masters,
-        recorder: Recorder,
+        recorder: EventRecorder,
         metrics: Metrics,
         creator: Creator,
         now: Callable[[], float] = time.time,

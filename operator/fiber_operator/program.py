@@ -30,7 +30,7 @@ from fiber_operator.cluster import (
 )
 from fiber_operator.controller import Controller
 from fiber_operator.creation import Creator, Draw, draw_suffix
-from fiber_operator.events import Recorder
+from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.handlers import Configure, Watcher
 from fiber_operator.health import Health
 from fiber_operator.lease import Guard
@@ -139,7 +139,7 @@ class Program:
             wall_clock=self._now,
         )
         self.masters = Masters(cluster, lambda key: self.queue.add(key, urgent=True))
-        self.recorder = Recorder(cluster, self._now, settings.identity)
+        self.recorder = EventRecorder(cluster, self._now, settings.identity)
         self.controller = Controller(
             cluster,
             masters=self.masters,

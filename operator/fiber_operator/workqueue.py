@@ -65,7 +65,7 @@ class Key(NamedTuple):
 class Result:
     """What came out of one reconcile of a pool."""
 
-    again: float | None = None
+    requeue_after: float | None = None
     """Reconcile again after this many seconds though nothing happens."""
     rest: float = 0.0
     """Do not reconcile again for this many seconds whatever happens."""

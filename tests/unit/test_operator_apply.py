@@ -13,10 +13,10 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
-from fiber_operator import events
+from fiber_operator import event_recorder
 from fiber_operator.cluster import Cluster, Conflict, Permit, TooMany, Unavailable
 from fiber_operator.creation import ENOUGH, Created, Creator, Pace, draw_suffix
-from fiber_operator.events import Recorder
+from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.lease import NotHolder
 from fiber_operator.planning.plans import Event
 from fiber_operator.workqueue import Key
@@ -164,8 +164,8 @@ def test_without_the_lease_nothing_is_created() -> None:
 # -- Events
 
 
-def recorder(api: KubernetesApi, door: Cluster) -> Recorder:
-    return Recorder(door, api.store.unix_now, "operator-1")
+def recorder(api: KubernetesApi, door: Cluster) -> EventRecorder:
+    return EventRecorder(door, api.store.unix_now, "operator-1")
 
 
 @played
@@ -176,9 +176,9 @@ async def test_an_event_that_repeats_is_counted(api: KubernetesApi, door: Cluste
         await asyncio.sleep(1)
     (found,) = api.store.list("events")
     assert 60 < found["count"] <= 100
-    assert len(api.calls) <= 1 + 100 / events.PAUSE
+    assert len(api.calls) <= 1 + 100 / event_recorder.PAUSE
     assert found["lastTimestamp"] > found["firstTimestamp"]
-    await asyncio.sleep(events.WINDOW)
+    await asyncio.sleep(event_recorder.WINDOW)
     await record.record(ES, "uid", event)
     assert len(api.store.list("events")) == 2
 
@@ -191,7 +191,7 @@ async def test_events_are_posted_in_order_and_nobody_waits(
     running = asyncio.ensure_future(record.run())
     slow = Fault("create", "events", late=4.5, times=10**6)
     api.faults.append(slow)
-    for number in range(events.WAITING + 10):
+    for number in range(event_recorder.WAITING + 10):
         record.tell(ES, "uid", Event("Normal", "A", str(number)))
     assert clock() == 0.0
     await asyncio.sleep(20)
@@ -199,7 +199,7 @@ async def test_events_are_posted_in_order_and_nobody_waits(
     slow.late = 0.001
     await asyncio.sleep(30)
     told = [change.object["message"] for change in api.store.changes]
-    assert told == [str(number) for number in range(10, events.WAITING + 10)]
+    assert told == [str(number) for number in range(10, event_recorder.WAITING + 10)]
     running.cancel()
 
 
@@ -260,12 +260,12 @@ def test_an_event_that_cannot_be_posted_is_forgotten(fault: Fault) -> None:
 async def test_a_long_message_is_cut(api: KubernetesApi, door: Cluster) -> None:
     await recorder(api, door).record(ES, "uid", Event("Normal", "A", "a" * 5000))
     (found,) = api.store.list("events")
-    assert len(found["message"]) == events.MESSAGE_LIMIT
+    assert len(found["message"]) == event_recorder.MESSAGE_LIMIT
 
 
 @played
 async def test_memory_of_events_is_bounded(api: KubernetesApi, door: Cluster) -> None:
     record = recorder(api, door)
-    record._posted.update({("uid", str(n), ""): None for n in range(events.REMEMBERED)})  # type: ignore[misc]
+    record._posted.update({("uid", str(n), ""): None for n in range(event_recorder.REMEMBERED)})  # type: ignore[misc]
     await record.record(ES, "uid", Event("Normal", "A", "a"))
-    assert len(record._posted) == events.REMEMBERED
+    assert len(record._posted) == event_recorder.REMEMBERED
