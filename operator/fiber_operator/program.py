@@ -29,7 +29,7 @@ from fiber_operator.cluster import (
     load_configuration,
 )
 from fiber_operator.controller import Controller
-from fiber_operator.creation import Creator, Draw, draw_suffix
+from fiber_operator.creation import Draw, draw_suffix
 from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.handlers import Configure, Watcher
 from fiber_operator.health import Health
@@ -145,7 +145,7 @@ class Program:
             masters=self.masters,
             recorder=self.recorder,
             metrics=self.metrics,
-            creator=Creator(cluster, self._draw),
+            draw=self._draw,
             now=self._now,
         )
         self.resync = Resync(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
@@ -15,10 +16,11 @@ from fakes.store import Body, Store
 from fakes.world import configuration
 from fiber_operator import event_recorder
 from fiber_operator.cluster import Cluster, Conflict, Permit, TooMany, Unavailable
-from fiber_operator.creation import ENOUGH, Created, Creator, Pace, draw_suffix
+from fiber_operator.creation import Created, Creation, Order, Pace, draw_suffix
 from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.lease import NotHolder
 from fiber_operator.planning.plans import Event
+from fiber_operator.planning.pods import PodView, observe
 from fiber_operator.workqueue import Key
 
 ES = Key("team", "es")
@@ -50,8 +52,20 @@ def body(name: str) -> Body:
     return {"metadata": {"name": name}}
 
 
-async def create(door: Cluster, count: int, pace: Pace | None = None, limit: int = 100) -> Created:
-    return await Creator(door).create("es", "team", body, count, limit, pace or Pace())
+def order(limit: int = 100) -> Order:
+    return Order("hash", body, "worker", limit)
+
+
+async def create(door: Cluster, count: int, pace: Pace | None = None) -> Created:
+    creation = Creation(door, ES, pace or Pace())
+    creation.aim(count, order())
+    await creation.wait()
+    return creation.take()
+
+
+def views(api: KubernetesApi) -> list[PodView]:
+    """What a list shows now."""
+    return [observe(pod, "worker") for pod in api.store.list("pods")]
 
 
 # -- Creation
@@ -129,24 +143,79 @@ async def test_the_longest_wait_that_was_asked_for_counts(
 
 
 @played
-async def test_a_long_creation_stops_in_between_and_goes_on(
+async def test_a_creation_that_is_stopped_ends_with_its_batch(
     api: KubernetesApi, door: Cluster
 ) -> None:
     api.faults.append(Fault("create", "pods", late=0.4, times=10**6))
-    pace = Pace()
-    done = await create(door, 100, pace)
-    assert done.failure is done.refusal is None
-    assert len(done.names) == 1 + 2 + 4
-    assert pace.batch == 8
-    assert asyncio.get_running_loop().time() < ENOUGH + 0.5
-    assert len((await create(door, 93, pace)).names) == 8 + 16 + 32
+    creation = Creation(door, ES, Pace())
+    creation.aim(100, order(limit=16))
+    assert not await creation.wait(1.0)
+    assert len(creation.take().names) == 1 + 2
+    creation.stop()
+    assert await creation.wait()
+    assert len(creation.take().names) == 4
+    creation.expect(views(api), asyncio.get_running_loop().time())
+    creation.aim(2, order())
+    assert await creation.wait()
+    assert len(api.store.list("pods")) == 7 + 2
 
 
 @played
-async def test_a_creation_that_has_time_takes_it(api: KubernetesApi, door: Cluster) -> None:
+async def test_what_a_list_cannot_show_is_expected_and_nothing_is_made_twice(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    """Lists are asked for at any time and answered at any later one; ten are always wanted."""
+    clock = asyncio.get_running_loop().time
     api.faults.append(Fault("create", "pods", late=0.4, times=10**6))
-    done = await Creator(door).create("es", "team", body, 100, 16, Pace(), enough=3.0)
-    assert len(done.names) == 1 + 2 + 4 + 8 + 16 + 16 + 16 + 16
+    for asked, answered in itertools.product([0.0, 0.3, 0.5, 1.3], [0.0, 0.2, 0.7, 1.5]):
+        for pod in api.store.list("pods"):
+            api.store.remove("pods", "team", pod["metadata"]["name"])
+        creation = Creation(door, ES, Pace())
+        creation.aim(10, order(limit=4))
+        for _ in range(3):
+            await asyncio.sleep(asked)
+            began, listed = clock(), views(api)
+            await asyncio.sleep(answered)
+            pods = creation.expect(listed, began)
+            assert len({pod.name for pod in pods}) == len(pods) <= 10
+            creation.aim(10 - len(pods), order(limit=4))
+        await creation.wait()
+        assert len(api.store.list("pods")) == 10
+
+
+@played
+async def test_what_was_created_and_is_not_in_a_later_list_is_gone(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    creation = Creation(door, ES, Pace())
+    before = asyncio.get_running_loop().time()
+    creation.aim(2, order())
+    await asyncio.sleep(1)
+    first, second = (pod["metadata"]["name"] for pod in api.store.list("pods"))
+    assert {pod.name for pod in creation.expect([], before)} == {first, second}
+    api.store.remove("pods", "team", first)
+    now = asyncio.get_running_loop().time()
+    assert {pod.name for pod in creation.expect(views(api), now)} == {second}
+    assert creation.expect([], now) == []
+
+
+@played
+async def test_a_creation_that_is_cancelled_is_unsure_of_what_is_under_way(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    api.faults.append(Fault("create", "pods", late=0.4, times=10**6, skip=1))
+    pace = Pace()
+    creation = Creation(door, ES, pace)
+    creation.aim(10, order())
+    await asyncio.sleep(0.2)
+    await creation.cancel()
+    assert len(pace.unsure) == 2
+    await asyncio.sleep(1)
+    again = Creation(door, ES, pace)
+    pods = again.expect(views(api), asyncio.get_running_loop().time())
+    again.aim(10 - len(pods), order())
+    await again.wait()
+    assert len(api.store.list("pods")) == 10
 
 
 def test_without_the_lease_nothing_is_created() -> None:

@@ -129,6 +129,28 @@ async def test_what_takes_long_to_list_is_listed_seldom_and_created_meanwhile(
 
 
 @played()
+async def test_creation_goes_on_while_the_list_is_read(world: World) -> None:
+    world.make_pool(replicas=1)
+    await world.ready(1)
+    at: list[float] = []
+    lists: list[float] = []
+    clock = asyncio.get_running_loop().time
+
+    def note(call: Call) -> None:
+        if call.plural == "pods":
+            {"list": lists, "create": at}.get(call.verb, []).append(clock())
+
+    world.api.after = note
+    world.slow("list", "pods", 2.0)
+    world.slow("create", "pods", 0.25)
+    world.edit(replicas=1 + 100, scaleUp={"maxInFlight": 4})
+    await world.ready(101)
+    assert max(late - early for early, late in itertools.pairwise(at)) < 0.3
+    assert len([time for time in lists if at[0] < time < at[-1]]) >= 1
+    assert len(world.created()) == 101
+
+
+@played()
 async def test_no_more_at_once_than_asked_for(world: World) -> None:
     world.make_pool(replicas=20, scaleUp={"maxInFlight": 3})
     await world.ready(20)
