@@ -1,9 +1,9 @@
 """One reconcile of one pool: read, plan, act.
 
 While pods are being created this is done again and again beside it, so that neither waits for the
-other.  Nothing that an event said is used: the pool and its pods are read anew, from the API server's own
-store.  Every step may be the last one before this process dies, and any may fail; the next
-reconcile goes on from what there is.
+other.  Nothing that an event said is used: the pool and its pods are read anew, from the API
+server's own store.  Every step may be the last one before this process dies, and any may fail; the
+next reconcile goes on from what there is.
 """
 
 from __future__ import annotations

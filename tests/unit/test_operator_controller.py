@@ -63,6 +63,14 @@ async def test_bad_news_is_in_the_status_within_a_second(world: World) -> None:
 
 
 @played()
+async def test_a_new_pool_is_not_asked_for_what_it_cannot_have_yet(world: World) -> None:
+    world.make_pool(replicas=1)
+    await world.ready(1)
+    for plural in ("services", "secrets", "endpointslices"):
+        assert (world.api.count("create", plural), world.api.count("get", plural)) == (1, 0)
+
+
+@played()
 async def test_a_quiet_pool_costs_a_look_a_minute(world: World) -> None:
     world.make_pool(replicas=5)
     await world.ready(5)
