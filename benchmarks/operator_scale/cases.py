@@ -6,7 +6,7 @@ Plain data and decisions on it; nothing here talks to a cluster.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fiber_api import names
@@ -21,7 +21,8 @@ _LABEL = f"{names.GROUP}/benchmark-set"
 class Case:
     """So many objects with so many pods each, `rounds` times if nothing else is asked for.
 
-    `limit`: seconds that each step of a trial may take.
+    `limit`: seconds that each step of a trial may take.  `by_default`: whether ReplicaSets are
+    also measured as Kubernetes' defaults make them.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Case:
     size: int
     rounds: int
     limit: float
+    by_default: bool = False
 
     @property
     def pods(self) -> int:
@@ -40,8 +42,8 @@ class Case:
 CASES = {
     case.name: case
     for case in (
-        Case("1000", "1,000 pods", 1, 1000, rounds=3, limit=120),
-        Case("100x10", "100 times 10 pods", 100, 10, rounds=2, limit=120),
+        Case("1000", "1,000 pods", 1, 1000, rounds=3, limit=120, by_default=True),
+        Case("100x10", "100 times 10 pods", 100, 10, rounds=2, limit=120, by_default=True),
         # The last, as what the operator's memory grew to does not shrink by itself.
         Case("5000", "5,000 pods", 1, 5000, rounds=1, limit=400),
     )
@@ -53,7 +55,7 @@ WARM_UP = Case("warm-up", "50 pods to warm up", 1, 50, rounds=1, limit=60)
 
 @dataclass(frozen=True)
 class Subject:
-    """One of the two that make pods. `group` is the API's path before the namespace."""
+    """One of those that make pods. `group` is the API's path before the namespace."""
 
     name: str
     label: str
@@ -126,6 +128,11 @@ REPLICA_SET = Subject(
     "replicaset", "ReplicaSet", "#1f77b4", "/apis/apps/v1", "replicasets", _replica_set
 )
 SUBJECTS = (FIBER, REPLICA_SET)
+
+DEFAULT_RATE = 20
+"""Calls a second that a controller of Kubernetes makes unless it is told otherwise."""
+BY_DEFAULT = replace(REPLICA_SET, name="replicaset-20", label=f"ReplicaSet at {DEFAULT_RATE}")
+"""The same at that rate, once a case: it takes what it takes."""
 
 
 def in_turn(turn: int) -> tuple[Subject, ...]:

@@ -11,9 +11,10 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from benchmarks.operator_scale.cases import DEFAULT_RATE
 from benchmarks.operator_scale.installed import CannotMeasure
 
-from cluster import ability, build, fake_nodes, images, lifecycle, places
+from cluster import ability, build, control_plane, fake_nodes, images, lifecycle, places
 from cluster.kubectl import ready_nodes
 from e2e.kube import Kube, path_of
 from e2e.release import Release, crd_owner
@@ -65,6 +66,16 @@ def own_cluster(fakes: int) -> Iterator[Path]:
             fake_nodes.set_count(before)
         else:
             lifecycle.down()
+
+
+@contextlib.contextmanager
+def default_rate() -> Iterator[None]:
+    """Kubernetes' controllers make no more calls a second meanwhile than by default."""
+    try:
+        control_plane.limit_controllers(DEFAULT_RATE)
+        yield
+    finally:
+        control_plane.limit_controllers()
 
 
 @contextlib.contextmanager

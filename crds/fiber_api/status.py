@@ -17,44 +17,34 @@ ExitCode = Annotated[int, Field(ge=-(2**31), le=2**31 - 1)]
 
 
 class Failures(Model):
-    """Workers that ended and were not meant to."""
+    """Workers that ended and were not meant to. Those that end before the next ones come are one
+    wave."""
 
     consecutive: Count = 0
-    """Failures in a row, since a worker was last ready for a minute."""
+    """Waves in a row since half of the workers wanted were last ready for a minute. With more than
+    failurePolicy.backoffLimit nothing more is created."""
+    waves: Count = 0
+    """Waves in a row since a new worker was last ready for a minute. Each doubles the time until
+    those that failed are replaced."""
+    waiting: Count = 0
+    """Workers that are not replaced before nextCreateTime."""
     total: Count = 0
-    """Failures since the pool was made."""
+    """Workers that failed, since the pool was made."""
     disrupted: Count = 0
     """Workers that the cluster ended, since the pool was made. They do not count as failures."""
-    completed: Count = 0
-    """Workers that ended with exit code 0 and were not released, since the pool was made."""
-    completions: Count = 0
-    """Rounds of such ends in a row. From the second on, the next creation waits."""
-    last_completed: Time | None = None
-    """When the last of these rounds began."""
     last_exit_code: ExitCode | None = None
     """Exit code of the worker that failed last."""
     last_reason: str | None = None
     """Why it failed."""
-    last_time: Time | None = None
-    """When it failed."""
     next_create_time: Time | None = None
-    """Nothing is created before this time."""
-    newest_created: Time | None = None
-    """When the newest pod was created that was there at the first of the last failures. Pods up to
-    this age that fail too count as the same failure in a row."""
+    """Workers that failed are not replaced before this time."""
     counted: Annotated[
         tuple[str, ...],
         Field(strict=False, json_schema_extra={"x-kubernetes-list-type": "atomic"}),
     ] = ()
-    """Pods that have ended, still exist and are counted already, by the ends of their names."""
-    deleting: Annotated[
-        tuple[str, ...],
-        Field(strict=False, json_schema_extra={"x-kubernetes-list-type": "atomic"}),
-    ] = ()
-    """Pods that the operator deletes, whose end counts as nothing, by the ends of their names."""
+    """Pods that are in these sums and still exist."""
     spec_hash: str | None = None
-    """Hash of the part of the spec that the failures in a row are those of; it changes, they are
-    forgotten."""
+    """Hash of the part of the spec that these waves are of; when it changes they are forgotten."""
 
 
 class Problem(Model):

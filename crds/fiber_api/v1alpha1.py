@@ -186,14 +186,14 @@ class FailurePolicy(Model):
     )
 
     backoff_base_seconds: Annotated[int, Field(ge=1, le=3600)] = 5
-    """How long to wait after the first failure before the next pod is created. Doubled with each
-    failure in a row."""
+    """How long to wait before workers that failed are replaced. Doubled with each wave of failures,
+    until a new worker is ready for a minute."""
     backoff_max_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 300
-    """The longest wait between two attempts."""
+    """The longest wait between two waves."""
     backoff_limit: Annotated[int, Field(ge=0, le=10_000)] = 6
-    """With more rounds of failures in a row than this nothing more is created until template,
-    processesPerPod, failurePolicy, update or suspend changes, or a master with a new epoch comes.
-    Workers that fail together are one round."""
+    """With more waves of failures in a row than this, at none of which half of the workers wanted
+    had been ready for a minute, nothing more is created until template, processesPerPod,
+    failurePolicy, update or suspend changes, or a master with a new epoch comes."""
     startup_timeout_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 900
     """How long a worker may take to become ready once its container runs. Then it counts as
     failed: its pod is deleted, and replaced like that of any other failure. A pod whose container

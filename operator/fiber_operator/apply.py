@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.cluster import (
@@ -21,21 +21,23 @@ from fiber_operator.cluster import (
     Invalid,
     Refused,
 )
-from fiber_operator.creation import ENOUGH, Creator, Pace
+from fiber_operator.creation import Creation, Draw, Order, Pace
 from fiber_operator.dependents import Dependents
-from fiber_operator.events import Recorder
+from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics
-from fiber_operator.planning import error_conditions, manifests
+from fiber_operator.planning import error_conditions, manifests, problems
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.plans import Deletion, Event, Obstacle, Plan, Refusal
 from fiber_operator.workqueue import GAP, Key, Result
 
+ENOUGH = 1.0
+"""Seconds that pods are changed for, so that the status is not out of date for long."""
 DELETIONS = 50
 """Pods that are deleted at once."""
 
-_NO_DRY_RUN = "does not support dry run"
-"""What the API server says of an admission webhook."""
+_NO_VERDICTS = ("does not support dry run", problems.QUOTA_IS_FULL)
+"""Refusals of a dry run that say nothing about the template: a webhook's fault, a full quota."""
 
 log = logging.getLogger(__name__)
 
@@ -89,8 +91,9 @@ class Work:
     """None if the spec cannot be read."""
     state: State
     plan: Plan
+    creation: Creation
     rested: float = 0.0
-    """When the pool has rested from the list of its pods, by the loop's clock.  No reconcile comes
+    """When the pool has rested from the list of its pods, by the loop's clock.  It is not listed
     before, so pods may be changed until then."""
 
 
@@ -101,25 +104,26 @@ class Applier:
         self,
         cluster: Cluster,
         *,
-        creator: Creator,
-        recorder: Recorder,
+        draw: Draw,
+        recorder: EventRecorder,
         metrics: Metrics,
         now: Callable[[], float],
     ) -> None:
         self._cluster = cluster
-        self._creator = creator
+        self._draw = draw
         self._recorder = recorder
         self._metrics = metrics
         self._now = now
 
     async def dry_run(self, pool: FiberPool, plan: Plan, state: State) -> ApiError | None:
         """Ask whether the API server takes a pod of this template; returns what hindered that."""
-        body = manifests.pod(pool, self._creator.name(pool.metadata.name), state.address or "")
+        name = names.pod_name(pool.metadata.name, self._draw())
+        body = manifests.pod(pool, name, state.address or "")
         try:
             await self._cluster.create(PODS, pool.metadata.namespace, body, dry_run=True)
         except (Refused, Invalid) as error:
-            if _NO_DRY_RUN in error.message:
-                # A webhook's fault and no verdict; the first pods will show.
+            if any(words in error.message for words in _NO_VERDICTS):
+                # The first pods will show.
                 state.accepted, state.creation = plan.template_hash, None
                 return None
             state.refused(plan.template_hash, error, self._now(), dry_run=True)
@@ -145,6 +149,22 @@ class Applier:
         self._tell(work, work.plan.events)
         return await self._change_pods(work)
 
+    def created(self, key: Key, state: State, creation: Creation) -> Result:
+        """Remember what came of the creation so far; what follows from it."""
+        done = creation.take()
+        if done.names:
+            self._metrics.created(len(done.names))
+            state.refusal = state.creation = None
+            log.info("created %s", _some(done.names), extra=about(*key, uid=state.uid))
+        if done.refusal is not None:
+            state.refused(creation.order.template_hash, done.refusal, self._now())
+            return Result(requeue_after=0.0)  # so that the status says it
+        if done.failure is not None:
+            state.not_created(done.failure)
+            log.warning("%s", done.failure, extra=about(*key, uid=state.uid))
+            return Result(failed=True, rest=done.wait)
+        return Result()
+
     async def _write_status(self, work: Work) -> None:
         if work.plan.status is None:
             return
@@ -169,17 +189,23 @@ class Applier:
         self._tell(work, work.plan.events)
 
     async def _change_pods(self, work: Work) -> Result:
+        if work.plan.delete or not work.plan.create:
+            work.creation.stop()
         deleted, as_planned = await self._delete(work)
         if deleted < len(work.plan.delete):
             # Of a change an event tells; a pool that changes all the time is not looked at so.
             return Result(requeue_after=0.0 if as_planned else GAP)
-        result = await self._create(work)
-        return result if as_planned else dataclasses.replace(result, requeue_after=0.0)
+        if work.pool is not None and work.state.address is not None and work.plan.create:
+            body = manifests.pod_maker(work.pool, work.state.address)
+            container, limit = work.pool.spec.worker_container, work.plan.batch_limit
+            order = Order(work.plan.template_hash, body, container, limit)
+            work.creation.aim(work.plan.create, order)
+        return Result() if as_planned else Result(requeue_after=0.0)
 
     async def _delete(self, work: Work) -> tuple[int, bool]:
         """How many of the pods were seen to, and whether each was as the plan had it.
 
-        Like creation this stops after a while, so that the status is not out of date for long.
+        This stops after a while, so that the status is not out of date for long.
         """
         key = work.key
         deletions = sorted(work.plan.delete, key=lambda deletion: deletion.may_work)
@@ -230,32 +256,6 @@ class Applier:
             uid=deletion.uid,
             resource_version=deletion.resource_version,
         )
-
-    async def _create(self, work: Work) -> Result:
-        pool, state, plan, address = work.pool, work.state, work.plan, work.state.address
-        if pool is None or address is None or not plan.create:
-            return Result()
-        done = await self._creator.create(
-            pool.metadata.name,
-            pool.metadata.namespace,
-            manifests.pod_maker(pool, address),
-            plan.create,
-            plan.batch_limit,
-            state.pace,
-            enough=_enough(work),
-        )
-        if done.names:
-            self._metrics.created(len(done.names))
-            state.refusal = state.creation = None
-            log.info("created %s", _some(done.names), extra=about(*work.key, uid=state.uid))
-        if done.refusal is not None:
-            state.refused(plan.template_hash, done.refusal, self._now())
-            return Result(requeue_after=0.0)  # so that the status says it
-        if done.failure is not None:
-            state.not_created(done.failure)
-            log.warning("%s", done.failure, extra=about(*work.key, uid=state.uid))
-            return Result(failed=True, rest=done.wait)
-        return Result(requeue_after=0.0) if len(done.names) < plan.create else Result()
 
     def _tell(self, work: Work, events: Sequence[Event]) -> None:
         for event in events:

@@ -119,6 +119,10 @@ class Cluster:
         """Close the connections."""
         await self._client.close()
 
+    def check_permit(self, namespace: str) -> None:
+        """Raise what ``permit`` does where this process may change nothing now."""
+        self._permit(namespace)
+
     async def read(self, resource: Resource, namespace: str, name: str) -> Body:
         """The object as it is now, not as a cache had it."""
         answer = await self._call("get", resource, namespace, name)

@@ -1,8 +1,9 @@
 """One reconcile of one pool: read, plan, act.
 
-Nothing that an event said is used: the pool and its pods are read anew, from the API server's own
-store.  Every step may be the last one before this process dies, and any may fail; the next
-reconcile goes on from what there is.
+While pods are being created this is done again and again beside it, so that neither waits for the
+other.  Nothing that an event said is used: the pool and its pods are read anew, from the API
+server's own store.  Every step may be the last one before this process dies, and any may fail; the
+next reconcile goes on from what there is.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from collections.abc import Callable, Sequence
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
 from fiber_operator import pod_events
-from fiber_operator.apply import Applier, State, Work
+from fiber_operator.apply import ENOUGH, Applier, State, Work
 from fiber_operator.cluster import PODS, POOLS, ApiError, Body, Cluster, Gone, TooMany, Unavailable
-from fiber_operator.creation import Creator
+from fiber_operator.creation import Creation, Draw, draw_suffix
 from fiber_operator.dependents import DependentsReconciler
-from fiber_operator.events import Recorder
+from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.leader_election import NotLeader
 from fiber_operator.lease_monitor import LeaseMonitor, MasterLease
 from fiber_operator.logs import about
@@ -36,6 +37,8 @@ LIST_SHARE = 2.0
 """A pool rests for this many times as long as the list of its pods took: what it does meanwhile
 is part of that."""
 LONGEST_REST = 10.0
+LONGEST = 60.0
+"""Seconds for which one reconcile goes on while pods are being created."""
 OBSTRUCTED = 5.0
 """Seconds until a pool that lacks something other than pods is looked at again."""
 
@@ -50,18 +53,17 @@ class Controller:
         cluster: Cluster,
         *,
         lease_monitor: LeaseMonitor,
-        recorder: Recorder,
+        recorder: EventRecorder,
         metrics: Metrics,
-        creator: Creator,
+        draw: Draw = draw_suffix,
         now: Callable[[], float] = time.time,
     ) -> None:
         self._cluster = cluster
         self._lease_monitor = lease_monitor
         self._metrics = metrics
         self._dependents = DependentsReconciler(cluster, now)
-        self._applier = Applier(
-            cluster, creator=creator, recorder=recorder, metrics=metrics, now=now
-        )
+        self._applier = Applier(cluster, draw=draw, recorder=recorder, metrics=metrics, now=now)
+        self._draw = draw
         self._now = now
         self._states: dict[Key, State] = {}
 
@@ -95,11 +97,48 @@ class Controller:
         return result
 
     async def _reconcile(self, key: Key) -> Result:
+        """One pass, and others while pods are created beside them."""
+        found = await self._read(key)
+        if found is None:
+            return Result(forget=True)
+        state = found[1]
+        creation = Creation(self._cluster, key, state.pace, self._draw)
+        try:
+            result = await self._passes(key, found, creation)
+        except BaseException:
+            state.generation = -1
+            raise
+        finally:
+            await creation.cancel()
+        if result.failed:
+            state.generation = -1
+        return result
+
+    async def _passes(
+        self, key: Key, found: tuple[Body, State] | None, creation: Creation
+    ) -> Result:
+        clock = asyncio.get_running_loop().time
+        state, end = found[1] if found else None, clock() + LONGEST
+        while found is not None and found[1] is state:
+            self._cluster.check_permit(key.namespace)
+            result = await self._pass(key, *found, creation)
+            began, last = clock(), clock() > end
+            if last:
+                creation.stop()
+            over = await creation.wait(None if last else max(ENOUGH, result.rest))
+            made = self._applier.created(key, found[1], creation)
+            if over:
+                return _together(result, made, clock() - began)
+            found = await self._read(key)
+        return Result(requeue_after=0.0)
+
+    async def _read(self, key: Key) -> tuple[Body, State] | None:
+        """The pool as it is now, and what is remembered of it."""
         try:
             document = await self._cluster.read(POOLS, *key)
         except Gone:
             self._drop(key)
-            return Result(forget=True)
+            return None
         uid = text(mapping(document, "metadata").get("uid"))
         if not uid:
             raise Unavailable("the answer has no uid", what=f"get fiberpools {key.name}")
@@ -108,24 +147,17 @@ class Controller:
             state = self._states[key] = State(uid)
         # Events about this very spec, our own status among them, are no news while this lasts.
         state.generation = whole(mapping(document, "metadata").get("generation"))
-        try:
-            result = await self._reconcile_document(key, document, state)
-        except BaseException:
-            state.generation = -1
-            raise
-        if result.failed:
-            state.generation = -1
-        return result
+        return document, state
 
-    async def _reconcile_document(self, key: Key, document: Body, state: State) -> Result:
+    async def _pass(self, key: Key, document: Body, state: State, creation: Creation) -> Result:
         try:
             pool = FiberPool.read(document)
         except InvalidPool as error:
-            return await self._reconcile_unreadable(key, document, state, error)
-        return await self._reconcile_readable(key, document, pool, state)
+            return await self._reconcile_unreadable(key, document, state, creation, error)
+        return await self._reconcile_readable(key, document, pool, state, creation)
 
     async def _reconcile_readable(
-        self, key: Key, document: Body, pool: FiberPool, state: State
+        self, key: Key, document: Body, pool: FiberPool, state: State, creation: Creation
     ) -> Result:
         if pool.unread:
             complaint = "; ".join(pool.unread)
@@ -134,7 +166,8 @@ class Controller:
         if pool.metadata.deletion_timestamp is None:
             state.dependents = await self._dependents.ensure(pool, state.dependents)
             failure = state.dependents.failure
-        pods, rested = await self._pods(key, document, state, pool.spec.worker_container)
+        container = pool.spec.worker_container
+        pods, rested = await self._pods(key, document, state, creation, container)
         plan = self._plan(key, pool, pods, state)
         if plan.inspect:
             # Not added to: what is not asked about any more may be over.
@@ -143,41 +176,48 @@ class Controller:
             failure = await self._applier.dry_run(pool, plan, state) or failure
         if plan.inspect or plan.dry_run:
             plan = self._plan(key, pool, pods, state)
-        result = await self._act(Work(key, document, pool, state, plan, rested), pods)
+        result = await self._act(Work(key, document, pool, state, plan, creation, rested), pods)
         if failure is not None:
             raise failure
         return result
 
     async def _reconcile_unreadable(
-        self, key: Key, document: Body, state: State, error: InvalidPool
+        self,
+        key: Key,
+        document: Body,
+        state: State,
+        creation: Creation,
+        error: InvalidPool,
     ) -> Result:
         container = text(mapping(document, "spec").get("workerContainer"))
-        pods, rested = await self._pods(key, document, state, container or names.WORKER_CONTAINER)
+        container = container or names.WORKER_CONTAINER
+        pods, rested = await self._pods(key, document, state, creation, container)
         plan = reconcile.plan_unreadable(document, pods, error.errors, self._now())
-        return await self._act(Work(key, document, None, state, plan, rested), pods)
+        return await self._act(Work(key, document, None, state, plan, creation, rested), pods)
 
     async def _pods(
-        self, key: Key, document: Body, state: State, container: str
+        self, key: Key, document: Body, state: State, creation: Creation, container: str
     ) -> tuple[list[PodView], float]:
         """The pool's pods, from a fresh list, and until when to rest from it."""
         clock = asyncio.get_running_loop().time
         started = clock()
         try:
-            pods = await self._cluster.list(
+            listed = await self._cluster.list(
                 PODS,
                 key.namespace,
                 lambda pod: observe(pod, container),
                 selector=f"{names.LABEL_POOL_UID}={state.uid}",
             )
         except ApiError as error:
+            creation.stop()
             plan = reconcile.plan_blind(document, error_conditions.with_list(error), self._now())
-            await self._applier.apply(Work(key, document, None, state, plan))
+            await self._applier.apply(Work(key, document, None, state, plan, creation))
             raise
         ended = clock()
         rested = ended + min(LIST_SHARE * (ended - started), LONGEST_REST)
+        pods = creation.expect(listed, started)
         there = {pod.name for pod in pods}
         state.warnings = {name: text for name, text in state.warnings.items() if name in there}
-        state.pace.unsure = [name for name in state.pace.unsure if name not in there]
         return pods, rested
 
     def _plan(self, key: Key, pool: FiberPool, pods: Sequence[PodView], state: State) -> Plan:
@@ -226,3 +266,12 @@ def _master_lease(pool: FiberPool) -> MasterLease | None:
     if master is None or master.lease_name is None:
         return None
     return MasterLease(master.lease_name, master.epoch, master.lease_duration_seconds)
+
+
+def _together(result: Result, made: Result, waited: float) -> Result:
+    """What follows from a pass, and then from the creation that it ``waited`` for."""
+    after = made.requeue_after
+    if after is None and result.requeue_after is not None:
+        after = max(0.0, result.requeue_after - waited)
+    rest = max(made.rest, result.rest - waited)
+    return dataclasses.replace(result, requeue_after=after, rest=rest, failed=made.failed)

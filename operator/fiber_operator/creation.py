@@ -1,4 +1,8 @@
-"""Creating pods: carefully at first, then many at a time, and never one twice."""
+"""Creating pods: carefully at first, then many at a time, and never one twice.
+
+It goes on while the pool's pods are listed, planned for and told of.  A list that is read meanwhile
+may or may not have what is created meanwhile, so the creation itself says what to expect besides.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +23,10 @@ from fiber_operator.cluster import (
     TooMany,
     Unavailable,
 )
+from fiber_operator.planning.pods import PodView, observe
+from fiber_operator.workqueue import Key
 
 Draw = Callable[[], str]
-ENOUGH = 1.0
-"""Seconds after which no further batch begins, so that the status is not out of date for long."""
 
 
 def draw_suffix() -> str:
@@ -41,6 +45,19 @@ class Pace:
     that exists after all is refused as a duplicate, so none is created twice."""
 
 
+@dataclass(frozen=True)
+class Order:
+    """Which pods to create."""
+
+    template_hash: str
+    body: Callable[[str], Body]
+    """The pod of that name."""
+    container: str
+    """The one that it is judged by."""
+    limit: int
+    """How many may be created at once."""
+
+
 @dataclass
 class Created:
     """What came of it."""
@@ -54,66 +71,118 @@ class Created:
     """Seconds that the API server asked to wait."""
 
 
-class Creator:
-    """Creates pods in batches of 1, 2, 4 ... up to a limit."""
+class Creation:
+    """The pods of one pool that are being created, in batches of 1, 2, 4 ... up to a limit.
 
-    def __init__(self, cluster: Cluster, draw: Draw = draw_suffix) -> None:
+    A batch in which anything fails is the last, and the next time begins with one pod.
+    """
+
+    def __init__(self, cluster: Cluster, key: Key, pace: Pace, draw: Draw = draw_suffix) -> None:
         self._cluster = cluster
+        self._key = key
+        self._pace = pace
         self._draw = draw
+        self.order: Order
+        self._left = 0
+        """Pods that are still to be begun."""
+        self._under_way: set[str] = set()
+        self._unlisted = 0
+        """Pods that were begun and that ``expect`` did not return."""
+        self._created: dict[str, tuple[float, PodView]] = {}
+        """Pods that no list has shown yet, and when they were there, by the loop's clock."""
+        self._task: asyncio.Task[None] | None = None
+        self._done = Created()
 
-    async def create(
-        self,
-        pool: str,
-        namespace: str,
-        body: Callable[[str], Body],
-        count: int,
-        limit: int,
-        pace: Pace,
-        *,
-        enough: float = ENOUGH,
-    ) -> Created:
-        """Create up to ``count`` pods, ``body(name)`` each.
+    def expect(self, listed: list[PodView], began: float) -> list[PodView]:
+        """``listed``, from a list that was asked for then, and what was created since."""
+        there = {pod.name for pod in listed}
+        self._pace.unsure = [name for name in self._pace.unsure if name not in there]
+        # What was there before and is not in the list is gone.
+        self._created = {
+            name: (at, pod)
+            for name, (at, pod) in self._created.items()
+            if at >= began and name not in there
+        }
+        self._unlisted = len(self._under_way - there)
+        return [*listed, *(pod for _, pod in self._created.values())]
 
-        A batch in which anything fails is the last, and the next time begins with one pod.  Fewer
-        than ``count`` without any failure means that it took ``enough`` seconds: come back soon.
-        """
-        done = Created()
-        clock = asyncio.get_running_loop().time
-        started = clock()
-        while count > 0 and (not done.names or clock() - started < enough):
-            size = min(pace.batch, limit, count)
-            chosen = [pace.unsure.pop(0) if pace.unsure else self.name(pool) for _ in range(size)]
-            results = await asyncio.gather(
-                *(self._cluster.create(PODS, namespace, body(name)) for name in chosen),
-                return_exceptions=True,
-            )
-            for name, result in zip(chosen, results, strict=True):
-                _sort(name, result, done, pace)
-            for result in results:
-                if isinstance(result, BaseException) and not isinstance(result, ApiError):
-                    raise result
-            if done.refusal or done.failure:
-                pace.batch = 1
-                break
-            count -= size
-            pace.batch = min(2 * size, limit) if count else 1
+    def aim(self, count: int, order: Order) -> None:
+        """Create as many more as make ``count`` with those that ``expect`` did not return."""
+        self.order = order
+        self._left = max(0, count - self._unlisted)
+        if self._left and (self._task is None or self._task.done()):
+            self._task = asyncio.create_task(self._run(), name=f"creation for {self._key}")
+
+    def stop(self) -> None:
+        """Begin no further batch."""
+        self._left = 0
+
+    async def wait(self, seconds: float | None = None) -> bool:
+        """Until there is nothing more to do, or for so long; whether there is not."""
+        if self._task is None:
+            return True
+        done, _ = await asyncio.wait([self._task], timeout=seconds)
+        for task in done:
+            self._task = None
+            task.result()
+        return bool(done)
+
+    def take(self) -> Created:
+        """What came of it since this was asked last."""
+        done, self._done = self._done, Created()
         return done
 
-    def name(self, pool: str) -> str:
-        """The name of a pod that never was."""
-        return names.pod_name(pool, self._draw())
+    async def cancel(self) -> None:
+        """End it at once; of what is under way nobody knows whether it was created."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
 
+    async def _run(self) -> None:
+        while self._left and not (self._done.refusal or self._done.failure):
+            size = min(self._pace.batch, self.order.limit, self._left)
+            self._left -= size
+            self._unlisted += size
+            batch = [self._name() for _ in range(size)]
+            self._under_way.update(batch)
+            results = await asyncio.gather(*map(self._create, batch), return_exceptions=True)
+            for result in results:
+                if result is not None:
+                    raise result
+            more = self._left and not (self._done.refusal or self._done.failure)
+            self._pace.batch = min(2 * size, self.order.limit) if more else 1
 
-def _sort(name: str, result: Body | BaseException, done: Created, pace: Pace) -> None:
-    if isinstance(result, dict):
-        done.names.append(name)
-    elif isinstance(result, Refused | Invalid):
-        done.refusal = done.refusal or result
-    elif isinstance(result, Conflict) and result.reason == "AlreadyExists":
-        done.names.append(name)  # it was created before, and the answer was lost
-    elif isinstance(result, ApiError):
-        if isinstance(result, TooMany):
-            done.wait = max(done.wait, result.retry_after)
-        elif isinstance(result, Unavailable):
-            pace.unsure.append(name)
-        done.failure = done.failure or result
+    def _name(self) -> str:
+        unsure = self._pace.unsure
+        return unsure.pop(0) if unsure else names.pod_name(self._key.name, self._draw())
+
+    async def _create(self, name: str) -> None:
+        try:
+            document = await self._have(name)
+        except (Refused, Invalid) as error:
+            self._done.refusal = self._done.refusal or error
+        except ApiError as error:
+            if isinstance(error, TooMany):
+                self._done.wait = max(self._done.wait, error.retry_after)
+            elif isinstance(error, Unavailable):
+                self._pace.unsure.append(name)
+            self._done.failure = self._done.failure or error
+        except asyncio.CancelledError:
+            self._pace.unsure.append(name)
+            raise
+        else:
+            self._done.names.append(name)
+            now = asyncio.get_running_loop().time()
+            self._created[name] = now, observe(document, self.order.container)
+        finally:
+            self._under_way.discard(name)
+
+    async def _have(self, name: str) -> Body:
+        namespace = self._key.namespace
+        try:
+            return await self._cluster.create(PODS, namespace, self.order.body(name))
+        except Conflict as error:
+            if error.reason != "AlreadyExists":
+                raise
+        # It was created before, and the answer was lost.
+        return await self._cluster.read(PODS, namespace, name)

@@ -200,6 +200,13 @@ class DependentsReconciler:
     ) -> Body:
         """The object of this name, made if there is none; obstructed if it is another's."""
         namespace = pool.metadata.namespace
+        if pool.status.endpoint is None:
+            # A pool of which nothing is told yet has none, as a rule.
+            try:
+                return await self._cluster.create(resource, namespace, new())
+            except Conflict as error:
+                if error.reason != "AlreadyExists":
+                    raise
         try:
             existing = await self._cluster.read(resource, namespace, name)
         except Gone:

@@ -30,8 +30,8 @@ from fiber_operator.cluster import (
     load_configuration,
 )
 from fiber_operator.controller import Controller
-from fiber_operator.creation import Creator, Draw, draw_suffix
-from fiber_operator.events import Recorder
+from fiber_operator.creation import Draw, draw_suffix
+from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.handlers import Configure, Watcher
 from fiber_operator.health import Health
 from fiber_operator.leader_election import LeaderElector
@@ -140,13 +140,13 @@ class Program:
             wall_clock=self._now,
         )
         self.lease_monitor = LeaseMonitor(cluster, lambda key: self.queue.add(key, urgent=True))
-        self.recorder = Recorder(cluster, self._now, settings.identity)
+        self.recorder = EventRecorder(cluster, self._now, settings.identity)
         self.controller = Controller(
             cluster,
             lease_monitor=self.lease_monitor,
             recorder=self.recorder,
             metrics=self.metrics,
-            creator=Creator(cluster, self._draw),
+            draw=self._draw,
             now=self._now,
         )
         self.resync = Resync(

@@ -20,7 +20,7 @@ from fakes.world import NAMESPACE, World, a_world, configuration
 from fiber_operator import claims as claiming
 from fiber_operator import handlers
 from fiber_operator.cluster import Configuration
-from fiber_operator.events import PAUSE
+from fiber_operator.event_recorder import PAUSE
 
 Right = tuple[str, str, str]
 MASTER = {

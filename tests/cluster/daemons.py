@@ -54,7 +54,13 @@ class Daemon:
     def start_again(self) -> None:
         """Start it with the command that it had; nothing happens when it runs."""
         if not self.runs():
-            self._spawn(json.loads(self._command_file.read_text()))
+            self._spawn(self.command)
+
+    @property
+    def command(self) -> list[str]:
+        """What it was started with."""
+        words: list[str] = json.loads(self._command_file.read_text())
+        return words
 
     def _spawn(self, words: list[str]) -> None:
         # The child of a child: nobody here has to wait for it, and it is not taken for a process

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cluster import places
+from cluster import control_plane, places
 from cluster.daemons import Daemon, all_daemons
 from cluster.shell import ClusterError, wait_for
 
@@ -52,6 +52,20 @@ def test_starting_it_twice_starts_it_once() -> None:
 def test_another_process_finds_it_again() -> None:
     Daemon("sleeper").start(*SLEEP)
     assert Daemon("sleeper").runs()
+
+
+def test_controllers_are_started_again_with_another_rate_and_as_before() -> None:
+    manager = Daemon("controller-manager")
+    command = ["sh", "-c", "exec sleep 300.0625", "sh", "--bind-address=127.0.0.1"]
+    manager.start(*command, "--kube-api-qps=1000", "--kube-api-burst=2000")
+    before, first = manager.command, pid_of(manager)
+    control_plane.limit_controllers(20)
+    assert manager.command == [*command, "--kube-api-qps=20", "--kube-api-burst=30"]
+    assert manager.runs()
+    assert pid_of(manager) != first
+    control_plane.limit_controllers()
+    assert manager.command == before
+    assert manager.runs()
 
 
 def test_it_is_started_again_as_it_was() -> None:

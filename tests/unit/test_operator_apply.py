@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
@@ -13,12 +14,13 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
-from fiber_operator import events
+from fiber_operator import event_recorder
 from fiber_operator.cluster import Cluster, Conflict, Permit, TooMany, Unavailable
-from fiber_operator.creation import ENOUGH, Created, Creator, Pace, draw_suffix
-from fiber_operator.events import Recorder
+from fiber_operator.creation import Created, Creation, Order, Pace, draw_suffix
+from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.leader_election import NotLeader
 from fiber_operator.planning.plans import Event
+from fiber_operator.planning.pods import PodView, observe
 from fiber_operator.workqueue import Key
 
 ES = Key("team", "es")
@@ -50,8 +52,20 @@ def body(name: str) -> Body:
     return {"metadata": {"name": name}}
 
 
-async def create(door: Cluster, count: int, pace: Pace | None = None, limit: int = 100) -> Created:
-    return await Creator(door).create("es", "team", body, count, limit, pace or Pace())
+def order(limit: int = 100) -> Order:
+    return Order("hash", body, "worker", limit)
+
+
+async def create(door: Cluster, count: int, pace: Pace | None = None) -> Created:
+    creation = Creation(door, ES, pace or Pace())
+    creation.aim(count, order())
+    await creation.wait()
+    return creation.take()
+
+
+def views(api: KubernetesApi) -> list[PodView]:
+    """What a list shows now."""
+    return [observe(pod, "worker") for pod in api.store.list("pods")]
 
 
 # -- Creation
@@ -129,24 +143,79 @@ async def test_the_longest_wait_that_was_asked_for_counts(
 
 
 @played
-async def test_a_long_creation_stops_in_between_and_goes_on(
+async def test_a_creation_that_is_stopped_ends_with_its_batch(
     api: KubernetesApi, door: Cluster
 ) -> None:
     api.faults.append(Fault("create", "pods", late=0.4, times=10**6))
-    pace = Pace()
-    done = await create(door, 100, pace)
-    assert done.failure is done.refusal is None
-    assert len(done.names) == 1 + 2 + 4
-    assert pace.batch == 8
-    assert asyncio.get_running_loop().time() < ENOUGH + 0.5
-    assert len((await create(door, 93, pace)).names) == 8 + 16 + 32
+    creation = Creation(door, ES, Pace())
+    creation.aim(100, order(limit=16))
+    assert not await creation.wait(1.0)
+    assert len(creation.take().names) == 1 + 2
+    creation.stop()
+    assert await creation.wait()
+    assert len(creation.take().names) == 4
+    creation.expect(views(api), asyncio.get_running_loop().time())
+    creation.aim(2, order())
+    assert await creation.wait()
+    assert len(api.store.list("pods")) == 7 + 2
 
 
 @played
-async def test_a_creation_that_has_time_takes_it(api: KubernetesApi, door: Cluster) -> None:
+async def test_what_a_list_cannot_show_is_expected_and_nothing_is_made_twice(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    """Lists are asked for at any time and answered at any later one; ten are always wanted."""
+    clock = asyncio.get_running_loop().time
     api.faults.append(Fault("create", "pods", late=0.4, times=10**6))
-    done = await Creator(door).create("es", "team", body, 100, 16, Pace(), enough=3.0)
-    assert len(done.names) == 1 + 2 + 4 + 8 + 16 + 16 + 16 + 16
+    for asked, answered in itertools.product([0.0, 0.3, 0.5, 1.3], [0.0, 0.2, 0.7, 1.5]):
+        for pod in api.store.list("pods"):
+            api.store.remove("pods", "team", pod["metadata"]["name"])
+        creation = Creation(door, ES, Pace())
+        creation.aim(10, order(limit=4))
+        for _ in range(3):
+            await asyncio.sleep(asked)
+            began, listed = clock(), views(api)
+            await asyncio.sleep(answered)
+            pods = creation.expect(listed, began)
+            assert len({pod.name for pod in pods}) == len(pods) <= 10
+            creation.aim(10 - len(pods), order(limit=4))
+        await creation.wait()
+        assert len(api.store.list("pods")) == 10
+
+
+@played
+async def test_what_was_created_and_is_not_in_a_later_list_is_gone(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    creation = Creation(door, ES, Pace())
+    before = asyncio.get_running_loop().time()
+    creation.aim(2, order())
+    await asyncio.sleep(1)
+    first, second = (pod["metadata"]["name"] for pod in api.store.list("pods"))
+    assert {pod.name for pod in creation.expect([], before)} == {first, second}
+    api.store.remove("pods", "team", first)
+    now = asyncio.get_running_loop().time()
+    assert {pod.name for pod in creation.expect(views(api), now)} == {second}
+    assert creation.expect([], now) == []
+
+
+@played
+async def test_a_creation_that_is_cancelled_is_unsure_of_what_is_under_way(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    api.faults.append(Fault("create", "pods", late=0.4, times=10**6, skip=1))
+    pace = Pace()
+    creation = Creation(door, ES, pace)
+    creation.aim(10, order())
+    await asyncio.sleep(0.2)
+    await creation.cancel()
+    assert len(pace.unsure) == 2
+    await asyncio.sleep(1)
+    again = Creation(door, ES, pace)
+    pods = again.expect(views(api), asyncio.get_running_loop().time())
+    again.aim(10 - len(pods), order())
+    await again.wait()
+    assert len(api.store.list("pods")) == 10
 
 
 def test_without_the_lease_nothing_is_created() -> None:
@@ -164,8 +233,8 @@ def test_without_the_lease_nothing_is_created() -> None:
 # -- Events
 
 
-def recorder(api: KubernetesApi, door: Cluster) -> Recorder:
-    return Recorder(door, api.store.unix_now, "operator-1")
+def recorder(api: KubernetesApi, door: Cluster) -> EventRecorder:
+    return EventRecorder(door, api.store.unix_now, "operator-1")
 
 
 @played
@@ -176,9 +245,9 @@ async def test_an_event_that_repeats_is_counted(api: KubernetesApi, door: Cluste
         await asyncio.sleep(1)
     (found,) = api.store.list("events")
     assert 60 < found["count"] <= 100
-    assert len(api.calls) <= 1 + 100 / events.PAUSE
+    assert len(api.calls) <= 1 + 100 / event_recorder.PAUSE
     assert found["lastTimestamp"] > found["firstTimestamp"]
-    await asyncio.sleep(events.WINDOW)
+    await asyncio.sleep(event_recorder.WINDOW)
     await record.record(ES, "uid", event)
     assert len(api.store.list("events")) == 2
 
@@ -191,7 +260,7 @@ async def test_events_are_posted_in_order_and_nobody_waits(
     running = asyncio.ensure_future(record.run())
     slow = Fault("create", "events", late=4.5, times=10**6)
     api.faults.append(slow)
-    for number in range(events.WAITING + 10):
+    for number in range(event_recorder.WAITING + 10):
         record.tell(ES, "uid", Event("Normal", "A", str(number)))
     assert clock() == 0.0
     await asyncio.sleep(20)
@@ -199,7 +268,7 @@ async def test_events_are_posted_in_order_and_nobody_waits(
     slow.late = 0.001
     await asyncio.sleep(30)
     told = [change.object["message"] for change in api.store.changes]
-    assert told == [str(number) for number in range(10, events.WAITING + 10)]
+    assert told == [str(number) for number in range(10, event_recorder.WAITING + 10)]
     running.cancel()
 
 
@@ -260,12 +329,12 @@ def test_an_event_that_cannot_be_posted_is_forgotten(fault: Fault) -> None:
 async def test_a_long_message_is_cut(api: KubernetesApi, door: Cluster) -> None:
     await recorder(api, door).record(ES, "uid", Event("Normal", "A", "a" * 5000))
     (found,) = api.store.list("events")
-    assert len(found["message"]) == events.MESSAGE_LIMIT
+    assert len(found["message"]) == event_recorder.MESSAGE_LIMIT
 
 
 @played
 async def test_memory_of_events_is_bounded(api: KubernetesApi, door: Cluster) -> None:
     record = recorder(api, door)
-    record._posted.update({("uid", str(n), ""): None for n in range(events.REMEMBERED)})  # type: ignore[misc]
+    record._posted.update({("uid", str(n), ""): None for n in range(event_recorder.REMEMBERED)})  # type: ignore[misc]
     await record.record(ES, "uid", Event("Normal", "A", "a"))
-    assert len(record._posted) == events.REMEMBERED
+    assert len(record._posted) == event_recorder.REMEMBERED

@@ -63,6 +63,14 @@ async def test_bad_news_is_in_the_status_within_a_second(world: World) -> None:
 
 
 @played()
+async def test_a_new_pool_is_not_asked_for_what_it_cannot_have_yet(world: World) -> None:
+    world.make_pool(replicas=1)
+    await world.ready(1)
+    for plural in ("services", "secrets", "endpointslices"):
+        assert (world.api.count("create", plural), world.api.count("get", plural)) == (1, 0)
+
+
+@played()
 async def test_a_quiet_pool_costs_a_look_a_minute(world: World) -> None:
     world.make_pool(replicas=5)
     await world.ready(5)
@@ -126,6 +134,28 @@ async def test_what_takes_long_to_list_is_listed_seldom_and_created_meanwhile(
     assert lists[-1] - creations[-1] >= LULL
     assert creations[-1] - creations[0] > 1.0
     assert not [at for at in lists if creations[0] < at < creations[-1]]
+
+
+@played()
+async def test_creation_goes_on_while_the_list_is_read(world: World) -> None:
+    world.make_pool(replicas=1)
+    await world.ready(1)
+    at: list[float] = []
+    lists: list[float] = []
+    clock = asyncio.get_running_loop().time
+
+    def note(call: Call) -> None:
+        if call.plural == "pods":
+            {"list": lists, "create": at}.get(call.verb, []).append(clock())
+
+    world.api.after = note
+    world.slow("list", "pods", 2.0)
+    world.slow("create", "pods", 0.25)
+    world.edit(replicas=1 + 100, scaleUp={"maxInFlight": 4})
+    await world.ready(101)
+    assert max(late - early for early, late in itertools.pairwise(at)) < 0.3
+    assert len([time for time in lists if at[0] < time < at[-1]]) >= 1
+    assert len(world.created()) == 101
 
 
 @played()

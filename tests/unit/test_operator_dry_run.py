@@ -193,6 +193,22 @@ async def test_a_webhook_that_cannot_do_dry_runs_is_no_verdict(world: World) -> 
 
 
 @played
+async def test_a_full_quota_says_nothing_about_a_new_template(world: World) -> None:
+    def quota(plural: str, body: Body) -> None:
+        if plural == "pods" and len(world.pods()) >= 4:
+            raise Failure(403, "Forbidden", 'pods "es-x" is forbidden: exceeded quota: pods')
+
+    world.store.admit = quota
+    world.make_pool(replicas=4, update={"strategy": "Recreate"})
+    await world.ready(4)
+    before = world.names()
+    world.edit(template=template({"image": "registry/worker:2"}))
+    await world.until(lambda: not set(before) & set(world.names()))
+    await world.ready(4)
+    assert world.reasons() == []
+
+
+@played
 async def test_a_new_pool_is_pending_while_nobody_judges_its_template(world: World) -> None:
     world.api.faults.append(Fault("create", "pods", status=500, times=3))
     world.make_pool(replicas=2)

@@ -136,7 +136,7 @@ def test_a_worker_that_ran_and_was_never_ready_is_told_with_all_that_is_known_of
     assert said in found.message
     assert "kubectl describe pod" not in found.message
     assert "kubectl logs --follow --selector fiber.dev/pool=es." in found.message
-    assert "No other is created before" in found.message
+    assert "It is not replaced before" in found.message
     probe = "Unhealthy: Readiness probe failed: HTTP probe failed with statuscode: 503"
     assert probe in problem(POOL, pod, warnings={name_of(1): probe}).message
 
@@ -190,7 +190,7 @@ def test_workers_that_end_well_again_and_again_are_a_warning_that_says_what_it_m
     for said in ("exit code 0 after 12 s", "python -m fiber.agent", "lostGraceSeconds", "before"):
         assert said in found.message
     assert status_of(pool, now=now).problems == (found,)
-    assert status_of(pool, now=now + 900).problems == ()
+    assert status_of(pool, running(3, age=-900), now=now + 970).problems == ()
 
 
 def test_a_program_that_is_not_in_the_image_is_hopeless() -> None:
@@ -241,14 +241,14 @@ def test_failures_are_summed_up_while_they_last() -> None:
     ],
 )
 def test_a_failure_of_which_little_is_known_is_told_as_far_as_it_is(known: Json, said: str) -> None:
-    edited = {"failures": {"consecutive": 2, "specHash": spec_hash(POOL), **known}}
+    edited = {"failures": {"waves": 2, "specHash": spec_hash(POOL), **known}}
     found = problem(then(POOL, FiberPoolStatus.model_validate(edited)))
     assert found.reason == "ContainerFailed"
     assert found.message == f"{said} See the events of the pool with kubectl describe fiberpool es."
 
 
 def test_a_wait_that_is_not_waited_for_is_not_shown() -> None:
-    far = {"consecutive": 1, "specHash": spec_hash(POOL), "nextCreateTime": "2099-01-01T00:00:00Z"}
+    far = {"waves": 1, "specHash": spec_hash(POOL), "nextCreateTime": "2099-01-01T00:00:00Z"}
     pool = then(POOL, FiberPoolStatus.model_validate({"failures": far}))
     status = status_of(pool, ended(1))
     assert status.failures.next_create_time is None or status.failures.next_create_time < NOW + 999

@@ -32,6 +32,7 @@ from unit.operator_objects import (
     pod_document,
     running,
     terminating,
+    unschedulable,
     views,
     waiting,
     with_plan,
@@ -87,7 +88,8 @@ def test_only_live_pods_of_the_pool_count() -> None:
     pool = tried(replicas=3)
     foreign = running(3)
     foreign["metadata"]["ownerReferences"][0]["uid"] = "an earlier pool"
-    made = plan_of(pool, running(1), terminating(running(2)), foreign, ended(4, code=0))
+    evicted = ended(4, conditions=[condition("DisruptionTarget", "True")])
+    made = plan_of(pool, running(1), terminating(running(2)), foreign, evicted)
     assert made.create == 2
     assert name_of(3) not in gone(made)
 
@@ -144,12 +146,13 @@ def test_the_end_of_a_released_pod_is_no_failure() -> None:
     assert (after.total, after.disrupted) == (0, 0)
 
 
-def test_lowered_replicas_cancel_what_was_never_ready_newest_first() -> None:
+def test_lowered_replicas_cancel_what_does_not_run_yet_newest_first() -> None:
+    """A worker that runs may have joined, though it was never Ready."""
     pool = tried(replicas=2, master=MASTER)
     pods = [running(1), running(2), running(3), running(4, age=9, ready=False)]
     made = plan_of(pool, *pods, pod_document(5, age=5), pod_document(6, age=2))
-    assert gone(made) == names(6, 5, 4)
-    assert [deletion.resource_version for deletion in made.delete] == ["1006", "1005", "1004"]
+    assert gone(made) == names(6, 5)
+    assert [deletion.resource_version for deletion in made.delete] == ["1006", "1005"]
     status = with_plan(pool, made).status
     (progressing,) = (c for c in status.conditions if c.type == "Progressing")
     assert (progressing.status, progressing.reason) == ("True", "Draining")
@@ -218,10 +221,11 @@ def outdated(*documents: Json) -> list[Json]:
 
 def test_on_idle_leaves_ready_workers_to_their_master() -> None:
     pool = tried(replicas=2, master=MASTER)
-    made = plan_of(pool, *outdated(running(1), waiting(2, "ErrImagePull")))
+    starting = running(3, age=9, ready=False)
+    made = plan_of(pool, *outdated(running(1), waiting(2, "ErrImagePull"), starting))
     assert gone(made) == names(2)
     assert made.delete[0].resource_version is not None
-    assert made.create == 1
+    assert made.create == 0
     released = tried(replicas=2, master=MASTER, scaleDown={"release": names(1)})
     assert plan_of(released, *outdated(running(1)), running(3)).create == 1
 
@@ -287,47 +291,61 @@ def test_a_disrupted_worker_is_replaced_at_once_and_not_counted() -> None:
     assert "low on memory" in event.message
 
 
-def test_a_worker_that_somebody_deletes_is_disrupted() -> None:
+def test_a_worker_that_somebody_deletes_is_replaced_at_once_and_not_counted() -> None:
     pool = tried(replicas=2)
     made = plan_of(pool, terminating(running(1)), running(2))
     assert made.create == 1
-    assert with_plan(pool, made).status.failures.disrupted == 1
+    assert with_plan(pool, made).status.failures == pool.status.failures
 
 
-def test_what_the_operator_deletes_is_its_own_doing_after_a_restart_as_well() -> None:
-    pool = tried(replicas=1)
-    made = plan_of(pool, running(1), running(2, age=50))
-    assert gone(made) == names(2)
-    told = with_plan(pool, made)
-    again = plan_of(told, running(1), terminating(running(2, age=50)))
-    assert with_plan(told, again).status.failures.disrupted == 0
-    assert Reason.DISRUPTED not in [event.reason for event in again.events]
-    # Others may delete it yet, if the operator ended before it did.
-    kept = with_plan(told, plan_of(with_replicas(told, 2), running(1), running(2, age=50)))
-    other = plan_of(with_replicas(kept, 2), running(1), terminating(running(2, age=50)))
-    assert with_plan(kept, other).status.failures.disrupted == 1
+def test_only_the_places_of_workers_that_failed_wait() -> None:
+    """Drained workers, and those that a new demand asks for, are none of these."""
+    pool = tried(replicas=10)
+    ready = [running(number) for number in range(3, 10)]
+    made = plan_of(pool, ended(1), ended(2), terminating(running(10)), *ready)
+    failures = with_plan(pool, made).status.failures
+    assert (made.create, failures.waiting) == (1, 2)
+    assert made.requeue_at == failures.next_create_time
+    more = with_replicas(with_plan(pool, made), 14)
+    assert plan_of(more, *ready, running(11), now=NOW + 1).create == 4
+    fewer = with_replicas(more, 9)
+    made = plan_of(fewer, *ready, running(11), now=NOW + 1)
+    assert (made.create, with_plan(fewer, made).status.failures.waiting) == (0, 1)
+    again = with_replicas(with_plan(fewer, made), 10)
+    assert plan_of(again, *ready, running(11), now=NOW + 2).create == 1
+    assert failures.next_create_time is not None
+    assert plan_of(more, *ready, running(11), now=failures.next_create_time).create == 6
+
+
+def test_fifty_of_a_hundred_drained_during_a_back_off_are_replaced_at_once() -> None:
+    pool = tried(replicas=100)
+    drained = condition("DisruptionTarget", "True", reason="EvictionByEvictionAPI")
+    failures = {"waves": 5, "consecutive": 0, "waiting": 0, "nextCreateTime": format_time(NOW + 80)}
+    failing = make_pool(proven(pool, failures=failures), replicas=100)
+    pods = [running(number) for number in range(50)]
+    pods += [terminating(ended(number, conditions=[drained])) for number in range(50, 100)]
+    made = plan_of(failing, *pods)
+    assert made.create == 50
+    assert with_plan(failing, made).status.failures.disrupted == 50
+
+
+def test_what_a_quota_or_the_nodes_keep_out_says_nothing_of_those_that_work() -> None:
+    """A pool is given up for workers that fail, not for workers that never came."""
+    failures = {"consecutive": 6, "waves": 6, "nextCreateTime": format_time(NOW - 1)}
+    pool = tried(replicas=10)
+    pool = make_pool(proven(pool, failures=failures), replicas=10)
+    ready = [running(number, age=500) for number in (1, 2, 3)]
+    homeless = [unschedulable(number) for number in range(5, 11)]
+    made = with_plan(pool, plan_of(pool, *ready, ended(4), *homeless))
+    assert made.status.failures.consecutive == 0
+    refused = Refusal(template_hash(pool), 403, "exceeded quota: q", NOW - 1)
+    made = with_plan(pool, plan_of(pool, *ready, ended(4), refusal=refused))
+    assert made.status.failures.consecutive == 0
+    assert with_plan(pool, plan_of(pool, *ready, ended(4))).status.failures.consecutive == 7
 
 
 def with_replicas(pool: FiberPool, replicas: int) -> FiberPool:
     return pool.model_copy(update={"spec": pool.spec.model_copy(update={"replicas": replicas})})
-
-
-def test_what_is_too_much_for_the_status_is_deleted_in_rounds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("fiber_operator.planning.failures.NAMES", 5)
-    monkeypatch.setattr("fiber_operator.planning.failures.ROUND", 2)
-    pool = tried(replicas=12, update={"strategy": "Recreate"})
-    old = outdated(*(running(number) for number in range(12)))
-    made = plan_of(pool, *old)
-    assert (gone(made), made.create, made.requeue_at) == (names(*range(5)), 0, NOW + 1)
-    pool = with_plan(pool, made)
-    assert pool.status.failures.deleting == tuple(f"-{number:010x}" for number in range(5))
-    lingering = [terminating(pod) for pod in old[:5]]
-    assert gone(plan_of(pool, *lingering, *old[5:])) == names(5, 6)
-    assert len(gone(plan_of(pool, *old[5:]))) == 5
-    last = plan_of(pool, *old[10:])
-    assert (gone(last), last.create) == (names(10, 11), 12)
 
 
 def test_a_status_stays_small_whatever_happens_to_how_many() -> None:
@@ -348,15 +366,18 @@ def test_a_status_stays_small_whatever_happens_to_how_many() -> None:
             assert len(json.dumps(made.status)) < 40_000
 
 
-def test_a_worker_that_ends_well_is_replaced_at_once() -> None:
+def test_a_worker_that_ends_well_is_replaced_like_one_that_failed() -> None:
     pool = tried(replicas=1)
     made = plan_of(pool, ended(1, code=0, ran=100))
-    assert (gone(made), made.create) == (names(1), 1)
+    assert (gone(made), made.create) == (names(1), 0)
     assert why(made) == {Reason.COMPLETED}
-    assert with_plan(pool, made).status.failures.completed == 1
+    status = with_plan(pool, made).status
+    assert (status.failures.total, status.failures.waiting, status.problems) == (1, 1, ())
+    assert status.failures.next_create_time is not None
+    assert plan_of(with_plan(pool, made), now=status.failures.next_create_time).create == 1
     released = tried(replicas=0, master=MASTER, scaleDown={"release": names(1)})
     made = plan_of(released, ended(1, code=0, ran=100))
-    assert with_plan(released, made).status.failures.completed == 0
+    assert with_plan(released, made).status.failures.total == 0
 
 
 @pytest.mark.parametrize(
@@ -367,7 +388,7 @@ def test_an_agent_whose_grace_is_short_has_not_failed_when_it_ends_soon(
 ) -> None:
     pool = tried(replicas=1, master={**MASTER, "lostGraceSeconds": grace})
     status = with_plan(pool, plan_of(pool, ended(1, code=0, ran=ran))).status
-    assert (status.failures.completed, status.failures.total) == (completed, 1 - completed)
+    assert (status.failures.total, status.failures.consecutive) == (1, 1 - completed)
     assert bool(status.problems) is not bool(completed)
     crash = with_plan(pool, plan_of(pool, ended(1, code=1, ran=ran))).status
     assert crash.failures.total == 1

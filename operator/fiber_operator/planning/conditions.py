@@ -56,7 +56,7 @@ class Outlook:
     delete: int = 0
     """Live pods that go now."""
     waits_until: float | None = None
-    """Nothing is created before this time, for workers have failed or ended too often."""
+    """Workers that failed are not replaced before this time."""
     draining: int = 0
     """Workers more than wanted, of which only the master may say which are idle."""
     replacing: int = 0
@@ -195,7 +195,7 @@ def _progressing(pool: FiberPool, outlook: Outlook) -> Finding:
         return Finding(kind, "True", Reason.CREATING, lack)
     if outlook.waits_until is not None:
         message = (
-            f"{lack}; workers ended, so none is created before {format_time(outlook.waits_until)}"
+            f"{lack}; those that failed are not replaced before {format_time(outlook.waits_until)}"
         )
         return Finding(kind, "True", Reason.BACKING_OFF, message)
     if outlook.replacing:

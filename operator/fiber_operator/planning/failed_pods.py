@@ -7,44 +7,48 @@ from collections.abc import Iterator
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import Problem
 from fiber_operator.planning import wording
+from fiber_operator.planning.failures import given_up
 from fiber_operator.planning.pods import PodView, State, Trouble
 from fiber_operator.planning.situation import Situation
 
 
 def failed_pods(situation: Situation) -> Iterator[Problem]:
     """What is wrong as long as failures are not forgotten."""
-    record = situation.account.record
-    if not record.consecutive:
+    failures = situation.account.failures
+    if not failures.waves:
         return
-    last = _last_failure(situation)
-    policy = situation.pool.spec.failure_policy
-    if record.exhausted(policy):
+    last = _last_failure(situation) if _has_failed(situation) else _last_completed(situation)
+    if given_up(failures, situation.pool.spec.failure_policy):
         yield situation.problem(
             Reason.BACKOFF_LIMIT_EXCEEDED,
-            wording.limit_exceeded(situation.pool, record, last.message),
+            wording.limit_exceeded(situation.pool, failures, last.message if last else ""),
             terminal=True,
-            count=record.consecutive,
-            pod=last.pod,
+            count=failures.consecutive,
+            pod=last.pod if last else None,
         )
-    yield last
+    if last:
+        yield last
 
 
-def completed_pods(situation: Situation) -> Iterator[Problem]:
+def _has_failed(situation: Situation) -> bool:
+    """Whether the last one did, and did not end of itself after a while."""
+    if newly := situation.account.failed[-1:]:
+        return newly[0].trouble is not Trouble.COMPLETED
+    if situation.account.failures.last_reason != Reason.COMPLETED:
+        return True
+    before = situation.previous(Reason.COMPLETED)
+    kept = any(pod.trouble is Trouble.APPLICATION for pod in situation.ended)
+    return before.severity == "Error" if before else kept
+
+
+def _last_completed(situation: Situation) -> Problem | None:
     """Workers that end of themselves again and again."""
-    record, reason = situation.account.record, Reason.COMPLETED
-    if record.completions < 2:
-        return
-    before, newly = situation.previous(reason), situation.account.completed[-1:]
-    if before and before.severity == "Warning" and not newly:
-        yield before
-        return
-    message = wording.completed(situation.pool, record, newly[0] if newly else None)
-    yield situation.problem(
-        reason,
-        message,
-        severity="Warning",
-        count=record.completions,
-        pod=newly[0].name if newly else None,
+    waves, newly = situation.account.failures.waves, situation.account.failed[-1:]
+    if not newly or waves < 2:
+        return situation.previous(Reason.COMPLETED)
+    message = wording.completed(situation.pool, situation.account.failures, newly[0])
+    return situation.problem(
+        Reason.COMPLETED, message, severity="Warning", count=waves, pod=newly[0].name
     )
 
 
@@ -58,24 +62,24 @@ _FAILURES = (
 
 
 def _last_failure(situation: Situation) -> Problem:
-    record, pool = situation.account.record, situation.pool
+    failures, pool = situation.account.failures, situation.pool
     newly = situation.account.failed[-1:]
     late = [pod for pod in newly if pod.state is not State.ENDED]
     failed = [pod for pod in situation.ended if pod.trouble is Trouble.APPLICATION]
     newest = max(late or failed, key=lambda pod: (pod.since, pod.name), default=None)
-    was_late = record.last_reason == Reason.STARTUP_TIMEOUT and not late
+    was_late = failures.last_reason == Reason.STARTUP_TIMEOUT and not late
     if newest is None or was_late:
         # The pods are gone; what the status said of them is all that is left.
         kinds = (Reason.STARTUP_TIMEOUT,) if was_late else _FAILURES
         before = next(filter(None, map(situation.previous, kinds)), None)
-        return before or situation.problem(kinds[0], wording.forgotten_failure(pool, record))
+        return before or situation.problem(kinds[0], wording.forgotten_failure(pool, failures))
     reason = failure_reason(newest)
     before = situation.previous(reason)
     if late:
         warning = situation.memory.warnings.get(newest.name, "")
-        message = wording.late_failure(pool, record, newest, warning)
+        message = wording.late_failure(pool, failures, newest, warning)
     else:
-        message = wording.failure(pool, record, reason, newest)
+        message = wording.failure(pool, failures, reason, newest)
     return situation.problem(
         reason,
         message,

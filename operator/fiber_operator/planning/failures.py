@@ -1,19 +1,18 @@
-"""Counting failed workers, each once, and how long to wait after them.
+"""Workers that failed: each is counted once, and how soon they are replaced.
 
-Failures that are one event count once: a *round* is what fails of the pods that were there at its
-first failure.  Were each pod counted, a pool of two hundred workers would be past its limit the
-first time that all of them run into the same fault.  A failed pod that was created after the last
-round began opens the next one.
+*One rate.*  What fails until the next are created is one wave.  Each wave takes twice as long as
+the one before, until workers live: a new one was Ready for a minute, or those that fail now were.
+Only the places of workers that failed wait; whatever else is missing is created meanwhile.
 
-A worker that ends with exit code 0 and was not released has not failed: an agent ends so when it
-was without a master for too long.  But one that does so again and again runs the wrong program,
-and its successors wait like those of failures, from the second round on, though without a limit.
+*One question*, which decides whether a pool is given up: was half of what is wanted Ready for a
+minute?  If for more than ``backoffLimit`` waves in a row it was not, nothing more is created until
+the spec changes.
 
-The whole record stands in the pool's status, so that it survives the operator; ``counted`` names
-the ended pods that still exist and are in the sums already, ``deleting`` those whose end the
-operator itself is about to ask for or has asked for.  Both are written before anything is deleted.
-They are kept small, for a status that etcd refuses would stop the pool: what has no place in them
-waits for the next look.
+A worker that ends with exit code 0 and was not released waits like any, but nothing is given up for
+it: an agent ends so when it was without a master for too long.
+
+All of it stands in the pool's status, so that it survives the operator; ``counted`` names the ended
+pods that still exist and are in the sums already, written before they are deleted.
 """
 
 from __future__ import annotations
@@ -21,162 +20,63 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 from fiber_api.names import Reason
 from fiber_api.status import MAX_COUNT
-from fiber_api.v1alpha1 import FailurePolicy, Failures, FiberPoolStatus
-from fiber_operator.planning.documents import past
+from fiber_api.v1alpha1 import FailurePolicy, Failures
 from fiber_operator.planning.pods import BRIEF, PodView, State, Trouble
 
 RECOVERY = 60.0
-"""Seconds that a new pod must stay Ready until the failures before it are forgotten."""
+"""Seconds for which a worker must be Ready to show that workers can live."""
 
-FORGIVEN = 600.0
-"""Seconds without a new round after which ends with exit code 0 are no row any more."""
-
-NAMES = 2000
-"""Pods that a record names, at most: some thirty kilobytes."""
-
-ROUND = 50
-"""Pods that are seen to in one look though no name has a place any more: others may take long to
-end, on a node that is silent for instance."""
+NAMES = 1000
+"""Pods that a status names, at most; a status that etcd refuses would stop the pool.  What has no
+place in it is counted when pods that have one are gone."""
 
 _JITTER = 0.1
 """How much longer than its due a wait may be, so that pools which fail together come apart."""
 
 
-def delay(policy: FailurePolicy, rounds: int, seed: str) -> float:
-    """Seconds to wait after so many rounds in a row; the same for the same arguments."""
-    doubled = policy.backoff_base_seconds * (1 << min(max(rounds, 1) - 1, 30))
-    digest = hashlib.sha256(f"{seed}/{rounds}".encode()).digest()
+def delay(policy: FailurePolicy, waves: int, seed: str) -> float:
+    """Seconds to wait after so many waves in a row; the same for the same arguments."""
+    doubled = policy.backoff_base_seconds * (1 << min(max(waves, 1) - 1, 30))
+    digest = hashlib.sha256(f"{seed}/{waves}".encode()).digest()
     jitter = _JITTER * int.from_bytes(digest[:4]) / 2**32
     return min(policy.backoff_max_seconds, doubled) * (1 + jitter)
 
 
-@dataclass(frozen=True)
-class Record:
-    """``status.failures``, and the template that was proven to work."""
-
-    consecutive: int = 0
-    """Rounds in a row."""
-    total: int = 0
-    disrupted: int = 0
-    completed: int = 0
-    completions: int = 0
-    """Rounds in a row in which workers ended with exit code 0."""
-    last_completed: float | None = None
-    """When the last of these began."""
-    last_exit_code: int | None = None
-    last_reason: str | None = None
-    last_time: float | None = None
-    """When the last failure was counted."""
-    next_create_time: float | None = None
-    newest_created: float | None = None
-    """When the newest pod was created that was there at the beginning of the last round."""
-    counted: frozenset[str] = frozenset()
-    deleting: frozenset[str] = frozenset()
-    spec_hash: str | None = None
-    """What the user asked for when this was written; something else begins anew."""
-    proven: str | None = None
-    """The template hash of which a pod was Ready."""
-
-    @classmethod
-    def read(cls, status: FiberPoolStatus, pool: str, now: float) -> Record:
-        """What the status of ``pool`` remembers, less times that have not come yet: those are none
-        of ours."""
-        kept = status.failures
-        return cls(
-            kept.consecutive,
-            kept.total,
-            kept.disrupted,
-            kept.completed,
-            kept.completions,
-            past(kept.last_completed, now),
-            kept.last_exit_code,
-            kept.last_reason,
-            past(kept.last_time, now),
-            kept.next_create_time,
-            past(kept.newest_created, now),
-            frozenset(_long(name, pool) for name in kept.counted),
-            frozenset(_long(name, pool) for name in kept.deleting),
-            kept.spec_hash,
-            status.proven_template_hash,
-        )
-
-    def failures(self, pool: str) -> Failures:
-        """As it stands in the status of ``pool``."""
-        return Failures(
-            consecutive=self.consecutive,
-            total=self.total,
-            disrupted=self.disrupted,
-            completed=self.completed,
-            completions=self.completions,
-            last_completed=self.last_completed,
-            last_exit_code=self.last_exit_code,
-            last_reason=self.last_reason,
-            last_time=self.last_time,
-            next_create_time=self.next_create_time,
-            newest_created=self.newest_created,
-            counted=tuple(sorted(_short(name, pool) for name in self.counted)),
-            deleting=tuple(sorted(_short(name, pool) for name in self.deleting)),
-            spec_hash=self.spec_hash,
-        )
-
-    @property
-    def room(self) -> int:
-        """How many more pods it has a place for."""
-        return max(0, NAMES - len(self.counted) - len(self.deleting))
-
-    def next_creation(self, policy: FailurePolicy, now: float) -> float | None:
-        """``next_create_time`` if it can be ours.
-
-        One that is further away than the policy allows is not, nor is one past the limit.
-        """
-        longest = policy.backoff_max_seconds * (1 + _JITTER) + 1
-        due = self.next_create_time
-        return None if due is None or due > now + longest or self.exhausted(policy) else due
-
-    def waits_until(self, policy: FailurePolicy, now: float) -> float | None:
-        """When the next pod may be created; None for at once."""
-        due = self.next_creation(policy, now)
-        return due if due is not None and due > now else None
-
-    def exhausted(self, policy: FailurePolicy) -> bool:
-        """Whether nothing more is created until the user changes something."""
-        return self.consecutive > policy.backoff_limit
+def given_up(failures: Failures, policy: FailurePolicy) -> bool:
+    """Whether nothing more is created until the user changes something."""
+    return failures.consecutive > policy.backoff_limit
 
 
-def _short(name: str, pool: str) -> str:
-    """A pod's name less the pool's, with which nearly all begin: ``-1a2b3c4d5e``."""
-    return name.removeprefix(pool) if name.startswith(f"{pool}-") else name
-
-
-def _long(name: str, pool: str) -> str:
-    return f"{pool}{name}" if name.startswith("-") else name
+def held_back_until(failures: Failures, now: float) -> float | None:
+    """When those that wait are replaced; None if none does."""
+    due = failures.next_create_time
+    return due if failures.waiting and due is not None and due > now else None
 
 
 @dataclass(frozen=True)
 class Account:
     """What one look at the pods added."""
 
-    record: Record
+    failures: Failures
+    proven: str | None
+    """The template hash of which a pod was Ready."""
     failed: tuple[PodView, ...] = ()
-    """Newly counted failures, the newest last."""
+    """Newly counted, the newest last."""
     disrupted: tuple[PodView, ...] = ()
-    completed: tuple[PodView, ...] = ()
-    """Newly counted ends with exit code 0, the newest last."""
-    again: float | None = None
-    """When something will be forgotten: a pod was Ready for long enough, say."""
-
-    @property
-    def news(self) -> bool:
-        """Whether anything was counted."""
-        return bool(self.failed or self.disrupted or self.completed)
+    held_back: int = 0
+    """Places of workers that failed, which are not to be taken yet."""
+    recovers: float | None = None
+    """When the waves are over, if nothing happens until then."""
 
 
 def account(
-    record: Record,
+    before: Failures,
+    proven: str | None,
     pods: Sequence[PodView],
     *,
     expected: Collection[str],
@@ -188,162 +88,151 @@ def account(
     seed: str,
     now: float,
 ) -> Account:
-    """Bring the record up to date.
+    """Bring the account up to date.
 
     ``expected`` names pods whose end was asked for; ``late`` names pods that are not Ready in
-    time, which counts as a failure; ``desired`` is how many are wanted.
+    time, which counts as a failure; ``desired`` is how many are wanted and could be there.
     """
-    record = _begin(record, pods, late, spec_hash)
-    record = replace(record, next_create_time=record.next_creation(policy, now))
-    uncounted = [p for p in pods if p.name not in record.counted and p.name not in expected]
-    uncounted.sort(key=lambda pod: (pod.since, pod.name))
-    failed = [p for p in uncounted if _failed(p) or p.name in late][: max(ROUND, record.room)]
-    record = _count(record, failed)
-    completed = [p for p in uncounted if _completed(p)][: max(ROUND, record.room)]
-    record = _count(record, completed)
-    disrupted = [p for p in uncounted if p.name not in late and _disrupted(p, record)]
-    disrupted = disrupted[: record.room]
-    record = _count(record, disrupted)
-    record = replace(
-        record,
-        total=min(record.total + len(failed), MAX_COUNT),
-        completed=min(record.completed + len(completed), MAX_COUNT),
-        disrupted=min(record.disrupted + len(disrupted), MAX_COUNT),
+    found = _begin(before, pods, late, spec_hash, policy, now)
+    ended = [p for p in pods if p.name not in found.counted and p.name not in expected]
+    ended.sort(key=lambda pod: (pod.since, pod.name))
+    failing = [p for p in ended if p.name in late or _failed(p)]
+    failed = failing[: NAMES - len(found.counted)]
+    # Those of a silent node stay for long; they must leave room for failures.
+    room = max(0, NAMES // 2 - len(found.counted) - len(failed))
+    disrupted = [p for p in ended if p.name not in late and _disrupted(p)][:room]
+    found = _with(
+        found,
+        total=found.total + len(failed),
+        disrupted=found.disrupted + len(disrupted),
+        waiting=found.waiting + len(failed),
+        counted=tuple(sorted({*found.counted, *(p.name for p in (*failed, *disrupted))})),
     )
+    lives = sum(_has_lived(p, now) for p in (*(p for p in pods if p.live), *failed))
+    works = 2 * lives >= max(1, desired)
     if failed:
-        record = _fail(record, pods, failed, policy, seed, now)
-    if completed:
-        record = _complete(record, completed, policy, seed, now)
-    again = None if record.exhausted(policy) else _recovery(record, pods, desired)
-    if again is not None and again <= now:
-        record, again = replace(record, consecutive=0, next_create_time=None), None
-    record, forgiven = _forgive(record, now)
-    record = _prove(record, pods, failed, template_hash, now)
-    times = [time for time in (again, forgiven) if time is not None]
+        found = _fail(found, failed, works, policy, seed, now)
+    if works and not given_up(found, policy):
+        found = _with(found, consecutive=0)
+    recovers = _recovers(found, pods, desired, policy, seed)
+    if recovers is not None and recovers <= now:
+        found, recovers = _with(found, waves=0, waiting=0, next_create_time=None), None
     return Account(
-        record, tuple(failed), tuple(disrupted), tuple(completed), min(times, default=None)
+        found,
+        _proven(proven, found, pods, failed, template_hash, now),
+        tuple(failed),
+        tuple(disrupted),
+        found.waiting + len(failing) - len(failed),
+        recovers,
     )
 
 
-def _count(record: Record, pods: Sequence[PodView]) -> Record:
-    return replace(record, counted=record.counted.union(pod.name for pod in pods))
+def _with(failures: Failures, **fields: Any) -> Failures:
+    """With other fields; sums stay what a status may hold."""
+    held = {key: min(x, MAX_COUNT) if isinstance(x, int) else x for key, x in fields.items()}
+    return failures.model_copy(update=held)
 
 
 def _begin(
-    record: Record, pods: Sequence[PodView], late: Collection[str], spec_hash: str
-) -> Record:
-    # One that was to be deleted and lives, for something came between, is like any other.
-    ending = {pod.name for pod in pods if not pod.live or pod.name in late}
-    deleted = {pod.name for pod in pods if pod.state is State.TERMINATING}
-    record = replace(
-        record, counted=record.counted & ending, deleting=record.deleting & deleted - record.counted
-    )
-    if record.spec_hash == spec_hash:
-        return record
-    return replace(
-        record,
-        spec_hash=spec_hash,
-        consecutive=0,
-        completions=0,
-        last_completed=None,
-        next_create_time=None,
-    )
+    before: Failures,
+    pods: Sequence[PodView],
+    late: Collection[str],
+    spec_hash: str,
+    policy: FailurePolicy,
+    now: float,
+) -> Failures:
+    """Less what is over: pods that are gone, a wait, and waves of another spec."""
+    # One that was late and became Ready, for its deletion came too late, is like any other.
+    there = {pod.name for pod in pods if not pod.live or pod.name in late}
+    found = _with(before, counted=tuple(name for name in before.counted if name in there))
+    if found.spec_hash != spec_hash:
+        fresh = {"consecutive": 0, "waves": 0, "waiting": 0, "next_create_time": None}
+        return _with(found, spec_hash=spec_hash, **fresh)
+    due = found.next_create_time
+    if given_up(found, policy) or due is None or due > now + _longest(policy):
+        return _with(found, waiting=0, next_create_time=None)
+    return found if due > now else _with(found, waiting=0)
+
+
+def _longest(policy: FailurePolicy) -> float:
+    """A time further away was written by nobody who knows this policy."""
+    return policy.backoff_max_seconds * (1 + _JITTER) + 1
 
 
 def _failed(pod: PodView) -> bool:
-    return pod.state is State.ENDED and pod.trouble is Trouble.APPLICATION
+    return pod.state is State.ENDED and pod.trouble is not Trouble.DISRUPTED
 
 
-def _completed(pod: PodView) -> bool:
-    return pod.state is State.ENDED and pod.trouble is Trouble.COMPLETED
+def _disrupted(pod: PodView) -> bool:
+    return not pod.live and pod.trouble is Trouble.DISRUPTED
 
 
-def _disrupted(pod: PodView, record: Record) -> bool:
-    if pod.state is State.TERMINATING:
-        return pod.name not in record.deleting
-    return pod.state is State.ENDED and pod.trouble is Trouble.DISRUPTED
+def _has_lived(pod: PodView, now: float) -> bool:
+    """Whether it is Ready for long enough, or was as far as anybody can tell."""
+    if pod.state is State.READY:
+        return now - pod.since >= RECOVERY
+    return pod.state is State.ENDED and pod.was_ready and pod.ran >= RECOVERY
 
 
 def _fail(
-    record: Record,
-    pods: Sequence[PodView],
+    found: Failures,
     failed: Sequence[PodView],
+    works: bool,
     policy: FailurePolicy,
     seed: str,
     now: float,
-) -> Record:
+) -> Failures:
     last = failed[-1]
-    ended = last.state is State.ENDED
-    record = replace(
-        record,
-        last_exit_code=last.exit_code,
-        last_reason=last.reason if ended else Reason.STARTUP_TIMEOUT,
-        last_time=float(math.floor(now)),
-    )
-    if record.consecutive and all(pod.created <= (record.newest_created or 0.0) for pod in failed):
-        return record
-    rounds = min(record.consecutive + 1, MAX_COUNT)
-    record = replace(record, consecutive=rounds, newest_created=max(pod.created for pod in pods))
-    # In whole seconds, so that what is created then is newer than what is there now.
-    due = math.ceil(now + delay(policy, rounds, seed))
-    return replace(record, next_create_time=None if record.exhausted(policy) else float(due))
+    found = _with(found, last_exit_code=last.exit_code, last_reason=_reason(last))
+    if found.next_create_time is not None and found.next_create_time > now:
+        return found  # more of the same wave
+    lived = all(_has_lived(pod, now) for pod in failed)
+    in_vain = not works and any(pod.trouble is not Trouble.COMPLETED for pod in failed)
+    waves = 1 if lived else found.waves + 1
+    found = _with(found, waves=waves, consecutive=found.consecutive + in_vain)
+    # In whole seconds, as it stands in the status.
+    due = float(math.ceil(now + delay(policy, waves, seed)))
+    return _with(found, next_create_time=None if given_up(found, policy) else due)
 
 
-def _complete(
-    record: Record, completed: Sequence[PodView], policy: FailurePolicy, seed: str, now: float
-) -> Record:
-    began = record.last_completed
-    if began is not None and all(pod.created <= began for pod in completed):
-        return record
-    rounds = min(record.completions + 1, MAX_COUNT)
-    record = replace(record, completions=rounds, last_completed=float(math.floor(now)))
-    if rounds == 1 or record.exhausted(policy):
-        return record
-    due = float(math.ceil(now + delay(policy, rounds - 1, seed)))
-    return replace(record, next_create_time=max(due, record.next_create_time or 0.0))
+def _reason(pod: PodView) -> str:
+    if pod.state is not State.ENDED:
+        return Reason.STARTUP_TIMEOUT
+    return Reason.COMPLETED if pod.trouble is Trouble.COMPLETED else pod.reason
 
 
-def _forgive(record: Record, now: float) -> tuple[Record, float | None]:
-    """Without a row that is over, and when it will be."""
-    if not record.completions:
-        return record, None
-    due = max(record.last_completed or 0.0, record.next_create_time or 0.0) + FORGIVEN
-    if due > now:
-        return record, due
-    return replace(record, completions=0, last_completed=None), None
+def _recovers(
+    found: Failures, pods: Sequence[PodView], desired: int, policy: FailurePolicy, seed: str
+) -> float | None:
+    """When workers have lived, if nothing happens until then.
 
-
-def _recovery(record: Record, pods: Sequence[PodView], desired: int) -> float | None:
-    """When the failures in a row are forgotten, if nothing happens until then.
-
-    That is when a pod that became Ready after them has stayed so for a minute, or when all that
-    are wanted have: where fewer are wanted than there were, no new one need ever come.
+    That is when one that became Ready since the last wave began has stayed so for a minute, or all
+    that are wanted have: where fewer are wanted than there were, no new one need ever come.
     """
-    if not record.consecutive:
+    if not found.waves or given_up(found, policy):
         return None
-    last = record.last_time or 0.0
-    newest = record.newest_created or 0.0
-    ready = [pod for pod in pods if pod.state is State.READY]
-    starts = [pod.since for pod in ready if pod.created > newest or pod.since >= last]
+    due = found.next_create_time
+    began = 0.0 if due is None else due - delay(policy, found.waves, seed)
+    ready = [pod.since for pod in pods if pod.state is State.READY]
+    starts = [since for since in ready if since >= began]
     if len(ready) >= desired:
-        starts.append(max((last, *(pod.since for pod in ready))))
+        starts.append(max((began, *ready)))
     return min(starts) + RECOVERY if starts else None
 
 
-def _prove(
-    record: Record,
+def _proven(
+    before: str | None,
+    found: Failures,
     pods: Sequence[PodView],
     failed: Sequence[PodView],
     template_hash: str,
     now: float,
-) -> Record:
-    current = [pod for pod in pods if pod.template_hash == template_hash]
-    ready = [pod for pod in current if pod.state is State.READY]
+) -> str | None:
+    ready = [p for p in pods if p.template_hash == template_hash and p.state is State.READY]
     # Without a readiness probe a worker is Ready for a moment before it fails.  Once that has
     # happened, Ready has to last.
-    if any(not record.consecutive or now - pod.since >= BRIEF for pod in ready):
-        return replace(record, proven=template_hash)
+    if any(not found.waves or now - pod.since >= BRIEF for pod in ready):
+        return template_hash
+    failed = [pod for pod in failed if pod.trouble is not Trouble.COMPLETED]
     brief = any(pod.template_hash == template_hash and pod.ran < BRIEF for pod in failed)
-    if brief and not ready and record.proven == template_hash:
-        return replace(record, proven=None)
-    return record
+    return None if brief and not ready and before == template_hash else before

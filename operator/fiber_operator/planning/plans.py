@@ -107,7 +107,7 @@ class Deletion:
     uid: str
     """Always a precondition."""
     resource_version: str | None
-    """A precondition where set: the pod must not have become Ready meanwhile."""
+    """A precondition where set: the pod must not have begun to run meanwhile."""
     reason: Reason
     may_work: bool = False
     """The pod could be at work if a master attached after the pool was read: nobody released it,

@@ -41,10 +41,10 @@ class Trouble(StrEnum):
     """What is wrong with a pod, by what follows from it."""
 
     DISRUPTED = "Disrupted"
-    """The cluster ended it: replaced at once, not counted."""
+    """The cluster ended it: replaced at once, no failure."""
     COMPLETED = "Completed"
-    """The worker ended with exit code 0 after a while: replaced at once, unless that happens again
-    and again."""
+    """The worker ended with exit code 0 after a while: replaced like one that failed, but the pool
+    is not given up for it."""
     APPLICATION = "Application"
     """The worker failed, or ended at once: counted, and replaced after a while."""
     CANNOT_START = "CannotStart"
@@ -208,7 +208,7 @@ class _Observation:
         running = self._state.get("running")
         if isinstance(running, Mapping) and self._condition("Ready").get("status") != "False":
             return True  # nobody can tell: it must not be taken for one that never worked
-        started = seconds(mapping(running).get("startedAt"))
+        started = seconds(mapping(running or self._end).get("startedAt"))
         return 0 < started < seconds(self._condition("Ready").get("lastTransitionTime"))
 
     def _since(self, state: State) -> float:

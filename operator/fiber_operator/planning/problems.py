@@ -10,11 +10,13 @@ from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Problem
 from fiber_operator.planning import cut_off, error_conditions, wording
-from fiber_operator.planning.failed_pods import completed_pods, failed_pods
+from fiber_operator.planning.failed_pods import failed_pods
 from fiber_operator.planning.plans import Refusal
 from fiber_operator.planning.situation import Situation
 from fiber_operator.planning.starting_pods import pods_not_ready_any_more, pods_that_do_not_start
 
+QUOTA_IS_FULL = "exceeded quota"
+"""What the API server says where a quota allows no more."""
 _NAMESPACE_ENDS = "because it is being terminated"
 """What the API server says where nothing new may be made because the namespace is deleted."""
 _WORKER_NAME = re.compile(f"[0-9a-f]{{{names.POD_SUFFIX_LENGTH}}}")
@@ -35,7 +37,6 @@ def _all(situation: Situation) -> Iterator[Problem]:
     yield from _obstacles(situation)
     yield from _refusals(situation)
     yield from failed_pods(situation)
-    yield from completed_pods(situation)
     yield from pods_that_do_not_start(situation)
     yield from pods_not_ready_any_more(situation)
     yield from cut_off.problems(situation)
@@ -79,7 +80,7 @@ def refusal_reason(refused: Refusal) -> Reason:
     """Which problem a refusal is."""
     if refused.status != 403 and not _may_pass(refused):
         return Reason.INVALID_TEMPLATE
-    return Reason.QUOTA_EXCEEDED if "exceeded quota" in refused.message else Reason.FORBIDDEN
+    return Reason.QUOTA_EXCEEDED if QUOTA_IS_FULL in refused.message else Reason.FORBIDDEN
 
 
 def _may_pass(refused: Refusal) -> bool:

@@ -6,10 +6,10 @@
       │
       ├─ attachment   is a master there, alive, lost for good?
       ├─ scaling      who goes: released, suspended, outdated, too many, ended and looked at
-      ├─ failures     who failed since the last look; how long to wait for it
+      ├─ failures     who failed since the last look; when their places are taken again
       ├─ scaling      who comes: as many as are missing, a few of a template that never worked
       ├─ problems     what is wrong
-      └─ status       what to say of all that, and transitions what to announce
+      └─ status       what to say of all that, and events what to announce
 
 What with and without a master
 ------------------------------
@@ -37,10 +37,10 @@ from fiber_operator.planning import cut_off, failures, problems, revisions, scal
 from fiber_operator.planning.attachment import idleness, judge
 from fiber_operator.planning.conditions import Counts, Outlook
 from fiber_operator.planning.documents import items, mapping, text
+from fiber_operator.planning.events import Change, events
 from fiber_operator.planning.plans import Deletion, Event, Memory, Obstacle, Plan
 from fiber_operator.planning.pods import PodView, State, Trouble
 from fiber_operator.planning.situation import SECOND_LOOK, Situation
-from fiber_operator.planning.transitions import Change, events
 
 STUCK = 5.0
 """Seconds after which a pod's events are looked at, if its status does not say why it waits."""
@@ -48,8 +48,7 @@ STUCK = 5.0
 QUOTA_WAIT = 30.0
 """The longest wait until a full quota is tried again: it is freed without a sign."""
 
-NEXT_ROUND = 1.0
-"""Seconds until those pods are deleted that were too many for one look."""
+_HINDERED = (Trouble.UNSCHEDULABLE, Trouble.CANNOT_START)
 
 _ENDED: Mapping[Trouble | None, Reason] = {
     Trouble.COMPLETED: Reason.COMPLETED,
@@ -112,12 +111,10 @@ class _Planner:
         self._late = self._not_ready_in_time()
         self._desired = self._wanted()
         self._expected = self._asked_to_end()
-        self._account = self._count()
-        self._record = self._account.record
         self._refused = self._refused_until()
+        self._account = self._count()
         self._may_create = self._can_make_pods()
         self._deletions: dict[str, Deletion] = {}
-        self._postponed: set[str] = set()
 
     def plan(self) -> Plan:
         """The whole of it."""
@@ -125,17 +122,18 @@ class _Planner:
             return self._delete_pool()
         if not self._ends:
             self._delete()
-        self._remember_deletions()
+        held_back = self._hold_back()
         dry_run = self._may_create and not self._accepted and not self._spec.suspend
-        create, trial_ends = self._creations()
+        create, trial_ends = self._creations(held_back)
         found = problems.find(self._situation())
         after = self._status(found, create, judged=not dry_run)
         document = status.patch(self._pool, after)
-        change = Change(self._pool.status, after, self._account, create, self._in_order())
+        deletions = tuple(self._deletions.values())
+        change = Change(self._pool.status, after, self._account, create, deletions)
         return Plan(
             create=create,
             batch_limit=self._spec.scale_up.max_in_flight,
-            delete=self._in_order(),
+            delete=deletions,
             dry_run=dry_run,
             template_hash=self._hash,
             status=document,
@@ -181,17 +179,23 @@ class _Planner:
 
     def _count(self) -> failures.Account:
         return failures.account(
-            failures.Record.read(self._pool.status, self._pool.metadata.name, self._now),
+            self._pool.status.failures,
+            self._pool.status.proven_template_hash,
             self._pods,
             expected=self._expected,
             late={pod.name for pod in self._late},
-            desired=self._desired,
+            desired=self._desired - self._hindered(),
             template_hash=self._hash,
             spec_hash=revisions.spec_hash(self._pool),
             policy=self._spec.failure_policy,
             seed=self._pool.metadata.uid,
             now=self._now,
         )
+
+    def _hindered(self) -> int:
+        """Workers that are wanted and not there for other reasons than that workers fail."""
+        missing = max(0, self._desired - len(self._live)) if self._refused else 0
+        return missing + sum(pod.trouble in _HINDERED for pod in self._live)
 
     def _wanted(self) -> int:
         attachment = self._attachment
@@ -212,7 +216,7 @@ class _Planner:
     @property
     def _accepted(self) -> bool:
         """The API server takes pods of this template, or did."""
-        return self._hash in (self._memory.accepted, self._record.proven)
+        return self._hash in (self._memory.accepted, self._account.proven)
 
     def _refused_until(self) -> float | None:
         refused = self._memory.refusal
@@ -230,8 +234,7 @@ class _Planner:
             or memory.address is None
             or memory.obstacles
             or self._is_orphaned()
-            or self._record.exhausted(policy)
-            or self._record.waits_until(policy, self._now) is not None
+            or failures.given_up(self._account.failures, policy)
             or (self._refused is not None and self._now < self._refused)
         )
 
@@ -255,7 +258,7 @@ class _Planner:
             template_hash=self._hash,
         )
         self._take(released, Reason.RELEASED)
-        late = [pod for pod in self._late if pod.name in self._record.counted]
+        late = [pod for pod in self._late if pod.name in self._account.failures.counted]
         self._take(late, Reason.STARTUP_TIMEOUT, guarded=True)
         if self._accepted and self._may_create:
             self._take(self._outdated(), Reason.REPLACED, guarded=attached)
@@ -267,7 +270,7 @@ class _Planner:
             free_choice=free,
         )
         self._take(excess, Reason.SCALED_DOWN, guarded=not free)
-        settled = self._record.counted.union(self._expected)
+        settled = self._expected.union(self._account.failures.counted)
         for pod in scaling.ended_to_delete(self._ended, settled):
             self._take([pod], _ENDED.get(pod.trouble, Reason.CONTAINER_FAILED))
 
@@ -278,7 +281,7 @@ class _Planner:
             strategy=self._spec.update.strategy,
             attached=self._attachment.attached,
             desired=self._desired,
-            proven=self._record.proven == self._hash,
+            proven=self._account.proven == self._hash,
         )
 
     def _take(self, pods: Sequence[PodView], reason: Reason, *, guarded: bool = False) -> None:
@@ -289,40 +292,39 @@ class _Planner:
                 pod.name, Deletion(pod.name, pod.uid, version, reason, may_work)
             )
 
-    def _remember_deletions(self) -> None:
-        """So that nobody takes them for somebody else's doing; what is too much comes later."""
-        counted = self._record.counted
-        named = [name for name in self._deletions if name not in counted]
-        self._postponed = set(named[max(failures.ROUND, self._record.room) :])
-        deleting = self._record.deleting.union(named).difference(self._postponed)
-        self._record = replace(self._record, deleting=deleting)
-
-    def _in_order(self) -> tuple[Deletion, ...]:
-        return tuple(d for d in self._deletions.values() if d.name not in self._postponed)
-
     @property
     def _remaining(self) -> list[PodView]:
         return [pod for pod in self._live if pod.name not in self._deletions]
 
     # Who comes
 
-    def _creations(self) -> tuple[int, float | None]:
+    def _hold_back(self) -> int:
+        """Places of workers that failed, which are not to be taken yet and are still wanted."""
+        missing = max(0, self._desired - len(self._remaining))
+        found = self._account.failures
+        if found.waiting > missing:
+            found = found.model_copy(update={"waiting": missing})
+            self._account = replace(self._account, failures=found)
+        return min(self._account.held_back, missing)
+
+    def _creations(self, held_back: int) -> tuple[int, float | None]:
         """How many now, and when more may follow if that is not all."""
-        missing = self._desired - len(self._remaining)
-        if missing <= 0 or not self._may_create or not self._accepted or self._postponed:
+        missing = self._desired - len(self._remaining) - held_back
+        if missing <= 0 or not self._may_create or not self._accepted:
             return 0, None
         current = [pod for pod in self._remaining if pod.template_hash == self._hash]
         trial = scaling.trial(
             current,
-            proven=self._record.proven == self._hash,
+            proven=self._account.proven == self._hash,
             failing=self._is_complained_of(current),
+            held_back=held_back,
             now=self._now,
         )
         return missing if trial.room is None else min(missing, trial.room), trial.again
 
     def _is_complained_of(self, pods: Sequence[PodView]) -> bool:
-        ended = self._record.consecutive or self._record.completions
-        return bool(ended) or any(self._memory.warnings.get(pod.name) for pod in pods)
+        complained = any(self._memory.warnings.get(pod.name) for pod in pods)
+        return complained or self._account.failures.waves > 0
 
     # What to say
 
@@ -344,7 +346,6 @@ class _Planner:
 
     def _status(self, found: tuple[Problem, ...], create: int, *, judged: bool) -> FiberPoolStatus:
         missing = self._desired - len(self._remaining)
-        waits = self._record.waits_until(self._spec.failure_policy, self._now)
         outlook = Outlook(
             Counts.of(self._pods, self._desired, self._hash),
             found,
@@ -352,7 +353,7 @@ class _Planner:
             judged=judged,
             create=create,
             delete=len(self._live) - len(self._remaining),
-            waits_until=waits if missing > 0 else None,
+            waits_until=failures.held_back_until(self._account.failures, self._now),
             draining=0 if self._ends else max(0, -missing),
             replacing=self._to_be_replaced(),
             lease_unreadable=bool(self._memory.master.unreadable),
@@ -360,7 +361,7 @@ class _Planner:
         return status.describe(
             self._pool,
             outlook,
-            self._record,
+            self._account,
             address=self._memory.address,
             led=self._memory.led,
             credentials=self._memory.credentials,
@@ -394,12 +395,11 @@ class _Planner:
         timeout = self._spec.failure_policy.startup_timeout_seconds
         times = [
             trial_ends,
-            self._account.again,
-            self._now + NEXT_ROUND if self._postponed else None,
+            self._account.recovers,
             self._attachment.due,
             self._idleness.due,
             self._refused,
-            self._record.waits_until(self._spec.failure_policy, self._now),
+            failures.held_back_until(self._account.failures, self._now),
             *(self._next_inspection(pod) for pod in self._silent()[:1]),
             *(pod.created + timeout for pod in self._remaining if not pod.was_ready),
             *(pod.since + timeout for pod in self._remaining if pod.state is State.STARTING),

@@ -2,7 +2,8 @@
 
 Who may be taken depends on who could be working.  While a master is attached, only it knows which
 of its workers are idle: under ``ReleasedOnly`` the operator takes what the master has released and
-what was never Ready, nothing else.  Without a master nobody works, and it may take any.
+pods whose worker container does not run yet, nothing else, for an agent dials before its pod is
+Ready.  Without a master nobody works, and it may take any.
 """
 
 from __future__ import annotations
@@ -30,25 +31,31 @@ def outdated_to_replace(
 ) -> list[PodView]:
     """Pods of an older template that go now.
 
-    ``OnDelete``: none.  ``Recreate``: all, at work or not.  ``OnIdle``: those that were never
-    Ready.  The others are at work while a master is attached; it sees ``updatedReplicas`` and
-    releases them when they are idle.  Without one they are replaced a quarter at a time, and no
-    more than there may be canaries until the new template is ``proven`` to work.
+    ``OnDelete``: none.  ``Recreate``: all, at work or not.  ``OnIdle``: those that do not run yet.
+    The others may be at work while a master is attached; it sees ``updatedReplicas`` and releases
+    them when they are idle.  Without one those that were never Ready go too, and the others a
+    quarter at a time, and no more than there may be canaries until the new template is ``proven``
+    to work.
     """
     outdated = [pod for pod in live if pod.template_hash != template_hash]
     if strategy == "OnDelete":
         return []
     if strategy == "Recreate":
         return outdated
-    fresh = [pod for pod in outdated if not pod.was_ready]
     if attached:
-        return fresh
+        return _idle(outdated)
+    fresh = [pod for pod in outdated if not pod.was_ready]
     unready = [pod for pod in outdated if pod.was_ready and pod.state is not State.READY]
     ready = [pod for pod in outdated if pod.state is State.READY]
     missing = desired - sum(pod.state is State.READY for pod in live)
     quarter = max(1, desired // 4)
     spare = max(0, (quarter if proven else min(quarter, CANARIES)) - max(0, missing))
     return fresh + unready + expendable(ready, template_hash)[:spare]
+
+
+def _idle(pods: Sequence[PodView]) -> list[PodView]:
+    """Those that no master can have given work to."""
+    return [pod for pod in pods if pod.state is State.PENDING]
 
 
 def expendable(pods: Sequence[PodView], template_hash: str) -> list[PodView]:
@@ -76,8 +83,7 @@ def excess_to_delete(
     if free_choice:
         candidates = expendable(live, template_hash)
     else:
-        never_ready = (pod for pod in live if not pod.was_ready)
-        candidates = sorted(never_ready, key=lambda pod: (-pod.created, pod.name))
+        candidates = sorted(_idle(live), key=lambda pod: (-pod.created, pod.name))
     return candidates[: max(0, excess)]
 
 
@@ -106,19 +112,22 @@ class Trial:
     """When there will be more room, if nothing happens until then."""
 
 
-def trial(current: Sequence[PodView], *, proven: bool, failing: bool, now: float) -> Trial:
+def trial(
+    current: Sequence[PodView], *, proven: bool, failing: bool, held_back: int, now: float
+) -> Trial:
     """Whether a template, of which ``current`` are the live pods, is still being tried out.
 
     It is until one of its pods is Ready.  A pod that cannot start, or ``failing`` ones before
-    these, leave it at the canaries that there are.  While nothing is wrong their number doubles
-    each ``PATIENCE``, for an image may take long to fetch and fetching it on three nodes does not
-    help the others.  Pods that no node takes do not count, and let as many again ask for a node: a
-    cluster autoscaler must see the whole demand.
+    these, leave it at the canaries that there are, the places of failed ones that are ``held_back``
+    included.  While nothing is wrong their number doubles each ``PATIENCE``, for an image may take
+    long to fetch and fetching it on three nodes does not help the others.  Pods that no node takes
+    do not count, and let as many again ask for a node: a cluster autoscaler must see the whole
+    demand.
     """
     if proven:
         return Trial()
     if failing or any(pod.trouble is Trouble.CANNOT_START for pod in current):
-        return Trial(max(0, CANARIES - len(current)))
+        return Trial(max(0, CANARIES - len(current) - held_back))
     turned_away = sum(pod.trouble is Trouble.UNSCHEDULABLE for pod in current)
     placed = len(current) - turned_away
     room = max(CANARIES, turned_away) - placed

@@ -20,7 +20,7 @@ from fiber_operator.planning.conditions import (
     phase,
 )
 from fiber_operator.planning.documents import mapping, past, whole
-from fiber_operator.planning.failures import Record
+from fiber_operator.planning.failures import Account
 from fiber_operator.planning.plans import Obstacle
 from fiber_operator.planning.pods import PodView
 from fiber_operator.planning.situation import SECOND_LOOK
@@ -29,7 +29,7 @@ from fiber_operator.planning.situation import SECOND_LOOK
 def describe(
     pool: FiberPool,
     outlook: Outlook,
-    record: Record,
+    account: Account,
     *,
     address: str | None,
     led: bool,
@@ -60,8 +60,8 @@ def describe(
         idle_since=idle_since,
         credentials_secret=before.credentials_secret if credentials is None else secret,
         template_hash=template_hash,
-        proven_template_hash=record.proven,
-        failures=record.failures(pool.metadata.name),
+        proven_template_hash=account.proven,
+        failures=account.failures,
         problems=outlook.problems,
         conditions=found,
     )

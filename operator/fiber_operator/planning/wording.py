@@ -9,9 +9,8 @@ from typing import Any
 from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.times import format_time
-from fiber_api.v1alpha1 import FiberPool, Master
+from fiber_api.v1alpha1 import Failures, FiberPool, Master
 from fiber_operator.planning.documents import items, mapping, text
-from fiber_operator.planning.failures import Record
 from fiber_operator.planning.plans import LeaseVerdict, Refusal
 from fiber_operator.planning.pods import PodView
 
@@ -140,47 +139,46 @@ LAST_LINES = " Its last lines:\n"
 """Ends what is said of a failure; a worker's own output follows."""
 
 
-def failure(pool: FiberPool, record: Record, reason: Reason, pod: PodView) -> str:
+def failure(pool: FiberPool, failures: Failures, reason: Reason, pod: PodView) -> str:
     """How a worker failed, when the next one comes, and its last lines."""
-    wait = _wait(record)
+    wait = _wait(failures)
     own = pod.message and not _ended_by_node(pod) and reason != Reason.RUN_CONTAINER_ERROR
     lines = f"{LAST_LINES}{pod.message}" if own else ""
     return f"{_ending(pool, reason, pod)}{wait}{lines}"
 
 
-def late_failure(pool: FiberPool, record: Record, pod: PodView, warning: str) -> str:
+def late_failure(pool: FiberPool, failures: Failures, pod: PodView, warning: str) -> str:
     """A worker that runs and counts as failed, and when the next one comes."""
-    return f"{never_ready(pool, pod, warning)}.{_wait(record)}"
+    return f"{never_ready(pool, pod, warning)}.{_wait(failures)}"
 
 
-def _wait(record: Record) -> str:
-    due = record.next_create_time
-    return f" No other is created before {format_time(due)}." if due else ""
+def _wait(failures: Failures) -> str:
+    due = failures.next_create_time
+    return f" It is not replaced before {format_time(due)}." if due else ""
 
 
-def forgotten_failure(pool: FiberPool, record: Record) -> str:
+def forgotten_failure(pool: FiberPool, failures: Failures) -> str:
     """A failure of which nothing is left but what the status says, if that."""
-    code = None if record.last_exit_code is None else f"exit code {record.last_exit_code}"
-    known = ", ".join(filter(None, (record.last_reason, code)))
+    code = None if failures.last_exit_code is None else f"exit code {failures.last_exit_code}"
+    known = ", ".join(filter(None, (failures.last_reason, code)))
     return (
         f"A worker failed{f' ({known})' if known else ''}, and its pod is gone. See the events of "
         f"the pool with kubectl describe fiberpool {pool.metadata.name}."
     )
 
 
-def completed(pool: FiberPool, record: Record, pod: PodView | None) -> str:
-    """Workers that end of themselves, round after round."""
-    if pod is None:
-        what = "Workers end of themselves"
-    elif pod.reason == "DeadlineExceeded":
+def completed(pool: FiberPool, failures: Failures, pod: PodView) -> str:
+    """Workers that end of themselves, wave after wave."""
+    if pod.reason == "DeadlineExceeded":
         what = f"{pod.name} was ended by activeDeadlineSeconds of spec.template{_after(pod)}"
     else:
         what = f"{pod.name} ended with exit code 0{_after(pod)} and was not released"
     return (
-        f"{what}, and so did those before it: {record.completions} rounds in a row. A worker is to "
+        f"{what}, and so did those before it: {failures.waves} waves in a row. A worker is to "
         f"run until it is released, so the container {pool.spec.worker_container!r} must run "
         "python -m fiber.agent and nothing that ends. The agent itself ends so when it has had no "
-        f"master for master.lostGraceSeconds: see whether the master can be reached.{_wait(record)}"
+        "master for master.lostGraceSeconds: see whether the master can be reached."
+        f"{_wait(failures)}"
     )
 
 
@@ -237,13 +235,14 @@ def _memory_limit(pool: FiberPool) -> str:
     return text(limits[0]) if limits else ""
 
 
-def limit_exceeded(pool: FiberPool, record: Record, last: str) -> str:
+def limit_exceeded(pool: FiberPool, failures: Failures, last: str) -> str:
     """Nothing more is created."""
     limit = pool.spec.failure_policy.backoff_limit
     return (
-        f"{record.consecutive} failures in a row are more than failurePolicy.backoffLimit allows "
-        f"({limit}): no more workers are created until the spec changes, in template, "
-        "processesPerPod, failurePolicy, update or suspend, or by a master with a new epoch. "
+        f"{failures.consecutive} waves of failures in a row, while fewer than half of the workers "
+        f"wanted were ready for a minute, are more than failurePolicy.backoffLimit allows ({limit})"
+        ": no more workers are created until the spec changes, in template, processesPerPod, "
+        "failurePolicy, update or suspend, or by a master with a new epoch. "
         "Correct the cause and spec.template, or set spec.suspend and unset it to try again as it "
         f"is. The last one: {last}"
     )

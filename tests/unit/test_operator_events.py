@@ -96,10 +96,12 @@ def test_what_a_worker_wrote_is_not_why_it_was_disrupted() -> None:
 
 def test_disruptions_are_told_together() -> None:
     pool = make_pool(replicas=2)
-    made, _ = look(pool, terminating(running(1)), terminating(running(2)))
+    drained = condition("DisruptionTarget", "True", reason="EvictionByEvictionAPI")
+    pods = [terminating(ended(number, conditions=[drained])) for number in (1, 2)]
+    made, _ = look(pool, *pods, terminating(running(3)))
     (event,) = (event for event in made.events if event.reason == "Disrupted")
     assert event.message == (
-        f"{name_of(2)} and 1 more ended through no fault of its own: somebody deleted it. "
+        f"{name_of(2)} and 1 more ended through no fault of its own: EvictionByEvictionAPI. "
         "A new one takes its place at once"
     )
 

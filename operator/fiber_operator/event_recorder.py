@@ -43,7 +43,7 @@ class _Posted:
     count: int = 1
 
 
-class Recorder:
+class EventRecorder:
     """Posts events.  ``now`` gives unix seconds."""
 
     def __init__(self, cluster: Cluster, now: Callable[[], float], identity: str) -> None:

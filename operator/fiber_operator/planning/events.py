@@ -57,7 +57,7 @@ def _disruptions(change: Change) -> Iterator[Event]:
         return
     pod = disrupted[-1]
     others = f" and {len(disrupted) - 1} more" if len(disrupted) > 1 else ""
-    words = " ".join(filter(None, (pod.reason, pod.message))) or "somebody deleted it"
+    words = " ".join(filter(None, (pod.reason, pod.message)))
     message = f"{pod.name}{others} ended through no fault of its own{wording.quoted(words)}"
     yield Event("Normal", Reason.DISRUPTED, f"{message}. A new one takes its place at once")
 
