@@ -34,7 +34,7 @@ def test_a_lease_that_is_never_made_is_that_of_a_lost_master() -> None:
     told = with_plan(pool, soon)
     never = plans.LeaseVerdict(alive=False, missing=True)
     found = plan_of(told, running(1), running(2), master=never, now=NOW + 30)
-    assert (found.delete_pool, found.again) == (False, NOW + 90)
+    assert (found.delete_pool, found.requeue_at) == (False, NOW + 90)
     told = with_plan(told, found)
     assert not plan_of(told, running(1), running(2), master=never, now=NOW + 89).delete_pool
     assert plan_of(told, running(1), running(2), master=never, now=NOW + 90).delete_pool
@@ -82,7 +82,7 @@ IDLE = {"master": MASTER, "idle": {"timeoutSeconds": 3600}}
 def test_a_master_that_asks_for_nothing_for_long_does_not_hold_the_minimum() -> None:
     pool = tried(minReplicas=2, **IDLE)
     made = plan_of(pool, running(1), running(2))
-    assert made.again == NOW + 3600
+    assert made.requeue_at == NOW + 3600
     pool = with_plan(pool, made)
     assert (pool.status.idle_since, pool.status.desired_replicas) == (NOW, 2)
     soon = with_plan(pool, plan_of(pool, running(1), running(2), now=NOW + 3599))
