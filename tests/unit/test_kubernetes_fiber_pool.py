@@ -12,7 +12,7 @@ import pytest
 
 from fakes.kubernetes_api import Call, Fault
 from fakes.store import Failure
-from fiber._backends.kubernetes import fiber_pool, scaling
+from fiber._backends.kubernetes import fiber_pool, scaling, watches
 from fiber._transport.credentials import MasterCredentials
 from fiber_api import names
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told
@@ -142,7 +142,10 @@ def test_only_the_newest_demand_is_written(rig: Rig, told: Told) -> None:
     assert rig.server.api.count("patch", names.PLURAL) == 1
 
 
-def test_a_demand_is_written_until_it_holds(rig: Rig, told: Told) -> None:
+def test_a_demand_is_written_until_it_holds(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scaling, "_TIMEOUT", 0.0)
     rig.server.api.faults.append(Fault("patch", names.PLURAL, status=503, times=3))
     rig.own(told).demand(4)
     replicas_become(rig, told, 4)
@@ -276,6 +279,17 @@ def test_an_operator_that_is_silent(rig: Rig, told: Told, monkeypatch: pytest.Mo
     assert "helm install fiber-operator" in str(error)
     (warning,) = told.warnings
     assert "was not looked at by an operator" in warning
+
+
+def test_an_operator_of_which_nothing_could_be_heard(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.5)
+    monkeypatch.setattr(watches, "_PAUSE_MAX", 0.1)
+    rig.server.api.faults.append(Fault("list", names.PLURAL, status=503, times=12))
+    rig.own(told).demand(1)
+    told.wait(lambda: told.statuses)
+    assert not told.errors
 
 
 def test_an_operator_that_ends_later_is_waited_for(

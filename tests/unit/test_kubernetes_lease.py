@@ -79,6 +79,13 @@ def test_in_time_it_is_one_call(case: Case) -> None:
     assert [(call.verb, call.plural) for call in case.rig.server.api.calls] == [("patch", "leases")]
 
 
+def test_a_connection_that_breaks_once_is_made_again(case: Case) -> None:
+    before = case.lease()
+    case.rig.server.api.faults.append(Fault("patch", "leases"))
+    case.renewer.renew()
+    assert case.lease()["renewTime"] > before["renewTime"]
+
+
 def test_one_that_somebody_deleted_is_made_again(case: Case) -> None:
     case.rig.remove("leases", LEASE)
     case.renewer.renew()
@@ -123,7 +130,8 @@ def test_a_loss_that_came_of_being_late_says_so(case: Case) -> None:
     assert (explained.reason, explained.pool) == ("Deleted", "es-1")
 
 
-def test_what_failed_does_not_count_as_renewed(case: Case) -> None:
+def test_what_failed_does_not_count_as_renewed(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
     case.rig.server.api.faults.append(Fault("patch", "leases", status=503))
     case.now += 20
     with pytest.raises(Exception, match="this is a test"):
@@ -159,7 +167,7 @@ def test_the_thread_ends_when_the_pool_is_lost(rig: Rig) -> None:
 
 def test_the_thread_tells_what_keeps_it_from_renewing(rig: Rig) -> None:
     case = Case(rig, duration=0)
-    rig.server.api.faults.append(Fault("patch", "leases", status=503))
+    rig.server.api.faults.append(Fault("patch", "leases", status=422))
     case.renewer.start()
     assert "this is a test" in str(case.troubles.get(timeout=10))
     case.renewer.stop()

@@ -109,6 +109,28 @@ def test_what_keeps_it_from_going_on_is_told_until_it_passes(case: Case) -> None
     assert case.next() == ["+a"]
 
 
+def test_a_connection_that_breaks_once_is_nothing_to_speak_of(case: Case) -> None:
+    case.watch.start()
+    for name in ("a", "b"):
+        case.add(name)
+        assert case.next() == [f"+{name}"]
+        case.server.do(case.server.api.drop_watches)
+    case.add("c")
+    assert case.next() == ["+c"]
+    assert case.troubles.empty()
+
+
+def test_an_api_that_stays_away_is_told(case: Case) -> None:
+    case.watch.start()
+    case.add("a")
+    case.next()
+    case.server.api.faults.append(Fault("watch", "pods", status=503, message="down", times=2))
+    case.server.do(case.server.api.drop_watches)
+    case.add("b")
+    assert case.next() == ["+b"]
+    assert str(case.troubles.get_nowait()) == "down"
+
+
 def test_an_api_that_ends_every_watch_at_once_is_not_flooded(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:

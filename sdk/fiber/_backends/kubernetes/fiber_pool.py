@@ -82,9 +82,12 @@ class FiberPoolClient:
         """Taken by whoever tells of the error; never given back: there is only one."""
         self._over = threading.Event()
         self._warned: set[str] = set()
+        self._generation = 0
+        """That of the spec which first had this program as its master."""
         self._observed = False
         """The operator has seen the pool with this program as its master."""
         self._began = 0.0
+        """Since when the operator might have been heard."""
         self._followers: list[ObjectWatch | LeaseRenewer] = []
         self._thread = threading.Thread(target=self._run, name="fiber-kubernetes", daemon=True)
 
@@ -136,7 +139,7 @@ class FiberPoolClient:
 
     def _begin(self) -> HeldPool:
         held = self._tenure.begin(self._closing)
-        self._began = time.monotonic()
+        self._began, self._generation = time.monotonic(), held.generation
         self._tenure.doing = f"scale the FiberPool {held.name!r}"
         renewer = LeaseRenewer(
             held,
@@ -200,7 +203,7 @@ class FiberPoolClient:
             return
         assert found is not None
         status = found.get("status") or {}
-        if not self._observed and status.get("observedGeneration", 0) >= held.generation:
+        if not self._observed and status.get("observedGeneration", 0) >= self._generation:
             self._observed = True
             self._wake.set()
         self._warned -= {"Unreachable", "Throttled"}
@@ -211,8 +214,9 @@ class FiberPoolClient:
         if isinstance(error, Forbidden) and not self._observed:
             # Its status would never be known, and silence be taken for the operator's.
             self._refused(error)
-        else:
-            self._trouble(error)
+            return
+        self._began = time.monotonic()  # of an operator nothing could be heard either
+        self._trouble(error)
 
     def _pod_changed(self, name: str, pod: Body | None) -> None:
         if pod is None and self._scaling.gone(name):

@@ -19,6 +19,9 @@ from fiber.errors import FiberPoolError
 RENEWALS = 3
 """Within one duration."""
 
+_TIMEOUT = 1.0
+"""Seconds in which a connection that breaks is made again."""
+
 _RETRY = 2.0
 """Seconds after one that failed."""
 
@@ -89,7 +92,7 @@ class LeaseRenewer:
         if self._late() > self._pool.master.lease_duration:
             self._pool.check()
         try:
-            self._pool.renew_lease(timeout=0.0)
+            self._pool.renew_lease(timeout=_TIMEOUT)
         except NotFound:
             self._make()
         self._renewed = now
@@ -125,6 +128,6 @@ class LeaseRenewer:
         """Somebody deleted it, or all of the pool."""
         self._pool.check()
         try:
-            self._pool.make_lease(timeout=0.0)
+            self._pool.make_lease(timeout=_TIMEOUT)
         except Conflict:
             pass  # it is there again

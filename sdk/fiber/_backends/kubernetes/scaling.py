@@ -24,6 +24,9 @@ PATCH_INTERVAL = 1.0
 REFUSED = 30.0
 """Seconds that a login or a right may be missing that was there before."""
 
+_TIMEOUT = 1.0
+"""Seconds in which a connection that breaks is made again; after that a newer demand may count."""
+
 _PAUSE_MIN, _PAUSE_MAX = 0.2, 5.0
 """Seconds after an attempt that failed, growing."""
 
@@ -95,7 +98,7 @@ class Scaling:
 
     def _write(self, pool: HeldPool, replicas: int, release: list[str]) -> None:
         try:
-            pool.apply(replicas, release, timeout=0.0)
+            pool.apply(replicas, release, timeout=_TIMEOUT)
         except (Forbidden, Unauthorized, Unreachable):
             raise
         except ApiError:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 
 from fiber._backends.kubernetes.api import Api, Watch
-from fiber._backends.kubernetes.api_errors import ApiError, Body, Expired
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Expired, Unreachable
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 """Seconds before it goes on after an end that came early, growing."""
@@ -33,7 +33,7 @@ class ObjectWatch:
         on_fault: Callable[[Exception], None],
     ) -> None:
         """``on_change`` is told the name and the object as it is, or None once it is gone;
-        ``on_trouble`` what keeps the watch from going on, each time; ``on_fault`` of a fault of
+        ``on_trouble`` what keeps the watch from going on, while it does; ``on_fault`` of a fault of
         ours, which ends it.  All on the thread.
         """
         self._api = api
@@ -45,6 +45,8 @@ class ObjectWatch:
         self._version: str | None = None
         """Where the next watch goes on; None: with a list."""
         self._known: set[str] = set()
+        self._failed = False
+        """The last attempt brought nothing."""
         self._lock = threading.Lock()
         self._watch: Watch | None = None
         self._stopped = threading.Event()
@@ -91,11 +93,15 @@ class ObjectWatch:
         except Expired:
             self._version = None
         except ApiError as error:
-            if not self._stopped.is_set():
+            # A connection that breaks once is nothing to speak of: it is made again.
+            if self._failed or not isinstance(error, Unreachable):
                 self._on_trouble(error)
+            self._failed = True
+        else:
+            self._failed = False
 
     def _list(self) -> str:
-        listing = self._api.list(self._path, self._selector, cancel=self._stopped)
+        listing = self._api.list(self._path, self._selector, timeout=0.0)
         found = {str(item["metadata"]["name"]): item for item in listing.get("items") or ()}
         for name in sorted(self._known - found.keys()):
             self._tell(name, None)
@@ -117,6 +123,7 @@ class ObjectWatch:
             self._version = str(found["metadata"]["resourceVersion"])
 
     def _tell(self, name: str, found: Body | None) -> None:
+        self._failed = False
         if self._stopped.is_set():
             return
         (self._known.discard if found is None else self._known.add)(name)
