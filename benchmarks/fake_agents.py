@@ -31,6 +31,7 @@ class FakeBackend:
 
     name = "fake"
     same_host = True
+    sends_program = False
 
     def __init__(self, agent: FakeAgent) -> None:
         self._agent = agent

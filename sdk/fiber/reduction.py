@@ -119,6 +119,27 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[int]]:
     return payload, attempt.fds
 
 
+def dump_shared(obj: Any, *, same_host: bool) -> bytes | None:
+    """Pickle ``obj`` once for several Processes that are to be started.
+
+    None if that cannot be: descriptors and grants in it are for one process each; and what does not
+    pickle at all is the error of whoever starts the first.
+    """
+    attempt = Spawning(None)
+    mp_context.set_spawning_popen(cast("Any", attempt if same_host else RemoteSpawning(None)))
+    try:
+        with handles.collecting_grants(reusable=False) as grants:
+            data = dumps(obj, before_retry=attempt.reset)
+        mine = bool(grants or attempt.fds)
+        grants.release()
+    except Exception:
+        return None
+    finally:
+        attempt.reset()
+        mp_context.set_spawning_popen(None)
+    return None if mine else data
+
+
 def _blame_process(process: Any, reason: Exception) -> UnpicklableError:
     """The error that names what of a Process does not pickle."""
     parts = {"the target": process._target}

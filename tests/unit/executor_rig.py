@@ -186,7 +186,10 @@ class Rig:
         self.refusal: BaseException | None = None
         """What stands in the way of another worker."""
         host: Any = SimpleNamespace(
-            loop=self.loop, start=self._start, config=SimpleNamespace(start_timeout=1.0)
+            loop=self.loop,
+            start=self._start,
+            look_at_program=lambda: None,
+            config=SimpleNamespace(start_timeout=1.0),
         )
         self.threads: dict[str, ManualThread] = {}
         new_process = partial(PoolProcess, like=Process)
@@ -204,7 +207,9 @@ class Rig:
         self.threads[name] = ManualThread(name)
         return self.threads[name]
 
-    def _start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> FakeChild:
+    def _start(
+        self, process: Any, owner: Any, *, tasks: bool, method: str, shared: object
+    ) -> FakeChild:
         if self.refusal is not None:
             raise self.refusal
         self.children.append(FakeChild(process.name))

@@ -58,6 +58,7 @@ class LocalChild:
         self.fault: Exception | None = None
         self.zygote: ZygoteLink | None = None
         self.observer = observer
+        self.program = spec.program
         self._spec = spec
         self._fds = spec.fds
         self._owner = owner
@@ -100,6 +101,8 @@ class LocalChild:
         spec = self._spec
         fds = self._descriptors()
         request = StartRequest(
+            spec.name,
+            self.host,
             spec.method,
             spec.preparation,
             spec.payload,
@@ -109,6 +112,8 @@ class LocalChild:
             open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
             hub=hub,
             ancestors=lineage(),
+            folder=zygote.folder,
+            has_arguments=spec.arguments is not None,
         )
         zygote.start(self.id, request, fds)
 
@@ -118,8 +123,12 @@ class LocalChild:
             self.zygote.children -= 1
 
     def _descriptors(self) -> list[int]:
-        """New descriptors for the child: stdout, stderr, task channel, and those of its handles."""
+        """New descriptors for the child: stdout, stderr, task channel, arguments, and those of its
+        handles.
+        """
         ours = [] if self._theirs is None else [self._theirs.fileno()]
+        if self._spec.arguments is not None:
+            ours.append(self._spec.arguments.fileno())
         fds: list[int] = []
         try:
             with naming_the_limit("starting a process"):

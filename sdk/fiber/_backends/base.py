@@ -14,6 +14,10 @@ class Backend(Protocol):
     same_host: bool
     """Whether its agents run on the program's own host, so that descriptors can be handed over."""
 
+    @property
+    def sends_program(self) -> bool:
+        """Whether its agents have not the program's files, which their children need."""
+
     def place(self) -> AgentHandle:
         """The agent for the next child, at once, though it may not have joined yet; StartError if
         none can take one more.

@@ -12,6 +12,7 @@ class LocalBackend:
 
     name = "local"
     same_host = True
+    sends_program = False
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None) -> None:
         self._agent = Agent(loop, host, hub)

@@ -41,6 +41,10 @@ class LoopbackBackend:
 
     name = "loopback"
     same_host = False
+    elsewhere: str | None = None
+    """For tests: a directory that agents are started in as if this machine were another one, which
+    has not the program's files.
+    """
 
     def __init__(self, loop: Loop, hub: Hub, config: Config) -> None:
         self._loop = loop
@@ -70,6 +74,11 @@ class LoopbackBackend:
         )
         for index in range(config.agents):
             self._launch(index)
+
+    @property
+    def sends_program(self) -> bool:
+        """Whether its agents have not the program's files."""
+        return self.elsewhere is not None
 
     def place(self) -> RemoteAgent:
         """The agent with the fewest children; StartError if none can take one more."""
@@ -105,7 +114,7 @@ class LoopbackBackend:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
         agent = RemoteAgent(name, self._loop, self._hub, self._output, on_lost=self._lost)
-        process = AgentProcess(self._loop, agent.lose)
+        process = AgentProcess(self._loop, agent.lose, self.elsewhere)
         slot = self._by_name[name] = _Slot(index, agent, process)
         self._processes[index : index + 1] = [slot]
         launch = self._launcher.launch, process, name, self._environment(name)
@@ -116,8 +125,11 @@ class LoopbackBackend:
             launch[0](*launch[1:])
 
     def _environment(self, name: str) -> dict[str, str]:
+        environment = dict(os.environ)
+        if self.sends_program:
+            environment.pop("PYTHONPATH", None)
         return {
-            **os.environ,
+            **environment,
             "FIBER_AGENT_ADDRESS": self._listener.address,
             "FIBER_AGENT_NAME": name,
             "FIBER_AGENT_PARENT": str(os.getpid()),

@@ -8,14 +8,17 @@ import signal
 import weakref
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
+from fiber._backends.parcels import Parcels
 from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._hub.hub import Hub
 from fiber._transport.link import EventLoop, Link
 from fiber._transport.stream import Frame
 from fiber._wire import messages, packet
+from fiber._wire.blob import Blob
 from fiber._wire.packet import BytesLike
 
 _SHUTDOWN_GRACE = 0.5
@@ -50,6 +53,7 @@ class RemoteAgent:
         self._ids = itertools.count(1)
         self._children: dict[int, RemoteChild] = {}
         self._to_start: weakref.WeakSet[RemoteChild] = weakref.WeakSet()
+        self._parcels = Parcels(loop, self._send)
         self._link: Link | None = None
         self._early: list[Frame] = []
         self._lost: str | None = None
@@ -90,12 +94,13 @@ class RemoteAgent:
         return child
 
     def start(self, child: RemoteChild, message: messages.Start) -> None:
-        """Start it.  On the loop's thread."""
+        """Start it, once all that it needs is there.  On the loop's thread."""
         self._to_start.discard(child)
         if self._lost is not None:
             child.end(self._report_of_loss(self._lost))
             return
         self._children[child.number] = child
+        self._parcels.send_missing(child.blobs)
         self._send(message.encode())
 
     def send(self, message: messages.Message) -> None:
@@ -139,6 +144,9 @@ class RemoteAgent:
         if isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
             self._tunnels.on_frame(message)
             return
+        if isinstance(message, messages.Lacking):
+            self._parcels.lost(message.digest)
+            return
         number = getattr(message, "child", None)
         child = None if number is None else self._children.get(number)
         if child is None:
@@ -162,6 +170,12 @@ class RemoteAgent:
         self.lose(reason)
 
 
+@lru_cache(maxsize=8)
+def _preparation(data: bytes) -> Blob:
+    """The blob of a preparation: few are in use at a time, and agents forget the others."""
+    return Blob(data)
+
+
 class RemoteChild:
     """A ``ChildHandle`` whose child is on another host."""
 
@@ -179,7 +193,11 @@ class RemoteChild:
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None
         self._gone = False
-        fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
+        needed = (_preparation(spec.preparation), spec.program, spec.arguments)
+        self.blobs = [blob for blob in needed if blob is not None]
+        """What its agent must have, for as long as it lives."""
+        digests = tuple(blob and blob.digest for blob in needed)
+        fields = (spec.name, spec.method, spec.payload, spec.tasks, digests)
         self._start: messages.Start | None = messages.Start(
             number, pickle.dumps(fields, protocol=5)
         )
@@ -243,6 +261,7 @@ class RemoteChild:
     def end(self, report: ExitReport, crossed: int = 0) -> None:
         """It is gone; the last ``crossed`` packets met the news of that on their way."""
         self._gone = True
+        self.blobs.clear()
         if self._channel is not None:
             self._channel.end()
         missed = list(self._latest)[max(0, len(self._latest) - crossed) :]

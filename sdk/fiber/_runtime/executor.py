@@ -143,6 +143,7 @@ class Executor:
             self._end()
             raise
         handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
+        self._host.look_at_program()
         try:
             self._loop.call_soon(self._begin, handles)
             self._launcher.launch_now(handles, self._host.config.start_timeout)

@@ -9,15 +9,16 @@ from fiber._runtime.background import BackgroundThread
 from fiber._runtime.host import Loop
 from fiber._runtime.latch import Latch
 from fiber._runtime.options import PoolOptions
+from fiber._runtime.shared_arguments import SharedArguments
 from fiber._runtime.worker_handle import WorkerHandle
 
 
 class Launcher:
     """Starts workers of one pool.
 
-    Not on the loop's thread: the user's initializer and its arguments are pickled for each, and
-    agents may need the loop.  ``on_failed`` is called, on the loop's thread, with workers whose
-    processes there will never be, and why, if that was tried.
+    Not on the loop's thread: the user's initializer and its arguments are pickled, and agents may
+    need the loop.  ``on_failed`` is called, on the loop's thread, with workers whose processes
+    there will never be, and why, if that was tried.
     """
 
     def __init__(
@@ -29,6 +30,9 @@ class Launcher:
         on_failed: Callable[[Sequence[WorkerHandle], BaseException | None], None],
     ) -> None:
         self._options = options
+        self._arguments = SharedArguments(
+            (options.initializer, options.initargs, options.retryable)
+        )
         self._loop = loop
         self._background = background
         self._on_failed = on_failed
@@ -54,12 +58,8 @@ class Launcher:
                 raise handle.child.start_error
 
     def _start(self, handle: WorkerHandle) -> None:
-        options = self._options
-        process = options.new_process(
-            handle,
-            target=worker.run,
-            args=(options.initializer, options.initargs, options.retryable),
-        )
+        handle.shared = self._arguments
+        process = self._options.new_process(handle, target=worker.run, args=self._arguments.args)
         process.start()
         handle.process = process
 

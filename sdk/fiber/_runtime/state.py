@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber import config, inherited, reduction
 from fiber._agent import child
-from fiber._agent.interface import AgentHandle, ChildHandle, ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import ChildHandle, ChildObserver, ChildSpec, ExitReport
 from fiber._hub import client as hub_client
 from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.hub import Hub
@@ -28,6 +28,8 @@ from fiber.errors import StartError
 
 if TYPE_CHECKING:
     from fiber._backends.base import Backend
+    from fiber._backends.shipping import Program, Shipping
+    from fiber._runtime.shared_arguments import SharedArguments
 
 _EXIT_PRIORITY = -100  # after multiprocessing has ended daemons and joined the other children
 
@@ -43,7 +45,11 @@ class Runtime:
         try:
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
-            reduction.readers_are_remote(not self.backend.same_host)
+            self._shipping = _make_shipping(self.backend)
+            reduction.readers_are_remote(
+                not self.backend.same_host
+                and not (self._shipping is not None and self._shipping.main_is_sent)
+            )
             self.loop.start_thread("fiber-io")
         except BaseException:
             self._close_hub()
@@ -69,8 +75,11 @@ class Runtime:
         *,
         tasks: bool = False,
         method: str = "fork",
+        shared: SharedArguments | None = None,
     ) -> ChildHandle:
         """Start ``process`` as a child of some agent; ``tasks`` makes it a pool worker.
+
+        ``shared``: the arguments of ``process``, as several have them.
 
         Returns at once; the owner hears what becomes of it, ``begin`` first.  An error in pickling
         is raised here.  Whoever is interrupted here will be called ``begin``, or nothing has
@@ -78,7 +87,10 @@ class Runtime:
         """
         agent = self.backend.place()
         same_host = self.backend.same_host
-        preparation = self._preparation(process, agent, same_host)
+        preparation, program = self._preparation(process, anew=not tasks)
+        arguments = None if shared is None else shared.blob(same_host=same_host)
+        if arguments is not None:
+            process._args = ()  # type: ignore[attr-defined]  # they go beside it
         with collecting_grants(reusable=False) as grants:
             payload, fds = reduction.dump_process(process, same_host=same_host)
         observer = _Releasing(owner, grants) if grants else owner
@@ -90,12 +102,16 @@ class Runtime:
             fds=tuple(fds),
             tasks=tasks,
             executable=spawn.get_executable() if same_host else None,
+            program=program and program.archive,
+            arguments=arguments,
         )
         made = agent.child(spec, observer)
         self.loop.call_soon(owner.begin, made)
         return made
 
-    def _preparation(self, process: Any, agent: AgentHandle, same_host: bool) -> bytes:
+    def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, Program | None]:
+        """What each child sets up, and the files that it needs; ``anew`` as in ``Shipping``."""
+        same_host = self.backend.same_host
         # pdb leaves its program a main module without one, which multiprocessing does not expect.
         vars(sys.modules["__main__"]).setdefault("__spec__", None)
         try:
@@ -104,23 +120,33 @@ class Runtime:
             reason = "its working directory is this program's, which was deleted; os.chdir() first"
             raise StartError(f"process {process.name!r}", reason) from error
         data["authkey"] = bytes(data["authkey"])
-        data["host"] = agent.host
         # What such a process starts itself runs on its own host.
         data["calls"] = [
             (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (methods.inherit, (methods.chosen, methods.preload)),
         ]
-        del data["start_method"]
+        del data["start_method"], data["name"]
         data["same_host"] = same_host
         if same_host:
             data["environ"] = dict(os.environb)
             data["preload"] = [*methods.preload, *_modules_of(process)]
+        elif self._shipping is not None:
+            data["preload"] = ["cloudpickle", *methods.preload, *_modules_of(process)]
         else:
             data["preload"] = ["cloudpickle"]
         if reduction.main_is_out_of_reach():
             data.pop("init_main_from_name", None)
             data.pop("init_main_from_path", None)
-        return pickle.dumps(data)
+        program = None
+        if self._shipping is not None:
+            program = self._shipping.program(data, anew=anew)
+            data["program"] = program.paths
+        return pickle.dumps(data), program
+
+    def look_at_program(self) -> None:
+        """Have the children that are started from now on see the program's files as they are."""
+        if self._shipping is not None:
+            self._shipping.look_again()
 
     def close(self) -> None:
         """End every child, agent and thread.  Not on the loop's thread."""
@@ -160,6 +186,14 @@ def _make_backend(runtime: Runtime) -> Backend:
     from fiber._backends.local import LocalBackend
 
     return LocalBackend(runtime.loop, runtime.host, runtime.hub)
+
+
+def _make_shipping(backend: Backend) -> Shipping | None:
+    if not backend.sends_program:
+        return None
+    from fiber._backends.shipping import Shipping
+
+    return Shipping()
 
 
 def _modules_of(process: Any) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from fiber._agent.interface import ChildHandle, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._runtime.latch import Latch
+from fiber._runtime.shared_arguments import SharedArguments
 from fiber._transport.loop import Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
@@ -53,6 +54,8 @@ class WorkerHandle:
         self.unwanted = False
         """It was told to end at once, whatever it does."""
         self.returncode: int | None = None
+        self.shared: SharedArguments | None = None
+        """What it is started with, as all workers of its pool."""
         self._supervisor = supervisor
         self._host = host
         self._pid: int | None = None
@@ -69,7 +72,7 @@ class WorkerHandle:
     def launch(self, process: BaseProcess, method: str) -> None:
         """Start the process; returns before it exists."""
         self._launched = process
-        self._host.start(process, self, tasks=True, method=method)
+        self._host.start(process, self, tasks=True, method=method, shared=self.shared)
 
     # What the agent says, on the loop's thread
 

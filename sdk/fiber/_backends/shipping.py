@@ -1,0 +1,75 @@
+"""Sends the program to agents that have not its file system: once to each, by its content."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from fiber._agent.program_folder import ProgramPaths
+from fiber._backends.program_archive import Entry, list_files, pack
+from fiber._backends.program_layout import find_layout, main_file
+from fiber._wire.blob import Blob
+from fiber.errors import ProgramTooLarge
+
+
+class Program(NamedTuple):
+    """The program's files, as they were when they were looked at last."""
+
+    archive: Blob
+    paths: ProgramPaths
+
+
+class Shipping:
+    """What is sent of this program.  Any thread: of several that look, each sees what is there."""
+
+    def __init__(self) -> None:
+        self._latest: tuple[dict[str, Entry], Program] | None = None
+        self._stale = False
+        self._left_out: frozenset[str] = frozenset()
+
+    @property
+    def main_is_sent(self) -> bool:
+        """Whether children can import the main module."""
+        return main_file() is not None
+
+    def program(self, preparation: Mapping[str, Any], *, anew: bool) -> Program:
+        """The program for children that ``preparation`` is for; ProgramTooLarge.
+
+        ``anew``: as its files are now, not as they were for the last child.
+        """
+        if self._latest is None or self._stale or anew:
+            self._latest = self._look(preparation)
+            self._stale = False
+        return self._latest[1]
+
+    def look_again(self) -> None:
+        """The next child has the files as they are then."""
+        self._stale = True
+
+    def _look(self, preparation: Mapping[str, Any]) -> tuple[dict[str, Entry], Program]:
+        layout = find_layout(preparation, self._left_out)
+        try:
+            files = list_files(layout)
+            latest = self._latest
+            if latest is not None and latest[0] == files:
+                return files, latest[1]._replace(paths=layout.paths)
+            data = pack(layout, files)
+        except ProgramTooLarge as error:
+            if not layout.session:
+                raise
+            self._left_out |= layout.session
+            _warn(error)
+            return self._look(preparation)
+        archive = Blob(data)
+        if latest is not None and latest[1].archive.digest == archive.digest:
+            archive = latest[1].archive  # touched, and the same
+        return files, Program(archive, layout.paths)
+
+
+def _warn(error: ProgramTooLarge) -> None:
+    warnings.warn(
+        f"{error} Until then workers have of the working directory only what was imported from it.",
+        RuntimeWarning,
+        stacklevel=2,
+    )
