@@ -60,10 +60,10 @@ class Zygote:
         ancestors: list[int],
         *,
         preload: bool,
-        fault: str | None = None,
+        program: tuple[int, str] | None = None,
     ) -> None:
-        """``fault``: what keeps every child from starting here."""
-        self._fault = fault
+        self._program = program
+        """What is to be unpacked before the first child, and where to."""
         self._control = control
         self._progress_table = progress_table
         self._ancestors = ancestors
@@ -137,8 +137,10 @@ class Zygote:
         return []
 
     def _start(self, child: int, start: StartRequest, fds: list[int]) -> None:
-        if self._fault is not None:
-            self._reply(FAILED, child, self._fault)
+        try:
+            self._unpack_program()
+        except Exception as error:  # the next child may find more room
+            self._reply(FAILED, child, f"the program's files could not be unpacked: {error}")
             _close_all(fds)
             return
         if start.method == "fork" and not self._is_fork_safe(start):
@@ -161,6 +163,13 @@ class Zygote:
         self._pids[child] = pid
         self._children[pid] = child
         self._reply(STARTED, child, pid)
+
+    def _unpack_program(self) -> None:
+        if self._program is not None:
+            archive, folder = self._program
+            program_folder.unpack(archive, folder)
+            self._program = None
+            os.close(archive)
 
     def _is_fork_safe(self, start: StartRequest) -> bool:
         """Whether this process may be forked, after it has imported what it shall."""
@@ -305,26 +314,18 @@ def _run_zygote(
     watched = _pidfds(ancestors)
     told_to = False
     if watched:
-        fault = None if folder is None else _unpack(archive[0], folder)
         told_to = Zygote(
-            sock, ProgressTable(progress_table), watched, preload=preload, fault=fault
+            sock,
+            ProgressTable(progress_table),
+            watched,
+            preload=preload,
+            program=None if folder is None else (archive[0], folder),
         ).run()
     ours = folder if told_to else cleanup_directory
     if ours is not None:
         import shutil  # rarely needed: whoever waits for the first child waits for our imports
 
         shutil.rmtree(ours, ignore_errors=True)
-
-
-def _unpack(archive: int, folder: str) -> str | None:
-    """Make the program's folder; what went wrong."""
-    try:
-        program_folder.unpack(archive, folder)
-    except Exception as error:
-        return f"the program's files could not be unpacked: {error}"
-    finally:
-        os.close(archive)
-    return None
 
 
 def _pidfds(ancestors: tuple[int, ...]) -> list[int]:

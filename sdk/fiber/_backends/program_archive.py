@@ -55,6 +55,8 @@ def list_files(layout: Layout) -> dict[str, Entry]:
             if len(found) > MOST_FILES:
                 raise _too_large(layout, found, f"more than {MOST_FILES:,} files")
     _check_size(layout, found)
+    if layout.paths.directory:  # whatever of it is sent, somebody will work in it
+        found.setdefault(layout.paths.directory, Entry("", stat.S_IFDIR))
     return found
 
 
@@ -91,10 +93,14 @@ def _everything_in(top: str) -> Iterator[tuple[str, Entry]]:
 def _walk(folder: str, rules: IgnoreRules, around: tuple[str, ...]) -> Iterator[tuple[str, Entry]]:
     """``around``: the real folders that this one was come to through, and itself."""
     rules = rules.within(folder)
-    for name in _names_in(folder):
-        path = os.path.join(folder, name)
-        real = os.path.realpath(path)
-        entry = _link(path, real, around) if os.path.islink(path) else _entry(path)
+    for found in _found_in(folder):
+        path = found.path
+        if found.is_symlink():
+            real = os.path.realpath(path)
+            entry = _link(path, real, around)
+        else:
+            real = os.path.join(around[-1], found.name)
+            entry = _entry(path)
         if entry is None or rules.ignores(path, is_folder=stat.S_ISDIR(entry.mode)):
             continue
         if not stat.S_ISDIR(entry.mode):
@@ -104,9 +110,10 @@ def _walk(folder: str, rules: IgnoreRules, around: tuple[str, ...]) -> Iterator[
             yield from _walk(path, rules, (*around, real))
 
 
-def _names_in(folder: str) -> list[str]:
+def _found_in(folder: str) -> list[os.DirEntry[str]]:
     try:
-        return os.listdir(folder)
+        with os.scandir(folder) as found:
+            return list(found)
     except OSError:
         return []
 

@@ -14,7 +14,6 @@ What is installed (the standard library, site-packages, Fiber) is the image's ow
 from __future__ import annotations
 
 import os
-import site
 import sys
 import sysconfig
 import tempfile
@@ -24,6 +23,8 @@ from multiprocessing import process as mp_process
 from typing import Any, NamedTuple
 
 from fiber._agent.program_folder import ProgramPaths
+
+_INSTALLED = frozenset({"site-packages", "dist-packages"})
 
 _LOOSE = "program"
 """The folder there for what is sent without the folder that it is in here."""
@@ -136,15 +137,17 @@ def _is_sent(path: str) -> bool:
 
 
 def _is_installed(path: str) -> bool:
-    return any(_is_inside(path, folder) for folder in _installed_folders())
+    if not _INSTALLED.isdisjoint(path.split(os.sep)):
+        return True
+    return any(_is_inside(path, folder) for folder in _own_folders())
 
 
 @lru_cache(maxsize=1)
-def _installed_folders() -> frozenset[str]:
-    kinds = ("stdlib", "platstdlib", "purelib", "platlib", "scripts")
+def _own_folders() -> frozenset[str]:
+    """Where the interpreter has its own, and Fiber."""
+    kinds = ("stdlib", "platstdlib", "scripts")
     fiber = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    found = {sysconfig.get_path(kind) for kind in kinds}
-    return frozenset({*found, *site.getsitepackages(), site.getusersitepackages(), fiber})
+    return frozenset({fiber, *map(sysconfig.get_path, kinds)})
 
 
 def _is_nobodys(folder: str) -> bool:
@@ -186,7 +189,7 @@ def _imported() -> Iterator[_Module]:
         if name in ("__main__", "__mp_main__"):
             continue
         file = getattr(module, "__dict__", {}).get("__file__")
-        if not isinstance(file, str) or not os.path.isfile(file) or _is_installed(file):
+        if not isinstance(file, str) or _is_installed(file) or not os.path.isfile(file):
             continue
         top = sys.modules.get(name.partition(".")[0], module)
         whole = getattr(top, "__path__", None)
