@@ -13,6 +13,7 @@ import signal
 import socket
 import struct
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from fiber._agent import zygote
@@ -25,6 +26,7 @@ from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
 from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire import packet
+from fiber._wire.blob import Blob
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import TooManyOpenFiles
 
@@ -58,7 +60,6 @@ class LocalChild:
         self.fault: Exception | None = None
         self.zygote: ZygoteLink | None = None
         self.observer = observer
-        self.program = spec.program
         self._spec = spec
         self._fds = spec.fds
         self._owner = owner
@@ -140,10 +141,16 @@ class LocalChild:
             raise
         return fds
 
+    @property
+    def program(self) -> Blob | None:
+        """The files that it needs, until it has them."""
+        return self._spec.program
+
     def release_descriptors(self) -> None:
         """It has its own now: the other end must see EOF when the child lets go."""
         fds, self._fds = self._fds, ()
         close_all(fds)
+        self._spec = replace(self._spec, payload=b"", program=None, arguments=None)
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to the worker; False if it is gone."""
