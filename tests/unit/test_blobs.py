@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from collections.abc import Iterator
 from typing import Any
 
@@ -219,3 +220,11 @@ def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: An
     with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
         assert pool.apply(size_of_kept) == LARGE
     assert state.runtime().backend is backend
+
+
+def test_the_agent_that_replaces_a_lost_one_is_sent_them_too(backend: Any) -> None:
+    with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
+        assert pool.apply(size_of_kept) == LARGE
+        os.kill(backend._processes[0].process.pid, signal.SIGKILL)
+        assert pool.apply(size_of_kept) == LARGE
+        assert backend._processes[0].agent.host == "loopback-1"

@@ -135,6 +135,17 @@ def test_of_a_home_directory_only_what_was_imported_is_sent(machine: Machine) ->
     assert layout.paths == (("program",), (), "program", "program/train.py")
 
 
+def test_what_was_imported_from_a_namespace_keeps_its_name(machine: Machine) -> None:
+    machine.runs(machine.home / "train.py")
+    module = write(machine.home / "space", part__tool_py="") / "part/tool.py"
+    space: Any = ModuleType("space")
+    space.__path__ = [str(machine.home / "space")]
+    machine.modules["space"] = space
+    machine.has_imported("space.part.tool", module)
+    layout = machine.layout(machine.home, STDLIB, directory=machine.home)
+    assert layout.places[str(module)] == "program/space/part/tool.py"
+
+
 @pytest.mark.parametrize("folder", ["/", "home", "above"])
 def test_a_session_in_a_folder_that_is_nobodys_sends_nothing_of_it(
     machine: Machine, folder: str

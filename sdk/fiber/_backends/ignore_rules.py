@@ -68,7 +68,7 @@ class IgnoreRules:
 
     def within(self, folder: str) -> IgnoreRules:
         """Those that hold in ``folder``, which these are around."""
-        found = [_Level(folder, _compiled(text)) for text in _read_all(folder)]
+        found = [_Level(folder.rstrip(os.sep), _compiled(text)) for text in _read_all(folder)]
         return IgnoreRules((*self._levels, *found)) if found else self
 
     def ignores(self, path: str, *, is_folder: bool) -> bool:

@@ -61,7 +61,9 @@ class _Module(NamedTuple):
 
     file: str
     whole: str
-    """The file, or the folder of the package."""
+    """The file, or the folder of the package that it is in."""
+    name: str
+    """What that has to be called to be imported."""
 
 
 def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Layout:
@@ -74,11 +76,11 @@ def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Lay
     path = list(map(os.path.abspath, preparation["sys_path"]))
     whole = [folder for folder in (program, *path) if _is_sent(folder) and folder not in left_out]
     places = Places(_named(_outermost(whole)))
-    modules = list(_imported())
+    modules = sorted(_imported())
     if main is not None:
-        modules.append(_Module(main, main))
-    loose = sorted({module.whole for module in modules if places.place_of(module.file) is None})
-    places.update({path: f"{_LOOSE}/{os.path.basename(path)}" for path in loose})
+        modules.append(_Module(main, main, os.path.basename(main)))
+    loose = [module for module in modules if places.place_of(module.file) is None]
+    places.update({module.whole: f"{_LOOSE}/{module.name}" for module in loose})
     return Layout(
         places,
         program,
@@ -191,6 +193,11 @@ def _imported() -> Iterator[_Module]:
         file = getattr(module, "__dict__", {}).get("__file__")
         if not isinstance(file, str) or _is_installed(file) or not os.path.isfile(file):
             continue
-        top = sys.modules.get(name.partition(".")[0], module)
-        whole = getattr(top, "__path__", None)
-        yield _Module(file, next(iter(whole)) if whole else file)
+        package, *_ = parts = name.split(".")
+        top = sys.modules.get(package, module)
+        if hasattr(top, "__path__") and getattr(top, "__file__", None):
+            yield _Module(file, next(iter(top.__path__)), package)
+        else:  # of a namespace package, whose folder may be anything
+            if not hasattr(module, "__path__"):
+                parts.pop()
+            yield _Module(file, file, os.path.join(*parts, os.path.basename(file)))

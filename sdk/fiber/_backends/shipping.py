@@ -25,7 +25,6 @@ class Shipping:
 
     def __init__(self) -> None:
         self._latest: tuple[dict[str, Entry], Program] | None = None
-        self._stale = False
         self._left_out: frozenset[str] = frozenset()
 
     @property
@@ -38,14 +37,9 @@ class Shipping:
 
         ``anew``: as its files are now, not as they were for the last child.
         """
-        if self._latest is None or self._stale or anew:
+        if self._latest is None or anew:
             self._latest = self._look(preparation)
-            self._stale = False
         return self._latest[1]
-
-    def look_again(self) -> None:
-        """The next child has the files as they are then."""
-        self._stale = True
 
     def _look(self, preparation: Mapping[str, Any]) -> tuple[dict[str, Entry], Program]:
         layout = find_layout(preparation, self._left_out)

@@ -143,9 +143,9 @@ class Executor:
             self._end()
             raise
         handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
-        self._host.look_at_program()
         try:
             self._loop.call_soon(self._begin, handles)
+            self._host.look_at_program()
             self._launcher.launch_now(handles, self._host.config.start_timeout)
         except BaseException as error:
             self._loop.call_soon(self._launcher.give_up, handles)

@@ -59,4 +59,7 @@ class Host(Protocol):
         """Start a worker's process, whose ``owner`` hears of it; ``shared`` are its arguments."""
 
     def look_at_program(self) -> None:
-        """Have the workers that are started from now on see the program's files as they are."""
+        """Have the workers that are started from now on see the program's files as they are.
+
+        Raises what is in the way of that.
+        """

@@ -111,21 +111,14 @@ class Runtime:
 
     def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, Program | None]:
         """What each child sets up, and the files that it needs; ``anew`` as in ``Shipping``."""
+        data = self._spawn_data(f"process {process.name!r}")
         same_host = self.backend.same_host
-        # pdb leaves its program a main module without one, which multiprocessing does not expect.
-        vars(sys.modules["__main__"]).setdefault("__spec__", None)
-        try:
-            data = spawn.get_preparation_data(process.name)
-        except FileNotFoundError as error:
-            reason = "its working directory is this program's, which was deleted; os.chdir() first"
-            raise StartError(f"process {process.name!r}", reason) from error
         data["authkey"] = bytes(data["authkey"])
         # What such a process starts itself runs on its own host.
         data["calls"] = [
             (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (methods.inherit, (methods.chosen, methods.preload)),
         ]
-        del data["start_method"], data["name"]
         data["same_host"] = same_host
         if same_host:
             data["environ"] = dict(os.environb)
@@ -134,19 +127,31 @@ class Runtime:
             data["preload"] = ["cloudpickle", *methods.preload, *_modules_of(process)]
         else:
             data["preload"] = ["cloudpickle"]
-        if reduction.main_is_out_of_reach():
-            data.pop("init_main_from_name", None)
-            data.pop("init_main_from_path", None)
         program = None
         if self._shipping is not None:
             program = self._shipping.program(data, anew=anew)
             data["program"] = program.paths
         return pickle.dumps(data), program
 
+    def _spawn_data(self, who: str) -> dict[str, Any]:
+        """What multiprocessing has every child know of this program."""
+        # pdb leaves its program a main module without one, which multiprocessing does not expect.
+        vars(sys.modules["__main__"]).setdefault("__spec__", None)
+        try:
+            data = spawn.get_preparation_data("")
+        except FileNotFoundError as error:
+            reason = "its working directory is this program's, which was deleted; os.chdir() first"
+            raise StartError(who, reason) from error
+        del data["start_method"], data["name"]
+        if reduction.main_is_out_of_reach():
+            data.pop("init_main_from_name", None)
+            data.pop("init_main_from_path", None)
+        return data
+
     def look_at_program(self) -> None:
         """Have the children that are started from now on see the program's files as they are."""
         if self._shipping is not None:
-            self._shipping.look_again()
+            self._shipping.program(self._spawn_data("a pool"), anew=True)
 
     def close(self) -> None:
         """End every child, agent and thread.  Not on the loop's thread."""
