@@ -111,6 +111,13 @@ def test_what_is_installed_is_the_images(machine: Machine) -> None:
     assert layout.places == {str(machine.es): "es"}
 
 
+def test_what_is_installed_within_the_programs_folder_is_on_no_path(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    inside = write(machine.es / ".venv/lib/site-packages", pkg_py="")
+    layout = machine.layout(machine.es, STDLIB, inside)
+    assert layout.paths == (("es",), (), "es", "es/main.py")
+
+
 def test_a_session_has_its_working_directory(machine: Machine) -> None:
     layout = machine.layout(machine.es, STDLIB)
     assert layout.places == {str(machine.es): "es"}

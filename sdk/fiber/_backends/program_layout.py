@@ -125,10 +125,14 @@ def _folder_of(main: str) -> str:
 
 def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is on ``sys.path`` there before and after the standard library."""
+
+    def there(entries: list[str]) -> list[str]:
+        names = [places.name_of(entry) for entry in entries if not _is_installed(entry)]
+        return [name for name in names if name is not None]
+
     library = sysconfig.get_path("stdlib")
     end = path.index(library) if library in path else len(path)
-    before = [name for entry in path[:end] if (name := places.name_of(entry)) is not None]
-    after = [name for entry in path[end:] if (name := places.name_of(entry)) is not None]
+    before, after = there(path[:end]), there(path[end:])
     if any(name.startswith(f"{_LOOSE}/") for name in places.values()):
         before.append(_LOOSE)
     return tuple(before), tuple(after)
