@@ -178,6 +178,31 @@ def test_a_session_in_a_folder_that_is_too_large_goes_on_with_what_it_imported(s
     assert "only what was imported from it" in done.stderr
 
 
+def test_a_script_in_a_home_directory_goes_on_with_what_it_imported(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(site.program))
+    write(site.program, helper_py="", secret_key="secret")
+    program = """
+import os
+import elsewhere, fiber, helper
+
+def look():
+    import helper
+    return sorted(name for name in os.listdir() if name != "__pycache__")
+
+if __name__ == "__main__":
+    elsewhere.begin()
+    for _ in range(2):
+        with fiber.Pool(1) as pool:
+            print(pool.apply(look))
+"""
+    done = site.run(program=program)
+    assert done.stdout.splitlines() == ["['helper.py', 'main.py']"] * 2
+    assert done.stderr.count("RuntimeWarning: the program is in") == 1
+    assert "Put it into a folder of its own" in done.stderr
+
+
 def test_a_script_whose_folder_is_too_large_is_told_at_once(site: Site) -> None:
     write(site.program, large_npy=bytes(2 << 20))
     program = """

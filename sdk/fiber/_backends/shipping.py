@@ -26,6 +26,7 @@ class Shipping:
     def __init__(self) -> None:
         self._latest: tuple[dict[str, Entry], Program] | None = None
         self._left_out: frozenset[str] = frozenset()
+        self._said: set[str] = set()
 
     @property
     def main_is_sent(self) -> bool:
@@ -43,6 +44,12 @@ class Shipping:
 
     def _look(self, preparation: Mapping[str, Any]) -> tuple[dict[str, Entry], Program]:
         layout = find_layout(preparation, self._left_out)
+        if self.main_is_sent and layout.places.place_of(layout.program) is None:
+            self._warn(
+                f"the program is in {layout.program!r}, where its user has all kinds of files: "
+                "workers on other machines get of them only what it has imported. Put it into a "
+                "folder of its own."
+            )
         try:
             files = list_files(layout)
             latest = self._latest
@@ -53,17 +60,17 @@ class Shipping:
             if not layout.session:
                 raise
             self._left_out |= layout.session
-            _warn(error)
+            self._warn(
+                f"{error} Until then workers have of the working directory only what was imported "
+                "from it."
+            )
             return self._look(preparation)
         archive = Blob(data)
         if latest is not None and latest[1].archive.digest == archive.digest:
             archive = latest[1].archive  # touched, and the same
         return files, Program(archive, layout.paths)
 
-
-def _warn(error: ProgramTooLarge) -> None:
-    warnings.warn(
-        f"{error} Until then workers have of the working directory only what was imported from it.",
-        RuntimeWarning,
-        stacklevel=2,
-    )
+    def _warn(self, message: str) -> None:
+        if message not in self._said:
+            self._said.add(message)
+            warnings.warn(message, RuntimeWarning, stacklevel=2)
