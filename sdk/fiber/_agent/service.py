@@ -17,6 +17,7 @@ from fiber._hub.hub import Hub
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
 from fiber._transport.stream import Frame
+from fiber._transport.unix import naming_the_limit
 from fiber._wire import messages, packet
 from fiber._wire.descriptor import contents
 
@@ -90,9 +91,12 @@ class AgentService:
     def _start(self, message: messages.Start) -> None:
         child = self._children[message.child] = _Observed(self, message.child)
         try:
-            spec = self._specification(*pickle.loads(message.spec))
+            with naming_the_limit("starting a process"):
+                spec = self._specification(*pickle.loads(message.spec))
         except BlobLacking as error:
             self.send(messages.Lacking(error.digest))
+            child.refuse(self._agent.host, error)
+        except OSError as error:
             child.refuse(self._agent.host, error)
         else:
             child.start(self._agent, self._loop, spec)
