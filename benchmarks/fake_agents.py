@@ -32,6 +32,7 @@ class FakeBackend:
     name = "fake"
     same_host = True
     elastic = False
+    sends_program = False
 
     def __init__(self, agent: FakeAgent) -> None:
         self._agent = agent

@@ -47,6 +47,7 @@ class FakeCluster:
     name = "fake"
     same_host = False
     elastic = False
+    sends_program = False
 
     def __init__(self, runtime: Runtime, hosts: Sequence[Host], agents: int) -> None:
         assert runtime.hub is not None

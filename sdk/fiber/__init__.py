@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from fiber.errors import LinkError as LinkError
     from fiber.errors import NotInFiber as NotInFiber
     from fiber.errors import ProcessError as ProcessError
+    from fiber.errors import ProgramTooLarge as ProgramTooLarge
     from fiber.errors import StartError as StartError
     from fiber.errors import TimeoutError as TimeoutError
     from fiber.errors import TooManyOpenFiles as TooManyOpenFiles
@@ -115,6 +116,7 @@ _HOMES = {
     "NotInFiber": "errors",
     "Process": "process",
     "ProcessError": "errors",
+    "ProgramTooLarge": "errors",
     "SUBDEBUG": "util",
     "SUBWARNING": "util",
     "StartError": "errors",

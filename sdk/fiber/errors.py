@@ -14,6 +14,7 @@
     │       ├── FileTooLarge      a message, or shared memory, above the limit (also OSError)
     │       ├── LinkError         no way between program and agent, a port in use for instance
     │       ├── NotInFiber        a part of multiprocessing that Fiber has not (yet)
+    │       ├── ProgramTooLarge   the program's folder is more than is sent to other machines
     │       ├── StartError        a process that does not start, an initializer that fails
     │       ├── TooManyOpenFiles  the limit of file descriptors is reached (also OSError)
     │       ├── UnpicklableError  an object that cannot travel (also PicklingError, TypeError)
@@ -32,7 +33,7 @@ import errno
 import pickle
 import resource
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from multiprocessing import AuthenticationError, BufferTooShort, ProcessError, TimeoutError
 from typing import Any
 
@@ -50,6 +51,7 @@ __all__ = [
     "MaybeEncodingError",
     "NotInFiber",
     "ProcessError",
+    "ProgramTooLarge",
     "StartError",
     "TimeoutError",
     "TooManyOpenFiles",
@@ -162,6 +164,25 @@ class LinkError(FiberError):
 
 class NotInFiber(FiberError, NotImplementedError):
     """A part of multiprocessing that this version of Fiber does not have; says what to use."""
+
+
+class ProgramTooLarge(FiberError):
+    """The program's files are more than Fiber sends to other machines.
+
+    `folder` is the program's, `largest` what takes most: paths and their sizes, as text.
+    """
+
+    def __init__(self, folder: str, size: str, limit: str, largest: Mapping[str, str]) -> None:
+        lines = [f"{size:>12}  {path}" for path, size in largest.items()]
+        super().__init__(
+            f"the program in {folder!r} cannot be sent to its workers: it has {size}, and what is "
+            f"sent is at most {limit}.\n{_block('What takes most:', lines)}\n"
+            f"Name what workers do not need in {folder}/.fiberignore, one line each, as in "
+            ".gitignore, or move it out of the folder; data that they do need belongs into their "
+            "image or on a volume."
+        )
+        self.folder = folder
+        self.largest = dict(largest)
 
 
 class StartError(FiberError):

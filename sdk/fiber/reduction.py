@@ -117,6 +117,27 @@ def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
         mp_context.set_spawning_popen(None)
 
 
+def dump_shared(obj: Any, *, same_host: bool) -> bytes | None:
+    """Pickle ``obj`` once for several Processes that are to be started.
+
+    None if that cannot be: descriptors and grants in it are for one process each; and what does not
+    pickle at all is the error of whoever starts the first.
+    """
+    attempt: Any = Spawning(None) if same_host else RemoteSpawning(None)
+    try:
+        mp_context.set_spawning_popen(attempt)
+        with handles.collecting_grants(reusable=False) as grants:
+            data = dumps(obj, before_retry=attempt.fds.clear)
+        mine = bool(grants or attempt.fds)
+        grants.release()
+    except Exception:
+        return None
+    finally:
+        attempt.fds.clear()
+        mp_context.set_spawning_popen(None)
+    return None if mine else data
+
+
 def _blame_process(process: Any, reason: Exception) -> UnpicklableError:
     """The error that names what of a Process does not pickle."""
     parts = {"the target": process._target}

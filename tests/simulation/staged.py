@@ -85,7 +85,10 @@ class Stage:
         self._actors.append(actor)
         return actor
 
-    def start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> None:
+    def look_at_program(self) -> None:
+        """No file is sent here."""
+
+    def start(self, process: Any, owner: Any, *, tasks: bool, method: str, shared: object) -> None:
         """Start a worker on some agent."""
         if self.running is not None:
             # What comes of it comes after all that this thread has asked for.

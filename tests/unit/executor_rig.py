@@ -191,6 +191,7 @@ class Rig:
             loop=self.loop,
             start=self._start,
             elastic=False,
+            look_at_program=lambda: None,
             config=SimpleNamespace(start_timeout=1.0),
         )
         self.threads: dict[str, ManualThread] = {}
@@ -209,7 +210,9 @@ class Rig:
         self.threads[name] = ManualThread(name)
         return self.threads[name]
 
-    def _start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> FakeChild:
+    def _start(
+        self, process: Any, owner: Any, *, tasks: bool, method: str, shared: object
+    ) -> FakeChild:
         if self.refusal is not None:
             raise self.refusal
         self.children.append(FakeChild(process.name))

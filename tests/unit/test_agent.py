@@ -66,7 +66,7 @@ def specification(target: Callable[..., Any], *args: Any, **options: Any) -> Chi
     """What the runtime asks of an agent for one process."""
     process = Process(target=target, args=args)
     preparation = spawn.get_preparation_data(process.name)
-    preparation |= {"authkey": bytes(preparation["authkey"]), "host": "here", "calls": []}
+    preparation |= {"authkey": bytes(preparation["authkey"]), "calls": []}
     preparation |= {"same_host": True, "preload": []}
     for key in ("start_method", "init_main_from_name", "init_main_from_path"):
         preparation.pop(key, None)

@@ -11,10 +11,14 @@ from hypothesis import strategies as st
 
 from fiber._agent.interface import Cause
 from fiber._wire.messages import (
+    DIGEST_BYTES,
     PROTOCOL,
+    Blob,
     Deliver,
     Exited,
+    Forget,
     FromChild,
+    Lacking,
     Message,
     Output,
     ProtocolError,
@@ -38,8 +42,13 @@ data = st.binary(max_size=200)
 buffers = st.lists(data, max_size=4)
 any_text = st.text(st.characters(), max_size=50)
 
+digests = st.binary(min_size=DIGEST_BYTES, max_size=DIGEST_BYTES)
+
 messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Start, ids, data),
+    st.builds(Blob, digests, data),
+    st.builds(Forget, digests),
+    st.builds(Lacking, digests),
     st.builds(Started, ids, numbers),
     st.builds(Signal, ids, numbers),
     st.builds(Deliver, ids, ids, data, buffers),
@@ -102,6 +111,8 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         (bytes([PROTOCOL, 99]), "unknown kind 99"),
         (Signal(1, 15).encode()[:-1], "of kind signal and 17 bytes is malformed"),
         (Recall(1).encode() + b"!", "of kind recall and 11 bytes is malformed"),
+        (Forget(bytes(DIGEST_BYTES)).encode()[:-1], "of kind forget and 33 bytes is malformed"),
+        (Blob(bytes(DIGEST_BYTES), b"").encode()[:-1], "of kind blob and 33 bytes is malformed"),
         (Recalled(1, (5,)).encode()[:-1], "sequence numbers is cut short"),
         (FromChild(1, b"", [b"12"]).encode()[:-1], "announces buffers of 2 bytes"),
         (bytes([PROTOCOL, 5]) + bytes(8) + b"\xff\xff\xff\xff", "announces 4294967295 buffers"),
@@ -156,6 +167,10 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
     ("message", "shown"),
     [
         (Start(3, SECRET.encode()), "Start(child=3, spec=<14 bytes>)"),
+        (
+            Blob(bytes(DIGEST_BYTES), SECRET.encode()),
+            "Blob(digest=<32 bytes>, data=<14 bytes>)",
+        ),
         (
             Deliver(3, 4, SECRET.encode(), [SECRET.encode()]),
             "Deliver(child=3, seq=4, payload=<14 bytes>, buffers=<1 items>)",

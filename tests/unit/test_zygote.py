@@ -43,7 +43,7 @@ class Master:
     ) -> None:
         self.process, self.sock = zygote_process.launch()
         self.sock.settimeout(PATIENCE)
-        setup = (zygote.SETUP, (os.getpid(),), preload, cleanup_directory)
+        setup = (zygote.SETUP, (os.getpid(),), preload, cleanup_directory, None)
         packet.send(self.sock, pickle.dumps(setup), fds=[progress_table.fd])
 
     def start(self, number: int, **options: Any) -> None:
@@ -80,11 +80,13 @@ class Master:
 def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.StartRequest:
     process = Process(target=target, args=args)
     preparation = spawn.get_preparation_data(process.name)
-    preparation |= {"authkey": b"key", "host": "here", "calls": [], "same_host": True}
+    preparation |= {"authkey": b"key", "calls": [], "same_host": True}
     preparation |= options.pop("preparation", {})
     for key in ("start_method", "init_main_from_name", "init_main_from_path"):
         preparation.pop(key, None)
     return zygote.StartRequest(
+        name=process.name,
+        host="here",
         method=options.pop("method", "fork"),
         preparation=pickle.dumps(preparation),
         payload=reduction.dump_process(process, same_host=True)[0],

@@ -11,6 +11,7 @@ needed that a finalizer or a signal handler could meet.
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import threading
 from typing import Any
@@ -24,6 +25,7 @@ from fiber._hub import client as hub_client
 from fiber._hub.hub import Hub
 from fiber._hub.protocol import HubAddress
 from fiber._transport.loop import Loop
+from fiber._wire.blob import Blob
 
 _ENDING = "this process is ending: no process can be started any more"
 
@@ -40,6 +42,7 @@ class Agent:
         self.progress_table = ProgressTable()
         self._hub = hub
         self._ids = itertools.count(1)
+        self._folders = itertools.count(1)
         self._children: dict[int, LocalChild] = {}
         self._abandoned: dict[int, int | None] = {}
         self._zygotes: list[ZygoteLink] = []
@@ -62,7 +65,7 @@ class Agent:
             child.open()
             if self._closed:
                 raise RuntimeError(_ENDING)
-            child.fork_from(self._zygote(), self._access())
+            child.fork_from(self._zygote(child.program), self._access())
         except Exception as error:
             child.start_error = error
             self._refused(child, error)
@@ -92,11 +95,41 @@ class Agent:
             return hub_client.inherited_address()
         return self._hub.address_or_problem
 
-    def _zygote(self, *, preload: bool = True) -> ZygoteLink:
-        if not self._zygotes or not preload:
-            table, directory = self.progress_table.fd, self._cleanup_directory
-            self._zygotes.append(ZygoteLink(self, self.loop, table, directory, preload=preload))
-        return self._zygotes[-1]
+    def _zygote(self, program: Blob | None, *, instead_of: ZygoteLink | None = None) -> ZygoteLink:
+        """The one for ``program``'s children: what it has imported is that program's."""
+        link = self._newest_zygote(program)
+        if link is None or link is instead_of:
+            link = ZygoteLink(
+                self,
+                self.loop,
+                self.progress_table.fd,
+                self._cleanup_directory,
+                preload=link is None,
+                program=program,
+                folder=None if program is None else self._new_folder(),
+            )
+            self._zygotes.append(link)
+            self._retire_zygotes()
+        return link
+
+    def _newest_zygote(self, program: Blob | None) -> ZygoteLink | None:
+        for link in reversed(self._zygotes):
+            if not link.retired and _same(link.program, program):
+                return link
+        return None
+
+    def _retire_zygotes(self) -> None:
+        """End those of a program that has changed since, once they have no children."""
+        newest = self._zygotes[-1].program if self._zygotes else None
+        for link in self._zygotes:
+            if not (link.children or link.retired or _same(link.program, newest)):
+                link.retire()
+
+    def _new_folder(self) -> str:
+        directory = self._cleanup_directory()
+        if directory is None:
+            raise OSError("there is no directory for the program's files on this host")
+        return os.path.join(directory, f"program-{next(self._folders)}")
 
     def _cleanup_directory(self) -> str | None:
         """The hub's directory, made now if there is to be one."""
@@ -152,13 +185,13 @@ class Agent:
             return  # and the end of its zygote is its own
         old = child.zygote
         try:
-            new = self._zygote(preload=self._zygotes[-1] is not old)
+            new = self._zygote(child.program, instead_of=old)
             child.fork_from(new, self._access())
         except Exception as error:
             self._refused(child, error)
             return
         if old is not None and not old.children:
-            old.send(zygote.QUIT)
+            old.retire()
 
     def _refused(self, child: LocalChild, why: object) -> None:
         self._child_exited(child, 1, f"could not be started: {why}", Cause.REFUSED)
@@ -168,6 +201,7 @@ class Agent:
     ) -> None:
         del self._children[child.id]
         child.leave_zygote()
+        self._retire_zygotes()
         unread, running = self._release(child)
         if child.fault is not None:
             reason = f"killed by its agent: {child.fault}"
@@ -182,6 +216,10 @@ class Agent:
         running = self.progress_table.running(child.slot)
         self.progress_table.release(child.slot)
         return unread, running
+
+
+def _same(one: Blob | None, other: Blob | None) -> bool:
+    return one is other or (one is not None and other is not None and one.digest == other.digest)
 
 
 def describe(exitcode: int) -> str:

@@ -16,11 +16,13 @@ from multiprocessing import process as mp_process
 from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
+from fiber._agent import program_folder
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import client as hub_client
 from fiber._hub.protocol import HubAddress
 from fiber._transport.unix import UnixChannel
+from fiber._wire.descriptor import Descriptor, contents, own
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
@@ -40,6 +42,9 @@ host = ""
 class StartRequest(NamedTuple):
     """What a zygote is told of one child, and the child of itself; descriptors come beside it."""
 
+    name: str
+    host: str
+    """What the master calls the host."""
     method: str
     preparation: bytes
     payload: bytes
@@ -54,8 +59,10 @@ class StartRequest(NamedTuple):
     """Where it finds the hub of its host."""
     ancestors: tuple[int, ...]
     """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
-    host: str
-    """What the master calls the host."""
+    folder: str | None = None
+    """Where the program's files are, if they were sent here."""
+    has_arguments: bool = False
+    """Whether a descriptor, the next one, brings the arguments of its Process."""
 
 
 def lineage() -> tuple[int, ...]:
@@ -120,18 +127,19 @@ def _run(start: StartRequest, fds: list[int], progress_table: ProgressTable, age
     if start.slot is not None:
         _task_channel = UnixChannel.from_fd(rest.pop(0))
         _progress = progress_table.slot(start.slot)
+    arguments = own(rest.pop(0)) if start.has_arguments else None
     _descriptors = rest
     try:
-        return _load_and_run(start, agent)
+        return _load_and_run(start, agent, arguments)
     finally:
         # Up to Python 3.12 ``_bootstrap`` runs multiprocessing's own, which know that they ran.
         atexit._run_exitfuncs()
         util._flush_std_streams()  # type: ignore[attr-defined]
 
 
-def _load_and_run(start: StartRequest, agent: int) -> int:
+def _load_and_run(start: StartRequest, agent: int, arguments: Descriptor | None) -> int:
     try:
-        process = _load(start)
+        process = _load(start, arguments)
     except BaseException:
         import traceback  # rarely needed, and long to import
 
@@ -141,20 +149,32 @@ def _load_and_run(start: StartRequest, agent: int) -> int:
     return int(process._bootstrap(parent_sentinel=agent))
 
 
-def _load(start: StartRequest) -> Any:
-    data: dict[str, Any] = pickle.loads(start.preparation)
+def _load(start: StartRequest, arguments: Descriptor | None = None) -> Any:
+    data = read_preparation(start)
     if start.hub is not None:
         hub_client.set_hub_address(start.hub)
     prepare_paths(data)
-    _prepare_environment(data, start.host)
+    _prepare_environment(data)
     with inheriting():
         prepare_main(data)
         process = pickle.loads(start.payload)
+        if arguments is not None:
+            process._args = pickle.loads(contents(arguments.fileno()))
+            arguments.close()
     for fd in _descriptors:
         if fd >= 0:  # sent along, but nothing unpickled took it
             os.close(fd)
     _descriptors.clear()
     return process
+
+
+def read_preparation(start: StartRequest) -> dict[str, Any]:
+    """What ``start`` has the child set up, as it is on this host."""
+    data: dict[str, Any] = pickle.loads(start.preparation)
+    data |= {"name": start.name, "host": start.host}
+    if start.folder is not None:
+        data |= program_folder.places(data["program"], start.folder)
+    return data
 
 
 @contextlib.contextmanager
@@ -169,7 +189,7 @@ def inheriting() -> Iterator[None]:
 
 def prepare_paths(data: dict[str, Any]) -> None:
     """Make modules importable as in the parent, as far as its directories exist here."""
-    if data["same_host"]:
+    if data["same_host"] or "program" in data:
         sys.path[:] = data["sys_path"]
     else:
         known = set(sys.path)
@@ -188,9 +208,9 @@ def prepare_main(data: dict[str, Any]) -> None:
     multiprocessing.spawn.prepare(wanted)
 
 
-def _prepare_environment(data: dict[str, Any], own_host: str) -> None:
+def _prepare_environment(data: dict[str, Any]) -> None:
     global host
-    host = own_host
+    host = data["host"]
     environ = data.get("environ")
     if environ is not None and environ != os.environb:
         os.environb.clear()

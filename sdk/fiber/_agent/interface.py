@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
+from fiber._wire.blob import Blob
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike, Message
 from fiber.resources import Resources
@@ -60,7 +61,10 @@ class ChildSpec:
     method: str
     """``fork`` from the zygote or ``spawn`` a new interpreter."""
     preparation: bytes
-    """Pickled dict: what a child sets up before it unpickles anything of the user's."""
+    """Pickled dict: what a child sets up before it unpickles anything of the user's.
+
+    The same for many children: what is this child's own has a field of its own.
+    """
     payload: bytes
     """The pickled Process object."""
     fds: tuple[Descriptor, ...] = ()
@@ -71,6 +75,10 @@ class ChildSpec:
     executable: str | None = None
     stdio: tuple[int, int] | None = field(default=None)
     """Descriptors for its stdout and stderr; None: those of the agent's process."""
+    program: Blob | None = None
+    """The program's files, for an agent that has not the program's own file system."""
+    arguments: Blob | None = None
+    """The pickled arguments of the Process, where they are not in the payload."""
     resources: Resources = field(default=Resources())
     """What it wishes of its host, heeded where hosts are made for children."""
 

@@ -13,6 +13,7 @@ import signal
 import socket
 import struct
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from fiber._agent import zygote
@@ -25,6 +26,7 @@ from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
 from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire import packet
+from fiber._wire.blob import Blob
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import TooManyOpenFiles
 
@@ -101,6 +103,8 @@ class LocalChild:
         spec = self._spec
         fds = self._descriptors()
         request = StartRequest(
+            spec.name,
+            self.host,
             spec.method,
             spec.preparation,
             spec.payload,
@@ -110,7 +114,8 @@ class LocalChild:
             open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
             hub=hub,
             ancestors=lineage(),
-            host=self.host,
+            folder=zygote.folder,
+            has_arguments=spec.arguments is not None,
         )
         zygote.start(self.id, request, fds)
 
@@ -120,8 +125,12 @@ class LocalChild:
             self.zygote.children -= 1
 
     def _descriptors(self) -> list[int]:
-        """New descriptors for the child: stdout, stderr, task channel, and those of its handles."""
+        """New descriptors for the child: stdout, stderr, task channel, arguments, and those of its
+        handles.
+        """
         ours = [] if self._theirs is None else [self._theirs.fileno()]
+        if self._spec.arguments is not None:
+            ours.append(self._spec.arguments.fileno())
         fds: list[int] = []
         try:
             with naming_the_limit("starting a process"):
@@ -134,9 +143,15 @@ class LocalChild:
             raise
         return fds
 
+    @property
+    def program(self) -> Blob | None:
+        """The files that it needs, until it has them."""
+        return self._spec.program
+
     def release_descriptors(self) -> None:
         """It has its own now: the other end must see EOF when the child lets go."""
         self._spec.close()
+        self._spec = replace(self._spec, payload=b"", fds=(), program=None, arguments=None)
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to the worker; False if it is gone."""

@@ -8,7 +8,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from fiber import config
 from fiber._agent.agent import Agent
+from fiber._agent.blob_store import BlobLacking, BlobStore
 from fiber._agent.capture import Capture
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
@@ -16,7 +18,9 @@ from fiber._hub.hub import Hub
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
 from fiber._transport.stream import Frame
+from fiber._transport.unix import naming_the_limit
 from fiber._wire import messages, packet
+from fiber._wire.descriptor import contents
 
 _KNOWN_HERE = ExitReport._fields.index("pod")
 """Fields of an exit report that an agent knows; the master adds the others."""
@@ -40,6 +44,7 @@ class AgentService:
         self._link = link
         self._agent = agent
         self._on_end = on_end
+        self._blobs = BlobStore(config.current().runtime_directory)
         self._children: dict[int, _Observed] = {}
         self._stopping = False
         self._reason = ""
@@ -60,6 +65,10 @@ class AgentService:
         message = messages.decode(frame)
         if isinstance(message, messages.Start):
             self._start(message)
+        elif isinstance(message, messages.Blob):
+            self._blobs.put(message)
+        elif isinstance(message, messages.Forget):
+            self._blobs.forget(message.digest)
         elif isinstance(message, messages.Shutdown):
             self.stop("the master ended", message.grace)
         elif isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
@@ -84,10 +93,35 @@ class AgentService:
     # Children
 
     def _start(self, message: messages.Start) -> None:
-        name, method, preparation, payload, tasks = pickle.loads(message.spec)
         child = self._children[message.child] = _Observed(self, message.child)
-        child.start(
-            self._agent, self._loop, ChildSpec(name, method, preparation, payload, tasks=tasks)
+        try:
+            with naming_the_limit("starting a process"):
+                spec = self._specification(*pickle.loads(message.spec))
+        except BlobLacking as error:
+            self.send(messages.Lacking(error.digest))
+            child.refuse(self._agent.host, error)
+        except OSError as error:
+            child.refuse(self._agent.host, error)
+        else:
+            child.start(self._agent, self._loop, spec)
+
+    def _specification(
+        self,
+        name: str,
+        method: str,
+        payload: bytes,
+        tasks: bool,
+        digests: tuple[bytes, bytes | None, bytes | None],
+    ) -> ChildSpec:
+        preparation, program, arguments = digests
+        return ChildSpec(
+            name,
+            method,
+            bytes(contents(self._blobs.get(preparation).fileno())),
+            payload,
+            tasks=tasks,
+            program=None if program is None else self._blobs.get(program),
+            arguments=None if arguments is None else self._blobs.get(arguments),
         )
 
     def forget(self, child: int) -> None:
@@ -135,8 +169,12 @@ class _Observed:
             self._child.start()
         except Exception as error:
             # Whatever keeps a child from starting here, the one who asked is the master.
-            reason = f"could not be started: {error}"
-            self.exited(ExitReport(1, reason, host=agent.host, cause=Cause.REFUSED))
+            self.refuse(agent.host, error)
+
+    def refuse(self, host: str, error: Exception) -> None:
+        """It is not started."""
+        reason = f"could not be started: {error}"
+        self.exited(ExitReport(1, reason, host=host, cause=Cause.REFUSED))
 
     def handle(self, message: messages.Deliver | messages.Signal | messages.Recall) -> None:
         """What the master wants of it."""

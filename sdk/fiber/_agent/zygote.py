@@ -5,8 +5,9 @@ imports once what its children need, so that forking is cheap.  As their parent 
 sends them signals (a pid that only we can reap cannot be someone else's).  It ends, and they with
 it, when its agent's process does.
 
-Packets from the agent: ``(SETUP, ancestors, preload, cleanup directory)``, first and once, with the
-descriptor of the progress table; ``(START, child, start request)``, ``(SIGNAL, child, signum)``,
+Packets from the agent: ``(SETUP, ancestors, preload, cleanup directory, program's folder)``, first
+and once, with the descriptors of the progress table and, if there is a folder, of what belongs into
+it; ``(START, child, start request)``, ``(SIGNAL, child, signum)``,
 ``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
 ``(FORK_UNSAFE, child, reason)``: this zygote's imports made forking unsafe, start that child
@@ -30,6 +31,7 @@ import warnings
 from typing import Any, NoReturn
 
 from fiber._agent import child as child_module
+from fiber._agent import program_folder
 from fiber._agent.child import StartRequest
 from fiber._agent.progress import ProgressTable
 from fiber._wire import packet
@@ -58,7 +60,10 @@ class Zygote:
         ancestors: list[int],
         *,
         preload: bool,
+        program: tuple[int, str] | None = None,
     ) -> None:
+        self._program = program
+        """What is to be unpacked before the first child, and where to."""
         self._control = control
         self._progress_table = progress_table
         self._ancestors = ancestors
@@ -132,6 +137,12 @@ class Zygote:
         return []
 
     def _start(self, child: int, start: StartRequest, fds: list[int]) -> None:
+        try:
+            self._unpack_program()
+        except Exception as error:  # the next child may find more room
+            self._reply(FAILED, child, f"the program's files could not be unpacked: {error}")
+            _close_all(fds)
+            return
         if start.method == "fork" and not self._is_fork_safe(start):
             self._reply(FORK_UNSAFE, child, self._fork_unsafe)
             _close_all(fds)
@@ -153,11 +164,18 @@ class Zygote:
         self._children[pid] = child
         self._reply(STARTED, child, pid)
 
+    def _unpack_program(self) -> None:
+        if self._program is not None:
+            archive, folder = self._program
+            program_folder.unpack(archive, folder)
+            self._program = None
+            os.close(archive)
+
     def _is_fork_safe(self, start: StartRequest) -> bool:
         """Whether this process may be forked, after it has imported what it shall."""
         if self._preload:
             self._preload = False
-            self._fork_unsafe = _preload(start.preparation)
+            self._fork_unsafe = _preload(start)
             self._listen_to_signals()  # an import may have set its own
         return self._fork_unsafe is None
 
@@ -226,9 +244,9 @@ class Zygote:
                 self._reply(EXITED, child, os.waitstatus_to_exitcode(status))
 
 
-def _preload(preparation: bytes) -> str | None:
+def _preload(start: StartRequest) -> str | None:
     """Import the program's main module and what it names; say why forking is unsafe after it."""
-    data: dict[str, Any] = pickle.loads(preparation)
+    data = child_module.read_preparation(start)
     child_module.prepare_paths(data)
     for name in data.get("preload", ()):
         # Whatever an import raises, a child that needs it will meet, and report, itself.
@@ -274,33 +292,40 @@ def main(control: int, agent: int) -> None:
             message = packet.receive(sock, descriptors=True)
         except (EOFError, ConnectionError):
             return  # nothing was ever asked of it
-        (progress_table,), message.fds = message.fds, []
-        _, ancestors, preload, cleanup_directory = packet.loads(message)
-        _run_zygote(sock, progress_table, ancestors, cleanup_directory, preload=preload)
+        fds, message.fds = message.fds, []
+        _, *setup = packet.loads(message)
+        _run_zygote(sock, fds, *setup)
 
 
 def _run_zygote(
     sock: socket.socket,
-    progress_table: int,
+    fds: list[int],
     ancestors: tuple[int, ...],
-    cleanup_directory: str | None,
-    *,
     preload: bool,
+    cleanup_directory: str | None,
+    folder: str | None,
 ) -> None:
     """Be the zygote that was asked for.
 
     ``ancestors``: pids, the agent's first.  ``cleanup_directory``: to be removed should they die
-    before they can do so themselves.
+    before they can do so themselves.  ``folder``: to be made for the program's files, and removed.
     """
+    progress_table, *archive = fds
     watched = _pidfds(ancestors)
-    told_to = (
-        bool(watched)
-        and Zygote(sock, ProgressTable(progress_table), watched, preload=preload).run()
-    )
-    if cleanup_directory is not None and not told_to:
+    told_to = False
+    if watched:
+        told_to = Zygote(
+            sock,
+            ProgressTable(progress_table),
+            watched,
+            preload=preload,
+            program=None if folder is None else (archive[0], folder),
+        ).run()
+    ours = folder if told_to else cleanup_directory
+    if ours is not None:
         import shutil  # rarely needed: whoever waits for the first child waits for our imports
 
-        shutil.rmtree(cleanup_directory, ignore_errors=True)
+        shutil.rmtree(ours, ignore_errors=True)
 
 
 def _pidfds(ancestors: tuple[int, ...]) -> list[int]:

@@ -17,6 +17,7 @@ from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
 from fiber._transport.unix import naming_the_limit
 from fiber._wire import packet
+from fiber._wire.blob import Blob
 
 _QUIT_TIMEOUT = 10.0
 
@@ -42,7 +43,14 @@ class ZygoteLink:
         cleanup_directory: Callable[[], str | None],
         *,
         preload: bool,
+        program: Blob | None = None,
+        folder: str | None = None,
     ) -> None:
+        """``program``: the files that it is to unpack to ``folder``, for its children."""
+        self.program = program
+        self.folder = folder
+        self.retired = False
+        """No further child is to live in it."""
         self.children = 0
         """Those that are to live on in it."""
         self._observer = observer
@@ -52,17 +60,19 @@ class ZygoteLink:
         self._asked: deque[int] = deque()
         """Children that it was asked for and has not answered; it answers in their order."""
         with naming_the_limit("starting the zygote"):
-            own_table = os.dup(progress_table)  # what is sent is closed
+            fds = [os.dup(progress_table)]  # what is sent is closed
             try:
+                if program is not None:
+                    fds.append(os.dup(program.fileno()))
                 self._process, self._sock = zygote_process.launch()
             except BaseException:
-                os.close(own_table)
+                close_all(fds)
                 raise
         self._sock.setblocking(False)
         self._outbox = Outbox(loop, self._sock)
         # Made at the last moment: from here on the zygote removes it, whoever is killed.
-        setup = (zygote.SETUP, lineage(), preload, cleanup_directory())
-        self._outbox.send(pickle.dumps(setup), fds=[own_table])
+        setup = (zygote.SETUP, lineage(), preload, cleanup_directory(), folder)
+        self._outbox.send(pickle.dumps(setup), fds=fds)
         loop.register(self._sock.fileno(), self._receive)
 
     def start(self, child: int, request: StartRequest, fds: list[int]) -> None:
@@ -72,6 +82,11 @@ class ZygoteLink:
             some, fds = fds[: packet.MAX_DESCRIPTORS], fds[packet.MAX_DESCRIPTORS :]
             self._outbox.send(pickle.dumps((zygote.DESCRIPTORS, child)), fds=some)
         self._outbox.send(pickle.dumps((zygote.START, child, tuple(request)), protocol=5), fds=fds)
+
+    def retire(self) -> None:
+        """End it; it has no children, and gets none any more."""
+        self.retired = True
+        self.send(zygote.QUIT)
 
     def send(self, *request: Any) -> None:
         """Ask for something else.  On the loop's thread, as ``start``."""

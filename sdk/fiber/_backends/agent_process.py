@@ -31,8 +31,12 @@ class AgentProcess:
     ``on_end`` is called once with how it ended, or why it never began, on the loop's thread.
     """
 
-    def __init__(self, loop: Loop, on_end: Callable[[str], None]) -> None:
+    def __init__(
+        self, loop: Loop, on_end: Callable[[str], None], directory: str | None = None
+    ) -> None:
+        """``directory``: the one to start it in, if that is not this program's."""
         self._loop = loop
+        self._directory = directory
         self._on_end = on_end
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
@@ -55,6 +59,7 @@ class AgentProcess:
                     env={**environment, "FIBER_AGENT_CREDENTIALS": f"fd:{descriptor}"},
                     stdin=subprocess.DEVNULL,
                     pass_fds=(descriptor,),
+                    cwd=self._directory,
                     process_group=0,
                 )
             finally:

@@ -17,6 +17,10 @@ class Backend(Protocol):
     elastic: bool
     """Whether a host may be made for a child: starting one does not wait for that."""
 
+    @property
+    def sends_program(self) -> bool:
+        """Whether its agents have not the program's files, which their children need."""
+
     def child(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
         """A child to be started, at once or when there is room for it; raises what is known to be
         in the way.  From anywhere.

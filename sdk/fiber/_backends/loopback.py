@@ -48,6 +48,10 @@ class LoopbackBackend:
     name = "loopback"
     elastic = False
     same_host = False
+    elsewhere: str | None = None
+    """For tests: a directory that agents are started in as if this machine were another one, which
+    has not the program's files.
+    """
 
     def __init__(self, loop: Loop, hub: Hub, config: Config) -> None:
         self._loop = loop
@@ -82,6 +86,11 @@ class LoopbackBackend:
         for index in range(config.agents):
             self._launch(index)
 
+    @property
+    def sends_program(self) -> bool:
+        """Whether its agents have not the program's files."""
+        return self.elsewhere is not None
+
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """A child for the agent with the fewest; StartError if none can take one more."""
         there = len(self._slots) - len(self._vacant)
@@ -109,7 +118,7 @@ class LoopbackBackend:
     def _launch(self, index: int, pause: float = 0.0) -> None:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
-        process = AgentProcess(self._loop, partial(self._ended, name))
+        process = AgentProcess(self._loop, partial(self._ended, name), self.elsewhere)
         self._by_name[name] = slot = _Slot(index, name, process)
         self._slots[index : index + 1] = [slot]
         launch = self._launcher.launch, process, name, self._environment(name)
@@ -119,8 +128,11 @@ class LoopbackBackend:
             launch[0](*launch[1:])
 
     def _environment(self, name: str) -> dict[str, str]:
+        environment = dict(os.environ)
+        if self.sends_program:
+            environment.pop("PYTHONPATH", None)
         return {
-            **os.environ,
+            **environment,
             "FIBER_AGENT_ADDRESS": self._listener.address,
             "FIBER_AGENT_NAME": name,
             "FIBER_AGENT_PARENT": str(os.getpid()),

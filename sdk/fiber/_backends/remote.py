@@ -7,15 +7,18 @@ import pickle
 import signal
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Protocol
 
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
+from fiber._backends.parcels import Parcels
 from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._hub.hub import Hub
 from fiber._transport.link import EventLoop, Link
 from fiber._transport.stream import Frame
 from fiber._wire import messages, packet
+from fiber._wire.blob import Blob
 from fiber._wire.packet import BytesLike
 
 _SHUTDOWN_GRACE = 0.5
@@ -77,6 +80,7 @@ class RemoteAgent:
         self.suspect = False
         """Whether it has been silent for a while."""
         self._link = link
+        self._parcels = Parcels(loop, link.send)
         self._hub = hub
         self._output = output
         self._observer = observer
@@ -85,12 +89,13 @@ class RemoteAgent:
         self._children: dict[int, RemoteChild] = {}
 
     def start(self, child: RemoteChild) -> None:
-        """Start a child."""
+        """Start a child, once all that it needs is there."""
         if self.lost is not None:
             child.end(self._report_of_loss(self.lost))
             return
         number = next(self._numbers)
         self._children[number] = child
+        self._parcels.send_missing(child.blobs)
         child.begin(self, number)
 
     def withdraw(self, child: RemoteChild) -> bool:
@@ -134,6 +139,9 @@ class RemoteAgent:
         if isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
             self._tunnels.on_frame(message)
             return
+        if isinstance(message, messages.Lacking):
+            self._parcels.lost(message.digest)
+            return
         number = getattr(message, "child", None)
         child = None if number is None else self._children.get(number)
         if child is None:
@@ -158,6 +166,12 @@ class RemoteAgent:
         self.lose(reason)
 
 
+@lru_cache(maxsize=8)
+def _preparation(data: bytes) -> Blob:
+    """The blob of a preparation: few are in use at a time, and agents forget the others."""
+    return Blob(data)
+
+
 class RemoteChild:
     """A ``ChildHandle`` whose child is, or will be, on another host."""
 
@@ -178,7 +192,11 @@ class RemoteChild:
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None
         self._gone = False
-        fields = (spec.name, spec.method, spec.preparation, spec.payload, spec.tasks)
+        needed = (_preparation(spec.preparation), spec.program, spec.arguments)
+        self.blobs = [blob for blob in needed if blob is not None]
+        """What its agent must have, for as long as it lives."""
+        digests = tuple(blob and blob.digest for blob in needed)
+        fields = (spec.name, spec.method, spec.payload, spec.tasks, digests)
         self._start: bytes | None = pickle.dumps(fields, protocol=5)
 
     @property
@@ -270,6 +288,7 @@ class RemoteChild:
     def end(self, report: ExitReport, crossed: int = 0) -> None:
         """It is gone; the last ``crossed`` packets met the news of that on their way."""
         self._gone, self._start = True, None
+        self.blobs.clear()
         if self._channel is not None:
             self._channel.end()
         missed = list(self._latest)[max(0, len(self._latest) - crossed) :]

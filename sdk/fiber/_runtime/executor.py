@@ -147,10 +147,12 @@ class Executor:
             self._end()
             raise
         if self._elastic:
+            self._host.look_at_program()
             return  # the first task says what they need, and starts them
         handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
         try:
             self._loop.call_soon(self._begin, handles)
+            self._host.look_at_program()
             self._launcher.launch_now(handles, self._host.config.start_timeout)
         except BaseException as error:
             self._loop.call_soon(self._launcher.give_up, handles)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from fiber._runtime.shared_arguments import SharedArguments
+
 
 class Timer(Protocol):
     """A call that is due."""
@@ -49,5 +51,19 @@ class Host(Protocol):
     def config(self) -> Any:
         """Its configuration, of which ``start_timeout`` is wanted."""
 
-    def start(self, process: Any, owner: Any, *, tasks: bool, method: str) -> object:
-        """Start a worker's process, whose ``owner`` hears of it."""
+    def start(
+        self,
+        process: Any,
+        owner: Any,
+        *,
+        tasks: bool,
+        method: str,
+        shared: SharedArguments | None,
+    ) -> object:
+        """Start a worker's process, whose ``owner`` hears of it; ``shared`` are its arguments."""
+
+    def look_at_program(self) -> None:
+        """Have the workers that are started from now on see the program's files as they are.
+
+        Raises what is in the way of that.
+        """

@@ -10,6 +10,7 @@ from fiber._runtime.background import BackgroundThread
 from fiber._runtime.host import Loop, Timer
 from fiber._runtime.latch import Latch
 from fiber._runtime.options import PoolOptions
+from fiber._runtime.shared_arguments import SharedArguments
 from fiber._runtime.worker_handle import WorkerHandle
 from fiber._runtime.worker_resources import WorkerResources
 from fiber.resources import with_resources
@@ -21,9 +22,9 @@ KILL_AFTER = 2.0
 class Launcher:
     """Starts workers of one pool, and ends them by force.
 
-    Not on the loop's thread: the user's initializer and its arguments are pickled for each, and
-    agents may need the loop.  ``on_failed`` is called, on the loop's thread, with workers whose
-    processes there will never be, and why, if that was tried.
+    Not on the loop's thread: the user's initializer and its arguments are pickled, and agents may
+    need the loop.  ``on_failed`` is called, on the loop's thread, with workers whose processes
+    there will never be, and why, if that was tried.
     """
 
     def __init__(
@@ -36,6 +37,9 @@ class Launcher:
         on_failed: Callable[[Sequence[WorkerHandle], BaseException | None], None],
     ) -> None:
         self._options = options
+        self._arguments = SharedArguments(
+            (options.initializer, options.initargs, options.retryable)
+        )
         self._resources = resources
         self._loop = loop
         self._background = background
@@ -64,11 +68,11 @@ class Launcher:
                 raise handle.child.start_error
 
     def _start(self, handle: WorkerHandle) -> None:
-        options = self._options
-        process = options.new_process(
+        handle.shared = self._arguments
+        process = self._options.new_process(
             handle,
             target=with_resources(worker.run, self._resources.chosen),
-            args=(options.initializer, options.initargs, options.retryable),
+            args=self._arguments.args,
         )
         process.start()
         handle.process = process

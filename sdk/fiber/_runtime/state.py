@@ -29,6 +29,8 @@ from fiber.resources import resources_of
 
 if TYPE_CHECKING:
     from fiber._backends.base import Backend
+    from fiber._backends.shipping import Program, Shipping
+    from fiber._runtime.shared_arguments import SharedArguments
 
 _EXIT_PRIORITY = -100  # after multiprocessing has ended daemons and joined the other children
 
@@ -44,7 +46,11 @@ class Runtime:
         try:
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
-            reduction.readers_are_remote(not self.backend.same_host)
+            self._shipping = _make_shipping(self.backend)
+            reduction.readers_are_remote(
+                not self.backend.same_host
+                and not (self._shipping is not None and self._shipping.main_is_sent)
+            )
             self.loop.start_thread("fiber-io")
         except BaseException:
             self._close_hub()
@@ -75,15 +81,21 @@ class Runtime:
         *,
         tasks: bool = False,
         method: str = "fork",
+        shared: SharedArguments | None = None,
     ) -> ChildHandle:
         """Start ``process`` as a child; ``tasks`` makes it a pool worker.
+
+        ``shared``: the arguments of ``process``, as several have them.
 
         Returns at once; the owner hears what becomes of it, ``begin`` first.  An error in pickling
         is raised here.  Whoever is interrupted here will be called ``begin``, or nothing has
         happened; what is asked of the loop from then on comes after it.
         """
         same_host = self.backend.same_host
-        preparation = self._preparation(process, same_host)
+        preparation, program = self._preparation(process, anew=not tasks)
+        arguments = None if shared is None else shared.blob(same_host=same_host)
+        if arguments is not None:
+            process._args = ()  # type: ignore[attr-defined]  # they go beside it
         with collecting_grants(reusable=False) as grants:
             payload, fds = reduction.dump_process(process, same_host=same_host)
         observer = _Releasing(owner, grants) if grants else owner
@@ -95,37 +107,57 @@ class Runtime:
             fds=tuple(fds),
             tasks=tasks,
             executable=spawn.get_executable() if same_host else None,
+            program=program and program.archive,
+            arguments=arguments,
             resources=resources_of(getattr(process, "_target", None) or process.run),
         )
         made = self.backend.child(spec, observer)
         self.loop.call_soon(owner.begin, made)
         return made
 
-    def _preparation(self, process: Any, same_host: bool) -> bytes:
-        # pdb leaves its program a main module without one, which multiprocessing does not expect.
-        vars(sys.modules["__main__"]).setdefault("__spec__", None)
-        try:
-            data = spawn.get_preparation_data(process.name)
-        except FileNotFoundError as error:
-            reason = "its working directory is this program's, which was deleted; os.chdir() first"
-            raise StartError(f"process {process.name!r}", reason) from error
+    def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, Program | None]:
+        """What each child sets up, and the files that it needs; ``anew`` as in ``Shipping``."""
+        data = self._spawn_data(f"process {process.name!r}")
+        same_host = self.backend.same_host
         data["authkey"] = bytes(data["authkey"])
         # What such a process starts itself runs on its own host.
         data["calls"] = [
             (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (methods.inherit, (methods.chosen, methods.preload)),
         ]
-        del data["start_method"]
         data["same_host"] = same_host
         if same_host:
             data["environ"] = dict(os.environb)
             data["preload"] = [*methods.preload, *_modules_of(process)]
+        elif self._shipping is not None:
+            data["preload"] = ["cloudpickle", *methods.preload, *_modules_of(process)]
         else:
             data["preload"] = ["cloudpickle"]
+        program = None
+        if self._shipping is not None:
+            program = self._shipping.program(data, anew=anew)
+            data["program"] = program.paths
+        return pickle.dumps(data), program
+
+    def _spawn_data(self, who: str) -> dict[str, Any]:
+        """What multiprocessing has every child know of this program."""
+        # pdb leaves its program a main module without one, which multiprocessing does not expect.
+        vars(sys.modules["__main__"]).setdefault("__spec__", None)
+        try:
+            data = spawn.get_preparation_data("")
+        except FileNotFoundError as error:
+            reason = "its working directory is this program's, which was deleted; os.chdir() first"
+            raise StartError(who, reason) from error
+        del data["start_method"], data["name"]
         if reduction.main_is_out_of_reach():
             data.pop("init_main_from_name", None)
             data.pop("init_main_from_path", None)
-        return pickle.dumps(data)
+        return data
+
+    def look_at_program(self) -> None:
+        """Have the children that are started from now on see the program's files as they are."""
+        if self._shipping is not None:
+            self._shipping.program(self._spawn_data("a pool"), anew=True)
 
     def close(self) -> None:
         """End every child, agent and thread.  Not on the loop's thread."""
@@ -179,6 +211,14 @@ def _is_on_cluster(settings: config.Config) -> bool:
     from fiber._backends.kubernetes.detection import may_make_pools
 
     return may_make_pools(settings.namespace)
+
+
+def _make_shipping(backend: Backend) -> Shipping | None:
+    if not backend.sends_program:
+        return None
+    from fiber._backends.shipping import Shipping
+
+    return Shipping()
 
 
 def _modules_of(process: Any) -> list[str]:

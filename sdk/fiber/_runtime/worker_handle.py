@@ -12,6 +12,7 @@ from fiber._agent.interface import Cause, ChildHandle, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._engine.worker_set import StartFailure
 from fiber._runtime.latch import Latch
+from fiber._runtime.shared_arguments import SharedArguments
 from fiber._transport.loop import Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
@@ -57,6 +58,8 @@ class WorkerHandle:
         self.tasks = 0
         """How many it has done."""
         self.returncode: int | None = None
+        self.shared: SharedArguments | None = None
+        """What it is started with, as all workers of its pool."""
         self._supervisor = supervisor
         self._host = host
         self._pid: int | None = None
@@ -73,7 +76,7 @@ class WorkerHandle:
     def launch(self, process: BaseProcess, method: str) -> None:
         """Start the process; returns before it exists."""
         self._launched = process
-        self._host.start(process, self, tasks=True, method=method)
+        self._host.start(process, self, tasks=True, method=method, shared=self.shared)
 
     # What the agent says, on the loop's thread
 

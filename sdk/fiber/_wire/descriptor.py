@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mmap
+import os
 import select
 from collections.abc import Callable
 from itertools import chain, starmap
@@ -37,3 +39,9 @@ def opened_pair(
     sockets = chain.from_iterable(starmap(opener, (args,)))
     one, other = map(own, map(SocketType.detach, sockets))
     return one, other
+
+
+def contents(fd: int) -> bytes | mmap.mmap:
+    """The bytes of the file ``fd``, whoever else reads them by a duplicate of it."""
+    size = os.fstat(fd).st_size
+    return mmap.mmap(fd, size, access=mmap.ACCESS_READ) if size else b""

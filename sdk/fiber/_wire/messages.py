@@ -19,6 +19,9 @@ from fiber.errors import FiberError
 PROTOCOL = 1
 """Version of everything that master and agent say to each other; both must have the same."""
 
+DIGEST_BYTES = 32
+"""Length of what names a blob: the SHA-256 of its bytes."""
+
 BytesLike: TypeAlias = bytes | bytearray | memoryview
 
 
@@ -38,6 +41,40 @@ class Start(NamedTuple):
 
     def __repr__(self) -> str:
         return _redacted(self)
+
+
+class Blob(NamedTuple):
+    """Master to agent: keep this; Start frames name it by its digest until a Forget does."""
+
+    digest: bytes
+    data: BytesLike
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _BLOB_HEAD.pack(PROTOCOL, _BLOB, self.digest) + self.data
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
+class Forget(NamedTuple):
+    """Master to agent: no Start will name this blob any more, unless it is sent again."""
+
+    digest: bytes
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _BLOB_HEAD.pack(PROTOCOL, _FORGET, self.digest)
+
+
+class Lacking(NamedTuple):
+    """Agent to master: this blob is not here; whoever needs it has to send it again."""
+
+    digest: bytes
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _BLOB_HEAD.pack(PROTOCOL, _LACKING, self.digest)
 
 
 class Started(NamedTuple):
@@ -204,6 +241,9 @@ class Shutdown(NamedTuple):
 
 Message: TypeAlias = (
     Start
+    | Blob
+    | Forget
+    | Lacking
     | Started
     | Signal
     | Deliver
@@ -246,12 +286,14 @@ def decode(frame: bytes | bytearray) -> Message:
 
 _START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
+_BLOB, _FORGET, _LACKING = 15, 16, 17
 
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
 _NUMBERS = struct.Struct("<BBQq")
 _DELIVERY = struct.Struct("<BBQQ")
 _GRACE = struct.Struct("<BBd")
+_BLOB_HEAD = struct.Struct(f"<BB{DIGEST_BYTES}s")
 _COUNT = struct.Struct("<I")
 _NO_BUFFERS = _COUNT.pack(0)
 
@@ -297,6 +339,18 @@ def _json(value: Any) -> bytes:
 
 def _read_start(view: memoryview) -> Start:
     return Start(_NUMBER.unpack_from(view)[2], view[_NUMBER.size :])
+
+
+def _read_blob(view: memoryview) -> Blob:
+    return Blob(_BLOB_HEAD.unpack_from(view)[2], view[_BLOB_HEAD.size :])
+
+
+def _read_forget(view: memoryview) -> Forget:
+    return Forget(_BLOB_HEAD.unpack(view)[2])
+
+
+def _read_lacking(view: memoryview) -> Lacking:
+    return Lacking(_BLOB_HEAD.unpack(view)[2])
 
 
 def _read_started(view: memoryview) -> Started:
@@ -385,6 +439,9 @@ def _string(value: Any) -> str:
 
 _READERS: dict[int, Callable[[memoryview], Message]] = {
     _START: _read_start,
+    _BLOB: _read_blob,
+    _FORGET: _read_forget,
+    _LACKING: _read_lacking,
     _STARTED: _read_started,
     _SIGNAL: _read_signal,
     _DELIVER: _read_deliver,

@@ -21,6 +21,7 @@ class KubernetesBackend:
     name = "kubernetes"
     same_host = False
     elastic = True
+    sends_program = True
 
     def __init__(self, loop: Loop, hub: Hub, config: Config) -> None:
         self._loop = loop

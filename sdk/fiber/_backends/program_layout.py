@@ -1,0 +1,207 @@
+"""Which folders make up the program, and where its children on another machine find them.
+
+* The folder of the main module; for ``-m`` the one that its package is found in.  A session without
+  a main module of its own (``-c``, stdin, a notebook, an installed command) has its working
+  directory instead.  That is only where somebody happened to be: one that is too large is left out,
+  with a warning, where the folder of a script is an error.
+* What ``sys.path`` has besides: folders of ``PYTHONPATH``, projects installed for editing.
+* Of folders that are nobody's in particular, such as a home directory, which holds secrets, and of
+  modules that were found by other ways than ``sys.path``: what has been imported from there.
+
+What is installed (the standard library, site-packages, Fiber) is the image's own.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from multiprocessing import process as mp_process
+from typing import Any, NamedTuple
+
+from fiber._agent.program_folder import ProgramPaths
+
+_INSTALLED = frozenset({"site-packages", "dist-packages"})
+
+_LOOSE = "program"
+"""The folder there for what is sent without the folder that it is in here."""
+
+
+class Places(dict[str, str]):
+    """Folders and files here, none of them in another, and what each is called there."""
+
+    def place_of(self, path: str) -> str | None:
+        """The place that ``path`` is, or is in."""
+        return next((place for place in self if _is_inside(path, place)), None)
+
+    def name_of(self, path: str) -> str | None:
+        """What ``path`` is called there; None if it is not sent."""
+        place = self.place_of(path)
+        return None if place is None else self[place] + path[len(place) :]
+
+
+class Layout(NamedTuple):
+    """What is sent, and where it will be."""
+
+    places: Places
+    program: str
+    """The program's folder; of some only a part is sent."""
+    files: tuple[str, ...]
+    """What has been imported from the places: children need it whatever rules say."""
+    session: frozenset[str]
+    """Those of the places that are a session's working directory and nothing else."""
+    paths: ProgramPaths
+
+
+class _Module(NamedTuple):
+    """A module that has been imported."""
+
+    file: str
+    whole: str
+    """The file, or the folder of the package that it is in."""
+    name: str
+    """What that has to be called to be imported."""
+
+
+def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Layout:
+    """The layout of this program, whose children are prepared by ``preparation``.
+
+    Of the folders ``left_out`` only what has been imported is sent.
+    """
+    main, here = main_file(), os.path.abspath(preparation["dir"])
+    program = here if main is None else _folder_of(main)
+    path = list(map(os.path.abspath, preparation["sys_path"]))
+    whole = [folder for folder in (program, *path) if _is_sent(folder) and folder not in left_out]
+    places = Places(_named(_outermost(whole)))
+    modules = sorted(_imported())
+    if main is not None:
+        modules.append(_Module(main, main, os.path.basename(main)))
+    loose = [module for module in modules if places.place_of(module.file) is None]
+    places.update({module.whole: f"{_LOOSE}/{module.name}" for module in loose})
+    return Layout(
+        places,
+        program,
+        tuple(module.file for module in modules),
+        _session(here).intersection(places) if main is None else frozenset(),
+        ProgramPaths(
+            *_search_path(places, path),
+            directory=(_is_inside(here, program) and places.name_of(here))
+            or places.name_of(program)
+            or _LOOSE,
+            main=None if main is None else places.name_of(main),
+        ),
+    )
+
+
+def main_file() -> str | None:
+    """The file of the main module, if that is the program's own and not installed."""
+    path = getattr(sys.modules["__main__"], "__file__", None)
+    if path is None:
+        return None
+    path = os.path.abspath(os.path.join(_started_in(), path))
+    return path if os.path.isfile(path) and not _is_installed(path) else None
+
+
+def _started_in() -> str:
+    directory: str | None = mp_process.ORIGINAL_DIR  # type: ignore[attr-defined]
+    return directory or ""
+
+
+def _session(here: str) -> frozenset[str]:
+    # An interactive interpreter has the directory that it was started in on its path.
+    return frozenset({here, os.path.abspath(_started_in())})
+
+
+def _folder_of(main: str) -> str:
+    folder = os.path.dirname(main)
+    spec = sys.modules["__main__"].__spec__
+    for _ in range(0 if spec is None else spec.name.count(".")):
+        folder = os.path.dirname(folder)
+    return folder
+
+
+def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What is on ``sys.path`` there before and after the standard library."""
+
+    def there(entries: list[str]) -> list[str]:
+        names = [places.name_of(entry) for entry in entries if not _is_installed(entry)]
+        return [name for name in names if name is not None]
+
+    library = sysconfig.get_path("stdlib")
+    end = path.index(library) if library in path else len(path)
+    before, after = there(path[:end]), there(path[end:])
+    if any(name.startswith(f"{_LOOSE}/") for name in places.values()):
+        before.append(_LOOSE)
+    return tuple(before), tuple(after)
+
+
+def _is_sent(path: str) -> bool:
+    return os.path.exists(path) and not (_is_installed(path) or _is_nobodys(path))
+
+
+def _is_installed(path: str) -> bool:
+    if not _INSTALLED.isdisjoint(path.split(os.sep)):
+        return True
+    return any(_is_inside(path, folder) for folder in _own_folders())
+
+
+@lru_cache(maxsize=1)
+def _own_folders() -> frozenset[str]:
+    """Where the interpreter has its own, and Fiber."""
+    kinds = ("stdlib", "platstdlib", "scripts")
+    fiber = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    return frozenset({fiber, *map(sysconfig.get_path, kinds)})
+
+
+def _is_nobodys(folder: str) -> bool:
+    """Whether all kinds of things are there, a user's secrets among them."""
+    home, here = os.path.realpath(os.path.expanduser("~")), os.path.realpath(folder)
+    return _is_inside(home, here) or here == os.path.realpath(tempfile.gettempdir())
+
+
+def _is_inside(path: str, folder: str) -> bool:
+    return path == folder or path.startswith(folder.rstrip(os.sep) + os.sep)
+
+
+def _outermost(paths: Iterable[str]) -> list[str]:
+    """Each path once, and none that is in another."""
+    found = list(dict.fromkeys(paths))
+    return [
+        path
+        for path in found
+        if not any(path != other and _is_inside(path, other) for other in found)
+    ]
+
+
+def _named(paths: Iterable[str]) -> dict[str, str]:
+    """For each a name of its own, as much like the one that it has as can be."""
+    names: dict[str, str] = {}
+    for path in paths:
+        name = wanted = os.path.basename(path)
+        number = 1
+        while name in (_LOOSE, *names.values()):
+            number += 1
+            name = f"{wanted}-{number}"
+        names[path] = name
+    return names
+
+
+def _imported() -> Iterator[_Module]:
+    """The modules that are not installed; parts of packages, too."""
+    for name, module in list(sys.modules.items()):
+        if name in ("__main__", "__mp_main__"):
+            continue
+        file = getattr(module, "__dict__", {}).get("__file__")
+        if not isinstance(file, str) or _is_installed(file) or not os.path.isfile(file):
+            continue
+        package, *_ = parts = name.split(".")
+        top = sys.modules.get(package, module)
+        if hasattr(top, "__path__") and getattr(top, "__file__", None):
+            yield _Module(file, next(iter(top.__path__)), package)
+        else:  # of a namespace package, whose folder may be anything
+            if not hasattr(module, "__path__"):
+                parts.pop()
+            yield _Module(file, file, os.path.join(*parts, os.path.basename(file)))

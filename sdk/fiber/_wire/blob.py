@@ -1,0 +1,64 @@
+"""Bytes that many children need: they go to each agent once, and to each child as a descriptor."""
+
+from __future__ import annotations
+
+import os
+
+from fiber._wire import messages
+from fiber._wire.descriptor import Descriptor, opened, own
+from fiber._wire.messages import BytesLike
+
+
+class Blob:
+    """Bytes, named by their content.
+
+    An agent has them for as long as the master has the object (``fiber._backends.parcels``).
+    """
+
+    __slots__ = ("__weakref__", "_data", "_file", "_frame", "digest")
+
+    def __init__(self, data: BytesLike) -> None:
+        import hashlib  # most programs need none of it, nor what follows
+
+        self.digest = hashlib.sha256(data).digest()
+        self._data = data
+        self._frame: bytes | None = None
+        self._file: Descriptor | None = None
+
+    @classmethod
+    def in_file(cls, digest: bytes, data: BytesLike, directory: str | None) -> Blob:
+        """What an agent keeps: on its disk and not in its memory, which has a limit in a pod.
+
+        The file has no name, so that none is left whatever becomes of the agent.  OSError.
+        """
+        import tempfile
+
+        blob = cls.__new__(cls)
+        blob.digest, blob._data, blob._frame = digest, b"", None
+        with tempfile.TemporaryFile(dir=directory) as file:
+            blob._file = own(os.dup(file.fileno()))
+        _write(blob._file.fileno(), data)
+        return blob
+
+    @property
+    def frame(self) -> bytes:
+        """The message that brings it to an agent: one, for all of them."""
+        if self._frame is None:
+            size = len(self._data)
+            self._frame = messages.Blob(self.digest, self._data).encode()
+            self._data = memoryview(self._frame)[len(self._frame) - size :]
+        return self._frame
+
+    def fileno(self) -> int:
+        """The descriptor of a file that holds the bytes; it stays this object's."""
+        if self._file is None:
+            file = opened(os.memfd_create, "fiber-blob")
+            _write(file.fileno(), self._data)
+            self._file = file
+        return self._file.fileno()
+
+
+def _write(fd: int, data: BytesLike) -> None:
+    view, done = memoryview(data), 0
+    while done < len(view):  # one write moves at most 2 GiB
+        done += os.write(fd, view[done:])

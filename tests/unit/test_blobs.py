@@ -1,0 +1,230 @@
+"""What many children need goes to each agent once, and is forgotten there with its last user."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+import census
+import fiber
+from fiber import reduction
+from fiber._agent import blob_store
+from fiber._agent.blob_store import BlobLacking, BlobStore
+from fiber._backends.parcels import Parcels
+from fiber._runtime import state
+from fiber._runtime.shared_arguments import SharedArguments
+from fiber._wire import messages
+from fiber._wire.blob import Blob
+from fiber._wire.descriptor import contents
+from memory_link import SimulatedLoop
+from unit.test_loopback import PATIENCE, running
+
+LARGE = 3 << 20
+
+
+class Sent:
+    """What one agent was sent."""
+
+    def __init__(self) -> None:
+        self.loop = SimulatedLoop()
+        self.messages: list[Any] = []
+        self.parcels = Parcels(
+            self.loop,  # type: ignore[arg-type]
+            lambda frame: self.messages.append(messages.decode(frame)),
+        )
+
+    def kinds(self) -> list[str]:
+        """What has been sent since this was asked last."""
+        self.loop.run_for(0)
+        sent, self.messages = self.messages, []
+        return [f"{type(message).__name__} {message.digest[:2].hex()}" for message in sent]
+
+
+def name(blob: Blob) -> str:
+    return blob.digest[:2].hex()
+
+
+def test_a_blob_is_sent_once_and_forgotten_with_its_last_holder() -> None:
+    sent, one, other = Sent(), Blob(b"one"), Blob(b"other")
+    sent.parcels.send_missing([one, other])
+    sent.parcels.send_missing([other, one])
+    known, gone = name(one), name(other)
+    assert sent.kinds() == [f"Blob {known}", f"Blob {gone}"]
+    del other
+    assert sent.kinds() == [f"Forget {gone}"]
+    sent.parcels.send_missing([one, Blob(b"other")])
+    assert sent.kinds()[0] == f"Blob {gone}"
+
+
+def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
+    sent, first = Sent(), Blob(b"content")
+    sent.parcels.send_missing([first])
+    del first  # the loop is told and has not looked yet
+    second = Blob(b"content")
+    sent.parcels.send_missing([second])
+    assert sent.kinds() == [f"Blob {name(second)}"]
+    del second
+    assert len(sent.kinds()) == 1
+
+
+def test_what_an_agent_could_not_keep_is_sent_again() -> None:
+    sent, blob = Sent(), Blob(b"content")
+    sent.parcels.send_missing([blob])
+    sent.parcels.lost(blob.digest)
+    sent.parcels.send_missing([blob])
+    assert sent.kinds() == [f"Blob {name(blob)}"] * 2
+
+
+def test_all_agents_are_sent_one_frame() -> None:
+    blob = Blob(b"content")
+    assert blob.frame is blob.frame
+    assert messages.decode(blob.frame) == messages.Blob(blob.digest, b"content")
+    assert bytes(contents(blob.fileno())) == b"content"
+
+
+@pytest.mark.parametrize("data", [b"", b"content"])
+def test_a_store_keeps_what_it_is_sent_until_it_is_told_to_forget(
+    data: bytes, tmp_path: Any
+) -> None:
+    store, digest = BlobStore(str(tmp_path)), Blob(data).digest
+    store.put(messages.Blob(digest, data))
+    held = store.get(digest)
+    store.forget(digest)
+    with pytest.raises(BlobLacking, match="it was forgotten"):
+        store.get(digest)
+    assert bytes(contents(held.fileno())) == data, "who has it still has it"
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_store_without_room_says_so_once_and_keeps_the_next(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    store, message = BlobStore(str(tmp_path)), messages.Blob(Blob(b"x").digest, b"x")
+    monkeypatch.setattr(blob_store.Blob, "in_file", full)
+    store.put(message)
+    with pytest.raises(BlobLacking, match="No space left on device") as caught:
+        store.get(message.digest)
+    assert caught.value.digest == message.digest
+    monkeypatch.undo()
+    store.put(message)
+    assert store.get(message.digest).digest == message.digest
+
+
+# Arguments of a pool's workers
+
+
+class Counted:
+    """Counts how often it is pickled."""
+
+    pickled = 0
+
+    def __init__(self) -> None:
+        self.content = bytes(LARGE)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        Counted.pickled += 1
+        return bytes, (self.content,)
+
+
+_kept: Any = None
+
+
+def keep(*values: Any) -> None:
+    global _kept
+    _kept = values
+
+
+def size_of_kept(_: object = None) -> int:
+    return len(_kept[0])
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_large_arguments_are_pickled_once_for_all_workers(method: str) -> None:
+    Counted.pickled = 0
+    with fiber.get_context(method).Pool(3, keep, (Counted(),)) as pool:
+        assert pool.map(size_of_kept, range(6), chunksize=1) == [LARGE] * 6
+    assert Counted.pickled == 1
+
+
+def test_what_holds_a_handle_is_pickled_for_each() -> None:
+    ours, theirs = fiber.Pipe()
+    for same_host in (True, False):
+        assert reduction.dump_shared((theirs,), same_host=same_host) is None
+    assert reduction.dump_shared(("plain",), same_host=True) is not None
+    before = len(os.listdir("/proc/self/fd"))
+    assert SharedArguments((theirs, bytes(LARGE))).blob(same_host=True) is None
+    assert len(os.listdir("/proc/self/fd")) == before
+    ours.close()
+    theirs.close()
+
+
+def test_what_does_not_pickle_is_named_as_ever() -> None:
+    with pytest.raises(fiber.UnpicklableError, match=r"argument 1 of process .* \(at \[1\]\)"):
+        fiber.Pool(1, keep, (bytes(LARGE), (i for i in range(3))))
+
+
+def test_small_arguments_stay_with_their_worker() -> None:
+    assert SharedArguments((keep, (1,), ())).blob(same_host=True) is None
+
+
+@pytest.fixture
+def backend() -> Iterator[Any]:
+    with running() as made:
+        yield made
+
+
+def blobs_at(backend: Any) -> int:
+    """Bytes of what the agent holds open without a name, as its own descriptors say."""
+    pid = backend._processes[0].process.pid
+    total = 0
+    for fd in os.listdir(f"/proc/{pid}/fd"):
+        path = f"/proc/{pid}/fd/{fd}"
+        if "(deleted)" in os.readlink(path) and "memfd" not in os.readlink(path):
+            total += os.stat(path).st_size
+    return total
+
+
+def test_an_agent_is_sent_them_once_and_forgets_them_after_the_pool(backend: Any) -> None:
+    with fiber.Pool(4, keep, (os.urandom(LARGE),)) as pool:
+        assert pool.map(size_of_kept, range(8)) == [LARGE] * 8
+        sent = backend._processes[0].agent._link.statistics().bytes_sent
+        assert LARGE < sent < 1.5 * LARGE
+        assert LARGE < blobs_at(backend) < 1.5 * LARGE
+        pool.terminate()
+        pool.join()
+    del pool
+
+    def forgotten() -> bool:
+        gc.collect()
+        return blobs_at(backend) < LARGE
+
+    assert census.wait_until(forgotten, PATIENCE)
+
+
+def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: Any) -> None:
+    # As if the agent had found no room for them: it says so, and they are sent again.
+    shared = SharedArguments((keep, (bytes(LARGE),), ()))
+    blob = shared.blob(same_host=False)
+    assert blob is not None
+    agent = backend._processes[0].agent
+    backend._loop.call_soon(agent._parcels.send_missing, [blob])
+    agent.send(messages.Forget(blob.digest))
+    with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
+        assert pool.apply(size_of_kept) == LARGE
+    assert state.runtime().backend is backend
+
+
+def test_the_agent_that_replaces_a_lost_one_is_sent_them_too(backend: Any) -> None:
+    with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
+        assert pool.apply(size_of_kept) == LARGE
+        os.kill(backend._processes[0].process.pid, signal.SIGKILL)
+        assert pool.apply(size_of_kept) == LARGE
+        assert backend._processes[0].agent.host == "loopback-1"

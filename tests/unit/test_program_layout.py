@@ -1,0 +1,177 @@
+"""Which folders make up a program, and where they are elsewhere."""
+
+from __future__ import annotations
+
+import os
+import sysconfig
+import tempfile
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+from fiber._backends import program_layout
+from fiber._backends.program_layout import find_layout
+from unit.shipping_site import write
+
+STDLIB = sysconfig.get_path("stdlib")
+
+
+class Machine:
+    """A machine with a program, which ``main`` and ``path`` describe."""
+
+    def __init__(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.home = write(tmp_path / "home", train_py="", helper_py="", secret="key")
+        self.es = write(self.home / "es", main_py="", pkg__sub__tool_py="", data__x_npy="x")
+        self.lib = write(tmp_path / "lib", shared__init_py="")
+        self.main = ModuleType("__main__")
+        monkeypatch.setenv("HOME", str(self.home))
+        monkeypatch.setattr(program_layout.mp_process, "ORIGINAL_DIR", str(self.es))
+        # Without what the tests themselves have imported from outside of site-packages.
+        self.modules = {"__main__": self.main}
+        monkeypatch.setattr(program_layout, "sys", SimpleNamespace(modules=self.modules))
+        monkeypatch.setattr(tempfile, "tempdir", "/nowhere")  # ours is in that
+
+    def runs(self, file: Path, name: str | None = None) -> None:
+        """Its main module is that one; ``-m name`` if that is given."""
+        self.main.__file__ = str(file)
+        spec: Any = ModuleType("spec")
+        spec.name = name
+        self.main.__spec__ = spec if name else None
+
+    def has_imported(self, name: str, file: Path, package: Path | None = None) -> None:
+        """A module from there."""
+        module = ModuleType(name)
+        module.__file__ = str(file)
+        if package is not None:
+            module.__path__ = [str(package)]
+        self.modules[name] = module
+
+    def layout(
+        self, *path: Path | str, directory: Path | None = None, left_out: tuple[Path, ...] = ()
+    ) -> program_layout.Layout:
+        """The layout, with that ``sys.path`` and working directory."""
+        preparation = {"sys_path": list(map(str, path)), "dir": str(directory or self.es)}
+        return find_layout(preparation, frozenset(map(str, left_out)))
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    return Machine(tmp_path, monkeypatch)
+
+
+def test_a_script_has_its_folder(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    layout = machine.layout(machine.es, STDLIB, directory=machine.es / "data")
+    assert layout.places == {str(machine.es): "es"}
+    assert layout.paths == (("es",), (), "es/data", "es/main.py")
+    assert not layout.session
+
+
+def test_a_working_directory_elsewhere_is_the_programs_folder_there(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    layout = machine.layout(machine.es, STDLIB, directory=machine.home)
+    assert layout.places == {str(machine.es): "es"}
+    assert layout.paths.directory == "es"
+
+
+def test_a_module_that_is_run_by_name_has_the_folder_of_its_package(machine: Machine) -> None:
+    machine.runs(machine.es / "pkg/sub/tool.py", name="pkg.sub.tool")
+    layout = machine.layout(machine.es, STDLIB)
+    assert (layout.program, layout.places) == (str(machine.es), {str(machine.es): "es"})
+
+
+def test_what_is_on_the_path_comes_along_in_its_order(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    editable = write(machine.lib.parent / "src" / "lib", other_py="")
+    layout = machine.layout(machine.es, machine.lib, STDLIB, "/gone", editable)
+    assert layout.places == {
+        str(machine.es): "es",
+        str(machine.lib): "lib",
+        str(editable): "lib-2",
+    }
+    assert layout.paths.before_library == ("es", "lib")
+    assert layout.paths.before_installed == ("lib-2",)
+
+
+def test_folders_within_one_another_are_sent_once(machine: Machine) -> None:
+    machine.runs(machine.es / "pkg/sub/tool.py")
+    layout = machine.layout(machine.es / "pkg/sub", machine.es, STDLIB)
+    assert layout.places == {str(machine.es): "es"}
+    assert layout.paths == (("es/pkg/sub", "es"), (), "es/pkg/sub", "es/pkg/sub/tool.py")
+
+
+def test_what_is_installed_is_the_images(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    fiber = Path(program_layout.__file__).parents[2]
+    other = machine.lib / "python3/site-packages"
+    other.mkdir(parents=True)
+    layout = machine.layout(machine.es, STDLIB, f"{STDLIB}/lib-dynload", other, fiber)
+    assert layout.places == {str(machine.es): "es"}
+
+
+def test_what_is_installed_within_the_programs_folder_is_on_no_path(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    inside = write(machine.es / ".venv/lib/site-packages", pkg_py="")
+    layout = machine.layout(machine.es, STDLIB, inside)
+    assert layout.paths == (("es",), (), "es", "es/main.py")
+
+
+def test_a_session_has_its_working_directory(machine: Machine) -> None:
+    layout = machine.layout(machine.es, STDLIB)
+    assert layout.places == {str(machine.es): "es"}
+    assert layout.session == {str(machine.es)}
+    assert layout.paths == (("es",), (), "es", None)
+
+
+def test_an_installed_command_is_like_a_session(machine: Machine) -> None:
+    machine.runs(Path(sysconfig.get_path("scripts")) / "tool")
+    layout = machine.layout(sysconfig.get_path("scripts"), STDLIB)
+    assert layout.session == {str(machine.es)}
+    assert layout.paths.main is None
+
+
+def test_of_a_home_directory_only_what_was_imported_is_sent(machine: Machine) -> None:
+    machine.runs(machine.home / "train.py")
+    machine.has_imported("helper", machine.home / "helper.py")
+    machine.has_imported("pkg", machine.es / "pkg/__init__.py", machine.es / "pkg")
+    (machine.es / "pkg/__init__.py").touch()
+    layout = machine.layout(machine.home, STDLIB, directory=machine.home)
+    assert set(layout.places.values()) == {"program/train.py", "program/helper.py", "program/pkg"}
+    assert layout.paths == (("program",), (), "program", "program/train.py")
+
+
+def test_what_was_imported_from_a_namespace_keeps_its_name(machine: Machine) -> None:
+    machine.runs(machine.home / "train.py")
+    module = write(machine.home / "space", part__tool_py="") / "part/tool.py"
+    space: Any = ModuleType("space")
+    space.__path__ = [str(machine.home / "space")]
+    machine.modules["space"] = space
+    machine.has_imported("space.part.tool", module)
+    layout = machine.layout(machine.home, STDLIB, directory=machine.home)
+    assert layout.places[str(module)] == "program/space/part/tool.py"
+
+
+@pytest.mark.parametrize("folder", ["/", "home", "above"])
+def test_a_session_in_a_folder_that_is_nobodys_sends_nothing_of_it(
+    machine: Machine, folder: str
+) -> None:
+    here = {"home": machine.home, "above": machine.home.parent}.get(folder, Path("/"))
+    layout = machine.layout(here, STDLIB, directory=here)
+    assert layout.places == {}
+    assert layout.paths == ((), (), "program", None)
+
+
+def test_what_was_left_out_is_sent_as_far_as_it_was_imported(machine: Machine) -> None:
+    machine.has_imported("tool", machine.es / "pkg/sub/tool.py")
+    layout = machine.layout(machine.es, STDLIB, left_out=(machine.es,))
+    assert layout.places == {str(machine.es / "pkg/sub/tool.py"): "program/tool.py"}
+
+
+def test_what_was_imported_is_named(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    machine.has_imported("tool", machine.es / "pkg/sub/tool.py")
+    machine.has_imported("gone", machine.es / "gone.py")
+    layout = machine.layout(machine.es, STDLIB)
+    assert {os.path.basename(file) for file in layout.files} == {"main.py", "tool.py"}
