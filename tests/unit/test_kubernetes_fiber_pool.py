@@ -7,6 +7,7 @@ import math
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -150,8 +151,7 @@ def test_a_demand_is_written_until_it_holds(
     rig.own(told).demand(4)
     replicas_become(rig, told, 4)
     assert not told.errors
-    (warning,) = told.warnings
-    assert "kubectl cluster-info" in warning
+    assert "kubectl cluster-info" in told.warnings[0]
 
 
 def test_names_to_release_are_written_until_their_pods_are_gone(
@@ -252,6 +252,22 @@ def test_what_keeps_it_from_being_born_is_said_at_once(
         raise error
 
 
+def test_fields_that_the_definition_does_not_know_are_not_dropped_in_silence(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strict: dict[str, bool] = {}
+    create = rig.api.create
+
+    def spy(path: str, body: Body, **how: Any) -> Body:
+        strict[body["kind"]] = how.get("strict", False)
+        return create(path, body, **how)
+
+    monkeypatch.setattr(rig.api, "create", spy)
+    rig.own(told).demand(1)
+    replicas_become(rig, told, 1)
+    assert strict[names.KIND]
+
+
 def test_a_pool_whose_secret_may_not_be_made_is_taken_back(rig: Rig, told: Told) -> None:
     rig.server.api.faults.append(Fault("create", "secrets", status=403, message="no secrets"))
     client = rig.own(told)
@@ -284,6 +300,7 @@ def test_an_operator_that_is_silent(rig: Rig, told: Told, monkeypatch: pytest.Mo
 def test_an_operator_of_which_nothing_could_be_heard(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.2)
     monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.5)
     monkeypatch.setattr(watches, "_PAUSE_MAX", 0.1)
     rig.server.api.faults.append(Fault("list", names.PLURAL, status=503, times=12))

@@ -130,6 +130,22 @@ def test_a_loss_that_came_of_being_late_says_so(case: Case) -> None:
     assert (explained.reason, explained.pool) == ("Deleted", "es-1")
 
 
+def test_a_namesake_is_another_pool(case: Case) -> None:
+    found = case.rig.pool()
+    assert case.pool.loss(found) is None
+    loss = case.pool.loss({**found, "metadata": {**found["metadata"], "uid": "another"}})
+    assert loss is not None
+    assert loss.reason == "Deleted"
+
+
+def test_a_pool_that_is_being_deleted_is_lost(case: Case) -> None:
+    found = case.rig.pool()
+    going = {**found["metadata"], "deletionTimestamp": "2026-01-01T00:00:00Z"}
+    loss = case.pool.loss({**found, "metadata": going})
+    assert loss is not None
+    assert loss.reason == "Deleted"
+
+
 def test_what_failed_does_not_count_as_renewed(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
     case.rig.server.api.faults.append(Fault("patch", "leases", status=503))
