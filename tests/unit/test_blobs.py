@@ -183,7 +183,7 @@ def backend() -> Iterator[Any]:
 
 def blobs_at(backend: Any) -> int:
     """Bytes of what the agent holds open without a name, as its own descriptors say."""
-    pid = backend._processes[0].process.pid
+    pid = backend._slots[0].process.pid
     total = 0
     for fd in os.listdir(f"/proc/{pid}/fd"):
         path = f"/proc/{pid}/fd/{fd}"
@@ -195,7 +195,7 @@ def blobs_at(backend: Any) -> int:
 def test_an_agent_is_sent_them_once_and_forgets_them_after_the_pool(backend: Any) -> None:
     with fiber.Pool(4, keep, (os.urandom(LARGE),)) as pool:
         assert pool.map(size_of_kept, range(8)) == [LARGE] * 8
-        sent = backend._processes[0].agent._link.statistics().bytes_sent
+        sent = backend.agents.agents["loopback-0"]._link.statistics().bytes_sent
         assert LARGE < sent < 1.5 * LARGE
         assert LARGE < blobs_at(backend) < 1.5 * LARGE
         pool.terminate()
@@ -214,7 +214,7 @@ def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: An
     shared = SharedArguments((keep, (bytes(LARGE),), ()))
     blob = shared.blob(same_host=False)
     assert blob is not None
-    agent = backend._processes[0].agent
+    agent = backend.agents.agents["loopback-0"]
     backend._loop.call_soon(agent._parcels.send_missing, [blob])
     agent.send(messages.Forget(blob.digest))
     with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
@@ -225,6 +225,6 @@ def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: An
 def test_the_agent_that_replaces_a_lost_one_is_sent_them_too(backend: Any) -> None:
     with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
         assert pool.apply(size_of_kept) == LARGE
-        os.kill(backend._processes[0].process.pid, signal.SIGKILL)
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)
         assert pool.apply(size_of_kept) == LARGE
-        assert backend._processes[0].agent.host == "loopback-1"
+        assert backend._slots[0].name == "loopback-1"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -31,7 +32,7 @@ def end(pool: Pool) -> None:
 
 WAITS: dict[str, Callable[[Pool], Any]] = {
     "apply": lambda pool: pool.apply(abs, (-1,)),
-    "apply_async": lambda pool: pool.apply_async(abs, (-1,)).get(),
+    "apply_async": lambda pool: pool.apply_async(time.sleep, (0.5,)).get(),  # not there at once
     "broadcast": lambda pool: pool.broadcast(abs, -1),
     "map": lambda pool: pool.map(abs, [-1]),
     "map an iterator": lambda pool: pool.map(abs, iter([-1])),

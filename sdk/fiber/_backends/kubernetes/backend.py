@@ -54,4 +54,5 @@ class KubernetesBackend:
         """End the pods, and the pools or their use."""
         for pods in self._pods.values():
             pods.close()
+        self._program.api.close()
         self._output.close()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import ApiError
+from fiber._backends.kubernetes.api_errors import ApiError, Body
 from fiber.errors import ConfigError
 from fiber_api import names
 
@@ -16,19 +18,22 @@ _TIMEOUT = 5.0
 def may_make_pools(namespace: str | None) -> bool:
     """Whether the account of the pod that this is may make FiberPools."""
     try:
-        api = Api.connect()
-        attributes = {
-            "group": names.GROUP,
-            "resource": names.PLURAL,
-            "verb": "create",
-            "namespace": namespace or api.namespace,
-        }
-        review = {
-            "apiVersion": "authorization.k8s.io/v1",
-            "kind": "SelfSubjectAccessReview",
-            "spec": {"resourceAttributes": attributes},
-        }
-        answer = api.create(_REVIEWS, review, timeout=_TIMEOUT)
+        with contextlib.closing(Api.connect()) as api:
+            answer = api.create(_REVIEWS, _review(namespace or api.namespace), timeout=_TIMEOUT)
     except (ConfigError, ApiError):  # no account, no client, no answer
         return False
     return bool(answer.get("status", {}).get("allowed"))
+
+
+def _review(namespace: str) -> Body:
+    attributes = {
+        "group": names.GROUP,
+        "resource": names.PLURAL,
+        "verb": "create",
+        "namespace": namespace,
+    }
+    return {
+        "apiVersion": "authorization.k8s.io/v1",
+        "kind": "SelfSubjectAccessReview",
+        "spec": {"resourceAttributes": attributes},
+    }
