@@ -23,6 +23,8 @@ OPERATORS = {names.operator_lease_name("fiber-operator"), "fiberpools.fiber.dev"
 
 PATIENCE = 30
 
+pytestmark = pytest.mark.may_leak("the operator's connections, for as long as the cluster is there")
+
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeCluster]:

@@ -214,6 +214,7 @@ def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: An
     shared = SharedArguments((keep, (bytes(LARGE),), ()))
     blob = shared.blob(same_host=False)
     assert blob is not None
+    assert census.wait_until(lambda: "loopback-0" in backend.agents.agents, PATIENCE)
     agent = backend.agents.agents["loopback-0"]
     backend._loop.call_soon(agent._parcels.send_missing, [blob])
     agent.send(messages.Forget(blob.digest))
