@@ -1,0 +1,77 @@
+"""What a person can see of a pool's workers, and which resources these get."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+
+import fiber
+from fiber._runtime.worker_resources import WorkerResources
+from fiber.errors import StartError, TimeoutError
+from fiber.resources import Resources
+
+PATIENCE = 20
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def fail() -> None:
+    raise LookupError("no such device")
+
+
+def test_workers_are_described() -> None:
+    with fiber.Pool(2) as pool:
+        pool.wait_until_workers_up(PATIENCE)
+        assert {info.state for info in pool.workers()} == {"idle"}
+        pool.map(square, range(100))
+        infos = pool.workers()
+        assert sum(info.tasks for info in infos) == 100
+        assert {info.pid for info in infos} == set(pool.broadcast(os.getpid))
+        assert {(info.host, info.node) for info in infos} == {("local", "")}
+        pool.apply_async(time.sleep, (PATIENCE,))
+        assert sorted(info.state for info in pool.workers()).count("leaving") == 0
+    pool.join()
+    assert pool.workers() == []
+
+
+def test_calls_that_their_callers_wait_for_count_too() -> None:
+    with fiber.Pool(1) as pool:
+        for _ in range(50):
+            pool.apply(square, (2,))
+        assert pool.workers()[0].tasks == 50
+    pool.join()
+
+
+def test_workers_that_do_not_come_in_time_are_counted() -> None:
+    with fiber.Pool(1, time.sleep, (PATIENCE,)) as pool:
+        with pytest.raises(TimeoutError, match=r"0 of 1 workers are ready after 0.1 s"):
+            pool.wait_until_workers_up(0.1)
+        assert pool.workers()[0].state == "starting"
+    pool.join()
+
+
+def test_what_keeps_workers_from_starting_is_raised() -> None:
+    with fiber.Pool(1, fail) as pool, pytest.raises(StartError, match="no such device"):
+        pool.wait_until_workers_up(PATIENCE)
+    pool.join()
+
+
+def test_the_first_function_decides_what_workers_get() -> None:
+    resources = WorkerResources(Resources(pool="warm"))
+    resources.choose_for(fiber.meta(cpu=2)(square))
+    assert resources.chosen == Resources(cpu=2, pool="warm")
+    resources.choose_for(square)  # which wishes nothing
+    resources.choose_for(fiber.meta(cpu=2)(square))
+    with pytest.raises(ValueError, match="Make another pool"):
+        resources.choose_for(fiber.meta(cpu=2, gpu=1)(square))
+
+
+def test_workers_that_were_started_before_have_no_wishes() -> None:
+    resources = WorkerResources(Resources())
+    assert resources.chosen == Resources()
+    with pytest.raises(ValueError, match="gpu=1"):
+        resources.choose_for(fiber.meta(gpu=1)(square))
