@@ -16,7 +16,7 @@ OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons e2e lint bench bench-operator conformance crds images cluster cluster-down clean
+.PHONY: help demo test test-fast test-pythons e2e lint bench bench-operator bench-kubernetes conformance crds images cluster cluster-down clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -63,6 +63,10 @@ bench: $(VENV)/.with-bench
 ## make bench-operator  FiberPools beside ReplicaSets at thousands of pretended pods (root, Go)
 bench-operator: $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.operator_scale --set-up
+
+## make bench-kubernetes  Fiber on pods beside multiprocessing, Ray and Dask (root, Go)
+bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
+	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
 
 ## make conformance   CPython's own multiprocessing tests (BACKEND=local or loopback)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from benchmarks import agents, coldstart, latency, overhead, pipes, startup, throughput, workers
+from benchmarks import (
+    agents,
+    coldstart,
+    kubernetes_start,
+    latency,
+    overhead,
+    pipes,
+    startup,
+    throughput,
+    workers,
+)
 from benchmarks.model import BASELINE, Metric, Run
 from benchmarks.samples import in_words, ratio, summary, times
 
@@ -67,15 +78,15 @@ def judge(budget: Budget, runs: Mapping[str, Run]) -> Verdict:
     return Verdict(budget, kept, measured, "met" if kept else f"missed by {_missed(value, budget)}")
 
 
-def verdicts(runs: Mapping[str, Run]) -> list[Verdict]:
-    """All budgets, in the design's order."""
-    return [judge(budget, runs) for budget in BUDGETS]
+def verdicts(runs: Mapping[str, Run], among: Sequence[Budget] | None = None) -> list[Verdict]:
+    """All budgets of `make bench`, or these, in the design's order."""
+    return [judge(budget, runs) for budget in (BUDGETS if among is None else among)]
 
 
 def of(measure: str, case: str, metric: str, contender: str) -> list[Budget]:
     """The budgets on one value of a contender."""
     keys = (measure, case, metric, contender)
-    return [b for b in BUDGETS if (b.measure, b.case, b.metric, b.contender) == keys]
+    return [b for b in (*BUDGETS, *ON_PODS) if (b.measure, b.case, b.metric, b.contender) == keys]
 
 
 def _value(budget: Budget, run: Run) -> float | None:
@@ -216,4 +227,28 @@ def _many() -> Iterator[Budget]:
     yield Budget(label, "workers", case, workers.COST.name, 1.1, to_case=few)
 
 
+def _on_pods() -> Iterator[Budget]:
+    def budget(
+        what: str, measure: str, case: str, metric: Metric, bound: float, **more: Any
+    ) -> Budget:
+        pods = {"contender": "fiber-kubernetes", **more}
+        return Budget(what, measure, case, metric.name, bound, **pods)
+
+    for chunks in overhead.CHUNKS:
+        for duration in (each for each in overhead.DURATIONS if each >= 0.001):
+            case = overhead.case_name(duration, chunks)
+            yield budget(f"overhead: {case}", "overhead", case, overhead.TIME, 1.02)
+    case = "map, chunksize 1"
+    yield budget("no-op tasks, chunksize 1", "throughput", case, throughput.RATE, 10, at_least=True)
+    what = "latency of one apply, p50"
+    yield budget(what, "latency", latency.NAME, latency.P50, 3)
+    for case in throughput.ARRAY_KINDS:
+        yield budget(case, "throughput", case, throughput.TIME, 1)
+    case = kubernetes_start.WARM
+    yield budget(
+        "a pool on warm pods", "kubernetes_start", case, kubernetes_start.TIME, 0.3, unit="s"
+    )
+
+
 BUDGETS = (*_pool(), *_pipes(), *_start(), *_remote(), *_many())
+ON_PODS = tuple(_on_pods())

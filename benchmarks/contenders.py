@@ -114,4 +114,15 @@ ALL = (
     ),
 )
 
-BY_NAME = {contender.name: contender for contender in ALL}
+ON_PODS = Contender(
+    "fiber-kubernetes",
+    "Fiber, pods",
+    ("fiber", "kubernetes"),
+    _POOL | _PROCESSES,
+    "#117733",
+    "*",
+    environment={"FIBER_BACKEND": "kubernetes"},
+)
+"""Takes part where a cluster is: see kubernetes_run.py."""
+
+BY_NAME = {contender.name: contender for contender in (*ALL, ON_PODS)}

@@ -20,7 +20,7 @@ Function = Callable[[Any], Any]
 
 
 class Adapter(abc.ABC):
-    """A pool of five workers, started when made."""
+    """A pool of so many workers, started when made."""
 
     @abc.abstractmethod
     def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
@@ -70,16 +70,16 @@ class PoolAdapter(Adapter):
 class Ray(PoolAdapter):
     """Ray's replacement for multiprocessing.Pool, on a Ray of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self, workers: int) -> None:
         self.ray = import_module("ray")
         self.ray.init(
-            num_cpus=WORKERS,
+            num_cpus=workers,
             include_dashboard=False,
             logging_level="ERROR",
             log_to_driver=False,
             _temp_dir=os.path.join(os.environ["TMPDIR"], "ray"),
         )
-        super().__init__(import_module("ray.util.multiprocessing").Pool(WORKERS))
+        super().__init__(import_module("ray.util.multiprocessing").Pool(workers))
 
     def close(self) -> None:
         super().close()
@@ -89,8 +89,8 @@ class Ray(PoolAdapter):
 class Futures(Adapter):
     """concurrent.futures: its default chunk is one item."""
 
-    def __init__(self) -> None:
-        self.executor = futures.ProcessPoolExecutor(WORKERS)
+    def __init__(self, workers: int) -> None:
+        self.executor = futures.ProcessPoolExecutor(workers)
 
     def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
         return list(self.executor.map(function, items, chunksize=chunksize or 1))
@@ -114,10 +114,11 @@ class Futures(Adapter):
 class Joblib(Adapter):
     """joblib.Parallel on its loky executor: the default chunk is joblib's batch_size="auto"."""
 
-    def __init__(self) -> None:
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
         self.joblib = import_module("joblib")
         # The one that joblib.Parallel gets too.
-        self.executor = import_module("joblib.executor").get_memmapping_executor(WORKERS)
+        self.executor = import_module("joblib.executor").get_memmapping_executor(workers)
 
     def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
         return list(self._parallel(function, items, chunksize or "auto", "list"))
@@ -137,7 +138,7 @@ class Joblib(Adapter):
     def _parallel(
         self, function: Function, items: Sequence[Any], batch: int | str, kind: str
     ) -> Iterable[Any]:
-        parallel = self.joblib.Parallel(WORKERS, batch_size=batch, return_as=kind)
+        parallel = self.joblib.Parallel(self.workers, batch_size=batch, return_as=kind)
         call = self.joblib.delayed(function)
         results: Iterable[Any] = parallel(call(item) for item in items)
         return results
@@ -149,10 +150,10 @@ class Dask(Adapter):
     Unchunked is Client.map, which has no chunks; default chunks are those of a dask.bag.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, workers: int) -> None:
         self.distributed = import_module("distributed")
         self.cluster = self.distributed.LocalCluster(
-            n_workers=WORKERS, threads_per_worker=1, dashboard_address=None
+            n_workers=workers, threads_per_worker=1, dashboard_address=None
         )
         self.client = self.distributed.Client(self.cluster)
 
@@ -186,8 +187,8 @@ class IPyParallel(Adapter):
     engine.
     """
 
-    def __init__(self) -> None:
-        self.cluster = import_module("ipyparallel").Cluster(n=WORKERS, log_level=40)
+    def __init__(self, workers: int) -> None:
+        self.cluster = import_module("ipyparallel").Cluster(n=workers, log_level=40)
         self.client = self.cluster.start_and_connect_sync(activate=False)
         self.balanced = self.client.load_balanced_view()
         self.direct = self.client[:]
@@ -223,10 +224,10 @@ class Spark(Adapter):
     task.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, workers: int) -> None:
         spark = import_module("pyspark")
         scratch = os.environ["TMPDIR"]
-        conf = spark.SparkConf().setMaster(f"local[{WORKERS}]").setAppName("benchmarks")
+        conf = spark.SparkConf().setMaster(f"local[{workers}]").setAppName("benchmarks")
         for key, value in {
             "spark.ui.enabled": "false",
             "spark.ui.showConsoleProgress": "false",
@@ -258,7 +259,7 @@ def processes_of(contender: str) -> Any:
     return multiprocessing.get_context("forkserver" if contender == "forkserver" else "fork")
 
 
-_ADAPTERS: dict[str, Callable[[], Adapter]] = {
+_ADAPTERS: dict[str, Callable[[int], Adapter]] = {
     "concurrent.futures": Futures,
     "joblib": Joblib,
     "dask": Dask,
@@ -268,7 +269,7 @@ _ADAPTERS: dict[str, Callable[[], Adapter]] = {
 }
 
 
-def start(contender: str) -> Adapter:
+def start(contender: str, workers: int = WORKERS) -> Adapter:
     """The contender's pool, its workers started."""
     make = _ADAPTERS.get(contender)
-    return make() if make else PoolAdapter(processes_of(contender).Pool(WORKERS))
+    return make(workers) if make else PoolAdapter(processes_of(contender).Pool(workers))

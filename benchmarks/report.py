@@ -51,7 +51,7 @@ def page(name: str, run: Run) -> str:
     cases = measure.cases(run.about["size"])
     groups = {case.group: [each for each in cases if each.group == case.group] for case in cases}
     sections = [
-        f"## {group[0].upper()}{group[1:]}\n\n{_group_table(run, members)}"
+        f"## {group[0].upper()}{group[1:]}\n\n{group_table(run, members)}"
         for group, members in groups.items()
     ]
     parts = [
@@ -59,10 +59,10 @@ def page(name: str, run: Run) -> str:
         f"# {measure.TITLE}",
         measure.ABOUT,
         f"![{measure.TITLE}]({name}.png)",
-        _reading(run),
+        reading(run),
         *sections,
-        _failures(run),
-        f"## Made on\n\n{_origin(run.about)}",
+        failures(run),
+        f"## Made on\n\n{origin(run.about)}",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -73,10 +73,6 @@ def index(runs: Mapping[str, Run], *, notes: bool) -> str:
     if notes:
         pages.append(f"* [Notes]({_NOTES}): why a budget is missed and what was tried")
     found = budgets.verdicts(runs)
-    rows = [
-        (v.budget.what, _against(v.budget), v.budget.in_words(), v.measured, v.verdict)
-        for v in found
-    ]
     met = sum(v.kept is True for v in found)
     parts = [
         _GENERATED,
@@ -86,9 +82,18 @@ def index(runs: Mapping[str, Run], *, notes: bool) -> str:
         "\n".join(pages),
         "## Budgets",
         f"{met} of {len(found)} met. Contender: Fiber with local processes, if not said otherwise.",
-        table(("what", "against", "budget", "measured", "verdict"), rows),
+        budget_table(found),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def budget_table(found: Iterable[budgets.Verdict]) -> str:
+    """A row for each budget."""
+    rows = [
+        (v.budget.what, _against(v.budget), v.budget.in_words(), v.measured, v.verdict)
+        for v in found
+    ]
+    return table(("what", "against", "budget", "measured", "verdict"), rows)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -103,7 +108,8 @@ def _against(budget: budgets.Budget) -> str:
     return budget.to_case or BY_NAME[budget.against].label
 
 
-def _group_table(run: Run, cases: Sequence[Case]) -> str:
+def group_table(run: Run, cases: Sequence[Case]) -> str:
+    """A row for each case, metric and contender, with its ratio, budget and verdict."""
     several = len({metric.label for case in cases for metric in case.metrics}) > 1
     head = (
         "case",
@@ -175,7 +181,8 @@ def _to_whom(budget: budgets.Budget) -> str:
     return f" {_against(budget)}"
 
 
-def _reading(run: Run) -> str:
+def reading(run: Run) -> str:
+    """How to read the tables, and whether the machine was idle."""
     rounds = run.about["rounds"]
     text = (
         f"Median of {rounds} round{'s' if rounds > 1 else ''}; contenders with servers of their "
@@ -202,7 +209,8 @@ def _company(in_use: Sequence[float]) -> str:
     return f"Of the processors' time others used {shares} in a moment before each round: {verdict}"
 
 
-def _failures(run: Run) -> str:
+def failures(run: Run) -> str:
+    """Who did not get through what, and why; empty if nobody."""
     rows = [
         (case, BY_NAME[contender].label, why.replace("|", "\\|").replace("\n", " "))
         for case, failed in run.failures.items()
@@ -222,7 +230,8 @@ def _skipped(run: Run) -> list[tuple[str, str]]:
     return sorted(run.about.get("skipped", {}).items())
 
 
-def _origin(about: Mapping[str, Any]) -> str:
+def origin(about: Mapping[str, Any]) -> str:
+    """Where, when and with what a run was made."""
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     rows = {
         "machine": f"{about['cores']} cores ({about['processor']}), {about['memory']} of memory",

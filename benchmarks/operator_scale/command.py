@@ -83,7 +83,7 @@ def _measure(
         if options.set_up
         else preparation.kubeconfig()
     )
-    kube = stack.enter_context(_open(kubeconfig))
+    kube = stack.enter_context(open_api(kubeconfig))
     if options.set_up:
         stack.enter_context(preparation.operator(kube))
     operator, nodes = find_operator(kube), check_nodes(kube, largest)
@@ -127,7 +127,8 @@ def _visit(kube: Kube, operator: Operator, case: Case, subject: Subject, turn: i
 
 
 @contextlib.contextmanager
-def _open(kubeconfig: Path) -> Iterator[Kube]:
+def open_api(kubeconfig: Path) -> Iterator[Kube]:
+    """The cluster's API, also while a Ctrl-C is answered."""
     # What it starts must outlive a Ctrl-C, which a terminal sends to all of us: it is needed to
     # remove everything.
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)

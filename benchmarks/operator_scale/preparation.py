@@ -53,18 +53,20 @@ def own_cluster(fakes: int) -> Iterator[Path]:
             f"the cluster of tests/cluster cannot run here: {'; '.join(obstacles)}. Set KUBECONFIG "
             "to a cluster that has the operator and KWOK's nodes, and run this without --set-up"
         )
-    build.build(["kwok"])
+    if fakes:
+        build.build(["kwok"])
     was_up = lifecycle.find() is not None
     before = 0
     try:
         lifecycle.up(_NODES)
         before = ready_nodes(f"{fake_nodes.KEY}={fake_nodes.VALUE}")
-        fake_nodes.set_count(max(fakes, before))
+        if fakes > before:
+            fake_nodes.set_count(fakes)
         yield places.KUBECONFIG
     finally:
-        if was_up:
+        if was_up and fakes > before:
             fake_nodes.set_count(before)
-        else:
+        elif not was_up:
             lifecycle.down()
 
 

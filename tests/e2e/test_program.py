@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
+from e2e.clusters import Cluster
 from e2e.delays import prompt
-from e2e.kube import Body
+from e2e.kube import Body, path_of
 from e2e.leftovers import leaves_nothing
 from e2e.pools import Pool, is_live, is_ready
 from e2e.program import PLACES, Program, Programs, local
@@ -20,6 +21,7 @@ pytestmark = pytest.mark.timeout(240, func_only=True)
 SQUARES = sum(number * number for number in range(1000))
 ES = ("--env", "CartPole-v1", "--generations", 3, "--population", 16, "--seed", 1, "--workers", 3)
 ENVS = ("--envs", 3, "--steps", 40, "--ms", 0.2)
+GPU = "nvidia.com/gpu"
 WARM = 0.3
 """Seconds, at most, to the first result of a pool whose pods are there."""
 BEYOND_READY = 0.5
@@ -156,6 +158,21 @@ def test_each_shape_has_pods_of_its_own(programs: Programs, scene: Scene) -> Non
     limits = {pod["spec"]["containers"][0]["resources"]["limits"]["memory"] for pod in pods}
     assert limits == {"160Mi", "192Mi"}
     leaves_nothing(program)
+
+
+def test_a_gpu_is_one_of_a_node_that_has_it(programs: Programs, cluster: Cluster) -> None:
+    scene = programs.scene
+    node = cluster.workers()[-1]
+    path = path_of("nodes", name=node, subresource="status")
+    scene.kube.patch(path, {"status": {"capacity": {GPU: "1"}}})
+    try:
+        program = programs.start("outside", "gpu.py")
+        pod = scene.now["pods"][program.says("ran", seconds=90)["host"]]
+        assert pod["spec"]["nodeName"] == node
+        program.ends()
+        leaves_nothing(program)
+    finally:
+        scene.kube.patch(path, {"status": {"capacity": {GPU: None}}})
 
 
 def test_a_warm_pool_is_given_back_as_it_was(programs: Programs, scene: Scene, agent: Body) -> None:

@@ -41,7 +41,10 @@ class Site:
 
     def a_worker(self) -> Body:
         """A pod that works."""
-        return next(pod for pod in workers(self.scene) if is_ready(pod))
+        ready = self.scene.wait(
+            "a worker is Ready", lambda: list(filter(is_ready, workers(self.scene)))
+        )
+        return ready[0]
 
     def gone(self, pod: Body) -> None:
         """Wait until the pod is no more."""
@@ -75,10 +78,10 @@ def operator_killed(site: Site) -> Iterator[None]:
 
 @contextmanager
 def api_server_stopped(site: Site) -> Iterator[None]:
-    """The work goes on and ends meanwhile."""
+    """For a minute, in which the work goes on."""
     with site.cluster.without_apiserver():
-        site.program.says("done", seconds=OUTAGE)
-        yield
+        site.scene.never("it ends", lambda: site.program.status is not None, OUTAGE)
+    yield
 
 
 @contextmanager
@@ -98,22 +101,41 @@ def node_cut_off(site: Site) -> Iterator[None]:
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize(
-    "fault", [pod_deleted, container_killed, operator_killed, api_server_stopped, node_cut_off]
+    ("fault", "seconds"),
+    [
+        (pod_deleted, 0.1),
+        (container_killed, 0.1),
+        (operator_killed, 0.1),
+        (api_server_stopped, 0.25),
+        (node_cut_off, 0.1),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_a_map_ends_as_if_nothing_had_been(
     fault: Fault,
+    seconds: float,
     place: str,
     programs: Programs,
     cluster: Cluster,
     release: Release,
     scene: Scene,
 ) -> None:
-    program = programs.start(place, "mapping.py", *RUNNING)
+    program = programs.start(place, "mapping.py", "--seconds", seconds)
     program.says("first")
     with fault(Site(cluster, release, scene, program)):
         assert program.says("done", seconds=120)["total"] == SQUARES
     program.ends(seconds=90)
     leaves_nothing(program, seconds=90)
+
+
+def test_a_program_that_ends_while_nobody_answers_says_what_stays(
+    programs: Programs, cluster: Cluster
+) -> None:
+    program = programs.outside("mapping.py", *RUNNING)
+    program.says("half")
+    with cluster.without_apiserver():
+        assert "kubectl" in program.ends(seconds=OUTAGE)
+    leaves_nothing(program, seconds=LOST + 30)
 
 
 def test_a_child_that_is_killed_is_replaced_in_its_pod(programs: Programs, scene: Scene) -> None:

@@ -1,0 +1,89 @@
+"""The page about pods: one for all of its measures, with their budgets above."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+
+from benchmarks import (
+    budgets,
+    figures,
+    kubernetes_es,
+    kubernetes_start,
+    latency,
+    overhead,
+    pipes,
+    throughput,
+)
+from benchmarks.model import Case, Run
+from benchmarks.report import budget_table, failures, group_table, origin, reading
+
+MEASURES: dict[str, ModuleType] = {
+    "overhead": overhead,
+    "throughput": throughput,
+    "latency": latency,
+    "pipes": pipes,
+    "kubernetes_es": kubernetes_es,
+    "kubernetes_start": kubernetes_start,
+}
+PAGE, PICTURE, RESULTS = "kubernetes.md", "kubernetes.png", "kubernetes.json"
+_OF_ONE_HOST = {
+    "throughput": ("map, chunksize 1", "map, default chunks", *throughput.ARRAY_KINDS),
+    "pipes": (pipes.environments(8),),
+}
+"""Of measures that have more cases: those that say something of pods."""
+_ABOUT = """\
+Fiber with its processes in pods, beside multiprocessing on the same machine and beside Ray's and
+Dask's own clusters of as many workers as processes on it. The program runs outside of the cluster,
+and each pod of Fiber's has one worker, if not said otherwise. Every pod is on this machine: what
+differs from one host is the way, through Kubernetes' network, encrypted, and not the distance."""
+
+
+def cases(size: float) -> list[Case]:
+    """What is measured."""
+    return [
+        case
+        for name, measure in MEASURES.items()
+        for case in measure.cases(size)
+        if case.name in _OF_ONE_HOST.get(name, (case.name,))
+    ]
+
+
+def write(folder: Path, runs: Mapping[str, Run]) -> None:
+    """The results, the page and the picture."""
+    folder.mkdir(parents=True, exist_ok=True)
+    data = {name: run.as_json() for name, run in runs.items()}
+    (folder / RESULTS).write_text(json.dumps(data, separators=(",", ":")) + "\n", encoding="utf-8")
+    figures.DRAW["overhead"](runs["overhead"], folder / PICTURE)
+    (folder / PAGE).write_text(page(runs), encoding="utf-8")
+
+
+def page(runs: Mapping[str, Run]) -> str:
+    """Every measure with a table for each of its groups."""
+    first = runs["overhead"]
+    parts = [
+        "<!-- Written by benchmarks/kubernetes_run.py; changes made by hand are lost. -->",
+        "# Pods",
+        _ABOUT,
+        "`make bench-kubernetes` writes this page.",
+        "## Budgets",
+        budget_table(budgets.verdicts(runs, budgets.ON_PODS)),
+        reading(first),
+        f"![Overhead]({PICTURE})",
+    ]
+    of_all = cases(first.about["size"])
+    for name, run in runs.items():
+        mine = [case for case in of_all if case.measure == name]
+        parts += _section(MEASURES[name], run, mine)
+    return "\n\n".join([*parts, f"## Made on\n\n{origin(first.about)}"]) + "\n"
+
+
+def _section(measure: ModuleType, run: Run, of_measure: Sequence[Case]) -> list[str]:
+    groups = {
+        case.group: [each for each in of_measure if each.group == case.group] for case in of_measure
+    }
+    tables = [group_table(run, members) for members in groups.values()]
+    missing = failures(run).replace("## Not measured", "Not measured:")
+    return [f"## {measure.TITLE}", measure.ABOUT, *tables, *filter(None, [missing])]

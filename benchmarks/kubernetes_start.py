@@ -1,0 +1,57 @@
+"""Start on pods: until a pool's first result, where nothing is there and where pods are."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from benchmarks import peers
+from benchmarks.model import Case, Metric
+from benchmarks.tasks import no_op
+
+if TYPE_CHECKING:
+    from benchmarks.contender import Bench
+
+TITLE = "Start"
+WORKERS = 8
+ABOUT = f"""\
+A pool of {WORKERS} workers, from the call that makes it until a first map of as many no-ops is
+complete. Cold: in a program that has done nothing before; for Ray and Dask the start of their own
+cluster is contained, for pods all that Kubernetes does until they run, with the image on the nodes.
+Warm: a second pool of the same program, after the first was closed."""
+
+TIME = Metric("time", "first results", "s")
+COLD, WARM = "cold", "warm"
+
+
+def cases(size: float) -> list[Case]:
+    """The same at every size: one pool cannot be made smaller."""
+    return [
+        Case(
+            measure="kubernetes_start",
+            name=name,
+            group="start",
+            needs=needs,
+            params={"warm": name == WARM},
+            metrics=(TIME,),
+            fresh=True,
+            limit=120.0,
+        )
+        for name, needs in ((COLD, "map"), (WARM, "start"))
+    ]
+
+
+def run(bench: Bench, warm: bool) -> dict[str, float]:
+    """Seconds to the first results of the first pool, or of the second."""
+    first = _time_of_one(bench.contender)
+    return {TIME.name: _time_of_one(bench.contender) if warm else first}
+
+
+def _time_of_one(contender: str) -> float:
+    begin = time.perf_counter()
+    pool = peers.start(contender, WORKERS)
+    try:
+        pool.map(no_op, range(WORKERS), 1)
+        return time.perf_counter() - begin
+    finally:
+        pool.close()
