@@ -81,17 +81,17 @@ class State:
         )
 
 
-@dataclass(frozen=True)
+@dataclass
 class Work:
-    """What one reconcile of a pool has to do, once it is planned."""
+    """One pass over a pool: what it is, and once that is planned what there is to do."""
 
     key: Key
     document: Body
-    pool: FiberPool | None
-    """None if the spec cannot be read."""
     state: State
-    plan: Plan
     creation: Creation
+    pool: FiberPool | None = None
+    """None if the spec cannot be read."""
+    plan: Plan = field(default_factory=Plan)
     rested: float = 0.0
     """When the pool has rested from the list of its pods, by the loop's clock.  It is not listed
     before, so pods may be changed until then."""

@@ -103,15 +103,13 @@ class Controller:
             return Result(forget=True)
         state = found[1]
         creation = Creation(self._cluster, key, state.pace, self._draw)
+        result = Result(failed=True)
         try:
             result = await self._passes(key, found, creation)
-        except BaseException:
-            state.generation = -1
-            raise
         finally:
+            if result.failed:
+                state.generation = -1
             await creation.cancel()
-        if result.failed:
-            state.generation = -1
         return result
 
     async def _passes(
@@ -121,7 +119,7 @@ class Controller:
         state, end = found[1] if found else None, clock() + LONGEST
         while found is not None and found[1] is state:
             self._cluster.check_permit(key.namespace)
-            result = await self._pass(key, *found, creation)
+            result = await self._pass(Work(key, *found, creation))
             began, last = clock(), clock() > end
             if last:
                 creation.stop()
@@ -149,76 +147,59 @@ class Controller:
         state.generation = whole(mapping(document, "metadata").get("generation"))
         return document, state
 
-    async def _pass(self, key: Key, document: Body, state: State, creation: Creation) -> Result:
+    async def _pass(self, work: Work) -> Result:
         try:
-            pool = FiberPool.read(document)
+            work.pool = pool = FiberPool.read(work.document)
         except InvalidPool as error:
-            return await self._reconcile_unreadable(key, document, state, creation, error)
-        return await self._reconcile_readable(key, document, pool, state, creation)
-
-    async def _reconcile_readable(
-        self, key: Key, document: Body, pool: FiberPool, state: State, creation: Creation
-    ) -> Result:
+            container = text(mapping(work.document, "spec").get("workerContainer"))
+            pods = await self._pods(work, container or names.WORKER_CONTAINER)
+            now = self._now()
+            work.plan = reconcile.plan_unreadable(work.document, pods, error.errors, now)
+            return await self._act(work, pods)
+        state, failure = work.state, None
         if pool.unread:
-            complaint = "; ".join(pool.unread)
-            log.warning("the status was damaged: %s", complaint, extra=about(*key, uid=state.uid))
-        failure = None
+            complaint = f"the status was damaged: {'; '.join(pool.unread)}"
+            log.warning("%s", complaint, extra=about(*work.key, uid=state.uid))
         if pool.metadata.deletion_timestamp is None:
             state.dependents = await self._dependents.ensure(pool, state.dependents)
             failure = state.dependents.failure
-        container = pool.spec.worker_container
-        pods, rested = await self._pods(key, document, state, creation, container)
-        plan = self._plan(key, pool, pods, state)
+        pods = await self._pods(work, pool.spec.worker_container)
+        plan = self._plan(work.key, pool, pods, state)
         if plan.inspect:
             # Not added to: what is not asked about any more may be over.
-            state.warnings = await pod_events.warnings(self._cluster, key, plan.inspect, pods)
+            state.warnings = await pod_events.warnings(self._cluster, work.key, plan.inspect, pods)
         if plan.dry_run:
             failure = await self._applier.dry_run(pool, plan, state) or failure
         if plan.inspect or plan.dry_run:
-            plan = self._plan(key, pool, pods, state)
-        result = await self._act(Work(key, document, pool, state, plan, creation, rested), pods)
+            plan = self._plan(work.key, pool, pods, state)
+        work.plan = plan
+        result = await self._act(work, pods)
         if failure is not None:
             raise failure
         return result
 
-    async def _reconcile_unreadable(
-        self,
-        key: Key,
-        document: Body,
-        state: State,
-        creation: Creation,
-        error: InvalidPool,
-    ) -> Result:
-        container = text(mapping(document, "spec").get("workerContainer"))
-        container = container or names.WORKER_CONTAINER
-        pods, rested = await self._pods(key, document, state, creation, container)
-        plan = reconcile.plan_unreadable(document, pods, error.errors, self._now())
-        return await self._act(Work(key, document, None, state, plan, creation, rested), pods)
-
-    async def _pods(
-        self, key: Key, document: Body, state: State, creation: Creation, container: str
-    ) -> tuple[list[PodView], float]:
-        """The pool's pods, from a fresh list, and until when to rest from it."""
-        clock = asyncio.get_running_loop().time
+    async def _pods(self, work: Work, container: str) -> list[PodView]:
+        """The pool's pods, from a fresh list, from which it rests then."""
+        clock, state = asyncio.get_running_loop().time, work.state
         started = clock()
         try:
             listed = await self._cluster.list(
                 PODS,
-                key.namespace,
+                work.key.namespace,
                 lambda pod: observe(pod, container),
                 selector=f"{names.LABEL_POOL_UID}={state.uid}",
             )
         except ApiError as error:
-            creation.stop()
-            plan = reconcile.plan_blind(document, error_conditions.with_list(error), self._now())
-            await self._applier.apply(Work(key, document, None, state, plan, creation))
+            obstacle = error_conditions.with_list(error)
+            work.plan = reconcile.plan_blind(work.document, obstacle, self._now())
+            await self._applier.apply(work)
             raise
         ended = clock()
-        rested = ended + min(LIST_SHARE * (ended - started), LONGEST_REST)
-        pods = creation.expect(listed, started)
+        work.rested = ended + min(LIST_SHARE * (ended - started), LONGEST_REST)
+        pods = work.creation.expect(listed, started)
         there = {pod.name for pod in pods}
         state.warnings = {name: text for name, text in state.warnings.items() if name in there}
-        return pods, rested
+        return pods
 
     def _plan(self, key: Key, pool: FiberPool, pods: Sequence[PodView], state: State) -> Plan:
         dependents = state.dependents

@@ -93,6 +93,8 @@ class KubernetesApi:
         self.accepts: set[str] | None = None
         """Values of Authorization that are let in; None: anybody."""
         self.port = 0
+        self.server: Callable[[], asyncio.Protocol]
+        """Makes the protocol of a connection, for clients that need no socket."""
         self._watches: set[asyncio.Task[Any]] = set()
         self._applied: dict[Place, Body] = {}
         """What the one field manager that applies has applied last."""
@@ -107,6 +109,8 @@ class KubernetesApi:
         application.router.add_route("*", "/{path:.*}", self._serve)
         runner = web.AppRunner(application, access_log=None, shutdown_timeout=0.1)
         await runner.setup()
+        assert runner.server is not None
+        self.server = runner.server
         site = web.TCPSite(runner, "127.0.0.1", self.port, ssl_context=tls)
         await site.start()
         self.port = runner.addresses[0][1]

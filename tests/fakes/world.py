@@ -16,6 +16,7 @@ from typing import Any
 from fakes import virtual_time
 from fakes.kubelet import Kubelet
 from fakes.kubernetes_api import Fault, KubernetesApi
+from fakes.memory_connector import MemoryConnector
 from fakes.store import Body, Failure, Store
 from fiber_api import names
 from fiber_api.certificates import make_pool_certificates
@@ -82,6 +83,22 @@ class Feed:
             await self._world.store.changed()
 
 
+class _InMemory(Configuration):
+    """How the operator reaches it without a socket."""
+
+    def __init__(self, connector: MemoryConnector) -> None:
+        super().__init__(host="http://in.memory", ca_cert_data=_any_authority())
+        self._connector = connector
+
+    @property
+    def client_session_kwargs(self) -> dict[str, Any]:
+        return {"connector": self._connector, "trust_env": False}
+
+    @client_session_kwargs.setter
+    def client_session_kwargs(self, _: dict[str, Any]) -> None:
+        """The operator's own leave the connector to the client."""
+
+
 class World:
     """The cluster, and the operator that is in it now, if any."""
 
@@ -89,6 +106,7 @@ class World:
         clock = asyncio.get_running_loop().time
         self.store = Store(clock) if past is None else past.copy(clock)
         self.api = KubernetesApi(self.store)
+        self.connector = MemoryConnector(self.api)
         self.kubelet = Kubelet(self.store)
         self.deaf = False
         """No event reaches the operator."""
@@ -114,7 +132,7 @@ class World:
 
     def another(self, **settings: Any) -> Program:
         async def configure() -> Configuration:
-            return configuration(self.api)
+            return _InMemory(self.connector)
 
         return Program(
             Settings(**settings),
@@ -293,6 +311,7 @@ async def a_world(
                 await world.kill()
             if world._nodes is not None:
                 world._nodes.cancel()
+            await world.connector.close()
 
 
 Test = Callable[[World], Coroutine[Any, Any, None]]

@@ -159,6 +159,12 @@ def test_a_wave_of_workers_that_had_lived_is_the_first() -> None:
     assert count(last, lived(1), failed(2)).failures.waves == 3
 
 
+def test_in_a_pool_that_is_given_up_nothing_waits() -> None:
+    found = count(failing(consecutive=3, next_create_time=NOW - 1), failed(1)).failures
+    assert (found.consecutive, found.waiting, found.next_create_time) == (4, 0, None)
+    assert count(found, failed(1)).failures == found
+
+
 def test_past_the_limit_only_the_user_ends_it() -> None:
     all_four = [ready(number, since=NOW + 15) for number in range(4)]
     past = failing(consecutive=4)

@@ -193,6 +193,15 @@ def test_workers_that_end_well_again_and_again_are_a_warning_that_says_what_it_m
     assert status_of(pool, running(3, age=-900), now=now + 970).problems == ()
 
 
+def test_of_a_failure_and_an_end_in_one_wave_the_failure_is_told() -> None:
+    pods = ended(1, ago=5), ended(2, code=0, ran=100)
+    first = status_of(POOL, *pods)
+    (found,) = first.problems
+    assert (found.reason, found.pod) == ("ContainerFailed", name_of(1))
+    assert first.failures.last_reason == "Error"
+    assert status_of(then(POOL, first), *pods) == first
+
+
 def test_a_program_that_is_not_in_the_image_is_hopeless() -> None:
     said = 'exec: "pyton": executable file not found in $PATH'
     found = problem(POOL, ended(1, code=128, reason="StartError", message=said))

@@ -153,16 +153,125 @@ def after(pool: FiberPool, made: Plan) -> FiberPool:
     return FiberPool.read({**pool.model_dump(mode="json", by_alias=True), "status": made.status})
 
 
-@given(cases())
-def test_only_pods_of_the_pool_are_deleted_and_each_once(case: Case) -> None:
-    pool, pods, memory = case
-    made = plan(pool, pods, memory, NOW)
+def only_pods_of_the_pool_are_deleted_and_each_once(
+    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+) -> None:
     names = [deletion.name for deletion in made.delete]
     assert len(set(names)) == len(names)
     known = own(pool, pods)
     for deletion in made.delete:
         assert deletion.uid == known[deletion.name].uid
         assert known[deletion.name].state is not State.TERMINATING
+
+
+def a_pool_is_deleted_for_a_lease_that_this_process_saw_expire_alone(
+    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+) -> None:
+    if made.delete_pool:
+        assert memory.master.alive is False
+        assert pool.spec.on_lost == "Delete"
+
+
+def creation_never_passes_what_is_wanted(
+    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+) -> None:
+    gone = {deletion.name for deletion in made.delete}
+    live = [pod for pod in own(pool, pods).values() if pod.live and pod.name not in gone]
+    assert made.create >= 0
+    if made.create:
+        assert len(live) + made.create <= pool.wanted <= pool.spec.max_replicas
+
+
+def nothing_is_created_where_something_forbids_it(
+    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+) -> None:
+    if not made.create:
+        return
+    failures = after(pool, made).status.failures
+    assert failures.consecutive <= pool.spec.failure_policy.backoff_limit
+    if held_back_until(failures, NOW):
+        gone = {deletion.name for deletion in made.delete}
+        live = [pod for pod in own(pool, pods).values() if pod.live and pod.name not in gone]
+        assert len(live) + made.create + failures.waiting <= pool.wanted
+    assert memory.address
+    assert not memory.obstacles
+    assert not memory.refusal
+    assert not pool.spec.suspend
+    assert not made.dry_run
+    proven = after(pool, made).status.proven_template_hash
+    assert template_hash(pool) in (memory.accepted, proven)
+
+
+def a_template_that_never_worked_gets_few_pods(
+    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+) -> None:
+    status, hash_ = after(pool, made).status, template_hash(pool)
+    if not made.create or status.proven_template_hash == hash_:
+        return
+    gone = {deletion.name for deletion in made.delete}
+    known = own(pool, pods).values()
+    live = [pod for pod in known if pod.live and pod.name not in gone]
+    current = [pod for pod in live if pod.template_hash == hash_]
+    homeless = sum(pod.trouble is Trouble.UNSCHEDULABLE for pod in current)
+    placed = len(current) - homeless + made.create
+    if status.failures.waves or Trouble.CANNOT_START in {pod.trouble for pod in current}:
+        held_back = status.failures.waiting if held_back_until(status.failures, NOW) else 0
+        assert len(current) + made.create + held_back <= CANARIES
+    elif all(pod.created > NOW - PATIENCE for pod in current):
+        assert placed <= max(CANARIES, homeless)
+    else:
+        assert placed <= max(CANARIES, homeless, 2 * len(current))
+
+
+def the_order_of_the_list_makes_no_difference(
+    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+) -> None:
+    assert plan(pool, pods[::-1], memory, NOW) == made
+    assert plan(pool, sorted(pods, key=lambda pod: pod.resource_version), memory, NOW) == made
+
+
+def a_plan_whose_status_is_written_stays_the_plan(
+    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+) -> None:
+    """The operator died after writing the status: the next one does the rest."""
+    second = plan(after(pool, made), pods, memory, NOW)
+    if made.status is None and not made.dry_run:
+        assert second == made
+    else:
+        assert (second.create, second.delete) == (made.create, made.delete)
+        assert second.status is None
+
+
+def nothing_is_planned_twice(
+    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+) -> None:
+    model = Model(
+        document=pool.model_dump(mode="json", by_alias=True),
+        pods={pod.name: pod for pod in pods},
+        memory=memory,
+    )
+    model.act()
+    if made.dry_run or made.delete_pool:
+        return
+    second = model.plan()
+    assert second.create == 0
+    assert {d.name for d in second.delete}.isdisjoint(d.name for d in made.delete)
+    assert not any(event.reason == "ScaledUp" for event in second.events)
+
+
+@settings(max_examples=250, deadline=None)
+@given(cases())
+def test_what_holds_of_every_plan(case: Case) -> None:
+    """One plan, and all that must hold of it: to draw a case takes longer than to check it."""
+    made = plan(*case, NOW)
+    only_pods_of_the_pool_are_deleted_and_each_once(made, *case)
+    a_pool_is_deleted_for_a_lease_that_this_process_saw_expire_alone(made, *case)
+    creation_never_passes_what_is_wanted(made, *case)
+    nothing_is_created_where_something_forbids_it(made, *case)
+    a_template_that_never_worked_gets_few_pods(made, *case)
+    the_order_of_the_list_makes_no_difference(made, *case)
+    a_plan_whose_status_is_written_stays_the_plan(made, *case)
+    nothing_is_planned_twice(made, *case)
 
 
 def at_work(spec: dict[str, Any]) -> dict[str, Any]:
@@ -186,106 +295,6 @@ def test_a_ready_worker_of_a_master_goes_only_when_released(case: Case) -> None:
             assert pod.state is (State.STARTING if late else State.PENDING)
             assert deletion.resource_version == pod.resource_version
     assert not made.delete_pool
-
-
-@given(cases())
-def test_a_pool_is_deleted_for_a_lease_that_this_process_saw_expire_alone(case: Case) -> None:
-    pool, pods, memory = case
-    made = plan(pool, pods, memory, NOW)
-    if made.delete_pool:
-        assert memory.master.alive is False
-        assert pool.spec.on_lost == "Delete"
-
-
-@given(cases())
-def test_creation_never_passes_what_is_wanted(case: Case) -> None:
-    pool, pods, memory = case
-    made = plan(pool, pods, memory, NOW)
-    gone = {deletion.name for deletion in made.delete}
-    live = [pod for pod in own(pool, pods).values() if pod.live and pod.name not in gone]
-    assert made.create >= 0
-    if made.create:
-        assert len(live) + made.create <= pool.wanted <= pool.spec.max_replicas
-
-
-@given(cases())
-def test_nothing_is_created_where_something_forbids_it(case: Case) -> None:
-    pool, pods, memory = case
-    made = plan(pool, pods, memory, NOW)
-    if not made.create:
-        return
-    failures = after(pool, made).status.failures
-    assert failures.consecutive <= pool.spec.failure_policy.backoff_limit
-    if held_back_until(failures, NOW):
-        gone = {deletion.name for deletion in made.delete}
-        live = [pod for pod in own(pool, pods).values() if pod.live and pod.name not in gone]
-        assert len(live) + made.create + failures.waiting <= pool.wanted
-    assert memory.address
-    assert not memory.obstacles
-    assert not memory.refusal
-    assert not pool.spec.suspend
-    assert not made.dry_run
-    proven = after(pool, made).status.proven_template_hash
-    assert template_hash(pool) in (memory.accepted, proven)
-
-
-@given(cases())
-def test_a_template_that_never_worked_gets_few_pods(case: Case) -> None:
-    pool, pods, memory = case
-    made = plan(pool, pods, memory, NOW)
-    status, hash_ = after(pool, made).status, template_hash(pool)
-    if not made.create or status.proven_template_hash == hash_:
-        return
-    gone = {deletion.name for deletion in made.delete}
-    known = own(pool, pods).values()
-    live = [pod for pod in known if pod.live and pod.name not in gone]
-    current = [pod for pod in live if pod.template_hash == hash_]
-    homeless = sum(pod.trouble is Trouble.UNSCHEDULABLE for pod in current)
-    placed = len(current) - homeless + made.create
-    if status.failures.waves or Trouble.CANNOT_START in {pod.trouble for pod in current}:
-        held_back = status.failures.waiting if held_back_until(status.failures, NOW) else 0
-        assert len(current) + made.create + held_back <= CANARIES
-    elif all(pod.created > NOW - PATIENCE for pod in current):
-        assert placed <= max(CANARIES, homeless)
-    else:
-        assert placed <= max(CANARIES, homeless, 2 * len(current))
-
-
-@given(cases(), st.randoms(use_true_random=False))
-def test_the_order_of_the_list_makes_no_difference(case: Case, random: Any) -> None:
-    pool, pods, memory = case
-    shuffled = list(pods)
-    random.shuffle(shuffled)
-    assert plan(pool, shuffled, memory, NOW) == plan(pool, pods, memory, NOW)
-
-
-@given(cases())
-def test_a_plan_whose_status_is_written_stays_the_plan(case: Case) -> None:
-    """The operator died after writing the status: the next one does the rest."""
-    pool, pods, memory = case
-    first = plan(pool, pods, memory, NOW)
-    second = plan(after(pool, first), pods, memory, NOW)
-    if first.status is None and not first.dry_run:
-        assert second == first
-    else:
-        assert (second.create, second.delete) == (first.create, first.delete)
-        assert second.status is None
-
-
-@given(cases())
-def test_nothing_is_planned_twice(case: Case) -> None:
-    pool, pods, memory = case
-    model = Model(
-        document=pool.model_dump(mode="json", by_alias=True),
-        pods={pod.name: pod for pod in pods},
-        memory=memory,
-    )
-    first = model.act()
-    assume(not first.dry_run and not first.delete_pool)
-    second = model.plan()
-    assert second.create == 0
-    assert {d.name for d in second.delete}.isdisjoint(d.name for d in first.delete)
-    assert not any(event.reason == "ScaledUp" for event in second.events)
 
 
 @settings(max_examples=30, deadline=None, phases=NO_SHRINKING)

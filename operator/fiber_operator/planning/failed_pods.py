@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import Problem
 from fiber_operator.planning import wording
-from fiber_operator.planning.failures import given_up
+from fiber_operator.planning.failures import given_up, in_itself
 from fiber_operator.planning.pods import PodView, State, Trouble
 from fiber_operator.planning.situation import Situation
 
@@ -17,7 +17,8 @@ def failed_pods(situation: Situation) -> Iterator[Problem]:
     failures = situation.account.failures
     if not failures.waves:
         return
-    last = _last_failure(situation) if _has_failed(situation) else _last_completed(situation)
+    has_failed = failures.last_reason != Reason.COMPLETED
+    last = _last_failure(situation) if has_failed else _last_completed(situation)
     if given_up(failures, situation.pool.spec.failure_policy):
         yield situation.problem(
             Reason.BACKOFF_LIMIT_EXCEEDED,
@@ -28,17 +29,6 @@ def failed_pods(situation: Situation) -> Iterator[Problem]:
         )
     if last:
         yield last
-
-
-def _has_failed(situation: Situation) -> bool:
-    """Whether the last one did, and did not end of itself after a while."""
-    if newly := situation.account.failed[-1:]:
-        return newly[0].trouble is not Trouble.COMPLETED
-    if situation.account.failures.last_reason != Reason.COMPLETED:
-        return True
-    before = situation.previous(Reason.COMPLETED)
-    kept = any(pod.trouble is Trouble.APPLICATION for pod in situation.ended)
-    return before.severity == "Error" if before else kept
 
 
 def _last_completed(situation: Situation) -> Problem | None:
@@ -63,7 +53,7 @@ _FAILURES = (
 
 def _last_failure(situation: Situation) -> Problem:
     failures, pool = situation.account.failures, situation.pool
-    newly = situation.account.failed[-1:]
+    newly = list(filter(in_itself, situation.account.failed))[-1:]
     late = [pod for pod in newly if pod.state is not State.ENDED]
     failed = [pod for pod in situation.ended if pod.trouble is Trouble.APPLICATION]
     newest = max(late or failed, key=lambda pod: (pod.since, pod.name), default=None)

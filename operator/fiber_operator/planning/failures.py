@@ -35,6 +35,9 @@ NAMES = 1000
 """Pods that a status names, at most; a status that etcd refuses would stop the pool.  What has no
 place in it is counted when pods that have one are gone."""
 
+AT_ONCE = "CompletedAtOnce"
+"""Why a worker failed that ended with exit code 0 and had not worked."""
+
 _JITTER = 0.1
 """How much longer than its due a wait may be, so that pools which fail together come apart."""
 
@@ -163,6 +166,11 @@ def _failed(pod: PodView) -> bool:
     return pod.state is State.ENDED and pod.trouble is not Trouble.DISRUPTED
 
 
+def in_itself(pod: PodView) -> bool:
+    """Of one that counts as failed: whether it did not just end after a while, with exit code 0."""
+    return pod.trouble is not Trouble.COMPLETED
+
+
 def _disrupted(pod: PodView) -> bool:
     return not pod.live and pod.trouble is Trouble.DISRUPTED
 
@@ -182,23 +190,26 @@ def _fail(
     seed: str,
     now: float,
 ) -> Failures:
-    last = failed[-1]
+    last = (list(filter(in_itself, failed)) or failed)[-1]
     found = _with(found, last_exit_code=last.exit_code, last_reason=_reason(last))
     if found.next_create_time is not None and found.next_create_time > now:
         return found  # more of the same wave
     lived = all(_has_lived(pod, now) for pod in failed)
-    in_vain = not works and any(pod.trouble is not Trouble.COMPLETED for pod in failed)
+    in_vain = not works and any(map(in_itself, failed))
     waves = 1 if lived else found.waves + 1
     found = _with(found, waves=waves, consecutive=found.consecutive + in_vain)
+    if given_up(found, policy):
+        return _with(found, waiting=0, next_create_time=None)
     # In whole seconds, as it stands in the status.
-    due = float(math.ceil(now + delay(policy, waves, seed)))
-    return _with(found, next_create_time=None if given_up(found, policy) else due)
+    return _with(found, next_create_time=float(math.ceil(now + delay(policy, waves, seed))))
 
 
 def _reason(pod: PodView) -> str:
     if pod.state is not State.ENDED:
         return Reason.STARTUP_TIMEOUT
-    return Reason.COMPLETED if pod.trouble is Trouble.COMPLETED else pod.reason
+    if in_itself(pod):
+        return AT_ONCE if pod.reason == Reason.COMPLETED else pod.reason
+    return Reason.COMPLETED
 
 
 def _recovers(
@@ -233,6 +244,6 @@ def _proven(
     # happened, Ready has to last.
     if any(not found.waves or now - pod.since >= BRIEF for pod in ready):
         return template_hash
-    failed = [pod for pod in failed if pod.trouble is not Trouble.COMPLETED]
-    brief = any(pod.template_hash == template_hash and pod.ran < BRIEF for pod in failed)
+    own = (pod for pod in failed if in_itself(pod) and pod.template_hash == template_hash)
+    brief = any(pod.ran < BRIEF for pod in own)
     return None if brief and not ready and before == template_hash else before
