@@ -177,6 +177,8 @@ class RemoteChild:
 
     def __init__(self, starter: Starter, spec: ChildSpec, observer: ChildObserver) -> None:
         self.name = spec.name
+        self.is_worker = spec.tasks
+        """Whether it is a pool's."""
         self.host = ""
         """Where it is; empty while it waits for an agent."""
         self.pid: int | None = None

@@ -119,7 +119,7 @@ class Pods:
 
     def _failed_to_open(self, error: FiberError) -> None:
         self._opener = None  # the next child may have more luck
-        self.agents.refuse_waiting(error)
+        self._refuse(error)
 
     def _began(self, opened: Opened) -> None:
         self._opened = opened
@@ -171,7 +171,14 @@ class Pods:
     def _give_up_waiting(self) -> None:
         self._patience = None
         timeout = self._config.start_timeout
-        self.agents.refuse_waiting(overdue(self._name, self._status, timeout, time.time()))
+        self._refuse(overdue(self._name, self._status, timeout, time.time()))
+
+    def _refuse(self, error: FiberError) -> None:
+        """Nobody is to wait any longer."""
+        if not all(child.is_worker for child in self._placement.waiting):
+            # Whoever started it has gone on.  Pools raise it to their callers.
+            self._output.write("fiber", str(error))
+        self.agents.refuse_waiting(error)
 
     # -- Agents
 
@@ -228,7 +235,7 @@ class Pods:
             self._output.write("fiber", problem)
         error = failure(self._name, status, len(self.agents.agents))
         if error is not None:
-            self.agents.refuse_waiting(error)
+            self._refuse(error)
 
     def on_warning(self, message: str) -> None:
         """Something that keeps the pool waiting, and may pass."""
@@ -236,6 +243,7 @@ class Pods:
 
     def on_error(self, error: FiberPoolError) -> None:
         """Nothing comes of the pool any more."""
+        self._refuse(error)
         self.agents.fail(error)
 
     def _describe(self) -> str:
