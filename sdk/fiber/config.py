@@ -156,6 +156,8 @@ class Config:
     processes_per_pod*: how many processes one pod runs; it asks for as many times what
         `fiber.meta` says that each needs.
     max_pods*: how many pods one FiberPool of the program may have at most.
+    pod_timeout*: seconds that the first pod may take to come, its image included; then the wait
+        for it is an error.
     idle_timeout*: seconds after which a pod that runs nothing is let go.
     listen_host*: the address at which the program listens for agents; None means the loopback
         address for agents on this machine, and for pods the one that they reach it at, which
@@ -182,6 +184,7 @@ class Config:
     pool: str | None = _key(None, _pool(), fixed=True)
     processes_per_pod: int = _key(1, _whole(1, 1024), fixed=True)
     max_pods: int = _key(1000, _whole(1, 100_000), fixed=True)
+    pod_timeout: float = _key(600.0, _seconds(), fixed=True)
     idle_timeout: float = _key(60.0, _seconds(), fixed=True)
     listen_host: str | None = _key(None, _word("a host name or address"), fixed=True)
     listen_port: int = _key(0, _whole(0, 65535), fixed=True)

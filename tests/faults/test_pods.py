@@ -227,3 +227,27 @@ def test_a_pool_on_somebody_elses_pods_leaves_them_as_they_were(cluster: FakeClu
     assert "master" not in left["spec"]
     assert pods_of(cluster) == before
     cluster.do(cluster.world.store.delete, "fiberpools", "lab", "warm")
+
+
+def test_an_outdated_pod_of_somebody_elses_is_replaced_when_it_is_idle(
+    cluster: FakeCluster,
+) -> None:
+    template = {"spec": {"containers": [{"name": "worker", "image": "worker:1"}]}}
+    newer = {"spec": {"containers": [{"name": "worker", "image": "worker:2"}]}}
+    cluster.do(lambda: cluster.world.make_pool("warm", "lab", minReplicas=1, template=template))
+
+    def images() -> list[str]:
+        pods = cluster.world.pods("lab")
+        return [pod["spec"]["containers"][0]["image"] for pod in pods]
+
+    with running(backend="kubernetes"):
+        with fiber.Pool(1, pool="warm") as pool:
+            assert pool.apply(square, (3,)) == 9
+            cluster.do(lambda: cluster.world.edit("warm", "lab", template=newer))
+            cluster.wait(lambda: cluster.world.status("warm", "lab").get("observedGeneration") > 2)
+            assert pool.apply(square, (4,)) == 16
+            assert cluster.do(images) == ["worker:1"]
+        cluster.wait(lambda: images() == ["worker:2"])
+        with fiber.Pool(1, pool="warm") as pool:
+            assert pool.apply(square, (5,)) == 25
+    cluster.do(cluster.world.store.delete, "fiberpools", "lab", "warm")

@@ -132,7 +132,7 @@ class TestOverdue:
         late = status(UNSCHEDULABLE, desiredReplicas=30, pendingReplicas=30)
         error = overdue(POOL, late, 60.0, NOW)
         assert error.reason == "Unschedulable"
-        for part in ("after 60 s", "0 of 30 pods ready", SCHEDULER, "Add nodes", "start_timeout"):
+        for part in ("after 60 s", "0 of 30 pods ready", SCHEDULER, "Add nodes", "pod_timeout"):
             assert part in str(error)
         assert "kubectl describe fiberpool es-1a2b3c --namespace team" in str(error)
 

@@ -175,8 +175,26 @@ def test_agents_that_have_not_joined_are_given_up_when_nobody_waits_for_long_eno
     assert wanted.decide(now=1 + LINGER).agents == 0
 
 
-def test_the_minimum_stays() -> None:
+def test_those_that_somebody_else_wants_stay_and_are_not_asked_for() -> None:
     placement = with_agents("a", "b", slots=1)
-    wanted = Demand(placement, minimum=1, maximum=9, idle_timeout=IDLE)
-    assert wanted.decide(now=1e9).release == ["a"]
+    wanted = Demand(placement, floor=1, maximum=9, idle_timeout=IDLE)
+    wish = wanted.decide(now=1e9)
+    assert (wish.agents, wish.release, wish.wake_at) == (0, ["a"], math.inf)
+    assert put(placement, "child") == ["b"]
     assert wanted.decide(now=2e9).agents == 1
+    placement.ended("b", now=3e9)
+    wanted.floor = 0
+    assert wanted.decide(now=4e9).release == ["b"]
+
+
+def test_one_that_retires_ends_its_work_and_goes_at_once() -> None:
+    placement = with_agents("a", slots=2)
+    wanted = Demand(placement, floor=1, maximum=9, idle_timeout=IDLE)
+    assert put(placement, "child") == ["a"]
+    wanted.retire("a")
+    assert put(placement, "another") == []
+    wish = wanted.decide(now=0)
+    assert (wish.agents, wish.release) == (2, [])
+    placement.ended("a", now=1)
+    assert wanted.decide(now=1).release == ["a"]
+    assert wanted.decide(now=1 + LINGER).agents == 1  # for the one that waits

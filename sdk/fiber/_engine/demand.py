@@ -27,62 +27,71 @@ class Wish(NamedTuple):
 
 
 class Demand:
-    """The agents that the children of ``placement`` want: between ``minimum`` and ``maximum``.
+    """The agents that the children of ``placement`` want, ``maximum`` at most.
 
     More are wanted as soon as children wait for whom those that are there have no room; an agent
-    goes when it was idle for ``idle_timeout`` seconds.  So what is ever given up is an idle agent,
-    by name, or one that has not joined.
+    goes when it was idle for ``idle_timeout`` seconds, but for the last ``floor`` ones, which
+    somebody else wants: they stay and are not asked for.  So what is ever given up is an idle
+    agent, by name, or one that has not joined.
     """
 
     def __init__(
-        self,
-        placement: Placement[Any, Any],
-        *,
-        minimum: int = 0,
-        maximum: int,
-        idle_timeout: float,
+        self, placement: Placement[Any, Any], *, maximum: int, idle_timeout: float, floor: int = 0
     ) -> None:
+        self.floor = floor
+        self.maximum = maximum
         self._placement = placement
-        self._minimum = minimum
-        self._maximum = maximum
         self._idle_timeout = idle_timeout
-        self._wanted = minimum
+        self._retiring: set[Any] = set()
+        self._wanted = 0
         self._less_since: float | None = None
 
-    def set_bounds(self, minimum: int, maximum: int) -> None:
-        """Others from now on."""
-        self._minimum, self._maximum = minimum, maximum
+    def retire(self, agent: Any) -> None:
+        """Another is to take its place: let it go as soon as it is idle."""
+        self._placement.withhold(agent)
+        self._retiring.add(agent)
 
     def decide(self, now: float) -> Wish:
         """What there should be; who is to be released counts as gone."""
-        release, wake_at = self._release(now)
+        release = self._release_retired()
+        overdue = self._overdue(now)
+        spare = max(len(self._placement.loads) - self.floor, 0)
+        release += overdue[:spare]
+        for agent in overdue[:spare]:
+            self._placement.remove(agent)
+        spared = len(overdue[spare:])
+        agents = self._decide_agents(now, len(release), spared)
+        return Wish(agents, release, self._wake_at(spared))
+
+    def _decide_agents(self, now: float, released: int, spared: int) -> int:
         placement = self._placement
-        joined = len(placement.loads)
+        used = len(placement.loads) - spared
         lacking = max(len(placement.waiting) - placement.room, 0)
-        needed = joined + math.ceil(lacking / placement.slots)
-        needed = min(max(needed, self._minimum), max(self._maximum, joined))
-        kept = self._wanted - len(release)
-        if needed >= kept:
+        needed = min(used + math.ceil(lacking / placement.slots), max(self.maximum, used))
+        kept = self._wanted - released
+        if needed >= kept or (self._less_since is not None and now >= self._less_since + LINGER):
             self._wanted, self._less_since = needed, None
         else:
-            if self._less_since is None:
-                self._less_since = now
-            if now < self._less_since + LINGER:
-                self._wanted = kept
-                wake_at = min(wake_at, self._less_since + LINGER)
-            else:
-                self._wanted, self._less_since = needed, None
-        return Wish(self._wanted, release, wake_at)
+            self._wanted = kept
+            self._less_since = now if self._less_since is None else self._less_since
+        return self._wanted
 
-    def _release(self, now: float) -> tuple[list[Any], float]:
+    def _release_retired(self) -> list[Any]:
         placement = self._placement
-        spare = len(placement.loads) - self._minimum
-        idle = placement.idle
-        longest_idle = itertools.islice(idle, max(spare, 0))
-        overdue = list(
-            itertools.takewhile(lambda agent: idle[agent] + self._idle_timeout <= now, longest_idle)
-        )
-        for agent in overdue:
+        self._retiring &= placement.loads.keys()
+        gone = [agent for agent in self._retiring if agent in placement.idle]
+        for agent in gone:
             placement.remove(agent)
-        oldest = next(iter(idle.values()), math.inf) if spare > len(overdue) else math.inf
-        return overdue, oldest + self._idle_timeout
+        return gone
+
+    def _overdue(self, now: float) -> list[Any]:
+        idle = self._placement.idle
+        return list(
+            itertools.takewhile(lambda agent: idle[agent] + self._idle_timeout <= now, idle)
+        )
+
+    def _wake_at(self, spared: int) -> float:
+        """When to look again: at the next idle agent, or when what lingers is given up."""
+        oldest = next(itertools.islice(self._placement.idle.values(), spared, None), math.inf)
+        due = oldest + self._idle_timeout
+        return due if self._less_since is None else min(due, self._less_since + LINGER)

@@ -23,6 +23,7 @@ from fiber._transport.link import Link
 from fiber._transport.loop import Loop, Timer
 from fiber.config import Config
 from fiber.errors import FiberError, FiberPoolError
+from fiber_api import names
 
 _END_TIMEOUT = 10.0
 """Seconds for the API server, and as many for the agents, to hear of the end."""
@@ -124,7 +125,7 @@ class Pods:
     def _began(self, opened: Opened) -> None:
         self._opened = opened
         self._placement.slots = opened.slots
-        self._demand.set_bounds(opened.minimum, opened.maximum)
+        self._demand.floor, self._demand.maximum = opened.minimum, opened.maximum
         self._client = FiberPoolClient(self._api, self._loop, opened.tenure, self)
         self._client.start()
         self._changed()
@@ -141,7 +142,7 @@ class Pods:
         if self._closing:
             return
         wish = self._demand.decide(self._loop.now())
-        if wish.agents and self._opener is None:
+        if self._placement.waiting and self._opener is None:
             self._begin()
         released = [agent.host for agent in wish.release]
         self._given_up.update(released)
@@ -165,12 +166,12 @@ class Pods:
                 self._patience = None
         elif self._patience is None:
             self._progress.start()
-            timeout = self._config.start_timeout
+            timeout = self._config.pod_timeout
             self._patience = self._loop.call_later(timeout, self._give_up_waiting)
 
     def _give_up_waiting(self) -> None:
         self._patience = None
-        timeout = self._config.start_timeout
+        timeout = self._config.pod_timeout
         self._refuse(overdue(self._name, self._status, timeout, time.time()))
 
     def _refuse(self, error: FiberError) -> None:
@@ -202,12 +203,21 @@ class Pods:
                 self._client.demand(self._wanted, [name])
 
     def _tell(self, agent: RemoteAgent) -> None:
-        """Say what is known of its pod."""
+        """Say what is known of its pod, and of that pod's template."""
         pod = self._pods.get(agent.host)
-        if pod is not None:
-            end = pod_end(pod)
-            agent.node = node_of(pod)
-            agent.ending = end.reason if end is not None else ""
+        if pod is None:
+            return
+        end = pod_end(pod)
+        agent.node = node_of(pod)
+        agent.ending = end.reason if end is not None else ""
+        made_from = pod["metadata"]["labels"].get(names.LABEL_TEMPLATE_HASH)
+        if self._status.get("templateHash", made_from) != made_from:
+            self._retire(agent)
+
+    def _retire(self, agent: RemoteAgent) -> None:
+        if agent in self._placement.loads:
+            self._demand.retire(agent)
+            self._changed()
 
     # -- What the API server says
 
@@ -233,6 +243,13 @@ class Pods:
         before, self._status = self._status, status
         for problem in new_problems(self._name, before, status):
             self._output.write("fiber", problem)
+        if self._opened is not None:
+            # Somebody else's pool keeps so many, unless it finds this program forgotten.
+            self._demand.floor = min(self._opened.minimum, status.get("desiredReplicas") or 0)
+        if before.get("templateHash") != status.get("templateHash"):
+            for agent in self.agents.agents.values():
+                self._tell(agent)
+        self._changed()
         error = failure(self._name, status, len(self.agents.agents))
         if error is not None:
             self._refuse(error)

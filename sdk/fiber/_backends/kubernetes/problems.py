@@ -89,7 +89,7 @@ def overdue(pool: PoolName, status: Status, waited: float, now: float) -> FiberP
     return pool.error(
         f"no worker has joined after {waited:g} s: {summary(status, now)}. {why}".rstrip()
         + f" See kubectl describe fiberpool {pool.name} --namespace {pool.namespace}, or allow "
-        "more time (start_timeout).",
+        "more time (pod_timeout).",
         "StartTimeout" if worst is None else worst["reason"],
     )
 
