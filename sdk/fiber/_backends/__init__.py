@@ -1,1 +1,1 @@
-"""Where agents come from: this process, subprocesses on loopback, later pods."""
+"""Where children run: this process, agents on this machine, pods."""
