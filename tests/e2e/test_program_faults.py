@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from e2e.accounts import ACCOUNT, write_kubeconfig
+from e2e.accounts import ACCOUNT, may_read_credentials, write_kubeconfig
 from e2e.clusters import Cluster
 from e2e.kube import Body
 from e2e.leftovers import leaves_nothing
@@ -288,6 +288,7 @@ def test_a_second_program_is_told_who_holds_a_pool(
     programs: Programs, scene: Scene, agent: Body
 ) -> None:
     warm = Pool(scene, "warm").apply(agent, minReplicas=2)
+    may_read_credentials(scene, "warm")
     there = warm.ready(2)
     first = programs.start("outside", "mapping.py", "--workers", 2, *RUNNING, pool="warm")
     first.says("first")

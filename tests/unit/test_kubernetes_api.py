@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import math
 import ssl
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from kubernetes.config import incluster_config
+from kubernetes.config import incluster_config, kube_config
 
 from fakes.kubernetes_api import Fault
 from fakes.served import Served, served
@@ -142,6 +143,21 @@ def test_a_login_plugin_is_asked_again_when_its_token_is_not_accepted(
     server.api.accepts = set()
     with pytest.raises(Unauthorized):
         api.list(ALL)
+
+
+def test_certificates_of_a_kubeconfig_outlive_the_clients_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the exit of the interpreter the client deletes them before our pools are deleted."""
+    made = make_certificates("localhost", "nobody", valid_for=RUN_VALIDITY)
+    authority = base64.b64encode(made.authority.encode()).decode()
+    with served(_server_side(made, tmp_path)) as server:
+        url = f"https://localhost:{server.api.port}"
+        file = kubeconfig(tmp_path, url, **{"certificate-authority-data": authority})
+        monkeypatch.setenv("KUBECONFIG", str(file))
+        api = Api.connect()
+        kube_config._cleanup_temp_files()
+        api.list(ALL, timeout=0)
 
 
 # -- The account of a pod

@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import random
+import ssl
 import threading
 import time
 import urllib.parse
@@ -347,7 +348,26 @@ class Login(NamedTuple):
         configuration.keep_alive = True
         client: ApiClient = package.client.ApiClient(configuration)
         client.user_agent = names.SDK_MANAGER
+        _read_certificates(client)
         return client
+
+
+def _read_certificates(client: ApiClient) -> None:
+    """Read now what each connection would read.
+
+    The data of a kubeconfig is in temporary files, which the client deletes when the interpreter
+    exits: before this program's FiberPools are deleted.
+    """
+    configuration = client.configuration
+    context = ssl.create_default_context(cafile=configuration.ssl_ca_cert)
+    if configuration.cert_file:
+        context.load_cert_chain(configuration.cert_file, configuration.key_file)
+    if not configuration.verify_ssl:
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    settings = client.rest_client.pool_manager.connection_pool_kw
+    for key in ("ca_certs", "cert_file", "key_file"):
+        settings.pop(key, None)
+    settings["ssl_context"] = context
 
 
 def _account_namespace() -> str:
