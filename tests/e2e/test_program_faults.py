@@ -149,7 +149,7 @@ def test_a_child_that_is_killed_is_replaced_in_its_pod(programs: Programs, scene
 def test_a_task_that_needs_too_much_memory_is_told_so(programs: Programs) -> None:
     program = programs.start("outside", "mapping.py", "--task", "swell", "--retries", 1)
     output = program.ends(status=1, seconds=90)
-    assert all(word in output for word in ("WorkerDied", "OOMKilled", "160Mi"))
+    assert all(word in output for word in ("WorkerDied", "OOMKilled", "160Mi")), output
     leaves_nothing(program)
 
 

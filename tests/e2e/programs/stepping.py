@@ -43,7 +43,7 @@ def main() -> None:
     try:
         for step in range(options.steps):
             for pipe in pipes:
-                pipe.send(step)
+                send(pipe, step)
             totals = [pipe.recv() for pipe in pipes]
             if step == 10:
                 say("stepping", hosts=hosts)
@@ -56,6 +56,15 @@ def main() -> None:
     for process in processes:
         process.join()
     say("left", exitcodes=[process.exitcode for process in processes])
+
+
+def send(pipe: Any, number: int) -> None:
+    """Send it; EOFError where nobody is there any more, which says why."""
+    try:
+        pipe.send(number)
+    except BrokenPipeError:
+        while True:  # what was sent before the end, and then that
+            pipe.recv()
 
 
 def say(event: str, **facts: object) -> None:
