@@ -151,6 +151,8 @@ def bare_cluster(cluster: Cluster, release: Release, kube: Kube) -> Iterator[Non
 def programs(scene: Scene, cluster: Cluster, tmp_path: Path) -> Iterator[Programs]:
     """Starts programs that use Fiber, in a namespace where they may use pools."""
     may_use_pools(scene)
+    default = scene.path("serviceaccounts", "default")  # of all workers; it comes a moment later
+    scene.wait("the namespace has its account", lambda: scene.kube.get(default), 60.0, poll=0.2)
     programs = Programs(scene, cluster, tmp_path)
     yield programs
     programs.close()

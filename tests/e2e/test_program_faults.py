@@ -167,6 +167,7 @@ def test_a_vector_environment_whose_pod_is_deleted(programs: Programs, scene: Sc
 # -- The program itself
 
 
+@pytest.mark.may_leak("a process that is killed cannot remove its temporary folder")
 @pytest.mark.parametrize("place", PLACES)
 def test_a_program_that_is_killed_leaves_nothing_after_its_grace(
     place: str, programs: Programs
