@@ -87,6 +87,11 @@ class Spawning:
         self.fds.append(opened(os.dup, fd))
         return len(self.fds) - 1
 
+    def forget(self) -> None:
+        """It is pickled anew, in another way."""
+        self.fds.clear()
+        handles.undo_pickling()
+
 
 def spawning() -> Any:
     """The Spawning in progress on this thread, None outside of a start on this host."""
@@ -105,7 +110,7 @@ def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
     fds: list[Descriptor] = popen.fds
     try:
         mp_context.set_spawning_popen(popen)
-        return dumps(process, before_retry=fds.clear), fds
+        return dumps(process, before_retry=popen.forget), fds
     except (*REFUSALS, AttributeError) as error:
         culprit = _blame_process(process, error)
         fds.clear()
@@ -127,7 +132,7 @@ def dump_shared(obj: Any, *, same_host: bool) -> bytes | None:
     try:
         mp_context.set_spawning_popen(attempt)
         with handles.collecting_grants(reusable=False) as grants:
-            data = dumps(obj, before_retry=attempt.fds.clear)
+            data = dumps(obj, before_retry=attempt.forget)
         mine = bool(grants or attempt.fds)
         grants.release()
     except Exception:
@@ -221,6 +226,10 @@ class RemoteSpawning:
             f"descriptor {fd} cannot go to a process on another host: "
             "use Fiber's Pipe and Queue there instead of multiprocessing's or a socket"
         )
+
+    def forget(self) -> None:
+        """It is pickled anew, in another way."""
+        handles.undo_pickling()
 
     DupFd = duplicate_for_child
 

@@ -148,6 +148,12 @@ def get_one_and_block(queue: Any, connection: Any) -> NoReturn:
     block()
 
 
+def echo_without(connection: Any, other_end: Any, _: object) -> None:
+    """Let go of the other end, and send back what comes, until it is closed elsewhere too."""
+    other_end.close()
+    echo(connection)
+
+
 def echo_each(connections: list[Any]) -> NoReturn:
     """Send back one message of each connection, then block."""
     for connection in connections:

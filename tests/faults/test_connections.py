@@ -51,6 +51,20 @@ def test_the_end_comes_when_the_holder_dies(
         ours.send("to nobody")
 
 
+def test_the_end_comes_when_the_holder_closes_a_copy_that_was_pickled_twice(
+    pipe: tuple[Any, Any], start: Callable[..., Any]
+) -> None:
+    ours, theirs = pipe
+    # As Baselines does it.  What stands last does not pickle by reference: all is pickled anew.
+    child = start(targets.echo_without, theirs, ours, lambda: None)
+    theirs.close()
+    ours.send("here")
+    assert ours.recv() == "here"
+    ours.close()
+    child.join(PATIENCE)
+    assert child.exitcode == 0
+
+
 def test_who_waits_is_woken_by_the_death(pipe: tuple[Any, Any], start: Callable[..., Any]) -> None:
     ours, theirs = pipe
     child = start(targets.hold, theirs)

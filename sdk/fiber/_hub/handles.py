@@ -248,7 +248,9 @@ class Pickling:
         self.done = False
 
     def take_back(self) -> None:
-        """It did not work out: what was granted meanwhile for one use, nobody will ever use."""
+        """It did not work out: what was granted meanwhile, nobody will ever use."""
+        if self.grants is not None:
+            self.grants.release()
         while self.undo:
             with contextlib.suppress(OSError, Unreachable):  # the hub is gone, and all with it
                 self.undo.pop()()
