@@ -145,7 +145,7 @@ class Connection:
             if popen.wait(_LAST_MOMENT) is None and _is_dead(popen.pid):
                 popen.wait(_NEWS)
             if popen.report is not None:
-                return ConnectionClosed(process.name, popen.report.reason)
+                return ConnectionClosed(process.name, popen.report.describe())
         return error
 
     # The end itself

@@ -76,6 +76,11 @@ def send(channel: Any, word: str) -> None:
     channel.send(word)
 
 
+def send_and_wait(channel: Any, word: str) -> None:
+    channel.send(word)
+    time.sleep(PATIENCE)
+
+
 def test_a_pool_is_pods_that_come_with_the_work_and_go_with_the_program(
     cluster: FakeCluster,
 ) -> None:
@@ -244,10 +249,26 @@ def test_an_outdated_pod_of_somebody_elses_is_replaced_when_it_is_idle(
         with fiber.Pool(1, pool="warm") as pool:
             assert pool.apply(square, (3,)) == 9
             cluster.do(lambda: cluster.world.edit("warm", "lab", template=newer))
-            cluster.wait(lambda: cluster.world.status("warm", "lab").get("observedGeneration") > 2)
+            cluster.wait(lambda: cluster.world.status("warm", "lab")["observedGeneration"] > 2)
             assert pool.apply(square, (4,)) == 16
             assert cluster.do(images) == ["worker:1"]
         cluster.wait(lambda: images() == ["worker:2"])
         with fiber.Pool(1, pool="warm") as pool:
             assert pool.apply(square, (5,)) == 25
     cluster.do(cluster.world.store.delete, "fiberpools", "lab", "warm")
+
+
+def test_the_end_of_a_pipe_says_what_became_of_the_pod(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"):
+        ours, theirs = fiber.Pipe()
+        child = fiber.Process(target=send_and_wait, args=(theirs, "ready"))
+        child.start()
+        theirs.close()
+        assert ours.recv() == "ready"
+        (victim,) = pods_of(cluster)
+        cluster.do(cluster.world.store.delete, "pods", "lab", victim)
+        with pytest.raises(EOFError, match=f"Deleted: somebody deleted the pod, in pod {victim}"):
+            ours.recv()
+        child.join(PATIENCE)
+        assert child.exitcode == -signal.SIGTERM
+        ours.close()

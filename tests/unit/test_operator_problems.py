@@ -18,6 +18,7 @@ from unit.operator_objects import (
     ended,
     make_pool,
     name_of,
+    plan_of,
     pod_document,
     running,
     status_of,
@@ -317,6 +318,17 @@ def test_a_refusal_is_told_in_the_api_servers_words(
     assert said in found.message
     (accepted,) = (c.status for c in status.conditions if c.type == "Accepted")
     assert accepted == ("True" if reason == "QuotaExceeded" else "False")
+
+
+def test_an_account_that_is_not_there_yet_is_a_warning_first_and_tried_again_at_once() -> None:
+    said = 'pods "es-1" is forbidden: error looking up service account team/default: not found'
+    refused = Refusal(template_hash(POOL), 403, said, NOW, 5, True)
+    status = status_of(POOL, refusal=refused)
+    (found,) = status.problems
+    assert (found.reason, found.severity, found.terminal) == ("Forbidden", "Warning", False)
+    later = status_of(then(POOL, status), refusal=refused, now=NOW + 31)
+    assert later.problems[0].severity == "Error"
+    assert plan_of(POOL, refusal=refused).requeue_at == NOW + 1
 
 
 def test_a_full_quota_is_no_problem_to_a_pool_that_wants_no_more() -> None:

@@ -19,6 +19,8 @@ QUOTA_IS_FULL = "exceeded quota"
 """What the API server says where a quota allows no more."""
 _NAMESPACE_ENDS = "because it is being terminated"
 """What the API server says where nothing new may be made because the namespace is deleted."""
+_NO_ACCOUNT_YET = "error looking up service account"
+"""What the API server says for a moment in a new namespace, whose accounts are made after it."""
 _WORKER_NAME = re.compile(f"[0-9a-f]{{{names.POD_SUFFIX_LENGTH}}}")
 
 
@@ -72,6 +74,7 @@ def _refusals(situation: Situation) -> Iterator[Problem]:
         yield situation.problem(
             reason,
             wording.refusal(reason, refused),
+            severity=situation.severity(reason) if lacks_account(refused) else "Error",
             terminal=reason != Reason.QUOTA_EXCEEDED and not _may_pass(refused),
         )
 
@@ -88,7 +91,12 @@ def _may_pass(refused: Refusal) -> bool:
 
     400 is how admission webhooks refuse what they find wrong at the moment.
     """
-    return refused.status not in (403, 422) and not refused.dry_run
+    return lacks_account(refused) or (refused.status not in (403, 422) and not refused.dry_run)
+
+
+def lacks_account(refused: Refusal) -> bool:
+    """Whether the ServiceAccount of the template is not there, or not there yet."""
+    return _NO_ACCOUNT_YET in refused.message
 
 
 def _masters(situation: Situation) -> Iterator[Problem]:

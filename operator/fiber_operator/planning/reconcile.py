@@ -48,6 +48,9 @@ STUCK = 5.0
 QUOTA_WAIT = 30.0
 """The longest wait until a full quota is tried again: it is freed without a sign."""
 
+ACCOUNT_WAIT = 1.0
+"""The same for a ServiceAccount that is not there: in a new namespace it is in a moment."""
+
 _HINDERED = (Trouble.UNSCHEDULABLE, Trouble.CANNOT_START)
 
 _ENDED: Mapping[Trouble | None, Reason] = {
@@ -225,6 +228,8 @@ class _Planner:
         wait = failures.delay(self._spec.failure_policy, refused.count, self._pool.metadata.uid)
         if problems.refusal_reason(refused) == Reason.QUOTA_EXCEEDED:
             wait = min(wait, QUOTA_WAIT)
+        if problems.lacks_account(refused):
+            wait = min(wait, ACCOUNT_WAIT)
         return refused.at + wait
 
     def _can_make_pods(self) -> bool:

@@ -19,6 +19,7 @@ from typing import Any
 from fiber._agent import zygote
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
+from fiber._agent.memory_limit import MemoryLimit
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink
 from fiber._hub import client as hub_client
@@ -40,6 +41,7 @@ class Agent:
         self.host = host
         self.loop = loop
         self.progress_table = ProgressTable()
+        self.memory_limit = MemoryLimit()
         self._hub = hub
         self._ids = itertools.count(1)
         self._folders = itertools.count(1)
@@ -148,7 +150,7 @@ class Agent:
             child.release_descriptors()
             child.observer.started(reply[2])
         elif reply[0] == zygote.EXITED:
-            self._child_exited(child, reply[2], describe(reply[2]))
+            self._child_exited(child, reply[2], self.describe_end(reply[2]))
         elif reply[0] == zygote.FAILED:
             self._refused(child, reply[2])
         elif reply[0] == zygote.FORK_UNSAFE:
@@ -207,6 +209,12 @@ class Agent:
             reason = f"killed by its agent: {child.fault}"
         report = ExitReport(exitcode, reason, unread, running, host=self.host, cause=cause)
         child.observer.exited(report)
+
+    def describe_end(self, exitcode: int) -> str:
+        """An exit code in words, with what the kernel knows of a SIGKILL."""
+        if exitcode == -signal.SIGKILL and self.memory_limit.was_exceeded():
+            return f"OOMKilled: {self.memory_limit.describe()}"
+        return describe(exitcode)
 
     def _release(self, child: LocalChild) -> tuple[tuple[int, ...], tuple[int, int] | None]:
         """Give back what it had; what it never read and what it was running."""

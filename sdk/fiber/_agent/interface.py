@@ -52,6 +52,12 @@ class ExitReport(NamedTuple):
     """The pod that it ran in, and that pod's node, where there is one."""
     node: str = ""
 
+    def describe(self) -> str:
+        """The reason, and where that was if it was in a pod."""
+        if not self.pod:
+            return self.reason
+        return f"{self.reason}, in pod {self.pod}" + (f" on node {self.node}" if self.node else "")
+
 
 @dataclass(frozen=True, slots=True)
 class ChildSpec:

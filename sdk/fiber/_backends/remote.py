@@ -297,4 +297,6 @@ class RemoteChild:
         report = report._replace(unread=(*report.unread, *missed))
         if self._agent is not None:
             report = report._replace(pod=self._agent.pod, node=self._agent.node)
+            if self._agent.ending and report.exitcode < 0:  # together with its pod
+                report = report._replace(reason=self._agent.ending)
         self.observer.exited(report)
