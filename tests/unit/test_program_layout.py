@@ -38,7 +38,7 @@ class Machine:
     def runs(self, file: Path, name: str | None = None) -> None:
         """Its main module is that one; ``-m name`` if that is given."""
         self.main.__file__ = str(file)
-        self.imported_by = {"init_main_from_name": name} if name else {"init_main_from_path": str(file)}
+        self.imported_by = {"name": name} if name else {"path": str(file)}
         spec: Any = ModuleType("spec")
         spec.name = name
         self.main.__spec__ = spec if name else None
@@ -58,7 +58,7 @@ class Machine:
         preparation = {
             "sys_path": list(map(str, path)),
             "dir": str(directory or self.es),
-            **self.imported_by,
+            **{f"init_main_from_{how}": main for how, main in self.imported_by.items()},
         }
         return find_layout(preparation, frozenset(map(str, left_out)))
 
