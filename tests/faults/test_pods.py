@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 import fiber
 from fakes.cluster import FakeCluster, fake_cluster
+from faults.program import Program
 from faults.runtime import running
 from fiber.errors import FiberPoolError, WorkerDied
 from fiber_api import names
@@ -272,3 +273,30 @@ def test_the_end_of_a_pipe_says_what_became_of_the_pod(cluster: FakeCluster) -> 
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGTERM
         ours.close()
+
+
+FORKS = """
+    import fiber, os, warnings
+
+    # From Python 3.12 on os.fork() warns of any thread, and the loop is one.
+    warnings.simplefilter("ignore", DeprecationWarning)
+
+    def square(number):
+        return number * number
+
+    if __name__ == "__main__":
+        with fiber.Pool(1) as pool:
+            pool.map(square, range(3))
+            pid = os.fork()
+            if pid == 0:
+                with fiber.Pool(1) as other:
+                    os._exit(other.apply(square, (3,)))
+            print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), pool.map(square, range(3)))
+"""
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_program_that_forks_itself_has_pods_and_its_copy_runs_beside_it(
+    launch: Callable[..., Program],
+) -> None:
+    assert launch(FORKS, env={"FIBER_BACKEND": "kubernetes"}).finish() == "9 [0, 1, 4]\n"

@@ -68,6 +68,13 @@ class TestWarnings:
     def test_there_are_none_without_problems(self) -> None:
         assert list(new_problems(POOL, status(UNSCHEDULABLE), {})) == []
 
+    @pytest.mark.parametrize("reason", ["LeaseNotFound", "MasterLost"])
+    def test_are_not_of_the_program_itself_which_lives(self, reason: str) -> None:
+        """The operator may look between the pool's making and the Lease's."""
+        found = status(problem(reason, severity="Warning"), desiredReplicas=2)
+        assert list(new_problems(POOL, {}, found)) == []
+        assert summary(found, NOW) == "0 of 2 pods ready"
+
 
 class TestFailure:
     @pytest.mark.parametrize(

@@ -26,6 +26,8 @@ class Machine:
         self.es = write(self.home / "es", main_py="", pkg__sub__tool_py="", data__x_npy="x")
         self.lib = write(tmp_path / "lib", shared__init_py="")
         self.main = ModuleType("__main__")
+        self.imported_by: dict[str, str] = {}
+        """How children import it."""
         monkeypatch.setenv("HOME", str(self.home))
         monkeypatch.setattr(program_layout.mp_process, "ORIGINAL_DIR", str(self.es))
         # Without what the tests themselves have imported from outside of site-packages.
@@ -36,6 +38,7 @@ class Machine:
     def runs(self, file: Path, name: str | None = None) -> None:
         """Its main module is that one; ``-m name`` if that is given."""
         self.main.__file__ = str(file)
+        self.imported_by = {"name": name} if name else {"path": str(file)}
         spec: Any = ModuleType("spec")
         spec.name = name
         self.main.__spec__ = spec if name else None
@@ -52,7 +55,11 @@ class Machine:
         self, *path: Path | str, directory: Path | None = None, left_out: tuple[Path, ...] = ()
     ) -> program_layout.Layout:
         """The layout, with that ``sys.path`` and working directory."""
-        preparation = {"sys_path": list(map(str, path)), "dir": str(directory or self.es)}
+        preparation = {
+            "sys_path": list(map(str, path)),
+            "dir": str(directory or self.es),
+            **{f"init_main_from_{how}": main for how, main in self.imported_by.items()},
+        }
         return find_layout(preparation, frozenset(map(str, left_out)))
 
 

@@ -116,6 +116,20 @@ if __name__ == "__main__":
     assert site.prints("-m", "pkg.tool") == ["__mp_main__ pkg.part"]
 
 
+def test_the_main_module_of_a_package_is_not_run_again(site: Site) -> None:
+    write(site.program, pkg__part_py="def double(number): return 2 * number")
+    (site.program / "pkg" / "__main__.py").write_text("""
+import elsewhere, fiber
+from .part import double
+def look(number):
+    return double(number)
+elsewhere.begin()
+with fiber.Pool(1) as pool:
+    print(*pool.map(look, range(3)))
+""")
+    assert site.prints("-m", "pkg") == ["0 2 4"]
+
+
 def test_a_pool_and_a_process_have_the_files_as_they_are_when_it_is_made(site: Site) -> None:
     write(site.program, value_py="VALUE = 1")
     program = """

@@ -73,6 +73,8 @@ def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Lay
     """
     main, here = main_file(), os.path.abspath(preparation["dir"])
     program = here if main is None else _folder_of(main)
+    # One that has a name is imported by that, and a package's not at all: importing it runs it.
+    by_path = "init_main_from_path" in preparation
     path = list(map(os.path.abspath, preparation["sys_path"]))
     whole = [folder for folder in (program, *path) if _is_sent(folder) and folder not in left_out]
     places = Places(_named(_outermost(whole)))
@@ -91,7 +93,7 @@ def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Lay
             directory=(_is_inside(here, program) and places.name_of(here))
             or places.name_of(program)
             or _LOOSE,
-            main=None if main is None else places.name_of(main),
+            main=None if main is None or not by_path else places.name_of(main),
         ),
     )
 

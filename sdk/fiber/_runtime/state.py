@@ -190,7 +190,11 @@ class _Releasing:
 
 
 def _make_backend(runtime: Runtime) -> Backend:
+    from fiber._backends.local import LocalBackend
+
     loop, hub, settings = runtime.loop, runtime.hub, runtime.config
+    if not _may_link:
+        return LocalBackend(loop, runtime.host, hub)
     if hub is not None and settings.backend == "loopback":
         from fiber._backends.loopback import LoopbackBackend
 
@@ -199,9 +203,7 @@ def _make_backend(runtime: Runtime) -> Backend:
         from fiber._backends.kubernetes.backend import KubernetesBackend
 
         return KubernetesBackend(loop, hub, settings)
-    from fiber._backends.local import LocalBackend
-
-    return LocalBackend(runtime.loop, runtime.host, runtime.hub)
+    return LocalBackend(loop, runtime.host, hub)
 
 
 def _is_on_cluster(settings: config.Config) -> bool:
@@ -236,6 +238,9 @@ _OURS = ("fiber.connection", "fiber.queues", "fiber.synchronize", "fiber._agent.
 
 _lock = threading.RLock()  # a finalizer may come back here while one is made
 _runtime: Runtime | None = None
+_may_link = True
+"""Whether this process may have agents: nng, which carries links, aborts a forked copy of a process
+that has used it.  Such a copy runs its processes beside it."""
 
 
 def runtime() -> Runtime:
@@ -274,8 +279,9 @@ def shutdown() -> None:
 
 def _forget() -> None:
     """In a process forked by someone else: the loop's thread did not come along."""
-    global _runtime, _lock
+    global _runtime, _lock, _may_link
     _runtime, _lock = None, threading.RLock()
+    _may_link = _may_link and "fiber._transport.nng" not in sys.modules
 
 
 os.register_at_fork(after_in_child=_forget)

@@ -148,9 +148,16 @@ def _cause(problem: Mapping[str, Any], now: float) -> str:
     return f"{cause} (for {seconds:.0f} s)"
 
 
+_OF_THE_MASTER = frozenset({Reason.LEASE_NOT_FOUND, Reason.MASTER_LOST})
+"""What others are told of this program, which lives.  It makes and renews the Lease itself: between
+two of its steps, or after it was stopped, the operator may have seen none."""
+
+
 def _problems(status: Status) -> Iterator[Mapping[str, Any]]:
     """The worst first, as the operator sorted them."""
-    yield from status.get("problems") or ()
+    for problem in status.get("problems") or ():
+        if problem.get("reason") not in _OF_THE_MASTER:
+            yield problem
 
 
 def _is_true(status: Status, kind: ConditionType) -> bool:
