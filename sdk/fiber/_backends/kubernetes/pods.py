@@ -235,8 +235,8 @@ class Pods:
             self._tell(agent)
             if (pod.get("status") or {}).get("phase") in _ENDED:
                 agent.lose("its pod has ended")
-            elif agent.ending:
-                self.agents.suspected(agent, True)
+            else:
+                self.agents.withhold(agent, bool(agent.ending), "ending")
 
     def on_status(self, status: Document) -> None:
         """The pool's status, as it is now."""
