@@ -66,7 +66,8 @@ class Pods:
         self._opener: threading.Thread | None = None
         self._opened: Opened | None = None
         self._client: FiberPoolClient | None = None
-        self._closing = False
+        self._closing = threading.Event()
+        """Nothing more is to be asked of the API server than the end."""
         self._decision_is_due = False
         self._timer: Timer | None = None
         self._patience: Timer | None = None
@@ -79,42 +80,58 @@ class Pods:
 
     def close(self) -> None:
         """End the children, and the pool or its use.  Not on the loop's thread."""
-        self._closing = True
-        if self._opener is None:
-            return
-        self._opener.join()
-        done = threading.Event()
-        self._loop.call_soon(self._shut_down, done)
-        done.wait()
+        self._closing.set()
+        self._wait_for(lambda then: self._loop.call_soon(self._shut_down, then))
+        opener = self._opener  # from here on there will be no other
+        if opener is not None:
+            opener.join(_END_TIMEOUT)
+            self._wait_for(self._loop.call_soon)  # until what it opened is known
         if self._client is not None:
             self._client.close(_END_TIMEOUT)
         if self._opened is not None:
-            done.clear()
-            self._opened.listener.close("the master ended", then=done.set)
+            listener = self._opened.listener
+            self._wait_for(lambda then: listener.close("the master ended", then=then))
+
+    def _wait_for(self, ask: Callable[[Callable[[], None]], None]) -> None:
+        """Until what is asked for is done on the loop's thread, if that still does anything."""
+        done = threading.Event()
+        ask(done.set)
+        if not self._loop.broken:
             done.wait(_END_TIMEOUT)
 
-    def _shut_down(self, done: threading.Event) -> None:
+    def _shut_down(self, then: Callable[[], None]) -> None:
         for timer in (self._timer, self._patience):
             if timer is not None:
                 timer.cancel()
         self._progress.stop()
         for agent in self.agents.agents.values():
             agent.close()
-        done.set()
+        then()
 
     # -- The pool begins
 
     def _begin(self) -> None:
         """Calls of the API server take their time: a thread makes them."""
-        self._opener = threading.Thread(target=self._run_open, name="fiber-open", daemon=True)
-        self._opener.start()
+        opener = threading.Thread(target=self._run_open, name="fiber-open", daemon=True)
+        try:
+            opener.start()
+        except RuntimeError as error:  # the system has no room for it
+            self._refuse(_unexpected(error))
+        else:
+            self._opener = opener
 
     def _run_open(self) -> None:
-        serve = Serve(self._joined, lambda why: self._output.write("fiber", f"refused {why}"))
+        serve = Serve(
+            self._joined,
+            lambda why: self._output.write("fiber", f"refused {why}"),
+            self._closing,
+        )
         try:
             opened = self._open(serve)
         except FiberError as error:
             self._loop.call_soon(self._failed_to_open, error)
+        except Exception as error:  # a fault of ours must not leave anybody waiting
+            self._loop.call_soon(self._failed_to_open, _unexpected(error))
         else:
             self._loop.call_soon(self._began, opened)
 
@@ -124,6 +141,8 @@ class Pods:
 
     def _began(self, opened: Opened) -> None:
         self._opened = opened
+        if self._closing.is_set():
+            return  # there is no pool yet, and nobody who wants one
         self._placement.slots = opened.slots
         self._demand.floor, self._demand.maximum = opened.minimum, opened.maximum
         self._client = FiberPoolClient(self._api, self._loop, opened.tenure, self)
@@ -139,7 +158,7 @@ class Pods:
 
     def _decide(self) -> None:
         self._decision_is_due = False
-        if self._closing:
+        if self._closing.is_set():
             return
         wish = self._demand.decide(self._loop.now())
         if self._placement.waiting and self._opener is None:
@@ -196,7 +215,7 @@ class Pods:
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
         name = agent.host
-        if name in self._pods and name not in self._given_up and not self._closing:
+        if name in self._pods and name not in self._given_up and not self._closing.is_set():
             # Its pod may live on where nobody hears it: another takes its place.
             self._given_up.add(name)
             if self._client is not None:
@@ -270,3 +289,9 @@ class Pods:
     def _name(self) -> PoolName:
         tenure = None if self._opened is None else self._opened.tenure
         return PoolName("", "") if tenure is None else PoolName(tenure.name, tenure.namespace)
+
+
+def _unexpected(error: Exception) -> FiberError:
+    failure = FiberError(f"no pods can be asked for, after an unexpected {error!r}")
+    failure.__cause__ = error
+    return failure
