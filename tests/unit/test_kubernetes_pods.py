@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
-from fiber._backends.kubernetes import program
+from fiber._backends.kubernetes import program, progress
 from fiber._backends.kubernetes.pods import Pods
 from fiber._backends.kubernetes.program import Opened, Serve
 from fiber._backends.kubernetes.shape import Shape
 from fiber._backends.remote import RemoteChild
 from fiber._transport.loop import Loop
 from fiber.config import Config
-from fiber.errors import FiberError
+from fiber.errors import FiberError, FiberPoolError
 from unit.kubernetes_rig import kubeconfig
 
 PATIENCE = 20
@@ -33,6 +33,9 @@ class Said:
     def write(self, who: str, text: str) -> None:
         self.lines.append(f"{who}: {text}")
 
+    def show(self, line: str) -> None:
+        self.lines.append(line)
+
     def __getattr__(self, name: str) -> Any:
         return lambda *args, **kwargs: None
 
@@ -40,12 +43,14 @@ class Said:
 class Owner:
     """Hears of one child."""
 
-    def __init__(self) -> None:
+    def __init__(self, said: Said) -> None:
+        self.said = said
         self.report: ExitReport | None = None
         self.gone = threading.Event()
 
     def exited(self, report: ExitReport) -> None:
         self.report = report
+        self.said.lines.append("refused")
         self.gone.set()
 
 
@@ -92,7 +97,7 @@ class Site:
         return self.made
 
     def start(self) -> tuple[RemoteChild, Owner]:
-        owner: Any = Owner()
+        owner: Any = Owner(self.said)
         spec = ChildSpec(
             name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=False
         )
@@ -154,6 +159,47 @@ def test_an_end_while_it_is_opened_makes_no_pool_and_closes_what_listens(site: S
     site.made.close()
     assert listener.closed
     assert not [t for t in threading.enumerate() if t.name == "fiber-kubernetes"]
+
+
+def until_the_end(serve: Serve) -> Opened:
+    """As an API server that does not answer."""
+    assert serve.cancel.wait(PATIENCE)
+    raise FiberError("the end")
+
+
+def test_what_ends_the_wait_ends_that_of_who_comes_later_too(site: Site) -> None:
+    pods = site.pods(until_the_end)
+    hopeless = {"reason": "BackoffLimitExceeded", "message": "all die", "terminal": True}
+    site.loop.call_soon(pods.on_status, {"problems": [hopeless]})
+    child, owner = site.start()
+    assert owner.gone.wait(PATIENCE)
+    assert "all die" in str(child.start_error)
+    pods.close()
+
+
+def test_the_live_line_goes_before_anybody_is_refused(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "_is_terminal", lambda: True)
+    waits = threading.Event()
+    pods = site.pods(lambda serve: waits.set() or until_the_end(serve))
+    _, owner = site.start()
+    assert waits.wait(PATIENCE)
+    error = FiberPoolError("it was deleted", pool="es-1", namespace="lab", reason="Deleted")
+    site.loop.call_soon(pods.on_error, error)
+    assert owner.gone.wait(PATIENCE)
+    assert site.said.lines == ["", "fiber: it was deleted", "refused"]
+    pods.close()
+
+
+def test_a_wait_for_the_api_server_says_so(site: Site) -> None:
+    waits = threading.Event()
+    pods = site.pods(lambda serve: waits.set() or until_the_end(serve))
+    pods._config = Config(pod_timeout=0.1)
+    child, owner = site.start()
+    assert owner.gone.wait(PATIENCE)
+    assert "within 0.1 s: the API server" in str(child.start_error)
+    pods.close()
 
 
 def test_an_end_after_the_loop_has_failed(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

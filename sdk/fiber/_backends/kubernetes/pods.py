@@ -63,6 +63,8 @@ class Pods:
         self.agents = AgentSet(
             loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
         )
+        self.over = False
+        """Nothing comes of its pool any more, and it was given back."""
         self._opener: threading.Thread | None = None
         self._opened: Opened | None = None
         self._client: FiberPoolClient | None = None
@@ -73,6 +75,7 @@ class Pods:
         self._patience: Timer | None = None
         self._wanted = 0
         self._pods: dict[str, Document] = {}
+        self._told_of_limit = False
         self._given_up: set[str] = set()
         """Pods that are there and of which nothing is expected any more."""
         self._status: Document = {}
@@ -173,12 +176,33 @@ class Pods:
             self._timer = None
         if wish.wake_at < float("inf"):
             self._timer = self._loop.call_later(wish.wake_at - self._loop.now(), self._decide)
+        self._watch_the_limit()
         self._watch_the_wait()
+
+    def _watch_the_limit(self) -> None:
+        """Processes for which there is no room until others end are spoken of, once: these may
+        wait for them.  A pool works with the workers that it has.
+        """
+        placement, most = self._placement, self._demand.maximum
+        too_many = placement.children + len(placement.waiting) > most * placement.slots
+        if not too_many or self._opened is None:
+            self._told_of_limit = False
+        elif not self._told_of_limit and not all(child.is_worker for child in placement.waiting):
+            self._told_of_limit = True
+            self._output.write(
+                "fiber",
+                f"{len(placement.waiting)} processes wait until others end: there are to be no "
+                f"more than {most} pods with {placement.slots} processes each. Raise max_pods, for "
+                "a pool of somebody else's its maxReplicas, or processes_per_pod",
+            )
 
     def _watch_the_wait(self) -> None:
         """Somebody who waits for a first host is told what for, and not kept for ever."""
-        waits = bool(self._placement.waiting) and not self.agents.agents
-        if not waits:
+        waits = bool(self._placement.waiting) and not self._placement.loads
+        known = self.agents.error or failure(self._name, self._status, 0)
+        if waits and known is not None:
+            self._refuse(known)  # it was heard before they came
+        elif not waits:
             self._progress.stop()
             if self._patience is not None:
                 self._patience.cancel()
@@ -191,10 +215,20 @@ class Pods:
     def _give_up_waiting(self) -> None:
         self._patience = None
         timeout = self._config.pod_timeout
-        self._refuse(overdue(self._name, self._status, timeout, time.time()))
+        if self._opened is not None:
+            self._refuse(overdue(self._name, self._status, timeout, time.time()))
+        else:
+            self._refuse(
+                FiberError(
+                    f"no pod could be asked for within {timeout:g} s: {self._asking}. Look with "
+                    "`kubectl get fiberpools` whether it answers, and whether its login waits for "
+                    "somebody"
+                )
+            )
 
-    def _refuse(self, error: FiberError) -> None:
+    def _refuse(self, error: Exception) -> None:
         """Nobody is to wait any longer."""
+        self._progress.stop()  # first: whoever is refused may write where its line stands
         if not all(child.is_worker for child in self._placement.waiting):
             # Whoever started it has gone on.  Pools raise it to their callers.
             self._output.write("fiber", str(error))
@@ -269,7 +303,7 @@ class Pods:
             for agent in self.agents.agents.values():
                 self._tell(agent)
         self._changed()
-        error = failure(self._name, status, len(self.agents.agents))
+        error = failure(self._name, status, len(self._placement.loads))
         if error is not None:
             self._refuse(error)
 
@@ -279,11 +313,27 @@ class Pods:
 
     def on_error(self, error: FiberPoolError) -> None:
         """Nothing comes of the pool any more."""
+        if not self._placement.waiting:
+            self._output.write("fiber", str(error))  # nobody else says it
         self._refuse(error)
         self.agents.fail(error)
 
+    def on_end(self) -> None:
+        """The pool is given back: whoever starts something now gets another."""
+        self.over = True
+        for agent in list(self.agents.agents.values()):
+            agent.close()
+            agent.lose("its FiberPool is not this program's any more")
+        if self._opened is not None:
+            self._opened.listener.close("its FiberPool is not this program's any more")
+
     def _describe(self) -> str:
-        return f"waiting for pods: {summary(self._status, time.time())}"
+        state = self._asking if self._opened is None else summary(self._status, time.time())
+        return f"waiting for pods: {state}"
+
+    @property
+    def _asking(self) -> str:
+        return f"the API server {self._api.server} is being asked"
 
     @property
     def _name(self) -> PoolName:
