@@ -14,6 +14,7 @@ import fiber
 from fakes.cluster import FakeCluster, fake_cluster
 from faults.program import Program
 from faults.runtime import running
+from fiber._runtime import state
 from fiber.errors import FiberPoolError, WorkerDied
 from fiber_api import names
 from unit.kubernetes_rig import kubeconfig
@@ -80,6 +81,10 @@ def send(channel: Any, word: str) -> None:
 def send_and_wait(channel: Any, word: str) -> None:
     channel.send(word)
     time.sleep(PATIENCE)
+
+
+def hear(channel: Any) -> None:
+    channel.recv()
 
 
 def test_a_pool_is_pods_that_come_with_the_work_and_go_with_the_program(
@@ -218,6 +223,39 @@ def test_an_image_that_cannot_be_had_is_an_error_within_seconds(
         child.join(PATIENCE)
         assert child.exitcode == 1
     assert "ErrImageNeverPull" in capfd.readouterr().err
+
+
+def test_a_fiber_pool_that_somebody_deletes_is_said_and_the_next_pool_has_another(
+    cluster: FakeCluster, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with running(backend="kubernetes"):
+        with fiber.Pool(1) as pool:
+            assert pool.apply(square, (3,)) == 9
+        (first,) = cluster.objects("fiberpools")
+        cluster.do(cluster.world.store.delete, "fiberpools", "lab", first["metadata"]["name"])
+        backend: Any = state.runtime().backend
+        cluster.wait(lambda: all(pods.over for pods in backend._pods.values()))
+        with fiber.Pool(1) as pool:
+            assert pool.apply(square, (3,)) == 9
+    assert capfd.readouterr().err.count("was deleted, and its processes with it") == 1
+
+
+def test_processes_for_which_there_will_be_no_room_are_spoken_of(
+    cluster: FakeCluster, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with running(backend="kubernetes", max_pods=1):
+        ours, theirs = fiber.Pipe()
+        children = [fiber.Process(target=hear, args=(theirs,)) for _ in range(2)]
+        for child in children:
+            child.start()
+        theirs.close()
+        for _ in children:
+            ours.send("go")
+        for child in children:
+            child.join(PATIENCE)
+            assert child.exitcode == 0
+        ours.close()
+    assert capfd.readouterr().err.count("processes wait until others end") == 1
 
 
 def test_a_pool_on_somebody_elses_pods_leaves_them_as_they_were(cluster: FakeCluster) -> None:

@@ -88,12 +88,12 @@ class Cluster:
         pods = sorted(self.running.keys() - self.released)
         if pods:
             pod = self.rng.choice(pods)
-            self.placement.withhold(pod)
+            self.placement.withhold(pod, "silent")
             self.later(self.rng.random(), "sound", pod)
 
     def sound(self, pod: str) -> None:
         if pod in self.running and pod not in self.released:
-            self.placement.restore(pod)
+            self.placement.restore(pod, "silent")
 
     def wake(self, _: object) -> None:
         pass

@@ -68,6 +68,7 @@ class Told:
     pods: list[tuple[str, Body | None]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     errors: list[FiberPoolError] = field(default_factory=list)
+    ended: bool = False
     _changed: threading.Condition = field(default_factory=threading.Condition)
 
     def on_status(self, status: Body) -> None:
@@ -81,6 +82,11 @@ class Told:
 
     def on_error(self, error: FiberPoolError) -> None:
         self._note(self.errors, error)
+
+    def on_end(self) -> None:
+        with self._changed:
+            self.ended = True
+            self._changed.notify_all()
 
     def wait(self, what: Callable[[], object], timeout: float = 20.0) -> None:
         """Until it is so; it is asked after each thing that is told."""

@@ -297,6 +297,18 @@ def test_an_operator_that_is_silent(rig: Rig, told: Told, monkeypatch: pytest.Mo
     assert "was not looked at by an operator" in warning
 
 
+def test_a_pool_of_which_nothing_comes_is_given_back_at_once(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.1)
+    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.2)
+    rig.operator.mute = True
+    rig.own(told)
+    told.error()
+    told.wait(lambda: told.ended)
+    assert rig.server.objects(names.PLURAL) == []
+
+
 def test_an_operator_of_which_nothing_could_be_heard(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:

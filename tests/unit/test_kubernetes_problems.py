@@ -120,11 +120,6 @@ class TestFailure:
         assert failure(POOL, hopeless, joined=1) is None
         assert failure(POOL, {**hopeless, "readyReplicas": 1}, joined=0) is None
 
-    def test_what_was_said_of_an_earlier_generation_does_not_count(self) -> None:
-        hopeless = status(problem("BackoffLimitExceeded", terminal=True))
-        assert failure(POOL, hopeless, joined=0, generation=3) is None
-        assert failure(POOL, hopeless, joined=0, generation=2) is not None
-
     def test_a_suspended_pool_has_no_workers(self) -> None:
         suspended = status(conditions=[{"type": "Suspended", "status": "True"}])
         error = failure(POOL, suspended, joined=0)

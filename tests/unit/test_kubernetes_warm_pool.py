@@ -10,6 +10,7 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes.warm_pool import read_credentials
+from fiber._transport.credentials import MasterCredentials
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from fiber_api.certificates import make_pool_certificates
@@ -234,9 +235,13 @@ def make_secret(rig: Rig, name: str = names.secret_name("warm"), **changed: str)
     rig.server.do(rig.server.store.create, "secrets", NAMESPACE, body)
 
 
+def credentials(rig: Rig) -> MasterCredentials:
+    return read_credentials(rig.api, NAMESPACE, "warm", rig.spec("warm"))
+
+
 def test_the_credentials_that_the_operator_made_are_read(rig: Rig) -> None:
     make_secret(rig)
-    read = read_credentials(rig.api, NAMESPACE, "warm")
+    read = credentials(rig)
     assert read.server_name == names.server_name("warm", NAMESPACE)
     assert read.key != read.agent_half().key
 
@@ -244,7 +249,7 @@ def test_the_credentials_that_the_operator_made_are_read(rig: Rig) -> None:
 def test_credentials_that_cannot_serve(rig: Rig) -> None:
     make_secret(rig, **{names.KEY_MASTER_KEY: "damaged"})
     with pytest.raises(FiberPoolError, match=r"master\.key.*delete it") as caught:
-        read_credentials(rig.api, NAMESPACE, "warm")
+        credentials(rig)
     assert caught.value.reason == "InvalidCredentials"
     assert "damaged" not in str(caught.value)
 
@@ -252,7 +257,7 @@ def test_credentials_that_cannot_serve(rig: Rig) -> None:
 def test_credentials_that_this_program_may_not_read(rig: Rig) -> None:
     rig.server.api.faults.append(Fault("get", "secrets", status=403, message="no secrets"))
     with pytest.raises(FiberPoolError, match=r"no secrets.*--resource-name=warm-") as caught:
-        read_credentials(rig.api, NAMESPACE, "warm")
+        credentials(rig)
     assert caught.value.reason == "Forbidden"
 
 
@@ -260,4 +265,4 @@ def test_credentials_that_the_pools_owner_brought(rig: Rig) -> None:
     make_secret(rig, "brought")
     patch = {"spec": {"credentialsSecretName": "brought"}}
     rig.server.do(rig.server.store.merge, names.PLURAL, NAMESPACE, "warm", patch)
-    assert read_credentials(rig.api, NAMESPACE, "warm").key
+    assert credentials(rig).key

@@ -64,16 +64,28 @@ def test_packed_children_leave_agents_idle_and_those_that_are_idle_longest_stay_
 
 def test_a_silent_agent_gets_none_until_it_is_heard_again() -> None:
     placement = with_agents("a", slots=2)
-    placement.withhold("a")
+    placement.withhold("a", "silent")
     assert put(placement, "1") == []
     assert placement.room == 0
-    placement.restore("a")
+    placement.restore("a", "silent")
     assert placement.place() == ("1", "a")
-    placement.withhold("a")
+    placement.withhold("a", "silent")
     placement.ended("a", now=5)
     assert put(placement, "2") == []
     placement.remove("a")
     assert placement.children == 0
+
+
+def test_one_that_is_heard_again_gets_none_while_there_is_another_reason() -> None:
+    placement = with_agents("a", slots=2)
+    placement.withhold("a", "ending")
+    placement.withhold("a", "silent")
+    placement.restore("a", "silent")
+    assert put(placement, "1") == []
+    placement.restore("a", "ending")
+    assert placement.place() == ("1", "a")
+    placement.restore("a", "ending")  # which it was not
+    assert placement.room == 1
 
 
 def test_counts_are_those_of_a_recount_whatever_happens() -> None:
@@ -101,10 +113,10 @@ def test_counts_are_those_of_a_recount_whatever_happens() -> None:
             placement.remove(agent)
         elif agent is not None and event == "silent":
             withheld.add(agent)
-            placement.withhold(agent)
+            placement.withhold(agent, "silent")
         elif agent is not None and event == "heard":
             withheld.discard(agent)
-            placement.restore(agent)
+            placement.restore(agent, "silent")
         assert placement.children == sum(map(len, running.values()))
         assert set(placement.idle) == {agent for agent in running if not running[agent]}
         assert list(placement.idle.values()) == sorted(placement.idle.values())

@@ -58,7 +58,7 @@ class AgentSet:
     def start(self, child: RemoteChild) -> None:
         """Give it an agent, now or as soon as there is room."""
         self._not_started.discard(child)
-        if self.error is not None and not self.agents:
+        if self.error is not None and not self._placement.loads:
             _refuse(child, self.error)
             return
         self._placement.wait(child)
@@ -84,7 +84,7 @@ class AgentSet:
     def fail(self, error: Exception) -> None:
         """No agent will come: if there is none, nobody has to wait."""
         self.error = error
-        if not self.agents:
+        if not self._placement.loads:
             self.refuse_waiting(error)
 
     def refuse_waiting(self, error: Exception) -> None:
@@ -109,7 +109,10 @@ class AgentSet:
         if agent in self._placement.loads:
             self._placement.remove(agent)
         self._on_lost(agent, reason)
-        self._on_change()
+        if self.error is not None and not self._placement.loads:
+            self.refuse_waiting(self.error)  # they waited for room that it would have had
+        else:
+            self._on_change()
 
     def child_gone(self, agent: RemoteAgent) -> None:
         """There is room for another."""
@@ -119,12 +122,16 @@ class AgentSet:
 
     def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
         """It gets no children while it is silent."""
+        self.withhold(agent, suspect, "silent")
+
+    def withhold(self, agent: RemoteAgent, withheld: bool, why: str) -> None:
+        """Whether it is given no children for this reason."""
         if agent not in self._placement.loads:
             return
-        if suspect:
-            self._placement.withhold(agent)
+        if withheld:
+            self._placement.withhold(agent, why)
         else:
-            self._placement.restore(agent)
+            self._placement.restore(agent, why)
         self._place()
 
 

@@ -48,7 +48,7 @@ class Demand:
 
     def retire(self, agent: Any) -> None:
         """Another is to take its place: let it go as soon as it is idle."""
-        self._placement.withhold(agent)
+        self._placement.withhold(agent, "retired")
         self._retiring.add(agent)
 
     def decide(self, now: float) -> Wish:

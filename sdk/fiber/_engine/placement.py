@@ -31,7 +31,8 @@ class Placement(Generic[Agent, Child]):
         self.idle: dict[Agent, float] = {}
         """Agents without children and since when, the longest idle first."""
         self._spread = spread
-        self._withheld: set[Agent] = set()
+        self._withheld: dict[Agent, set[str]] = {}
+        """Those that are given none, and why: each for a reason or more."""
         self._with_room: dict[int, dict[Agent, None]] = {}
         """Those that can be given children, by how many they have."""
         self._room = 0.0
@@ -52,20 +53,24 @@ class Placement(Generic[Agent, Child]):
     def remove(self, agent: Agent) -> None:
         """It is gone, and its children with it."""
         self._unlist(agent)
-        self._withheld.discard(agent)
+        self._withheld.pop(agent, None)
         self.children -= self.loads.pop(agent)
         self.idle.pop(agent, None)
 
-    def withhold(self, agent: Agent) -> None:
-        """Give it no children: it is silent, or about to go."""
+    def withhold(self, agent: Agent, why: str) -> None:
+        """Give it no children for as long as there is this reason, or another one."""
         self._unlist(agent)
-        self._withheld.add(agent)
+        self._withheld.setdefault(agent, set()).add(why)
 
-    def restore(self, agent: Agent) -> None:
-        """It can have children again."""
-        self._unlist(agent)
-        self._withheld.discard(agent)
-        self._list(agent)
+    def restore(self, agent: Agent, why: str) -> None:
+        """This is no reason any more."""
+        reasons = self._withheld.get(agent)
+        if reasons is None:
+            return
+        reasons.discard(why)
+        if not reasons:
+            del self._withheld[agent]
+            self._list(agent)
 
     # Children
 

@@ -28,18 +28,27 @@ class KubernetesBackend:
         self._hub = hub
         self._config = config
         self._output = Output()
-        self._program = Program(config)
         self._shape = Shape.of(config)
-        self._pods: dict[Shape | str, Pods] = {}
+        self._program = Program(config)
+        self._pods: dict[tuple[Shape | str, int], Pods] = {}
+        """By what they are like, and how many of these there were before them."""
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """A child in a pod that has what it wishes."""
         pool = spec.resources.pool or self._config.pool
         key = pool or self._shape.with_resources(spec.resources)
-        pods = self._pods.get(key)
-        if pods is None:  # one that another thread makes meanwhile has had no effect yet
-            pods = self._pods.setdefault(key, self._make(key))
-        return pods.agents.child(spec, observer)
+        return self._find(key).agents.child(spec, observer)
+
+    def _find(self, key: Shape | str) -> Pods:
+        """Those that are in use, or new ones.  No lock: a finalizer may come here too."""
+        before = 0
+        while True:
+            pods = self._pods.get((key, before))
+            if pods is None:  # one that another thread makes meanwhile has had no effect yet
+                pods = self._pods.setdefault((key, before), self._make(key))
+            if not pods.over:
+                return pods
+            before += 1
 
     def _make(self, key: Shape | str) -> Pods:
         program, loop = self._program, self._loop
@@ -52,7 +61,7 @@ class KubernetesBackend:
 
     def close(self) -> None:
         """End the pods, and the pools or their use."""
-        for pods in self._pods.values():
+        for pods in list(self._pods.values()):
             pods.close()
         self._program.api.close()
         self._output.close()

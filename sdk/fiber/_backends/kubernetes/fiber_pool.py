@@ -63,6 +63,9 @@ class Observer(Protocol):
     def on_error(self, error: FiberPoolError) -> None:
         """Once: nothing comes of the pool any more."""
 
+    def on_end(self) -> None:
+        """After that: the pool is given back, as at the end of the program."""
+
 
 class FiberPoolClient:
     """Holds one pool, on the thread ``fiber-kubernetes``; its methods return at once, but for
@@ -129,13 +132,14 @@ class FiberPoolClient:
             self._fault(error)
         for follower in self._followers:
             follower.stop()
-        self._closing.wait()
         try:
             self._tenure.end(self._close_timeout)
         except Exception as error:  # the program ends whatever comes
             self._say_what_stays(str(error))
         for follower in self._followers:
             follower.join(1.0)
+        if not self._closing.is_set():
+            self._loop.call_soon(self._observer.on_end)
 
     def _begin(self) -> HeldPool:
         held = self._tenure.begin(self._closing)

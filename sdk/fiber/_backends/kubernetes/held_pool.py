@@ -120,7 +120,7 @@ class HeldPool:
         """An error that ends what was done with the pool."""
         return FiberPoolError(
             f"the FiberPool {self.name!r} in namespace {self.namespace!r} {what}. "
-            "Start the program again to go on",
+            "Make a new Pool, or Process, to go on: it begins anew",
             pool=self.name,
             namespace=self.namespace,
             reason=reason,

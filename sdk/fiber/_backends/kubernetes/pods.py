@@ -63,15 +63,19 @@ class Pods:
         self.agents = AgentSet(
             loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
         )
+        self.over = False
+        """Nothing comes of its pool any more, and it was given back."""
         self._opener: threading.Thread | None = None
         self._opened: Opened | None = None
         self._client: FiberPoolClient | None = None
-        self._closing = False
+        self._closing = threading.Event()
+        """Nothing more is to be asked of the API server than the end."""
         self._decision_is_due = False
         self._timer: Timer | None = None
         self._patience: Timer | None = None
         self._wanted = 0
         self._pods: dict[str, Document] = {}
+        self._told_of_limit = False
         self._given_up: set[str] = set()
         """Pods that are there and of which nothing is expected any more."""
         self._status: Document = {}
@@ -79,42 +83,58 @@ class Pods:
 
     def close(self) -> None:
         """End the children, and the pool or its use.  Not on the loop's thread."""
-        self._closing = True
-        if self._opener is None:
-            return
-        self._opener.join()
-        done = threading.Event()
-        self._loop.call_soon(self._shut_down, done)
-        done.wait()
+        self._closing.set()
+        self._wait_for(lambda then: self._loop.call_soon(self._shut_down, then))
+        opener = self._opener  # from here on there will be no other
+        if opener is not None:
+            opener.join(_END_TIMEOUT)
+            self._wait_for(self._loop.call_soon)  # until what it opened is known
         if self._client is not None:
             self._client.close(_END_TIMEOUT)
         if self._opened is not None:
-            done.clear()
-            self._opened.listener.close("the master ended", then=done.set)
+            listener = self._opened.listener
+            self._wait_for(lambda then: listener.close("the master ended", then=then))
+
+    def _wait_for(self, ask: Callable[[Callable[[], None]], None]) -> None:
+        """Until what is asked for is done on the loop's thread, if that still does anything."""
+        done = threading.Event()
+        ask(done.set)
+        if not self._loop.broken:
             done.wait(_END_TIMEOUT)
 
-    def _shut_down(self, done: threading.Event) -> None:
+    def _shut_down(self, then: Callable[[], None]) -> None:
         for timer in (self._timer, self._patience):
             if timer is not None:
                 timer.cancel()
         self._progress.stop()
         for agent in self.agents.agents.values():
             agent.close()
-        done.set()
+        then()
 
     # -- The pool begins
 
     def _begin(self) -> None:
         """Calls of the API server take their time: a thread makes them."""
-        self._opener = threading.Thread(target=self._run_open, name="fiber-open", daemon=True)
-        self._opener.start()
+        opener = threading.Thread(target=self._run_open, name="fiber-open", daemon=True)
+        try:
+            opener.start()
+        except RuntimeError as error:  # the system has no room for it
+            self._refuse(_unexpected(error))
+        else:
+            self._opener = opener
 
     def _run_open(self) -> None:
-        serve = Serve(self._joined, lambda why: self._output.write("fiber", f"refused {why}"))
+        serve = Serve(
+            self._joined,
+            lambda why: self._output.write("fiber", f"refused {why}"),
+            self._closing,
+        )
         try:
             opened = self._open(serve)
         except FiberError as error:
             self._loop.call_soon(self._failed_to_open, error)
+        except Exception as error:  # a fault of ours must not leave anybody waiting
+            self._loop.call_soon(self._failed_to_open, _unexpected(error))
         else:
             self._loop.call_soon(self._began, opened)
 
@@ -124,6 +144,8 @@ class Pods:
 
     def _began(self, opened: Opened) -> None:
         self._opened = opened
+        if self._closing.is_set():
+            return  # there is no pool yet, and nobody who wants one
         self._placement.slots = opened.slots
         self._demand.floor, self._demand.maximum = opened.minimum, opened.maximum
         self._client = FiberPoolClient(self._api, self._loop, opened.tenure, self)
@@ -139,7 +161,7 @@ class Pods:
 
     def _decide(self) -> None:
         self._decision_is_due = False
-        if self._closing:
+        if self._closing.is_set():
             return
         wish = self._demand.decide(self._loop.now())
         if self._placement.waiting and self._opener is None:
@@ -154,12 +176,33 @@ class Pods:
             self._timer = None
         if wish.wake_at < float("inf"):
             self._timer = self._loop.call_later(wish.wake_at - self._loop.now(), self._decide)
+        self._watch_the_limit()
         self._watch_the_wait()
+
+    def _watch_the_limit(self) -> None:
+        """Processes for which there is no room until others end are spoken of, once: these may
+        wait for them.  A pool works with the workers that it has.
+        """
+        placement, most = self._placement, self._demand.maximum
+        too_many = placement.children + len(placement.waiting) > most * placement.slots
+        if not too_many or self._opened is None:
+            self._told_of_limit = False
+        elif not self._told_of_limit and not all(child.is_worker for child in placement.waiting):
+            self._told_of_limit = True
+            self._output.write(
+                "fiber",
+                f"{len(placement.waiting)} processes wait until others end: there are to be no "
+                f"more than {most} pods with {placement.slots} processes each. Raise max_pods, for "
+                "a pool of somebody else's its maxReplicas, or processes_per_pod",
+            )
 
     def _watch_the_wait(self) -> None:
         """Somebody who waits for a first host is told what for, and not kept for ever."""
-        waits = bool(self._placement.waiting) and not self.agents.agents
-        if not waits:
+        waits = bool(self._placement.waiting) and not self._placement.loads
+        known = self.agents.error or failure(self._name, self._status, 0)
+        if waits and known is not None:
+            self._refuse(known)  # it was heard before they came
+        elif not waits:
             self._progress.stop()
             if self._patience is not None:
                 self._patience.cancel()
@@ -172,10 +215,20 @@ class Pods:
     def _give_up_waiting(self) -> None:
         self._patience = None
         timeout = self._config.pod_timeout
-        self._refuse(overdue(self._name, self._status, timeout, time.time()))
+        if self._opened is not None:
+            self._refuse(overdue(self._name, self._status, timeout, time.time()))
+        else:
+            self._refuse(
+                FiberError(
+                    f"no pod could be asked for within {timeout:g} s: {self._asking}. Look with "
+                    "`kubectl get fiberpools` whether it answers, and whether its login waits for "
+                    "somebody"
+                )
+            )
 
-    def _refuse(self, error: FiberError) -> None:
+    def _refuse(self, error: Exception) -> None:
         """Nobody is to wait any longer."""
+        self._progress.stop()  # first: whoever is refused may write where its line stands
         if not all(child.is_worker for child in self._placement.waiting):
             # Whoever started it has gone on.  Pools raise it to their callers.
             self._output.write("fiber", str(error))
@@ -196,7 +249,7 @@ class Pods:
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
         name = agent.host
-        if name in self._pods and name not in self._given_up and not self._closing:
+        if name in self._pods and name not in self._given_up and not self._closing.is_set():
             # Its pod may live on where nobody hears it: another takes its place.
             self._given_up.add(name)
             if self._client is not None:
@@ -235,8 +288,8 @@ class Pods:
             self._tell(agent)
             if (pod.get("status") or {}).get("phase") in _ENDED:
                 agent.lose("its pod has ended")
-            elif agent.ending:
-                self.agents.suspected(agent, True)
+            else:
+                self.agents.withhold(agent, bool(agent.ending), "ending")
 
     def on_status(self, status: Document) -> None:
         """The pool's status, as it is now."""
@@ -250,7 +303,7 @@ class Pods:
             for agent in self.agents.agents.values():
                 self._tell(agent)
         self._changed()
-        error = failure(self._name, status, len(self.agents.agents))
+        error = failure(self._name, status, len(self._placement.loads))
         if error is not None:
             self._refuse(error)
 
@@ -260,13 +313,35 @@ class Pods:
 
     def on_error(self, error: FiberPoolError) -> None:
         """Nothing comes of the pool any more."""
+        if not self._placement.waiting:
+            self._output.write("fiber", str(error))  # nobody else says it
         self._refuse(error)
         self.agents.fail(error)
 
+    def on_end(self) -> None:
+        """The pool is given back: whoever starts something now gets another."""
+        self.over = True
+        for agent in list(self.agents.agents.values()):
+            agent.close()
+            agent.lose("its FiberPool is not this program's any more")
+        if self._opened is not None:
+            self._opened.listener.close("its FiberPool is not this program's any more")
+
     def _describe(self) -> str:
-        return f"waiting for pods: {summary(self._status, time.time())}"
+        state = self._asking if self._opened is None else summary(self._status, time.time())
+        return f"waiting for pods: {state}"
+
+    @property
+    def _asking(self) -> str:
+        return f"the API server {self._api.server} is being asked"
 
     @property
     def _name(self) -> PoolName:
         tenure = None if self._opened is None else self._opened.tenure
         return PoolName("", "") if tenure is None else PoolName(tenure.name, tenure.namespace)
+
+
+def _unexpected(error: Exception) -> FiberError:
+    failure = FiberError(f"no pods can be asked for, after an unexpected {error!r}")
+    failure.__cause__ = error
+    return failure

@@ -60,15 +60,12 @@ _WAITS_FOR_SOMEBODY = frozenset(
 operator takes care: it tries again, and says when it gives up."""
 
 
-def failure(
-    pool: PoolName, status: Status, joined: int, generation: int = 0
-) -> FiberPoolError | None:
+def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | None:
     """Why nobody will serve the program, with ``joined`` workers there now.
 
-    A pool with workers goes on with them, whatever is wrong with others.  A status of an earlier
-    ``generation`` of the resource than the program's own says nothing.
+    A pool with workers goes on with them, whatever is wrong with others.
     """
-    if joined or status.get("readyReplicas") or status.get("observedGeneration", 0) < generation:
+    if joined or status.get("readyReplicas"):
         return None
     if _is_true(status, ConditionType.SUSPENDED):
         return pool.error(

@@ -65,12 +65,13 @@ class Program:
         suffix = self._suffix if not number else f"{self._suffix}-{number}"
         name = pool_name(self._name, shape, suffix)
         credentials = make_credentials(name, self.namespace)
-        host, listener = self._listen(name, credentials, loop, serve)
-        master = self._master(host, listener)
-        own = self._find_own_pod()
+        own = self._find_own_pod(serve.cancel)
         container = own_container(own, _mountinfo()) if own is not None else ""
         template = pod_template(shape, own, container, sys.executable)
         body = fiber_pool_body(name, template, self._config)
+        # Last: whatever fails before leaves nothing open.
+        host, listener = self._listen(name, credentials, loop, serve)
+        master = self._master(host, listener)
         tenure = OwnPool(self._api, self.namespace, body, credentials, master, self._owner(own))
         slots = self._config.processes_per_pod
         return Opened(listener, tenure, slots, 0, self._config.max_pods)
@@ -78,8 +79,9 @@ class Program:
     def open_warm(self, name: str, loop: Loop, serve: Serve) -> Opened:
         """A pool that somebody else keeps."""
         try:
-            spec = self._api.get(POOLS.path(self.namespace, name))["spec"]
-            credentials = read_credentials(self._api, self.namespace, name)
+            path = POOLS.path(self.namespace, name)
+            spec = self._api.get(path, cancel=serve.cancel)["spec"]
+            credentials = read_credentials(self._api, self.namespace, name, spec, serve.cancel)
         except ApiError as error:
             raise self._explained(error, f"attach to the FiberPool {name!r}", name) from error
         host, listener = self._listen(name, credentials, loop, serve)
@@ -110,18 +112,19 @@ class Program:
 
     def _master(self, host: str, listener: MasterListener) -> Master:
         port = int(listener.address.rpartition(":")[2])
-        # The port makes it this very listener's, and not an earlier program's of the same pid.
+        # The suffix makes it this program's, and not an earlier one's of the same pid.
         return Master(host, port, f"{socket.gethostname()}:{os.getpid()}:{self._suffix}")
 
-    def _find_own_pod(self) -> Body | None:
+    def _find_own_pod(self, cancel: threading.Event) -> Body | None:
         """The pod that this program runs in, if it is in one."""
         if not self._api.in_cluster:
             return None
         with self._lock:
             if self._own_pod is None:
                 name = os.environ.get("HOSTNAME") or socket.gethostname()
+                path = PODS.path(self._api.namespace, name)
                 try:
-                    self._own_pod = self._api.get(PODS.path(self._api.namespace, name))
+                    self._own_pod = self._api.get(path, cancel=cancel)
                 except ApiError as error:
                     raise self._explained(error, f"read this program's pod {name!r}", "") from error
             return self._own_pod
@@ -143,10 +146,12 @@ class Program:
 
 
 class Serve(NamedTuple):
-    """Who hears of agents that dial in; on the loop's thread."""
+    """Who hears of agents that dial in, on the loop's thread; and whether to go on opening."""
 
     on_agent: Callable[[Link], str | None]
     on_refused: Callable[[str], None]
+    cancel: threading.Event
+    """Set once the API server is not to be asked again and again any more."""
 
 
 def _mountinfo() -> str:

@@ -21,13 +21,17 @@ _PAUSE = 0.05
 """Seconds until the next attempt after somebody else has written to the pool."""
 
 
-def read_credentials(api: Api, namespace: str, pool: str) -> MasterCredentials:
-    """Those of the pool, from its Secret.  Blocks; ``ApiError``, FiberPoolError."""
-    spec = api.get(POOLS.path(namespace, pool))["spec"]
+def read_credentials(
+    api: Api, namespace: str, pool: str, spec: Body, cancel: threading.Event | None = None
+) -> MasterCredentials:
+    """Those of the pool with this ``spec``, from its Secret.  Blocks; ``ApiError``,
+    FiberPoolError.
+    """
     name = spec.get("credentialsSecretName") or names.secret_name(pool)
     what = f"the Secret {name!r} of the FiberPool {pool!r} in namespace {namespace!r}"
     try:
-        return credentials_of(api.get(SECRETS.path(namespace, name)), pool, namespace)
+        secret = api.get(SECRETS.path(namespace, name), cancel=cancel)
+        return credentials_of(secret, pool, namespace)
     except InvalidCertificates as error:
         raise FiberPoolError(
             f"{what} cannot serve: {error}. If the operator made it, delete it: it makes a new "

@@ -1,0 +1,94 @@
+"""The agents of one shape: who gets which children, and who waits for none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fiber._agent.interface import Cause, ChildSpec, ExitReport
+from fiber._backends.agent_set import AgentSet
+from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._engine.placement import Placement
+from fiber.errors import FiberError
+from memory_link import SimulatedLoop
+
+ERROR = FiberError("no agent will come")
+
+
+class Nothing:
+    """A hub, an output and a link of which nothing is wanted here."""
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *args, **kwargs: None
+
+
+class Owner:
+    """Hears of one child."""
+
+    def __init__(self) -> None:
+        self.report: ExitReport | None = None
+
+    def exited(self, report: ExitReport) -> None:
+        self.report = report
+
+
+class Site:
+    """A set of agents with two places each."""
+
+    def __init__(self) -> None:
+        nothing: Any = Nothing()
+        self.loop = SimulatedLoop()
+        self.placement: Placement[RemoteAgent, RemoteChild] = Placement(2, spread=False)
+        self.agents = AgentSet(self.loop, nothing, nothing, self.placement)
+
+    def join(self, name: str) -> RemoteAgent:
+        link: Any = Nothing()
+        return self.agents.join(name, link)
+
+    def start(self) -> tuple[RemoteChild, Owner]:
+        owner: Any = Owner()
+        spec = ChildSpec(
+            name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=False
+        )
+        child = self.agents.child(spec, owner)
+        child.start()
+        return child, owner
+
+
+@pytest.fixture
+def site() -> Site:
+    return Site()
+
+
+def test_who_waits_for_room_is_refused_when_the_last_agent_goes_and_none_will_come(
+    site: Site,
+) -> None:
+    agent = site.join("a")
+    running = [site.start(), site.start()]
+    site.agents.fail(ERROR)
+    child, owner = site.start()  # there may be room for it yet
+    assert child.waiting
+    agent.lose("its pod is gone")
+    assert owner.report is not None
+    assert owner.report.cause == Cause.NO_HOST
+    assert child.start_error is ERROR
+    assert [owner.report and owner.report.cause for _, owner in running] == [Cause.AGENT_LOST] * 2
+
+
+def test_an_agent_that_is_let_go_is_none_to_wait_for(site: Site) -> None:
+    site.placement.remove(site.join("a"))
+    site.agents.fail(ERROR)
+    child, _ = site.start()
+    assert child.start_error is ERROR
+
+
+def test_an_agent_whose_pod_ends_gets_no_child_when_it_is_heard_again(site: Site) -> None:
+    agent = site.join("a")
+    site.agents.withhold(agent, True, "ending")
+    agent.on_suspect()
+    agent.on_trusted()
+    child, _ = site.start()
+    assert child.waiting
+    site.agents.withhold(agent, False, "ending")
+    assert child.host == "a"

@@ -1,0 +1,243 @@
+"""Pods as hosts, without a cluster: what becomes of who waits, and how it ends."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fiber._agent.interface import Cause, ChildSpec, ExitReport
+from fiber._backends.kubernetes import program, progress
+from fiber._backends.kubernetes.pods import Pods
+from fiber._backends.kubernetes.program import Opened, Serve
+from fiber._backends.kubernetes.shape import Shape
+from fiber._backends.remote import RemoteChild
+from fiber._transport.loop import Loop
+from fiber.config import Config
+from fiber.errors import FiberError, FiberPoolError
+from unit.kubernetes_rig import kubeconfig
+
+PATIENCE = 20
+DAMAGED = "the loop is to fail in this test"
+
+
+class Said:
+    """An ``Output``, and whatever else of which nothing is wanted here."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def write(self, who: str, text: str) -> None:
+        self.lines.append(f"{who}: {text}")
+
+    def show(self, line: str) -> None:
+        self.lines.append(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *args, **kwargs: None
+
+
+class Owner:
+    """Hears of one child."""
+
+    def __init__(self, said: Said) -> None:
+        self.said = said
+        self.report: ExitReport | None = None
+        self.gone = threading.Event()
+
+    def exited(self, report: ExitReport) -> None:
+        self.report = report
+        self.said.lines.append("refused")
+        self.gone.set()
+
+
+class Listener:
+    """A ``MasterListener`` that is closed at once."""
+
+    def __init__(self) -> None:
+        self.closed = False
+
+    def close(self, reason: str, *, then: Callable[[], None]) -> None:
+        self.closed = True
+        then()
+
+
+class Tenure:
+    """A pool that must not begin."""
+
+    name, namespace, doing, remedy = "es-1", "lab", "make", "delete"
+
+    def begin(self, cancel: threading.Event) -> Any:
+        raise AssertionError("it was made after the end")
+
+    def end(self, timeout: float) -> None:
+        raise AssertionError("there is none to end")
+
+
+class Site:
+    """Pods that are opened by ``open``."""
+
+    def __init__(self) -> None:
+        self.loop = Loop()
+        self.loop.start_thread("test-io")
+        self.said = Said()
+        self.opens = 0
+
+    def pods(self, open: Callable[[Serve], Opened]) -> Pods:
+        nothing: Any = self.said
+
+        def counted(serve: Serve) -> Opened:
+            self.opens += 1
+            return open(serve)
+
+        self.made = Pods(self.loop, nothing, nothing, Config(), nothing, counted)
+        return self.made
+
+    def start(self) -> tuple[RemoteChild, Owner]:
+        owner: Any = Owner(self.said)
+        spec = ChildSpec(
+            name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=False
+        )
+        child = self.made.agents.child(spec, owner)
+        self.loop.call_soon(child.start)
+        return child, owner
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    made = Site()
+    yield made
+    made.loop.stop()
+
+
+def test_what_nobody_foresaw_in_opening_ends_the_wait(site: Site) -> None:
+    def open(serve: Serve) -> Opened:
+        raise KeyError("containers")
+
+    site.pods(open)
+    child, owner = site.start()
+    assert owner.gone.wait(PATIENCE)
+    assert owner.report is not None
+    assert owner.report.cause == Cause.NO_HOST
+    assert isinstance(child.start_error, FiberError)
+    assert "KeyError('containers')" in str(child.start_error)
+    site.made.close()
+
+
+def test_a_thread_that_the_system_has_no_room_for_ends_the_wait(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site.pods(lambda serve: pytest.fail("it has no thread"))
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse_threads)
+        _, owner = site.start()
+        assert owner.gone.wait(PATIENCE)
+    assert owner.report is not None
+    assert "can't start new thread" in owner.report.reason
+    site.made.close()
+
+
+def refuse_threads(thread: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+def test_an_end_while_it_is_opened_makes_no_pool_and_closes_what_listens(site: Site) -> None:
+    asks, listener, tenure = threading.Event(), Listener(), Tenure()
+
+    def open(serve: Serve) -> Opened:
+        asks.set()
+        assert serve.cancel.wait(PATIENCE)  # so it is not asked again and again
+        some_listener: Any = listener
+        return Opened(some_listener, tenure, 1, 0, 10)
+
+    site.pods(open)
+    site.start()
+    assert asks.wait(PATIENCE)
+    site.made.close()
+    assert listener.closed
+    assert not [t for t in threading.enumerate() if t.name == "fiber-kubernetes"]
+
+
+def until_the_end(serve: Serve) -> Opened:
+    """As an API server that does not answer."""
+    assert serve.cancel.wait(PATIENCE)
+    raise FiberError("the end")
+
+
+def test_what_ends_the_wait_ends_that_of_who_comes_later_too(site: Site) -> None:
+    pods = site.pods(until_the_end)
+    hopeless = {"reason": "BackoffLimitExceeded", "message": "all die", "terminal": True}
+    site.loop.call_soon(pods.on_status, {"problems": [hopeless]})
+    child, owner = site.start()
+    assert owner.gone.wait(PATIENCE)
+    assert "all die" in str(child.start_error)
+    pods.close()
+
+
+def test_the_live_line_goes_before_anybody_is_refused(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "_is_terminal", lambda: True)
+    waits = threading.Event()
+    pods = site.pods(lambda serve: waits.set() or until_the_end(serve))
+    _, owner = site.start()
+    assert waits.wait(PATIENCE)
+    error = FiberPoolError("it was deleted", pool="es-1", namespace="lab", reason="Deleted")
+    site.loop.call_soon(pods.on_error, error)
+    assert owner.gone.wait(PATIENCE)
+    assert site.said.lines == ["", "fiber: it was deleted", "refused"]
+    pods.close()
+
+
+def test_a_wait_for_the_api_server_says_so(site: Site) -> None:
+    waits = threading.Event()
+    pods = site.pods(lambda serve: waits.set() or until_the_end(serve))
+    pods._config = Config(pod_timeout=0.1)
+    child, owner = site.start()
+    assert owner.gone.wait(PATIENCE)
+    assert "within 0.1 s: the API server" in str(child.start_error)
+    pods.close()
+
+
+def test_an_end_after_the_loop_has_failed(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    asks, failed = threading.Event(), threading.Event()
+    monkeypatch.setattr(threading, "excepthook", lambda _: failed.set())
+
+    def open(serve: Serve) -> Opened:
+        asks.set()
+        assert failed.wait(PATIENCE)
+        listener: Any = Listener()
+        return Opened(listener, Tenure(), 1, 0, 10)
+
+    def damage() -> None:
+        raise KeyboardInterrupt(DAMAGED)
+
+    site.pods(open)
+    site.start()
+    assert asks.wait(PATIENCE)
+    site.loop.call_soon(damage)
+    assert failed.wait(PATIENCE)
+    closer = threading.Thread(target=site.made.close, daemon=True)
+    closer.start()
+    closer.join(PATIENCE / 4)
+    assert not closer.is_alive()
+
+
+def test_what_fails_while_a_pool_is_opened_leaves_nothing_that_listens(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: object) -> Any:
+        raise FiberError("no template")
+
+    monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, "http://127.0.0.1:9")))
+    monkeypatch.setattr(program, "reachable_address", lambda *args, **kwargs: "127.0.0.1")
+    monkeypatch.setattr(program, "pod_template", refuse)
+    serve = Serve(lambda link: None, lambda reason: None, threading.Event())
+    opened = program.Program(Config())
+    with pytest.raises(FiberError, match="no template"):
+        opened.open_own(Shape(), site.loop, serve)
+    assert not [t for t in threading.enumerate() if t.name == "fiber-accept"]
+    opened.api.close()
