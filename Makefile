@@ -68,7 +68,7 @@ bench-operator: $(VENV)/.with-dev
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
 
-## make conformance   CPython's own multiprocessing tests (BACKEND=local or loopback)
+## make conformance   CPython's own multiprocessing tests (BACKEND=local, loopback or kubernetes)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(BIN)/python tests/conformance/run.py --backend $(BACKEND)
 

@@ -20,4 +20,5 @@ _CLOSED_AT_ONCE = {
 EXCLUSIONS: dict[str, dict[str, str]] = {
     "local": {**_MANAGERS, **_CLOSED_AT_ONCE},
     "loopback": {**_MANAGERS, **_CLOSED_AT_ONCE},
+    "kubernetes": {**_MANAGERS, **_CLOSED_AT_ONCE},
 }

@@ -2,6 +2,7 @@
 
     python tests/conformance/run.py --backend local
     python tests/conformance/run.py --backend loopback --method spawn -k TestPool
+    KUBECONFIG=… FIBER_IMAGE=… python tests/conformance/run.py --backend kubernetes
     python tests/conformance/run.py --module multiprocessing      (checks the harness itself)
 
 Exits with 1 when a test fails that `exclusions` does not list, or when a listed one passes.
@@ -13,6 +14,8 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 if __name__ == "__main__":
@@ -22,6 +25,7 @@ from conformance.cpython_suite.tiers import reason_of
 from conformance.exclusions import EXCLUSIONS
 from conformance.runner import Target, list_cases, run_groups
 from conformance.verdict import Verdict
+from conformance.warm_pools import warm_pools
 
 CLASSES = (
     "TestProcess",
@@ -43,9 +47,9 @@ CLASSES = (
     "TestLogging",
 )
 # An agent on another host cannot share a pid or a file with the master.
-TIERS = {"local": ("core", "local"), "loopback": ("core",)}
+TIERS = {"local": ("core", "local"), "loopback": ("core",), "kubernetes": ("core",)}
 # Agents start children by the same code behind a link: there one method is enough.
-METHODS = {"local": ("spawn", "forkserver"), "loopback": ("spawn",)}
+METHODS = {"local": ("spawn", "forkserver"), "loopback": ("spawn",), "kubernetes": ("spawn",)}
 _TIER_SAYS = {
     "core": "part of every run",
     "local": "needs one host",
@@ -69,7 +73,11 @@ def run_once(
     target = Target(module, method, frozenset(TIERS[backend]), limit, (("FIBER_BACKEND", backend),))
     started = time.monotonic()
     groups, left_out = select(target, substring)
-    report = run_groups(target, groups, jobs)
+    with ExitStack() as stack:
+        if backend == "kubernetes":
+            pools = stack.enter_context(warm_pools(jobs, target.variables()))
+            target = replace(target, lend=pools.lend)
+        report = run_groups(target, groups, jobs)
     listed = EXCLUSIONS[backend] if module == "fiber" else {}
     title = f"{module}, {backend}, {method}" if module == "fiber" else f"{module}, {method}"
     return Verdict(title, report, listed, time.monotonic() - started, left_out)

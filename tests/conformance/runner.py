@@ -17,9 +17,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
@@ -45,6 +45,8 @@ class Target:
     tiers: frozenset[str]
     limit: float  # seconds for one test
     environment: tuple[tuple[str, str], ...] = ()
+    lend: Callable[[], AbstractContextManager[Mapping[str, str]]] = lambda: nullcontext({})
+    """What an interpreter has for itself while it runs, as variables of its environment."""
 
     def variables(self) -> dict[str, str]:
         """The environment of an interpreter that runs tests."""
@@ -152,9 +154,9 @@ class _Interpreter:
     def run(self) -> Report:
         reports, writer = os.pipe()
         os.set_blocking(reports, False)
-        with tempfile.TemporaryFile() as output:
+        with tempfile.TemporaryFile() as output, self.target.lend() as lent:
             try:
-                process = self._start(writer, output)
+                process = self._start(writer, output, lent)
                 os.close(writer)
                 hung = not self._watch(process, reports)
                 self._conclude(process, output, hung)
@@ -162,10 +164,12 @@ class _Interpreter:
                 os.close(reports)
         return self.report
 
-    def _start(self, writer: int, output: IO[bytes]) -> subprocess.Popen[bytes]:
+    def _start(
+        self, writer: int, output: IO[bytes], lent: Mapping[str, str]
+    ) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
             [*WORKER, "run", str(writer), *self.ids],
-            env={**self.target.variables(), MARKER: self._marker},
+            env={**self.target.variables(), **lent, MARKER: self._marker},
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,

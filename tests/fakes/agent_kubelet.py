@@ -21,7 +21,8 @@ GRACE = 5.0
 class AgentKubelet:
     """Runs what ``store`` says; the agents dial their pool's master directly.
 
-    A pod waits for its Secret, as mounting does, and for a master: no Service is there to dial.
+    A pod waits for its Secret, as mounting does, and for a master, unless ``services`` says where
+    its masters will be.
     """
 
     def __init__(self, store: Store, folder: Path) -> None:
@@ -34,6 +35,8 @@ class AgentKubelet:
         """Reason and message of a container that cannot start, from now on."""
         self.processes: dict[str, asyncio.subprocess.Process] = {}
         """By the names of their pods."""
+        self.services: dict[str, str] = {}
+        """By the names of FiberPools, ``host:port`` that all their masters are at."""
         store.pods_linger = True
         store.created = self._created
 
@@ -77,21 +80,18 @@ class AgentKubelet:
             if self._is_deleted(namespace, name):
                 return None
             pod = self._store.get("pods", namespace, name)
-            pool = self._store.get(
-                "fiberpools", namespace, pod["metadata"]["labels"][names.LABEL_POOL]
-            )
             mounted = _credentials(pod)
             secrets = self._store.list("secrets", namespace)
             secret = next((s for s in secrets if s["metadata"]["name"] == mounted["name"]), None)
-            master = pool["spec"].get("master")
-            if secret is not None and master is not None and self.fails_with is None:
+            address = self._address(namespace, pod["metadata"]["labels"][names.LABEL_POOL])
+            if secret is not None and address is not None and self.fails_with is None:
                 break
             await self._store.changed()
         folder = self._mount(name, mounted["items"], secret["data"])
         environment = {
             **{key: value for key, value in os.environ.items() if not key.startswith("FIBER_")},
             **_environment(pod),
-            names.ENV_ADDRESS: names.address_of(master["host"], master["port"]),
+            names.ENV_ADDRESS: address,
             names.ENV_CREDENTIALS: str(folder),
         }
         process = await asyncio.create_subprocess_exec(
@@ -100,6 +100,13 @@ class AgentKubelet:
         self.processes[name] = process
         self._set(namespace, name, "Running", {"running": {"startedAt": self._store.now()}})
         return process
+
+    def _address(self, namespace: str, pool: str) -> str | None:
+        """Where the agents of the pool dial."""
+        if pool in self.services:
+            return self.services[pool]
+        master = self._store.get("fiberpools", namespace, pool)["spec"].get("master")
+        return None if master is None else names.address_of(master["host"], master["port"])
 
     def _mount(self, pod: str, items: list[Body], data: Body) -> Path:
         folder = self._folder / pod
