@@ -49,7 +49,7 @@ def warm_pools(count: int, variables: Mapping[str, str]) -> Iterator[WarmPools]:
         given = {"PYTHONPATH": path}
         cluster = None
         if not os.environ.get("KUBECONFIG"):
-            cluster = stack.enter_context(fake_cluster(folder / "nodes"))
+            cluster = stack.enter_context(fake_cluster())
             given["KUBECONFIG"] = str(kubeconfig(folder, cluster.url))
         with _environment(given):
             api = Api.connect(config.load({}).context)

@@ -6,8 +6,10 @@ import asyncio
 import base64
 import contextlib
 import os
+import shutil
 import signal
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +27,10 @@ class AgentKubelet:
     its masters will be.
     """
 
-    def __init__(self, store: Store, folder: Path) -> None:
+    def __init__(self, store: Store) -> None:
         self._store = store
-        self._folder = folder
+        self._folders: dict[str, Path] = {}
+        """What there is in place of a container's own files, by pod."""
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self.forced: list[str] = []
         """Pods whose agents did not end when they were told to."""
@@ -69,6 +72,8 @@ class AgentKubelet:
             if process is not None and process.returncode is None:
                 process.kill()
                 await process.wait()
+            if name in self._folders:
+                shutil.rmtree(self._folders.pop(name), ignore_errors=True)
 
     async def _start(self, namespace: str, name: str) -> asyncio.subprocess.Process | None:
         """The agent's process; None if the pod was deleted before."""
@@ -93,6 +98,7 @@ class AgentKubelet:
             **_environment(pod),
             names.ENV_ADDRESS: address,
             names.ENV_CREDENTIALS: str(folder),
+            "TMPDIR": str(folder),
         }
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "fiber.agent", env=environment, cwd=folder, process_group=0
@@ -109,8 +115,7 @@ class AgentKubelet:
         return None if master is None else names.address_of(master["host"], master["port"])
 
     def _mount(self, pod: str, items: list[Body], data: Body) -> Path:
-        folder = self._folder / pod
-        folder.mkdir(parents=True)
+        folder = self._folders[pod] = Path(tempfile.mkdtemp(prefix="pod-"))
         for item in items:
             (folder / item["path"]).write_bytes(base64.b64decode(data[item["key"]]))
         return folder

@@ -7,7 +7,6 @@ import concurrent.futures
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TypeVar
 
 from fakes.agent_kubelet import AgentKubelet
@@ -50,14 +49,14 @@ class FakeCluster:
 
 
 @contextlib.contextmanager
-def fake_cluster(folder: Path) -> Iterator[FakeCluster]:
-    """A new one with nothing in it but an operator; ``folder`` is for what nodes mount."""
+def fake_cluster() -> Iterator[FakeCluster]:
+    """A new one with nothing in it but an operator."""
     started: concurrent.futures.Future[FakeCluster] = concurrent.futures.Future()
     end = asyncio.Event()
 
     async def serve() -> None:
         async with a_world() as world:
-            nodes = AgentKubelet(world.store, folder)
+            nodes = AgentKubelet(world.store)
             started.set_result(FakeCluster(world, nodes, asyncio.get_running_loop()))
             await end.wait()
             await nodes.close()

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.may_leak("the operator's connections, for as long as th
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeCluster]:
     folder = tmp_path_factory.mktemp("cluster")
-    with fake_cluster(folder) as cluster, pytest.MonkeyPatch.context() as patch:
+    with fake_cluster() as cluster, pytest.MonkeyPatch.context() as patch:
         patch.setenv("KUBECONFIG", str(kubeconfig(folder, cluster.url)))
         yield cluster
 
