@@ -5,14 +5,19 @@ from __future__ import annotations
 import gc
 import pickle
 import signal
+import threading
 import weakref
+from concurrent.futures import Future
 from functools import partial
 
 import pytest
 
 from fiber._agent.interface import ExitReport
 from fiber._engine.ledger import PATIENCE
+from fiber._runtime import worker_view
+from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
+from fiber._runtime.latch import Latch
 from fiber._runtime.launcher import KILL_AFTER
 from fiber._runtime.outcome import Failure, Pickled
 from fiber._runtime.worker_handle import WorkerHandle
@@ -20,6 +25,9 @@ from fiber._wire import work
 from fiber.errors import FiberError, WorkerDied
 from unit import pool_tasks as tasks
 from unit.executor_rig import Results, Rig
+
+SECONDS = 10
+"""For what another thread does."""
 
 
 @pytest.fixture
@@ -423,6 +431,49 @@ def test_nobody_waits_for_a_loop_that_has_failed() -> None:
         rig.call()
     assert rig.executor.ended.is_set()
     assert [child.signals[-1:] for child in rig.children] == [[signal.SIGKILL]] * 2
+
+
+def test_nobody_waits_for_workers_of_a_pool_that_has_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig(2, ready=False)
+    found = wait_in_a_thread(rig.executor, monkeypatch)
+    rig.executor.terminate(RuntimeError("terminated"))
+    for handle in rig.handles:
+        rig.lose(handle)
+    assert str(found.exception(SECONDS)) == "Pool not running"
+
+
+def test_nobody_waits_for_workers_of_a_loop_that_has_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig(2, ready=False)
+    rig.loop.held = True  # it does nothing any more
+    found = wait_in_a_thread(rig.executor, monkeypatch)
+    rig.executor.broken(FiberError("the loop has failed"))
+    assert str(found.exception(SECONDS)) == "the loop has failed"
+
+
+def wait_in_a_thread(executor: Executor, patch: pytest.MonkeyPatch) -> Future[bool]:
+    """As a caller of ``wait_until_workers_up``; returns once that one waits."""
+    found: Future[bool] = Future()
+    asked = threading.Event()
+
+    def wait() -> None:
+        try:
+            found.set_result(executor.wait_until_up(None))
+        except Exception as error:
+            found.set_exception(error)
+
+    class Noted(Latch):
+        def wait(self, timeout: float | None = None) -> bool:
+            asked.set()
+            return super().wait(timeout)
+
+    patch.setattr(worker_view, "Latch", Noted)
+    threading.Thread(target=wait, daemon=True).start()
+    assert asked.wait(SECONDS)
+    return found
 
 
 def test_idle_workers_above_the_minimum_leave() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -174,6 +175,16 @@ def test_what_ends_the_wait_ends_that_of_who_comes_later_too(site: Site) -> None
     child, owner = site.start()
     assert owner.gone.wait(PATIENCE)
     assert "all die" in str(child.start_error)
+    pods.close()
+
+
+def test_an_agent_whose_pod_is_about_to_go_is_not_let_in(site: Site) -> None:
+    pods = site.pods(until_the_end)
+    metadata = {"name": "a", "labels": {}, "deletionTimestamp": "2026-01-01T00:00:00Z"}
+    pods.on_pod("a", {"metadata": metadata})
+    link: Any = SimpleNamespace(peer=SimpleNamespace(name="a"))
+    assert pods._joined(link) == "a, whose pod is about to go"
+    assert not pods.agents.agents
     pods.close()
 
 

@@ -302,7 +302,7 @@ class Executor:
             raise error
 
     def wait_until_up(self, timeout: float | None) -> bool:
-        """Wait for the first workers; False after ``timeout`` seconds, or why there are none."""
+        """Wait for the first workers; False after ``timeout`` seconds.  Raises why none come."""
         self.start_workers()
         up = self.workers.wait_until_up(timeout)
         self._check()
@@ -590,6 +590,7 @@ class Executor:
         self.callbacks.stop()
         # Its traceback may hold the pool, whose finalizer holds this.
         self._ended_by = None
+        self.workers.end()
         self.ended.set()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
@@ -35,6 +34,8 @@ class WorkerView:
         self._workers = workers
         self._loop = loop
         self._waiting: list[Latch] = []
+        """Any thread adds and removes its own."""
+        self._over = False
 
     def processes(self) -> list[BaseProcess]:
         """The processes of those that are there."""
@@ -50,28 +51,31 @@ class WorkerView:
         not be; False if ``timeout`` seconds are over first.
         """
         latch = Latch()
-        self._loop.call_soon(self._join, latch)
+        # Both sides note first and look then: one of both sees the other.
+        self._waiting.append(latch)
         try:
-            return latch.wait(timeout)
+            self._loop.call_soon(self.changed)
+            return self._over or latch.wait(timeout)
         finally:
-            self._loop.call_soon(self._leave, latch)
+            self._waiting.remove(latch)
 
     # On the loop's thread
 
     def changed(self) -> None:
         """Workers are ready, or it is clear that none will be."""
         workers = self._workers
-        if workers.size - workers.starting >= workers.minimum or workers.error is not None:
-            for latch in self._waiting:
+        if (
+            self._over
+            or workers.size - workers.starting >= workers.minimum
+            or workers.error is not None
+        ):
+            for latch in list(self._waiting):
                 latch.set()
 
-    def _join(self, latch: Latch) -> None:
-        self._waiting.append(latch)
+    def end(self) -> None:
+        """There will be none any more."""
+        self._over = True
         self.changed()
-
-    def _leave(self, latch: Latch) -> None:
-        with contextlib.suppress(ValueError):
-            self._waiting.remove(latch)
 
 
 def _describe(handle: Any) -> WorkerInfo:

@@ -242,6 +242,8 @@ class Pods:
             return f"{name}, which had been given up"
         if name in self.agents.agents:
             return f"{name}, which is there already"
+        if (pod := self._pods.get(name)) is not None and pod_end(pod) is not None:
+            return f"{name}, whose pod is about to go"
         agent = self.agents.join(name, link)
         agent.pod = name
         self._tell(agent)
