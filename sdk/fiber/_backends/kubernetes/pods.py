@@ -76,6 +76,13 @@ class Pods:
         self._status: Document = {}
         self._progress = Progress(loop, output, self._describe)
 
+    def begin_close(self) -> None:
+        """Begin to end; waits for nothing."""
+        self._closing = True
+        if self._client is not None:
+            self._loop.call_soon(self._shut_down, threading.Event())
+            self._client.begin_close(_END_TIMEOUT)
+
     def close(self) -> None:
         """End the children, and the pool or its use.  Not on the loop's thread."""
         self._closing = True
@@ -247,6 +254,8 @@ class Pods:
         self.agents.fail(error)
 
     def _describe(self) -> str:
+        if self._client is None or not self._client.made:
+            return f"waiting for the API server {self._api.server}, which has not answered yet"
         return f"waiting for pods: {summary(self._status, time.time())}"
 
     @property
