@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -14,6 +15,7 @@ import fiber
 from fakes.cluster import FakeCluster, fake_cluster
 from faults.program import Program
 from faults.runtime import running
+from fiber._backends.kubernetes.api import Api
 from fiber._runtime import state
 from fiber.errors import FiberPoolError, WorkerDied
 from fiber_api import names
@@ -311,6 +313,36 @@ def test_the_end_of_a_pipe_says_what_became_of_the_pod(cluster: FakeCluster) -> 
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGTERM
         ours.close()
+
+
+def test_pools_of_all_shapes_end_at_the_same_time(
+    cluster: FakeCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shapes = [fiber.meta(cpu=cpu)(square) for cpu in (0.1, 0.2, 0.3)]
+    deleting, met = threading.Barrier(len(shapes)), []
+    delete = Api.delete
+
+    def meet(api: Api, *arguments: Any, **options: Any) -> None:
+        met.append(deleting.wait(PATIENCE))
+        delete(api, *arguments, **options)
+
+    with running(backend="kubernetes"):
+        for shape in shapes:
+            with fiber.Pool(1) as pool:
+                assert pool.apply(shape, (2,)) == 4
+        monkeypatch.setattr(Api, "delete", meet)
+    assert sorted(met) == [0, 1, 2]
+
+
+def test_while_the_api_server_does_not_answer_that_is_what_is_said(
+    cluster: FakeCluster, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fiber._backends.kubernetes.progress._FIRST_WRITTEN", 0.1)
+    cluster.do(cluster.world.slow, "create", "fiberpools", 0.5)
+    with running(backend="kubernetes"), fiber.Pool(1) as pool:
+        assert pool.apply(square, (3,)) == 9
+    cluster.do(cluster.world.api.faults.clear)
+    assert "the API server 127.0.0.1 has not answered yet" in capfd.readouterr().err
 
 
 FORKS = """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -388,6 +389,25 @@ def test_what_stays_behind_is_said_with_the_command_that_removes_it(
     said = capsys.readouterr().err
     assert "kubectl delete fiberpool es-1 -n lab" in said
     assert "stays behind" in said
+
+
+def test_one_that_is_interrupted_says_what_stays_too(
+    rig: Rig, told: Told, capsys: pytest.CaptureFixture[str]
+) -> None:
+    client = rig.own(told)
+    client.demand(1)
+    replicas_become(rig, told, 1)
+    rig.server.api.down = True
+    raised = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            client.close()
+    finally:
+        signal.signal(signal.SIGALRM, raised)
+    said = capsys.readouterr().err
+    assert "stays behind: the program was interrupted" in said
+    assert "kubectl delete fiberpool es-1 -n lab" in said
 
 
 def test_the_certificates_are_the_pools(rig: Rig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from functools import partial
 
 from fiber._agent.interface import ChildObserver, ChildSpec
@@ -61,7 +62,9 @@ class KubernetesBackend:
 
     def close(self) -> None:
         """End the pods, and the pools or their use."""
-        for pods in list(self._pods.values()):
-            pods.close()
-        self._program.api.close()
-        self._output.close()
+        with contextlib.ExitStack() as rest:  # of which nothing is left out if it is interrupted
+            rest.callback(self._output.close)
+            rest.callback(self._program.api.close)
+            for pods in list(self._pods.values()):
+                pods.begin_close()
+                rest.callback(pods.close)

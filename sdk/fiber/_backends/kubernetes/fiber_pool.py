@@ -84,6 +84,7 @@ class FiberPoolClient:
         self._failing = threading.Lock()
         """Taken by whoever tells of the error; never given back: there is only one."""
         self._over = threading.Event()
+        self._ended = threading.Event()
         self._warned: set[str] = set()
         self._generation = 0
         """That of the spec which first had this program as its master."""
@@ -106,18 +107,33 @@ class FiberPoolClient:
         self._scaling.want(replicas, release)
         self._wake.set()
 
-    def close(self, timeout: float = CLOSE_TIMEOUT) -> None:
-        """Delete the pool, or detach from it.  Raises nothing: what stays behind is said on stderr,
-        with the command that removes it.
-        """
+    def begin_close(self, timeout: float = CLOSE_TIMEOUT) -> None:
+        """Begin to delete the pool, or to detach from it, and return at once."""
         self._close_timeout = timeout
         self._closing.set()
         self._wake.set()
+
+    def close(self, timeout: float = CLOSE_TIMEOUT) -> None:
+        """Delete the pool, or detach from it.  Raises nothing but what signal handlers do: what
+        stays behind is said on stderr, with the command that removes it.
+        """
+        self.begin_close(timeout)
         if self._thread.ident is None:
             return
-        self._thread.join(timeout + 1.0)
-        if self._thread.is_alive():
-            self._say_what_stays(f"the API server did not answer within {timeout:g} s")
+        why = "the program was interrupted before the API server had answered"
+        try:
+            # Not `join`, after which an interrupted one's thread counts as ended.
+            if self._ended.wait(timeout + 1.0):
+                self._thread.join()
+            why = f"the API server did not answer within {timeout:g} s"
+        finally:
+            if not self._ended.is_set():
+                self._say_what_stays(why)
+
+    @property
+    def made(self) -> bool:
+        """Whether the pool is there, with this program as its master."""
+        return bool(self._followers)
 
     # -- On the thread
 
@@ -140,6 +156,7 @@ class FiberPoolClient:
             follower.join(1.0)
         if not self._closing.is_set():
             self._loop.call_soon(self._observer.on_end)
+        self._ended.set()
 
     def _begin(self) -> HeldPool:
         held = self._tenure.begin(self._closing)

@@ -81,6 +81,12 @@ class Pods:
         self._status: Document = {}
         self._progress = Progress(loop, output, self._describe)
 
+    def begin_close(self) -> None:
+        """Begin to end; waits for nothing."""
+        self._closing.set()
+        if self._client is not None:
+            self._client.begin_close(_END_TIMEOUT)
+
     def close(self) -> None:
         """End the children, and the pool or its use.  Not on the loop's thread."""
         self._closing.set()
@@ -330,12 +336,14 @@ class Pods:
             self._opened.listener.close("its FiberPool is not this program's any more")
 
     def _describe(self) -> str:
-        state = self._asking if self._opened is None else summary(self._status, time.time())
+        state = summary(self._status, time.time())
+        if self._client is None or not self._client.made:
+            state = self._asking
         return f"waiting for pods: {state}"
 
     @property
     def _asking(self) -> str:
-        return f"the API server {self._api.server} is being asked"
+        return f"the API server {self._api.server} has not answered yet"
 
     @property
     def _name(self) -> PoolName:
