@@ -31,7 +31,7 @@ test: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(CLUSTER) prepare
 	$(FAST)
 	@$(MAKE) --no-print-directory test-pythons
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(FAST_TESTS))
+	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation
 test-fast: $(VENV)/.with-dev
@@ -44,7 +44,7 @@ test-pythons: $(VENV)/.made
 test-python-%: .venv-%/.with-test
 	.venv-$*/bin/python -m pytest $(SIDE_BY_SIDE) $(ESSENTIAL_TESTS)
 
-## make e2e           all scenarios on a real cluster: KUBECONFIG, kind or our own
+## make e2e           all scenarios on a real cluster, the long ones too: KUBECONFIG, kind or our own
 e2e: $(VENV)/.with-dev
 	$(CLUSTER) prepare
 	$(BIN)/python -m pytest tests/e2e

@@ -127,6 +127,7 @@ def test_the_first_pool_waits_for_pods_and_the_next_for_nothing(
     leaves_nothing(program)
 
 
+@pytest.mark.long
 def test_pods_follow_the_work(programs: Programs, scene: Scene) -> None:
     """From none to fifty and back while the program goes on, and no task runs twice."""
     arguments = ("--task", "loud", "--tasks", 400, "--seconds", 1, "--most", 50, "--stay")

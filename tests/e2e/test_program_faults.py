@@ -99,15 +99,15 @@ def node_cut_off(site: Site) -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("place", ["outside", pytest.param("inside", marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("fault", "seconds"),
     [
         (pod_deleted, 0.1),
         (container_killed, 0.1),
         (operator_killed, 0.1),
-        (api_server_stopped, 0.25),
-        (node_cut_off, 0.1),
+        pytest.param(api_server_stopped, 0.25, marks=pytest.mark.long),
+        pytest.param(node_cut_off, 0.1, marks=pytest.mark.long),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -168,6 +168,7 @@ def test_a_vector_environment_whose_pod_is_deleted(programs: Programs, scene: Sc
 
 
 @pytest.mark.may_leak("a process that is killed cannot remove its temporary folder")
+@pytest.mark.long
 @pytest.mark.parametrize("place", PLACES)
 def test_a_program_that_is_killed_leaves_nothing_after_its_grace(
     place: str, programs: Programs
@@ -197,6 +198,7 @@ def test_an_interrupt_ends_it_all(place: str, programs: Programs) -> None:
     leaves_nothing(program)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", PLACES)
 def test_an_interpreter_that_is_held_goes_on(place: str, programs: Programs) -> None:
     program = programs.start(place, "mapping.py", *RUNNING, "--hold", 40)
@@ -205,6 +207,7 @@ def test_an_interpreter_that_is_held_goes_on(place: str, programs: Programs) -> 
     leaves_nothing(program)
 
 
+@pytest.mark.long
 def test_a_program_that_is_stopped_and_continued_goes_on(programs: Programs, scene: Scene) -> None:
     program = programs.outside("mapping.py", *RUNNING)
     program.says("first")

@@ -29,7 +29,10 @@ def able(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_all_is_run_where_all_can_be() -> None:
     said = announcement(OTHERS, {})
-    assert "left out" not in said
+    _, _, left_out = said.partition("left out:")
+    assert [line.split(":")[0].strip() for line in left_out.splitlines()[1:-1]] == [
+        "scenarios that wait for a minute and more"
+    ]
     assert "on a cluster of their own on this machine" in said
     for version in SUPPORTED:
         assert f"on Python {version}" in said
@@ -52,7 +55,7 @@ def test_a_given_cluster_is_named() -> None:
 
 def test_what_is_left_out_has_its_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ability, "obstacles", lambda: ["it takes root"])
-    runs, _, left_out = announcement(OTHERS[:1], {}).partition("left out on this machine:")
+    runs, _, left_out = announcement(OTHERS[:1], {}).partition("left out:")
     assert "the operator's scenarios" not in runs
     assert "KUBECONFIG is not set" in left_out
     assert "kind is not on the PATH" in left_out
