@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import random
 
+import pytest
+
 from fiber._engine.demand import LINGER, Demand
 from fiber._engine.placement import Placement
 
@@ -180,3 +182,18 @@ def test_the_minimum_stays() -> None:
     wanted = Demand(placement, minimum=1, maximum=9, idle_timeout=IDLE)
     assert wanted.decide(now=1e9).release == ["a"]
     assert wanted.decide(now=2e9).agents == 1
+
+
+@pytest.mark.timeout(10)  # they take a second; passing over those that have gone, minutes
+def test_what_a_child_costs_does_not_grow_with_those_before() -> None:
+    many = 150_000
+    placement = with_agents(*map(str, range(many)), slots=1)
+    for child in range(many):
+        placement.wait(str(child))
+    placed = [placement.place() for _ in range(many)]
+    for agent in map(str, range(many)):
+        placement.ended(agent, now=1.0)
+    for _ in range(many):
+        placement.remove(next(iter(placement.idle)))
+    assert len({pair[1] for pair in placed if pair is not None}) == many
+    assert not placement.loads
