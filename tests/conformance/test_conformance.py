@@ -16,9 +16,7 @@ def test_cpython_tests(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.delenv(
-        "KUBECONFIG", raising=False
-    )  # `make conformance` runs them on a real cluster
+    monkeypatch.delenv("KUBECONFIG", raising=False)  # it is for `make conformance`
     verdict = run_once(backend, method)
     with capsys.disabled():
         print("", verdict.closing_line(), sep="\n")

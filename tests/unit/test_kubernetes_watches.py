@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fakes.kubernetes_api import Fault
+from fakes.kubernetes_api import Call, Fault
 from fiber._backends.kubernetes import watches
 from fiber._backends.kubernetes.resources import PODS
 from fiber._backends.kubernetes.watches import ObjectWatch
@@ -161,3 +161,19 @@ def test_an_event_that_no_api_server_sends_is_a_fault_and_not_a_silence(case: Ca
 def test_one_that_was_never_started_is_stopped(case: Case) -> None:
     case.end()
     assert case.told.empty()
+
+
+def test_a_long_list_comes_in_pages_and_what_changes_meanwhile_is_told(case: Case) -> None:
+    pods = [f"pod-{number:03}" for number in range(2 * watches._PAGE + 1)]
+    for name in pods:
+        case.add(name)
+    api, store = case.server.api, case.server.store
+
+    def change(call: Call) -> None:
+        if call.verb == "list" and api.count("list", "pods") == 2:
+            store.merge("pods", NAMESPACE, pods[0], {"spec": {"nodeName": "node-1"}})
+
+    api.after = change
+    case.watch.start()
+    assert case.next(len(pods) + 1) == [*(f"+{name}" for name in pods), f"+{pods[0]}"]
+    assert api.count("list", "pods") == 3

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import random
 
+import pytest
+
 from fiber._engine.demand import LINGER, Demand
 from fiber._engine.placement import Placement
 
@@ -210,3 +212,18 @@ def test_one_that_retires_ends_its_work_and_goes_at_once() -> None:
     placement.ended("a", now=1)
     assert wanted.decide(now=1).release == ["a"]
     assert wanted.decide(now=1 + LINGER).agents == 1  # for the one that waits
+
+
+@pytest.mark.timeout(10)  # they take a second; passing over those that have gone, minutes
+def test_what_a_child_costs_does_not_grow_with_those_before() -> None:
+    many = 150_000
+    placement = with_agents(*map(str, range(many)), slots=1)
+    for child in range(many):
+        placement.wait(str(child))
+    placed = [placement.place() for _ in range(many)]
+    for agent in map(str, range(many)):
+        placement.ended(agent, now=1.0)
+    for _ in range(many):
+        placement.remove(next(iter(placement.idle)))
+    assert len({pair[1] for pair in placed if pair is not None}) == many
+    assert not placement.loads

@@ -6,6 +6,7 @@ Pure: ``now`` is an argument.  No step's cost grows with the number of agents or
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Hashable
 from typing import Generic, TypeVar
 
@@ -23,17 +24,18 @@ class Placement(Generic[Agent, Child]):
 
     def __init__(self, slots: float, *, spread: bool) -> None:
         self.slots = slots
-        self.waiting: dict[Child, None] = {}
+        # From the front an ordinary dict passes over all that was ever deleted there.
+        self.waiting: OrderedDict[Child, None] = OrderedDict()
         self.children = 0
         """How many children run on agents."""
         self.loads: dict[Agent, int] = {}
         """How many each agent has."""
-        self.idle: dict[Agent, float] = {}
+        self.idle: OrderedDict[Agent, float] = OrderedDict()
         """Agents without children and since when, the longest idle first."""
         self._spread = spread
         self._withheld: dict[Agent, set[str]] = {}
         """Those that are given none, and why: each for a reason or more."""
-        self._with_room: dict[int, dict[Agent, None]] = {}
+        self._with_room: dict[int, OrderedDict[Agent, None]] = {}
         """Those that can be given children, by how many they have."""
         self._room = 0.0
 
@@ -114,13 +116,13 @@ class Placement(Generic[Agent, Child]):
     def _list(self, agent: Agent) -> None:
         load = self.loads[agent]
         if load < self.slots:
-            self._with_room.setdefault(load, {})[agent] = None
+            self._with_room.setdefault(load, OrderedDict())[agent] = None
             self._room = math.inf if self.slots == math.inf else self._room + self.slots - load
 
     def _unlist(self, agent: Agent) -> None:
         load = self.loads[agent]
-        agents = self._with_room.get(load, {})
-        if agent in agents:
+        agents = self._with_room.get(load)
+        if agents is not None and agent in agents:
             del agents[agent]
             if not agents:
                 del self._with_room[load]

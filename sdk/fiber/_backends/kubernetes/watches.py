@@ -16,6 +16,9 @@ _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 _EARLY = 1.0
 """A watch that ends sooner, in seconds, is not followed by the next one at once."""
 
+_PAGE = 50
+"""Objects of one answer.  Parsing holds the interpreter, and a thousand pods are several MB."""
+
 
 class ObjectWatch:
     """Lists once, then watches; where a watch ends the next goes on, and where that cannot be it
@@ -101,13 +104,20 @@ class ObjectWatch:
             self._failed = False
 
     def _list(self) -> str:
-        listing = self._api.list(self._path, self._selector, timeout=0.0)
-        found = {str(item["metadata"]["name"]): item for item in listing.get("items") or ()}
+        found: dict[str, Body] = {}
+        version = rest = ""
+        while not version or rest:
+            page = {"limit": str(_PAGE), **({"continue": rest} if rest else {})}
+            listing = self._api.list(self._path, {**self._selector, **page}, timeout=0.0)
+            found |= {str(item["metadata"]["name"]): item for item in listing.get("items") or ()}
+            # The first page's: whatever changes while the others are read is told once more.
+            version = version or str(listing["metadata"]["resourceVersion"])
+            rest = listing["metadata"].get("continue") or ""
         for name in sorted(self._known - found.keys()):
             self._tell(name, None)
         for name, item in found.items():
             self._tell(name, item)
-        return str(listing["metadata"]["resourceVersion"])
+        return version
 
     def _follow(self, version: str) -> None:
         watch = self._api.watch(self._path, self._selector, version)
