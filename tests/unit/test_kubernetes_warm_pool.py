@@ -70,6 +70,17 @@ def test_attaching_and_leaving_it_as_it_was(rig: Rig, told: Told) -> None:
     assert not told.errors
 
 
+def test_a_lease_that_may_not_be_written_keeps_nobody_in_the_pool(rig: Rig, told: Told) -> None:
+    before = spec(rig)
+    client = rig.warm(told)
+    client.demand(3)
+    told.wait(lambda: spec(rig)["replicas"] == 3)
+    fault = Fault("patch", "leases", status=403, reason="Forbidden", times=99)
+    rig.server.do(rig.server.api.faults.append, fault)
+    client.close()
+    assert spec(rig) == before
+
+
 def test_the_lease_is_the_pools_and_nobodys_afterwards(rig: Rig, told: Told) -> None:
     client = rig.warm(told)
     client.demand(1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import Body, NotFound
+from fiber._backends.kubernetes.api_errors import Body, Forbidden, NotFound
 from fiber._backends.kubernetes.resources import LEASES, POOLS
 from fiber.errors import FiberPoolError
 from fiber_api import names
@@ -154,7 +154,8 @@ class HeldPool:
 
     def free_lease(self, **how: Any) -> None:
         """Let whoever comes next find that nobody holds it."""
-        with contextlib.suppress(NotFound):
+        # Whoever may not has lost that right since; the pool itself can be left all the same.
+        with contextlib.suppress(NotFound, Forbidden):
             self._patch_lease({"holderIdentity": ""}, **how)
 
     def _patch_lease(self, spec: Body, **how: Any) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from fiber._backends.kubernetes.address import reachable_address
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body, explain
+from fiber._backends.kubernetes.api_errors import ApiError, Body, NotFound, explain
 from fiber._backends.kubernetes.fiber_pool import Tenure
 from fiber._backends.kubernetes.held_pool import Master
 from fiber._backends.kubernetes.own_pool import OwnPool
@@ -27,7 +27,7 @@ from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber.config import Config
-from fiber.errors import FiberPoolError
+from fiber.errors import ConfigError, FiberPoolError
 from fiber_api import names
 
 _SUFFIX_BYTES = 4
@@ -125,6 +125,13 @@ class Program:
                 path = PODS.path(self._api.namespace, name)
                 try:
                     self._own_pod = self._api.get(path, cancel=cancel)
+                except NotFound as error:
+                    raise ConfigError(
+                        f"there is no pod {name!r} in namespace {self._api.namespace!r}, which this "
+                        "program seems to run in: with hostNetwork, or a hostname of its own, a pod "
+                        "does not know its name. Set the variable HOSTNAME in its manifest by "
+                        "valueFrom.fieldRef, fieldPath metadata.name"
+                    ) from error
                 except ApiError as error:
                     raise self._explained(error, f"read this program's pod {name!r}", "") from error
             return self._own_pod

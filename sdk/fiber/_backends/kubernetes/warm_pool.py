@@ -94,6 +94,7 @@ class WarmPool:
         while not self._detach(held, left := max(deadline - time.monotonic(), 0.0)):
             if not left:
                 raise Conflict("it changes faster than it can be detached from", status=409)
+            time.sleep(min(_PAUSE, left))
 
     def _detach(self, held: HeldPool, timeout: float) -> bool:
         try:
