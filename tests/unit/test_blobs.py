@@ -15,7 +15,7 @@ import fiber
 from fiber import reduction
 from fiber._agent import blob_store
 from fiber._agent.blob_store import BlobLacking, BlobStore
-from fiber._backends.parcels import Parcels
+from fiber._backends.blob_sender import BlobSender
 from fiber._runtime import state
 from fiber._runtime.shared_arguments import SharedArguments
 from fiber._wire import messages
@@ -33,7 +33,7 @@ class Sent:
     def __init__(self) -> None:
         self.loop = SimulatedLoop()
         self.messages: list[Any] = []
-        self.parcels = Parcels(
+        self.parcels = BlobSender(
             self.loop,  # type: ignore[arg-type]
             lambda frame: self.messages.append(messages.decode(frame)),
         )
@@ -216,7 +216,7 @@ def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: An
     assert blob is not None
     assert census.wait_until(lambda: "loopback-0" in backend.agents.agents, PATIENCE)
     agent = backend.agents.agents["loopback-0"]
-    backend._loop.call_soon(agent._parcels.send_missing, [blob])
+    backend._loop.call_soon(agent._blobs.send_missing, [blob])
     agent.send(messages.Forget(blob.digest))
     with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
         assert pool.apply(size_of_kept) == LARGE

@@ -11,8 +11,8 @@ from functools import lru_cache
 from typing import Protocol
 
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
+from fiber._backends.blob_sender import BlobSender
 from fiber._backends.output import Output
-from fiber._backends.parcels import Parcels
 from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._hub.hub import Hub
 from fiber._transport.link import EventLoop, Link
@@ -80,7 +80,7 @@ class RemoteAgent:
         self.suspect = False
         """Whether it has been silent for a while."""
         self._link = link
-        self._parcels = Parcels(loop, link.send)
+        self._blobs = BlobSender(loop, link.send)
         self._hub = hub
         self._output = output
         self._observer = observer
@@ -95,7 +95,7 @@ class RemoteAgent:
             return
         number = next(self._numbers)
         self._children[number] = child
-        self._parcels.send_missing(child.blobs)
+        self._blobs.send_missing(child.blobs)
         child.begin(self, number)
 
     def withdraw(self, child: RemoteChild) -> bool:
@@ -140,7 +140,7 @@ class RemoteAgent:
             self._tunnels.on_frame(message)
             return
         if isinstance(message, messages.Lacking):
-            self._parcels.lost(message.digest)
+            self._blobs.lost(message.digest)
             return
         number = getattr(message, "child", None)
         child = None if number is None else self._children.get(number)

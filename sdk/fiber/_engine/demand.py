@@ -16,7 +16,7 @@ LINGER = 2.0
 gone: a worker that died is started again by its pool, a program goes on to its next pool."""
 
 
-class Wish(NamedTuple):
+class Desired(NamedTuple):
     """What there should be from now on."""
 
     agents: int
@@ -51,7 +51,7 @@ class Demand:
         self._placement.withhold(agent, "retired")
         self._retiring.add(agent)
 
-    def decide(self, now: float) -> Wish:
+    def decide(self, now: float) -> Desired:
         """What there should be; who is to be released counts as gone."""
         release = self._release_retired()
         overdue = self._overdue(now)
@@ -61,7 +61,7 @@ class Demand:
             self._placement.remove(agent)
         spared = len(overdue[spare:])
         agents = self._decide_agents(now, len(release), spared)
-        return Wish(agents, release, self._wake_at(spared))
+        return Desired(agents, release, self._wake_at(spared))
 
     def _decide_agents(self, now: float, released: int, spared: int) -> int:
         placement = self._placement

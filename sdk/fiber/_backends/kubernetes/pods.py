@@ -169,19 +169,19 @@ class Pods:
         self._decision_is_due = False
         if self._closing.is_set():
             return
-        wish = self._demand.decide(self._loop.now())
+        desired = self._demand.decide(self._loop.now())
         if self._placement.waiting and self._opener is None:
             self._begin()
-        released = [agent.host for agent in wish.release]
+        released = [agent.host for agent in desired.release]
         self._given_up.update(released)
-        if self._client is not None and (released or wish.agents != self._wanted):
-            self._wanted = wish.agents
-            self._client.demand(wish.agents, released)
+        if self._client is not None and (released or desired.agents != self._wanted):
+            self._wanted = desired.agents
+            self._client.demand(desired.agents, released)
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if wish.wake_at < float("inf"):
-            self._timer = self._loop.call_later(wish.wake_at - self._loop.now(), self._decide)
+        if desired.wake_at < float("inf"):
+            self._timer = self._loop.call_later(desired.wake_at - self._loop.now(), self._decide)
         self._watch_the_limit()
         self._watch_the_wait()
 

@@ -122,19 +122,22 @@ class Program:
         with self._lock:
             if self._own_pod is None:
                 name = os.environ.get("HOSTNAME") or socket.gethostname()
-                path = PODS.path(self._api.namespace, name)
-                try:
-                    self._own_pod = self._api.get(path, cancel=cancel)
-                except NotFound as error:
-                    raise ConfigError(
-                        f"there is no pod {name!r} in namespace {self._api.namespace!r}, which this "
-                        "program seems to run in: with hostNetwork, or a hostname of its own, a pod "
-                        "does not know its name. Set the variable HOSTNAME in its manifest by "
-                        "valueFrom.fieldRef, fieldPath metadata.name"
-                    ) from error
-                except ApiError as error:
-                    raise self._explained(error, f"read this program's pod {name!r}", "") from error
+                self._own_pod = self._read_own_pod(name, cancel)
             return self._own_pod
+
+    def _read_own_pod(self, name: str, cancel: threading.Event) -> Body:
+        namespace = self._api.namespace
+        try:
+            return self._api.get(PODS.path(namespace, name), cancel=cancel)
+        except NotFound as error:
+            raise ConfigError(
+                f"there is no pod {name!r} in namespace {namespace!r}, which this program seems to "
+                "run in: with hostNetwork, or a hostname of its own, a pod does not know its name. "
+                "Set the variable HOSTNAME in its manifest by valueFrom.fieldRef, fieldPath "
+                "metadata.name"
+            ) from error
+        except ApiError as error:
+            raise self._explained(error, f"read this program's pod {name!r}", "") from error
 
     def _explained(self, error: ApiError, doing: str, pool: str) -> FiberPoolError:
         return explain(error, doing, pool=pool, namespace=self.namespace, server=self._api.server)

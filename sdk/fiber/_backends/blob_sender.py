@@ -10,7 +10,7 @@ from fiber._wire import messages
 from fiber._wire.blob import Blob
 
 
-class Parcels:
+class BlobSender:
     """Sends each blob once, and has the agent forget it when nobody here has it any more.
 
     So an agent keeps no more than this program does, and nobody counts: a blob lives as long as a
