@@ -252,3 +252,34 @@ def test_what_fails_while_a_pool_is_opened_leaves_nothing_that_listens(
         opened.open_own(Shape(), site.loop, serve)
     assert not [t for t in threading.enumerate() if t.name == "fiber-accept"]
     opened.api.close()
+
+
+class Dialled(SimpleNamespace):
+    """The link of an agent that has dialled in."""
+
+    def __init__(self, name: str) -> None:
+        nothing = lambda *_: None  # noqa: E731
+        super().__init__(peer=SimpleNamespace(name=name), attach=nothing, send=nothing)
+
+
+def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> None:
+    """After this program was stopped for so long that its agents gave it up."""
+    pods = site.pods(lambda serve: pytest.fail("nothing is to be opened"))
+    pod: Any = {"metadata": {"name": "es-1-a", "labels": {}}, "status": {"phase": "Running"}}
+    first, second = Dialled("es-1-a"), Dialled("es-1-a")
+    done = threading.Event()
+    told: list[str | None] = []
+
+    def happen() -> None:
+        pods.on_pod("es-1-a", pod)
+        told.append(pods._joined(first))  # type: ignore[arg-type]
+        told.append(pods._joined(second))  # type: ignore[arg-type]
+        done.set()
+
+    site.loop.call_soon(happen)
+    assert done.wait(PATIENCE)
+    assert told == [None, None]
+    (agent,) = pods.agents.agents.values()
+    assert agent._link is second  # type: ignore[comparison-overlap]
+    assert pods._given_up == set()
+    pods.close()

@@ -78,6 +78,8 @@ class Pods:
         self._told_of_limit = False
         self._given_up: set[str] = set()
         """Pods that are there and of which nothing is expected any more."""
+        self._back_again: RemoteAgent | None = None
+        """Which agent is lost only to be there again."""
         self._status: Document = {}
         self._progress = Progress(loop, output, self._describe)
 
@@ -246,10 +248,13 @@ class Pods:
         name = link.peer.name
         if name in self._given_up:
             return f"{name}, which had been given up"
-        if name in self.agents.agents:
-            return f"{name}, which is there already"
         if (pod := self._pods.get(name)) is not None and pod_end(pod) is not None:
             return f"{name}, whose pod is about to go"
+        if (before := self.agents.agents.get(name)) is not None:
+            # It had given this program up, ended its children, and is back: after a program was
+            # stopped for a while, say.
+            self._back_again = before
+            before.lose("it had lost this program, and began anew")
         agent = self.agents.join(name, link)
         agent.pod = name
         self._tell(agent)
@@ -257,6 +262,8 @@ class Pods:
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
         name = agent.host
+        if agent is self._back_again:
+            return  # its pod is as good as before
         if name in self._pods and name not in self._given_up and not self._closing.is_set():
             # Its pod may live on where nobody hears it: another takes its place.
             self._given_up.add(name)
