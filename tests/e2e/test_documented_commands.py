@@ -29,7 +29,7 @@ SHOWN = {
     },
     "kubernetes.md": {
         "FIBER_BACKEND=kubernetes FIBER_NAMESPACE=default "
-        "python examples/02-es/main.py --workers 4": r"(?m)^  trained +-[12]\d\d\.\d ",
+        "python examples/02-es/main.py --workers 4": r"(?m)^  trained +-[12]?\d\d\.\d ",
         "kubectl get fiberpools": r"No resources found",
         "kubectl logs job/pi": r"Pi is roughly 3\.1[34]",
     },

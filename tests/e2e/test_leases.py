@@ -98,7 +98,7 @@ def test_a_lost_master_is_told(pools: Pools) -> None:
     pool = pools["retain"]
     problem = is_lost(pool)
     address = names.address_of(SOMEWHERE["host"], SOMEWHERE["port"])
-    words = ("Lease fiber-retain", "somebody", f"{DURATION} s", address, "workers stay")
+    words = ("Lease fiber-retain", f"{DURATION} s", address, "somebody", "workers stay")
     assert says(problem["message"], *words)
     alive = pool.condition("MasterAlive")
     assert (alive["status"], alive["reason"]) == ("False", "MasterLost")

@@ -123,7 +123,7 @@ def test_the_first_pool_waits_for_pods_and_the_next_for_nothing(
     prompt("a first result follows the first Ready worker", beyond)
     assert beyond < BEYOND_READY
     assert max(said["took"] for said in others) < WARM
-    assert len(list(filter(is_worker, ever(scene, "pods").values()))) == 8
+    assert len(list(filter(is_worker, ever(scene, "pods").values()))) <= 8
     leaves_nothing(program)
 
 

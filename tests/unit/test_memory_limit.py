@@ -52,6 +52,19 @@ def test_the_limit_is_written_as_kubernetes_does(group: Path, maximum: str, word
     assert limit_of(group).describe() == words
 
 
+def test_the_first_version_of_control_groups_counts_too(tmp_path: Path) -> None:
+    (tmp_path / "membership").write_text("4:memory:/node/pod\n0::/node/pod\n")
+    (tmp_path / "memory").mkdir()  # a container sees its own group as the root
+    control = tmp_path / "memory" / "memory.oom_control"
+    control.write_text("oom_kill_disable 0\nunder_oom 0\noom_kill 0\n")
+    (tmp_path / "memory" / "memory.limit_in_bytes").write_text("167772160\n")
+    limit = MemoryLimit(str(tmp_path), str(tmp_path / "membership"))
+    assert not limit.was_exceeded()
+    control.write_text("oom_kill_disable 0\nunder_oom 0\noom_kill 1\n")
+    assert limit.was_exceeded()
+    assert limit.describe() == "its memory limit is 160Mi"
+
+
 def test_where_nothing_is_counted_nobody_is_blamed(tmp_path: Path) -> None:
     limit = MemoryLimit(str(tmp_path), str(tmp_path / "nothing"))
     assert not limit.was_exceeded()

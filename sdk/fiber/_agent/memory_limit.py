@@ -1,7 +1,7 @@
 """Whether the kernel has killed a process of this control group for want of memory.
 
-A child that is killed so looks like any other that got a SIGKILL.  Version 2 of control groups
-counts such deaths; elsewhere nobody knows.
+A child that is killed so looks like any other that got a SIGKILL.  Control groups count such
+deaths, in both versions, and a container sees its own where it has them mounted.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class MemoryLimit:
     """Watches the control group that this process is in."""
 
     def __init__(self, root: str = _ROOT, membership: str = _MEMBERSHIP) -> None:
-        self._directory = root + _group(membership).rstrip("/")
+        self._events, self._maximum = _files(root, membership)
         self._kills = self._count()
 
     def was_exceeded(self) -> bool:
@@ -26,24 +26,33 @@ class MemoryLimit:
 
     def describe(self) -> str:
         """The limit as Kubernetes writes it, in a sentence."""
-        limit = _read(f"{self._directory}/memory.max").strip()
+        limit = _read(self._maximum).strip()
         if limit.isdigit():
             return f"its memory limit is {_quantity(int(limit))}"
         return "no limit of its own"
 
     def _count(self) -> int:
-        for line in _read(f"{self._directory}/memory.events").splitlines():
+        for line in _read(self._events).splitlines():
             name, _, count = line.partition(" ")
             if name == "oom_kill" and count.isdigit():
                 return int(count)
         return 0
 
 
-def _group(membership: str) -> str:
+def _files(root: str, membership: str) -> tuple[str, str]:
+    """What counts the deaths, and what holds the limit."""
+    groups = {}
     for line in _read(membership).splitlines():
-        if line.startswith("0::"):
-            return line.removeprefix("0::")
-    return ""
+        _, controllers, group = line.split(":", 2)
+        groups[controllers] = group.rstrip("/")
+    found = []
+    # In a namespace of its own a group is the root of what is mounted, whatever its name.
+    for group in (groups.get("", ""), ""):
+        found.append((f"{root}{group}/memory.events", f"{root}{group}/memory.max"))
+    for group in (groups.get("memory", ""), ""):
+        old = f"{root}/memory{group}"
+        found.append((f"{old}/memory.oom_control", f"{old}/memory.limit_in_bytes"))
+    return next((files for files in found if _read(files[0])), found[0])
 
 
 def _quantity(limit: int) -> str:
@@ -57,5 +66,5 @@ def _read(path: str) -> str:
     try:
         with open(path, encoding="utf-8") as file:
             return file.read()
-    except OSError:  # no such file in a root group, or in version 1
+    except OSError:  # no such file, or no such group
         return ""
