@@ -134,7 +134,7 @@ class Pods:
     def _run_open(self) -> None:
         serve = Serve(
             self._joined,
-            lambda why: self._output.write("fiber", f"refused {why}"),
+            self._refused,
             self._closing,
         )
         try:
@@ -243,6 +243,10 @@ class Pods:
         self.agents.refuse_waiting(error)
 
     # -- Agents
+
+    def _refused(self, why: str) -> None:
+        if not self._closing.is_set():  # else that is how it is to be
+            self._output.write("fiber", f"an agent was refused: {why}")
 
     def _joined(self, link: Link) -> str | None:
         name = link.peer.name
