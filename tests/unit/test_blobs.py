@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -187,8 +188,9 @@ def blobs_at(backend: Any) -> int:
     total = 0
     for fd in os.listdir(f"/proc/{pid}/fd"):
         path = f"/proc/{pid}/fd/{fd}"
-        if "(deleted)" in os.readlink(path) and "memfd" not in os.readlink(path):
-            total += os.stat(path).st_size
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            if "(deleted)" in os.readlink(path) and "memfd" not in os.readlink(path):
+                total += os.stat(path).st_size
     return total
 
 

@@ -155,9 +155,9 @@ def test_certificates_of_a_kubeconfig_outlive_the_clients_files(
         url = f"https://localhost:{server.api.port}"
         file = kubeconfig(tmp_path, url, **{"certificate-authority-data": authority})
         monkeypatch.setenv("KUBECONFIG", str(file))
-        api = Api.connect()
-        kube_config._cleanup_temp_files()
-        api.list(ALL, timeout=0)
+        with contextlib.closing(Api.connect()) as api:
+            kube_config._cleanup_temp_files()
+            api.list(ALL, timeout=0)
 
 
 # -- The account of a pod
