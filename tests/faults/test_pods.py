@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from faults.program import Program
 from faults.runtime import running
 from fiber._backends.kubernetes.api import Api
 from fiber._runtime import state
-from fiber.errors import FiberPoolError, WorkerDied
+from fiber.errors import ConfigError, FiberPoolError, WorkerDied
 from fiber_api import names
 from unit.kubernetes_rig import kubeconfig
 
@@ -370,3 +371,13 @@ def test_a_program_that_forks_itself_has_pods_and_its_copy_runs_beside_it(
     launch: Callable[..., Program],
 ) -> None:
     assert launch(FORKS, env={"FIBER_BACKEND": "kubernetes"}).finish() == "9 [0, 1, 4]\n"
+
+
+def test_one_port_is_not_enough_for_two_pools(cluster: FakeCluster) -> None:
+    with socket.create_server(("", 0)) as taken:
+        port = taken.getsockname()[1]
+    with running(backend="kubernetes", listen_port=port):
+        with fiber.Pool(1) as pool:
+            assert pool.apply(square, (2,)) == 4
+        with fiber.Pool(1) as pool, pytest.raises(ConfigError, match="needs one of its own"):
+            pool.apply(fiber.meta(cpu=0.5)(square), (2,))

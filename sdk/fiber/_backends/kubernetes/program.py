@@ -27,7 +27,7 @@ from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber.config import Config
-from fiber.errors import ConfigError, FiberPoolError
+from fiber.errors import ConfigError, FiberPoolError, LinkError
 from fiber_api import names
 
 _SUFFIX_BYTES = 4
@@ -58,6 +58,8 @@ class Program:
         self._name = program_name(getattr(sys.modules["__main__"], "__file__", None))
         self._suffix = secrets.token_hex(_SUFFIX_BYTES)
         self._numbers = itertools.count()
+        self._listens = False
+        """Whether a pool of this program has begun to listen."""
 
     def open_own(self, shape: Shape, loop: Loop, serve: Serve) -> Opened:
         """A pool of this program's own, for pods of this shape."""
@@ -99,15 +101,27 @@ class Program:
     ) -> tuple[str, MasterListener]:
         config = self._config
         host = reachable_address(self._api, config.listen_host, pool=pool, namespace=self.namespace)
-        listener = MasterListener(
-            loop,
-            names.address_of(config.listen_host or host, config.listen_port),
-            credentials,
-            on_agent=serve.on_agent,
-            on_refused=serve.on_refused,
-            keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
-            lost_grace=Master.lost_grace,
-        )
+        patience = config.heartbeat_interval, config.suspect_after, config.lost_after
+        try:
+            listener = MasterListener(
+                loop,
+                names.address_of(config.listen_host or host, config.listen_port),
+                credentials,
+                on_agent=serve.on_agent,
+                on_refused=serve.on_refused,
+                keepalive=Keepalive(*patience),
+                lost_grace=Master.lost_grace,
+            )
+        except LinkError as error:
+            if not (config.listen_port and self._listens):
+                raise
+            raise ConfigError(
+                f"listen_port={config.listen_port} is one port, and each FiberPool of a program "
+                "needs one of its own: this program uses several, for functions with different "
+                "wishes for instance. Leave listen_port out, so that free ones are taken, or give "
+                "all functions the same fiber.meta"
+            ) from error
+        self._listens = True
         return host, listener
 
     def _master(self, host: str, listener: MasterListener) -> Master:
