@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import socket
@@ -196,6 +197,32 @@ def test_connections_that_break_before_they_are_taken_harm_nobody(site: Site) ->
         sock.close()  # by a reset
     _, agent = site.dialer(listener.address)
     assert agent.link is not master.link
+
+
+class _BreaksAfterTheCheck(socket.socket):
+    """A connection that is reset right after it was found to be one."""
+
+    other: socket.socket
+
+    def getpeername(self) -> Any:
+        found = super().getpeername()
+        self.other.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+        self.other.close()
+        return found
+
+
+def test_one_that_breaks_as_it_is_taken_stays_open_nowhere(site: Site) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        other = socket.create_connection(server.getsockname(), DEADLINE)
+        accepted, _ = server.accept()
+    taken = _BreaksAfterTheCheck(fileno=accepted.detach())
+    taken.other = other
+    context = tls.context_of(site.credentials, listens=True)
+    with contextlib.closing(tls.Handshake(taken, context).sock) as secured:
+        fd = secured.fileno()
+        assert fd >= 0, "whoever goes on with it has it to close"
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(fd)
 
 
 def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:

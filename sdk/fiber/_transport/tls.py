@@ -48,10 +48,20 @@ class HungUp(Exception):
     """The peer ended the connection in the middle."""
 
 
+class _TakenSocket(ssl.SSLSocket):
+    """One that was connected.  Asked for its peer as it is made, the ssl module would leave open
+    what has broken at this very moment; the handshake finds that out and closes it.
+    """
+
+    def getpeername(self) -> None:
+        """Nobody asks any more."""
+
+
 def context_of(credentials: Credentials, *, listens: bool) -> ssl.SSLContext:
     """What one side demands and shows; AuthenticationError if ``credentials`` cannot be used."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if listens else ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.sslsocket_class = _TakenSocket
     context.verify_mode = ssl.CERT_REQUIRED
     if listens:
         context.num_tickets = 0  # nobody resumes, and nothing must follow the handshake
@@ -93,7 +103,7 @@ class Handshake:
         self._theirs = b""
         try:
             sock.setblocking(False)
-            sock.getpeername()  # of one that is broken already, wrap_socket would leave a rest
+            sock.getpeername()
             self.sock = context.wrap_socket(
                 sock,
                 server_side=self._for_master,
