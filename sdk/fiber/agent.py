@@ -24,6 +24,7 @@ import math
 import os
 import shutil
 import signal
+import socket
 import sys
 import time
 from collections.abc import Sequence
@@ -77,6 +78,7 @@ class Main:
     def run(self) -> int:
         """Serve until the end; the exit status."""
         self._dialer = self._dial()
+        self._wake_by_signals()
         signal.signal(signal.SIGTERM, self._on_sigterm)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # what an earlier life, or who began it, did
@@ -149,6 +151,15 @@ class Main:
         elif lost:
             self._status = 1
         self._link.close("the agent ended", then=self._loop.stop)
+
+    def _wake_by_signals(self) -> None:
+        """A signal that strikes just before the loop sleeps is noted by Python, and slept over."""
+        reader, writer = socket.socketpair()
+        for end in (reader, writer):
+            end.setblocking(False)
+        self._signals = reader, writer  # for as long as this lives
+        self._loop.register(reader.fileno(), lambda: reader.recv(4096))
+        signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
 
     def _on_sigterm(self, *_: object) -> None:
         self._told_to_end = True
