@@ -169,7 +169,7 @@ def test_a_gpu_is_one_of_a_node_that_has_it(programs: Programs, cluster: Cluster
     scene.kube.patch(path, {"status": {"capacity": {GPU: "1"}}})
     try:
         program = programs.start("outside", "gpu.py")
-        pod = scene.now["pods"][program.says("ran", seconds=90)["host"]]
+        pod = ever(scene, "pods")[program.says("ran", seconds=90)["host"]]
         assert pod["spec"]["nodeName"] == node
         program.ends()
         leaves_nothing(program)

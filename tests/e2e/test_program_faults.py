@@ -128,6 +128,7 @@ def test_a_map_ends_as_if_nothing_had_been(
     leaves_nothing(program, seconds=90)
 
 
+@pytest.mark.long
 def test_a_program_that_ends_while_nobody_answers_says_what_stays(
     programs: Programs, cluster: Cluster
 ) -> None:
