@@ -61,6 +61,8 @@ class Main:
     """The life of an agent: dial, serve, end."""
 
     def __init__(self) -> None:
+        # Until it can be heard it waits, where process 1 of a container would never see it.
+        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
         self._environment = dict(os.environ)
         self._credentials = _read(_required(_CREDENTIALS))  # before anything is started
         self._name = os.environ.get(_NAME) or f"agent-{os.getpid()}"
@@ -89,7 +91,7 @@ class Main:
         self._hub.close()
         # From here on it is for the next life, which hears of it when it is ready to.
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
-        if self._again and not self._told_to_end:
+        if self._again and not self._is_told_to_end():
             # Nothing of what the last master did or left may reach the next one.
             self._hand_on_credentials()
             os.execve(sys.executable, sys.orig_argv, self._environment)
@@ -151,6 +153,13 @@ class Main:
         elif lost:
             self._status = 1
         self._link.close("the agent ended", then=self._loop.stop)
+
+    def _is_told_to_end(self) -> bool:
+        """Also by a signal that another thread took, and of which Python has not told us yet."""
+        try:
+            return self._told_to_end or bool(self._signals[0].recv(1))
+        except BlockingIOError:
+            return False
 
     def _wake_by_signals(self) -> None:
         """A signal that strikes just before the loop sleeps is noted by Python, and slept over."""

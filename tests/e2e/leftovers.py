@@ -12,8 +12,11 @@ _NOT_THEIRS = {f"leases/{names.CRD_NAME}"}
 """The operator's, by which it serves the namespace."""
 
 
-def leaves_nothing(program: Program, seconds: float = 30.0) -> None:
-    """Wait until all that it made is gone from its namespace; its own pod may stay."""
+def leaves_nothing(program: Program, seconds: float = 45.0) -> None:
+    """Wait until all that it made is gone from its namespace; its own pod may stay.
+
+    A pod has 30 seconds to end before it is ended.
+    """
     found: list[str] = []
 
     def is_empty() -> bool:

@@ -169,7 +169,9 @@ def test_a_gpu_is_one_of_a_node_that_has_it(programs: Programs, cluster: Cluster
     scene.kube.patch(path, {"status": {"capacity": {GPU: "1"}}})
     try:
         program = programs.start("outside", "gpu.py")
-        pod = ever(scene, "pods")[program.says("ran", seconds=90)["host"]]
+        host = program.says("ran", seconds=90)["host"]
+        pod = scene.wait("its pod is seen", lambda: ever(scene, "pods").get(host))
+        assert pod is not None
         assert pod["spec"]["nodeName"] == node
         program.ends()
         leaves_nothing(program)

@@ -148,9 +148,13 @@ class AgentKubelet:
                 self.forced.append(name)
 
     def _is_deleted(self, namespace: str, name: str) -> bool:
-        """By somebody, or together with its pool."""
+        """By somebody, or together with its pool, which may have gone before it was made."""
         pods = {pod["metadata"]["name"]: pod for pod in self._store.list("pods", namespace)}
-        return name not in pods or "deletionTimestamp" in pods[name]["metadata"]
+        if name not in pods or "deletionTimestamp" in pods[name]["metadata"]:
+            return True
+        owners = {owner["uid"] for owner in pods[name]["metadata"]["ownerReferences"]}
+        pools = self._store.list("fiberpools", namespace)
+        return owners.isdisjoint(pool["metadata"]["uid"] for pool in pools)
 
     def _set(self, namespace: str, name: str, phase: str, state: Body) -> None:
         if "nodeName" not in self._store.get("pods", namespace, name)["spec"]:
