@@ -18,7 +18,7 @@ from multiprocessing.sharedctypes import (
     SynchronizedBase,
     SynchronizedString,
 )
-from typing import Any, SupportsIndex
+from typing import Any
 
 from fiber import synchronize
 from fiber._hub import shared_buffer
@@ -48,11 +48,11 @@ def RawValue(typecode_or_type: Any, *args: Any) -> Any:
     return value
 
 
-def RawArray(typecode_or_type: Any, size_or_initializer: SupportsIndex | Sequence[Any]) -> Any:
+def RawArray(typecode_or_type: Any, size_or_initializer: int | Sequence[Any]) -> Any:
     """A ctypes array in shared memory, of zeros or of the values given; nothing guards it."""
     element = _type(typecode_or_type)
-    if isinstance(size_or_initializer, SupportsIndex):
-        return _new(element * size_or_initializer.__index__())
+    if isinstance(size_or_initializer, int):
+        return _new(element * size_or_initializer)
     array = _new(element * len(size_or_initializer))
     array.__init__(*size_or_initializer)
     return array
@@ -68,7 +68,7 @@ def Value(typecode_or_type: Any, *args: Any, lock: Any = True, ctx: Any = None) 
 
 def Array(
     typecode_or_type: Any,
-    size_or_initializer: SupportsIndex | Sequence[Any],
+    size_or_initializer: int | Sequence[Any],
     *,
     lock: Any = True,
     ctx: Any = None,
