@@ -89,9 +89,8 @@ def copy(obj: Any) -> Any:
 
 def synchronized(obj: Any, lock: Any = None, ctx: Any = None) -> Any:
     """A ctypes object with a lock: ``lock``, or a new ``RLock``."""
-    wrapper = mp_sharedctypes.synchronized(
-        obj, synchronize.RLock() if lock is None else lock, ctx=synchronize
-    )
+    guard: Any = synchronize.RLock() if lock is None else lock
+    wrapper = mp_sharedctypes.synchronized(obj, guard, ctx=synchronize)
     copyreg.pickle(type(wrapper), _reduce_synchronized)
     return wrapper
 

@@ -19,7 +19,7 @@ ENVS, STEPS = 3, 20
 SPACE = spaces.Dict(
     {
         "buttons": spaces.MultiBinary(4),
-        "flag": spaces.Box(0, 1, (), np.bool_),
+        "flag": spaces.Box(0, 1, (), np.bool_),  # type: ignore[arg-type]
         "image": spaces.Box(0, 255, (6, 5), np.uint8),
         "pose": spaces.Tuple((spaces.Box(-1, 1, (3,), np.float64), spaces.Discrete(7))),
     }
