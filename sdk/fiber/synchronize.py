@@ -6,6 +6,8 @@ does: what it acquired stays acquired, as in multiprocessing.
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -31,14 +33,6 @@ SEM_VALUE_MAX = 2**31 - 1
 
 RECHECK = 1.0
 """Seconds after which whoever waits for a bell looks for itself: its ringer may have died."""
-
-
-class Lock(Unsupported):
-    pass
-
-
-class RLock(Unsupported):
-    pass
 
 
 class Condition(Unsupported):
@@ -105,6 +99,56 @@ class BoundedSemaphore(Semaphore):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}(value={self.get_value()}, maxvalue={self._maximum})>"
+
+
+class Lock(BoundedSemaphore):
+    """A mutex that any thread of any process may release."""
+
+    def __init__(self, *, ctx: Any = None) -> None:
+        super().__init__(1, ctx=ctx)
+
+
+class RLock:
+    """A mutex that its holder, a thread, may acquire again."""
+
+    def __init__(self, *, ctx: Any = None) -> None:
+        self._lock = Lock()
+        self._holder: tuple[int, int] | None = None
+        self._depth = 0
+
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
+        """Take it; False if another thread keeps it for ``timeout`` seconds."""
+        me = os.getpid(), threading.get_ident()
+        if self._holder != me:
+            if not self._lock.acquire(block, timeout):
+                return False
+            self._holder = me
+        self._depth += 1
+        return True
+
+    def release(self) -> None:
+        """Let go of it once; AssertionError if this thread does not have it."""
+        if self._holder != (os.getpid(), threading.get_ident()):
+            raise AssertionError("attempt to release recursive lock not owned by thread")
+        self._depth -= 1
+        if not self._depth:
+            self._holder = None
+            self._lock.release()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild_rlock, (self._lock,)
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
+def _rebuild_rlock(lock: Lock) -> RLock:
+    rlock = RLock.__new__(RLock)
+    rlock._lock, rlock._holder, rlock._depth = lock, None, 0
+    return rlock
 
 
 class Event:

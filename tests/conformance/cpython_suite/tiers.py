@@ -61,7 +61,7 @@ NOT_APPLICABLE = {
     "TestConnection.test_missing_fd_transfer": "passes descriptors",
     "TestListener.test_abstract_socket": "abstract AF_UNIX",
     "TestPicklingConnections.test_pickling": "pickles raw sockets",
-    "TestHeap.*": "mmap heap internals",
+    "TestHeap.*": "insides of multiprocessing's heap; of Fiber's: tests/unit/test_heap.py",
     "TestSharedMemory.*": "memory shared on one host",
     "TestFinalize.*": "util internals",
     "TestImportStar.*": "files of the standard library",
