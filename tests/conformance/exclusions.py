@@ -10,6 +10,10 @@ _MANAGERS = {
     f"TestInitializers.test_{name}_initializer": "its set-up makes a manager: not in Fiber yet"
     for name in ("manager", "pool")
 }
+_MEMORY_MANAGERS = {
+    f"WithProcessesTestSharedMemory.test_shared_memory_{name}": "SharedMemoryManager: not yet"
+    for name in ("SharedMemoryManager_basics", "SharedMemoryServer_ignores_sigint")
+}
 _CLOSED_AT_ONCE = {
     "WithProcessesTestQueue.test_closed_queue_empty_exceptions": (
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
@@ -32,7 +36,7 @@ _ONE_HOST = {
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
-    "local": {**_MANAGERS, **_CLOSED_AT_ONCE},
+    "local": {**_MANAGERS, **_MEMORY_MANAGERS, **_CLOSED_AT_ONCE},
     "loopback": {**_MANAGERS, **_CLOSED_AT_ONCE, **_ONE_HOST},
     "kubernetes": {**_MANAGERS, **_CLOSED_AT_ONCE, **_ONE_HOST},
 }

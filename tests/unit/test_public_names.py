@@ -103,8 +103,6 @@ def test_whoever_makes_an_object_that_is_not_there_is_told_what_to_use() -> None
     for make in (Own, fiber.synchronize.Barrier, fiber.Barrier, fiber.get_context("spawn").Barrier):
         with pytest.raises(fiber.NotInFiber, match=r"no Barrier yet.*Semaphore"):
             make()
-    with pytest.raises(fiber.NotInFiber, match=r"no SharedMemory yet.*Pipe or Queue"):
-        fiber.shared_memory.SharedMemory(create=True, size=16)
 
 
 @pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
