@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fiber.connection import Connection
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
-    from fiber.synchronize import BoundedSemaphore, Event, Semaphore
+    from fiber.synchronize import BoundedSemaphore, Event, Lock, RLock, Semaphore
 
 __all__ = [
     "BaseContext",
@@ -58,8 +58,6 @@ class BaseContext:
     Process: type[Process] = Process
 
     # What multiprocessing has and Fiber has not yet: each says what to use instead.
-    Lock = staticmethod(unsupported("Lock"))
-    RLock = staticmethod(unsupported("RLock"))
     Condition = staticmethod(unsupported("Condition"))
     Barrier = staticmethod(unsupported("Barrier"))
     Value = staticmethod(unsupported("Value"))
@@ -110,6 +108,20 @@ class BaseContext:
         return SimpleQueue()
 
     # Synchronization
+
+    def Lock(self) -> Lock:
+        """A mutex."""
+        from fiber.synchronize import Lock
+
+        config.use()
+        return Lock()
+
+    def RLock(self) -> RLock:
+        """A mutex that its thread may acquire again."""
+        from fiber.synchronize import RLock
+
+        config.use()
+        return RLock()
 
     def Event(self) -> Event:
         """A flag to wait for."""

@@ -45,6 +45,9 @@ CLASSES = (
     "TestTimeouts",
     "TestIgnoreEINTR",
     "TestLogging",
+    "TestLock",
+    "TestSemaphore",
+    "TestEvent",
 )
 # An agent on another host cannot share a pid or a file with the master.
 TIERS = {"local": ("core", "local"), "loopback": ("core",), "kubernetes": ("core",)}

@@ -8,8 +8,6 @@ from typing import Any, NoReturn
 from fiber.errors import NotInFiber
 
 _INSTEAD = {
-    "Lock": "use Semaphore(1)",
-    "RLock": "use Semaphore(1), acquired once by each holder",
     "Condition": "use an Event, or a Queue that carries what is waited for",
     "Barrier": "use a Semaphore for arrivals and an Event for the release",
     "Value": "send the value through a Pipe or Queue",
@@ -26,9 +24,7 @@ _INSTEAD = {
 
 def refuse(name: str) -> NoReturn:
     """Raise the error for ``name``."""
-    raise NotInFiber(
-        f"Fiber has no {name} yet: it shares no memory and no locks. Please {_INSTEAD[name]}."
-    )
+    raise NotInFiber(f"Fiber has no {name} yet. Please {_INSTEAD[name]}.")
 
 
 def unsupported(name: str) -> Callable[..., Any]:

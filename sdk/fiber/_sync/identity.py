@@ -9,18 +9,15 @@ from __future__ import annotations
 import os
 
 _PID = (1 << 31) - 1
-_PROXY = 1 << 31
-_START = 0xFFFFFFFF
+_START = (1 << 32) - 1
 
 
-def own(*, for_others: bool = False) -> int:
-    """The word for this process.
-
-    ``for_others``: a second one, for what it holds on behalf of processes of other hosts.
-    """
-    start = _start_time(os.getpid())
+def own() -> int:
+    """The word for this process."""
+    pid = os.getpid()
+    start = _start_time(pid)
     assert start is not None
-    return start << 32 | (_PROXY if for_others else 0) | os.getpid()
+    return start << 31 | pid
 
 
 def pid(who: int) -> int:
@@ -30,7 +27,7 @@ def pid(who: int) -> int:
 
 def is_alive(who: int) -> bool:
     """Whether that process still runs; one that has ended and that nobody reaped does not."""
-    return _start_time(who & _PID) == who >> 32
+    return _start_time(who & _PID) == who >> 31
 
 
 def _start_time(pid: int) -> int | None:

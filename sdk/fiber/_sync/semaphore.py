@@ -1,330 +1,444 @@
-"""The part that locks and semaphores in shared memory have in common: waiting, and reviving.
+"""Semaphores in shared memory: the tokens of a process that dies come back.
 
-A token is a POSIX semaphore's, so to acquire and to release is one atomic step in C, which can be
-waited for.  What it does not say is who has it.  So that the token of a dead process comes back:
+A token is a POSIX semaphore's, so to take one and to give it back is one step in C that the kernel
+can wait for.  What that does not say is who has it.  Beside it are *slots*, which belong to
+processes, one for each token that they have or are about to take::
 
-* *Notes* beside it say who holds it (``_note``, ``_unnote``: the subclasses').  Only who has a
-  token writes a note of it.
-* Between the token's step and the note's, nobody can tell.  So whoever is about to make one says
-  before, in a slot of the arena, at which record it is, and takes that back after both.
+    semaphore │ mutex │ attention, … │ slot │ slot │ …          slot: state, process, its name
 
-::
+Only the thread that has taken a slot out of its process's lists writes its state::
 
     acquire                               release
-      slot = this record                    slot = this record
+      state = BUSY                          state = BUSY
       stop?  then not                       stop?  then not
-      take the token                        clear the note
-      write the note                        give the token back
-      slot = 0                              slot = 0
+      take a token                          give the token back
+      state = HELD                          state = IDLE
 
 To revive is to give back the tokens of which no living process has a note.  One process at a time
 does it, which a robust mutex sees to:
 
 1. ``stop`` is set.  After a moment, longer than any processor keeps a store for itself, whoever
-   reads it sees it; whoever read it before is seen in its slot.
-2. It waits until no living process is at the record: all those have noted what they have, and none
-   takes or gives anything now.  (One that never gets on, since it is stopped, puts the revival off:
-   it may have the token.)
-3. A token that is neither there nor noted by the living is lost.  It is given back.
-4. ``stop`` is cleared.
+   reads it sees it, and whoever read it before is seen to be busy.
+2. It waits until no living process is busy: all those have noted what they have, and none takes or
+   gives anything now.  (One that does not get on, since it is stopped, puts the revival off: it may
+   have the token.)
+3. Tokens that are neither there nor noted by the living are lost.  They are given back.
+4. The slots of the dead are free, and ``stop`` is cleared.
 
-Nobody ever has a token that another one has: only lost ones are made anew, and what makes them lost,
-that who had them is dead and everybody else has noted what he has, stays so.  A reviver that dies
-leaves ``stop`` set and the mutex to the next one, who finds the same or less that is lost.
+So nobody has a token that another one has: only lost ones are made anew, and what makes them lost,
+that who had them is dead and all others have noted what they have, stays so.  A reviver that dies
+leaves ``stop`` and the mutex to the next one, who finds the same or less that is lost.
+
+Who is interrupted between two steps cannot tell how far it came, and leaves the slot as if it had
+died: state = LEFT.
+
+A process that gives back what it has not acquired gives another one's token, or makes one of
+nothing: who has which cannot be told any more.  From there on nothing is revived.
+
+No Python lock is taken: a finalizer, a signal's handler or a thread may come at any line.
 """
 
 from __future__ import annotations
 
+import ctypes
+import os
 import time
 import warnings
-from itertools import starmap
+import weakref
+from _multiprocessing import SemLock  # type: ignore[import-not-found]  # it has no stub
+from collections.abc import Iterator
+from itertools import compress, starmap
+from multiprocessing import current_process
+from typing import Protocol
 
+from fiber._sync import identity
 from fiber._sync.abandonment import Abandoned
-from fiber._sync.arena import AT, WHO, Arena
+from fiber._sync.robust_mutex import RobustMutex
 
-SEMAPHORE, RECURSIVE = 1, 0  # SemLock's kinds, in its own numbers
+RECURSIVE, COUNTING = 0, 1  # SemLock's kinds, in its own numbers
+SEM_VALUE_MAX: int = SemLock.SEM_VALUE_MAX
+
+SIZE = 1 << 15
+"""Bytes of a semaphore.  The kernel gives memory for the pages that are used."""
 
 SLICE = 0.2
 """Seconds that one wait in the kernel lasts: so long a signal may be slept over, and a token of a
 dead process lie unnoticed.
 """
 
-MOMENT = 0.002
-"""Seconds until what is stored here is seen by all."""
-
-_QUIET = 1.0
-"""Seconds that a revival waits for those who are at the record, before it is put off."""
-
+_MOMENT = 0.002  # seconds until what is stored here is seen by all
+_QUIET = 1.0  # seconds that a revival waits for those who are busy, before it is put off
 _NAP = 0.001
 
-_UNNOTED = 10
-"""Looks in a row that must find a token with nobody before it is thought lost."""
+# Words of 8 bytes, which are read and written in one piece.  The first four are the semaphore.
+_MUTEX = 8
+_ATTENTION = 16
+_IS_UNTRACKED = 17
+_TOTAL = 18
+_DEAD = 22  # whose token was given back, as in a slot
+_SLOTS = range(32, SIZE // 8, 8)
+_NO_SLOT = 31
+"""In place of one, when there are no more: nobody reads it."""
 
-# Words of a record, counted from its first.  The first four are the semaphore.
-ATTENTION = 4
-NOTE = 5
-TOTAL = 6
-DEAD = 7
-WORDS = 16
+# Of a slot
+_WHO = 1  # the process, or 0: it is nobody's
+_NAME = 2
+_NAME_BYTES = 48
+_IDLE, _BUSY, _HELD, _LEFT = range(4)  # states
 
-# Bytes of the word ``ATTENTION``, as bits of it.
-STOP = 1
-RING = 1 << 8
-ABANDONED = 1 << 16
+# Bytes of the word ``attention``.  Who reads it reads them all at once.
+_STOP = 8 * _ATTENTION
+_ABANDONED = 8 * _ATTENTION + 1
+_IS_STOPPED = 0xFF
 
-_ONCE = ((),)
+_NO_WAIT = (False,)
+
+_libc = ctypes.PyDLL(None, use_errno=True)
+
+
+class Block(Protocol):
+    """Memory that processes of this host share."""
+
+    @property
+    def view(self) -> memoryview:
+        """All of it, to be written to."""
+
+    @property
+    def address(self) -> int:
+        """Where it is in this process."""
 
 
 class SharedSemaphore:
-    """One record, as this process sees it."""
+    """A semaphore, as this process sees it; with the methods of multiprocessing's ``SemLock``."""
 
     __slots__ = (
-        "__weakref__", "_arena", "_at", "_attention", "_free", "_give", "_looks", "_me", "_sem",
-        "_take", "_words", "maximum", "offset",
+        "__weakref__", "_bytes", "_candidates", "_count", "_get_value", "_give", "_held", "_idle",
+        "_is_mine", "_is_mutex", "_is_recursive", "_is_zero", "_me", "_mutex", "_next_look",
+        "_revivals", "_sem", "_take", "_words", "block", "kind", "maximum",
     )  # fmt: skip
 
-    kind = SEMAPHORE
-    noun = "semaphore"
-
-    def __init__(self, arena: Arena, offset: int, maximum: int) -> None:
-        self.offset = offset
+    def __init__(self, block: Block, kind: int, maximum: int) -> None:
+        self.block = block
+        self.kind = kind
         self.maximum = maximum
-        self._arena = arena
-        self._words = arena.words
-        self._free = arena.free
-        self._me = arena.me
-        self._at = offset // 8
-        self._attention = self._at + ATTENTION
-        self._looks = 0
-        self._sem = arena.semaphore(offset, self.kind, maximum)
+        self._is_mutex = maximum == 1
+        self._is_recursive = kind == RECURSIVE
+        self._bytes = block.view
+        self._words = block.view.cast("q")
+        self._mutex = RobustMutex(block.address + 8 * _MUTEX)
+        self._sem = self._semlock(kind)
         self._take = self._sem.acquire
         self._give = self._sem.release
+        self._is_mine = self._sem._is_mine
+        self._count = self._sem._count
+        self._get_value = self._sem._get_value
+        self._is_zero = self._sem._is_zero
+        self._revivals = 0
+        self._next_look = 0.0
+        self._begin()
+        _all.add(self)
 
-    def create(self, value: int) -> None:
-        """Begin the record's life."""
-        words, at = self._words, self._at
-        for word in range(at + ATTENTION, at + WORDS):
-            words[word] = 0
-        words[at + TOTAL] = value
-        self._arena.make_semaphore(self.offset, value)
+    @classmethod
+    def create(cls, block: Block, kind: int, value: int, maximum: int) -> SharedSemaphore:
+        """Begin the life of one in zeroed memory."""
+        if _libc.sem_init(ctypes.c_void_p(block.address), 1, value):
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code))
+        new = cls(block, kind, maximum)
+        new._mutex.create()
+        new._words[_TOTAL] = value
+        return new
 
-    # What multiprocessing's SemLock has
+    def _begin(self) -> None:
+        """In a new process, which may be a fork: what its parent has is not its own."""
+        self._me = identity.own()
+        self._idle: list[int] = []
+        self._held: list[int] = []
+        self._candidates: Iterator[int] = iter(_SLOTS)
 
-    def is_mine(self) -> bool:
-        """Whether this thread has it, having been the last in this process to acquire it."""
-        return self._sem._is_mine()
-
-    def count(self) -> int:
-        """How often this process has acquired it and not released it."""
-        return self._sem._count()
-
-    def value(self) -> int:
-        """How often it can be acquired now."""
-        return self._sem._get_value()
+    def _after_fork(self) -> None:
+        self._sem._after_fork()
+        self._begin()
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
         """Take a token; False if there is none, nor within ``timeout`` seconds."""
-        taken: list[bool | Abandoned] = []
+        if self._is_recursive and self._is_mine():
+            return self._acquire_again()
+        if self._is_mutex:
+            # ``_try_acquire``, in the fewest steps.
+            words = self._words
+            try:
+                slot = self._idle.pop()
+            except IndexError:
+                return self._acquire(block, timeout)
+            try:
+                words[slot] = _BUSY
+                if not words[_ATTENTION] and self._take(False):
+                    # CPython looks for signals after a call, and there is none from here on.
+                    words[slot] = _HELD
+                    self._held += (slot,)
+                    return True
+                words[slot] = _IDLE
+                self._idle += (slot,)
+            except BaseException:
+                self._leave(slot)
+                raise
+        return self._acquire(block, timeout)
+
+    def release(self) -> None:
+        """Give a token back; ValueError if there are as many as there can be.
+
+        AssertionError if it is recursive and this thread has not acquired it.
+        """
+        if self._is_recursive and (not self._is_mine() or self._count() > 1):
+            self._give()
+            return
+        words = self._words
         try:
-            return self._acquire(block, timeout, taken)
+            slot = self._held.pop()
+        except IndexError:
+            self._mutex.run(self._give_untracked)
+            return
+        try:
+            words[slot] = _BUSY
+            while words[_ATTENTION] & _IS_STOPPED:
+                words[slot] = _HELD
+                self._park()
+                words[slot] = _BUSY
+            self._give()
+            words[slot] = _IDLE
+            self._idle += (slot,)
+        except BaseException:
+            self._leave(slot)
+            raise
+
+    # Steps
+
+    def _acquire(self, block: bool, timeout: float | None) -> bool | Abandoned:
+        taken: list[int] = []
+        try:
+            if self._try_acquire(_NO_WAIT, taken) or self._wait(block, timeout, taken):
+                return self._abandoned() if self._words[_ATTENTION] else True
+            return False
         except BaseException:
             if taken:
                 self.release()
             raise
 
-    def release(self) -> None:
-        """Give a token back; ValueError if there are as many as there can be."""
-        while not self._try_release():
-            self._park()
-        if self._words[self._attention] & RING:
-            self._arena.ring()
+    def _acquire_again(self) -> bool:
+        taken: list[bool] = []
+        try:
+            taken.extend(map(self._take, _NO_WAIT))
+            return True
+        except BaseException:
+            if taken:
+                self._give()
+            raise
 
-    # Notes: for subclasses
+    def _try_acquire(self, wait: tuple[bool] | tuple[bool, float], taken: list[int]) -> bool:
+        """One try; ``taken`` gets the slot if it succeeds, and keeps it if it is interrupted."""
+        try:
+            slot = self._idle.pop()
+        except IndexError:
+            slot = self._mutex.run(self._claim)
+        words = self._words
+        try:
+            words[slot] = _BUSY
+            if not words[_ATTENTION] & _IS_STOPPED:
+                # In the step that takes it: no signal strikes in between.
+                taken.extend(compress((slot,), starmap(self._take, (wait,))))
+        except BaseException:
+            if taken:
+                words[slot] = _HELD
+                self._held += (slot,)
+            else:
+                self._leave(slot)
+            raise
+        if not taken:
+            words[slot] = _IDLE
+            self._idle += (slot,)
+            return False
+        words[slot] = _HELD
+        self._held += (slot,)
+        return True
 
-    def _note(self) -> None:
-        """This process has a token more."""
-        raise NotImplementedError
+    def _give_untracked(self) -> None:
+        """Give back what this process has not acquired.  With the mutex."""
+        self._give()
+        self._words[_IS_UNTRACKED] = True
 
-    def _unnote(self) -> None:
-        """This process is about to give one back."""
-        raise NotImplementedError
+    def _leave(self, slot: int) -> None:
+        """What was done last was interrupted: a revival will see whether a token is lost."""
+        if self._is_recursive and self._is_mine():
+            self._sem._after_fork()  # it is not: the count is zero
+        self._words[slot] = _LEFT
 
-    def _holders(self) -> list[tuple[int, int]]:
-        """Processes and how many tokens each has a note of."""
-        raise NotImplementedError
-
-    def _forget(self, who: int) -> None:
-        """Clear the notes of a dead process."""
-        raise NotImplementedError
+    def _abandoned(self) -> Abandoned | bool:
+        """What the one who acquires it after a revival is told, and nobody else."""
+        if not self._bytes[_ABANDONED]:
+            return True
+        self._bytes[_ABANDONED] = 0
+        return Abandoned(self._named(_DEAD))
 
     # Waiting
 
-    def _acquire(
-        self, block: bool, timeout: float | None, taken: list[bool | Abandoned]
-    ) -> bool | Abandoned:
+    def _wait(self, block: bool, timeout: float | None, taken: list[int]) -> bool:
         deadline = None if timeout is None else time.monotonic() + timeout
-        left = 0.0
-        while not self._try_acquire(left, taken):
+        while True:
             left = SLICE if deadline is None else min(SLICE, deadline - time.monotonic())
-            if not block or left <= 0:
-                if not self._look_after_the_dead():
-                    return False
-                left = 0.0
-            elif self._words[self._attention] & STOP:
+            waits = block and left > 0
+            if self._is_stopped():
                 self._park()
-            else:
-                self._look_after_the_dead()
-        self._looks = 0
-        return taken[0]
-
-    def _try_acquire(self, seconds: float, taken: list[bool | Abandoned]) -> bool:
-        """One try, noted in ``taken`` if it succeeds."""
-        slot = self._slot()
-        words = self._words
-        try:
-            words[slot] = self._at
-            attention = words[self._attention]
-            if not attention & STOP:
-                # Noted in the step that takes it: no signal strikes in between.
-                taken.extend(filter(None, map(self._take, (True,), (seconds,))))
-                if taken:
-                    self._note()
-                    if attention & ABANDONED:
-                        taken[0] = self._told()
-            return bool(taken)
-        except BaseException:
-            if taken:
-                taken.clear()
-                self._unnote()
-                self._give()
-            raise
-        finally:
-            words[slot] = 0
-            self._free.append(slot)
-
-    def _try_release(self) -> bool:
-        """One try: not while dead processes' tokens are given back."""
-        slot = self._slot()
-        words = self._words
-        given: list[None] = []
-        try:
-            words[slot] = self._at
-            if words[self._attention] & STOP:
+            elif not self._look_after_the_dead() and not waits:
                 return False
-            self._unnote()
-            given.extend(starmap(self._give, _ONCE))
-            return True
-        except ValueError:
-            raise
-        except BaseException:
-            if not given:  # begun, so it is done
-                self._give()
-            raise
-        finally:
-            words[slot] = 0
-            self._free.append(slot)
+            if self._try_acquire((True, left) if waits else _NO_WAIT, taken):
+                return True
+            if not waits:
+                return False
 
-    def _slot(self) -> int:
-        try:
-            return self._free.pop()
-        except IndexError:
-            return self._arena.claim()
-
-    def _told(self) -> Abandoned:
-        """Take note of an abandonment, so that nobody else is told of it."""
-        self._arena.bytes[self._attention * 8 + 2] = 0
-        return Abandoned(self._arena.name(self._words[self._at + DEAD]))
-
-    # Reviving
+    def _is_stopped(self) -> bool:
+        return bool(self._words[_ATTENTION] & _IS_STOPPED)
 
     def _park(self) -> None:
         """Wait until a revival is over, and go on with it if its process died."""
-        self._warn(self._arena.exclusively(lambda: self._revive() if self._stopped() else []))
-
-    def _stopped(self) -> bool:
-        return bool(self._words[self._attention] & STOP)
+        self._warn(self._mutex.run(lambda: self._revive() if self._is_stopped() else []))
 
     def _look_after_the_dead(self) -> bool:
-        """Give back what dead processes have; whether there was any."""
-        if self.value() or not self._is_suspicious():
+        """Now and then: whether tokens were lost, which are given back."""
+        now = time.monotonic()
+        if now < self._next_look:
             return False
-        self._looks = 0
-        released = self._arena.exclusively(self._revive)
-        self._warn(released)
-        return bool(released)
-
-    def _is_suspicious(self) -> bool:
-        noted = 0
-        for who, tokens in self._holders():
-            if not self._arena.is_alive(who):
-                return True
-            noted += tokens
-        self._looks = self._looks + 1 if noted < self._words[self._at + TOTAL] else 0
-        return self._looks > _UNNOTED
-
-    def _revive(self) -> list[int]:
-        """Give back the tokens of the dead; whose they were, 0 for one that was not noted."""
-        stop = self._attention * 8
-        released: list[int] = []
-        self._arena.bytes[stop] = 1
-        try:
-            self._arena.sleep(MOMENT)
-            if self._is_quiet():
-                for who in self._lost():
-                    self._abandon(who)
-                    released.append(who)
-        finally:
-            self._arena.bytes[stop] = 0
-        return released
-
-    def _is_quiet(self) -> bool:
-        """Wait until no living process is at the record; False if that takes too long."""
-        naps = round(_QUIET / _NAP)
-        while any(map(self._is_at_it, self._arena.slots())):
-            naps -= 1
-            if not naps:
-                return False
-            self._arena.sleep(_NAP)
+        self._next_look = now + SLICE
+        if not self._is_suspicious():
+            return False
+        self._warn(self._mutex.run(self._revive))
         return True
 
-    def _is_at_it(self, slot: int) -> bool:
+    # Reviving
+
+    def _is_suspicious(self) -> bool:
+        """Whether somebody who is gone has a token, or may have."""
         words = self._words
-        if words[slot + AT] != self._at:
+        if words[_IS_UNTRACKED] or self._get_value():
             return False
-        if self._arena.is_alive(words[slot + WHO]):
-            return True
-        words[slot + AT] = 0  # it died at it
-        return False
+        states = [(words[slot], slot) for slot in self._used()]
+        noted = sum(state == _HELD for state, _ in states)
+        # If all are noted, nobody who is only busy has one: most of those wait for it.
+        least = _HELD if noted == words[_TOTAL] else _BUSY
+        return any(self._is_gone(slot) for state, slot in states if state >= least)
 
-    def _lost(self) -> list[int]:
-        """For each lost token whose it was.  Clears the notes of the dead."""
-        missing = self._words[self._at + TOTAL] - self.value()
-        lost: list[int] = []
-        for who, tokens in self._holders():
-            if self._arena.is_alive(who):
-                missing -= tokens
-            else:
-                self._forget(who)
-                lost += [who] * tokens
-        # One may be noted twice or not at all: its holder died between the token and the note.
-        return (lost + [0] * max(0, missing))[: max(0, missing)]
+    def _revive(self) -> list[str]:
+        """Give back the tokens of those who are gone; the names of the dead.  With the mutex."""
+        self._revivals += 1
+        revival = self._revivals
+        words = self._words
+        released: list[str] = []
+        self._bytes[_STOP] = 1
+        try:
+            time.sleep(_MOMENT)
+            gone = self._wait_until_quiet()
+            time.sleep(_MOMENT)
+            lost = words[_TOTAL] - self._get_value()
+            lost -= sum(words[slot] == _HELD for slot in self._used() if slot not in gone)
+            if gone and lost > 0 and not words[_IS_UNTRACKED]:
+                released = self._abandon(gone)
+                # By another view of it: ours counts what this process has.
+                give = self._semlock(COUNTING).release
+                for _ in range(lost):
+                    if self._revivals != revival:
+                        break  # a signal's handler has done it all, in the middle of this
+                    give()
+            for slot, who in gone.items():
+                if words[slot + _WHO] == who:
+                    words[slot + _WHO] = 0
+        finally:
+            self._bytes[_STOP] = 0
+        return released
 
-    def _abandon(self, who: int) -> None:
-        self._words[self._at + DEAD] = who
-        self._arena.bytes[self._attention * 8 + 2] = 1
-        # By another view of it: this one counts what this process has.
-        self._arena.semaphore(self.offset, SEMAPHORE, self.maximum).release()
+    def _wait_until_quiet(self) -> dict[int, int]:
+        """Wait until nobody who is there is busy: the slots of all who are not.
 
-    def _warn(self, released: list[int]) -> None:
-        for who in dict.fromkeys(released):
+        None of them if that takes too long.
+        """
+        words = self._words
+        deadline = time.monotonic() + _QUIET
+        while True:
+            owners = {slot: words[slot + _WHO] for slot in self._used()}
+            gone = {slot: who for slot, who in owners.items() if self._is_gone(slot)}
+            if all(words[slot] != _BUSY for slot in owners.keys() - gone.keys()):
+                return gone
+            if time.monotonic() > deadline:
+                return {}
+            time.sleep(_NAP)
+
+    def _abandon(self, gone: dict[int, int]) -> list[str]:
+        """Have the next one who acquires it know whose it was; the names of all who are dead."""
+        words, bytes_ = self._words, self._bytes
+        dead = [slot for slot in gone if words[slot] in (_BUSY, _HELD)]
+        dead = [slot for slot in dead if words[slot] == _HELD] or dead
+        for slot in dead[-1:]:
+            bytes_[8 * _DEAD : 8 * _DEAD + 64] = bytes_[8 * slot : 8 * slot + 64]
+            bytes_[_ABANDONED] = 1
+        return list(map(self._named, dead))
+
+    def _warn(self, released: list[str]) -> None:
+        for process in dict.fromkeys(released):
             warnings.warn(
-                f"a {self.noun} was released for {self._arena.name(who)}, which ended while it had "
-                "it: what it guards may be half changed",
+                f"{process} ended while it held a lock or semaphore, which is released: what it "
+                "guards may be half changed",
                 RuntimeWarning,
-                stacklevel=5,
+                stacklevel=7,  # who called acquire()
             )
 
-    def after_fork(self) -> None:
-        """In a process that somebody else forked: what the parent has is not ours."""
-        self._sem._after_fork()
-        self._me = self._arena.me
+    # Slots
+
+    def _used(self) -> Iterator[int]:
+        """All slots that belong to somebody."""
+        return compress(_SLOTS, self._words[_SLOTS.start + _WHO :: _SLOTS.step].tolist())
+
+    def _is_gone(self, slot: int) -> bool:
+        who = self._words[slot + _WHO]
+        return self._words[slot] == _LEFT or not (who == self._me or identity.is_alive(who))
+
+    def _named(self, slot: int) -> str:
+        start = 8 * (slot + _NAME)
+        name = bytes(self._bytes[start : start + _NAME_BYTES]).rstrip(b"\0")
+        pid = identity.pid(self._words[slot + _WHO])
+        return f"{name.decode(errors='replace')} (pid {pid})"
+
+    def _claim(self) -> int:
+        """One more slot for this process.  With the mutex."""
+        for _ in range(0 if self._words[_IS_UNTRACKED] else 2):
+            # One iterator for all: whoever interrupts this search looks at other slots.
+            for slot in self._candidates:
+                if not self._words[slot + _WHO]:
+                    return self._settle(slot)
+            self._revive()
+            self._candidates = iter(_SLOTS)
+        # More tokens are taken, or waited for, than can be told apart.
+        self._words[_IS_UNTRACKED] = True
+        return _NO_SLOT
+
+    def _settle(self, slot: int) -> int:
+        words, start = self._words, 8 * (slot + _NAME)
+        words[slot] = _IDLE
+        name = current_process().name.encode()[:_NAME_BYTES]
+        self._bytes[start : start + _NAME_BYTES] = name.ljust(_NAME_BYTES, b"\0")
+        words[slot + _WHO] = self._me  # last: from here on it is ours
+        return slot
+
+    def _semlock(self, kind: int) -> SemLock:
+        # Without a name it takes the handle, an address here, as it is.  What it does at its end,
+        # ``sem_close``, is refused for an address that ``sem_open`` never gave.
+        return SemLock._rebuild(self.block.address, kind, self.maximum, None)
+
+
+_all: weakref.WeakSet[SharedSemaphore] = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    for semaphore in _all:
+        semaphore._after_fork()
+
+
+os.register_at_fork(after_in_child=_after_fork)
