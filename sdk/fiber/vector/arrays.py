@@ -7,6 +7,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from gymnasium import Space
 
+from fiber._hub import client, handles, heap
+from fiber._hub.handles import BlockHandle
+from fiber._hub.protocol import ObjectKind
 from fiber.vector.columns import Allocate, Array, Carver, Rows, columns_of
 
 Packed: TypeAlias = tuple[Any, Array | None, Array | None, Array | None]
@@ -20,7 +23,7 @@ class Shape(NamedTuple):
     """Of one environment."""
     action_space: Space[Any]
     """Of one environment."""
-    count: int
+    num_envs: int
     """How many environments."""
     workers: int
 
@@ -32,14 +35,14 @@ class Shape(NamedTuple):
 
 
 class StepArrays:
-    """The arrays of ``shape.count`` environments, a row for each."""
+    """The arrays of ``shape.num_envs`` environments, a row for each."""
 
     def __init__(self, shape: Shape, allocate: Allocate) -> None:
-        self.actions = columns_of(shape.action_space, shape.count, allocate)
-        self.observations = columns_of(shape.observation_space, shape.count, allocate)
-        self.rewards = allocate((shape.count,), np.float64)
-        self.terminations = allocate((shape.count,), np.bool_)
-        self.truncations = allocate((shape.count,), np.bool_)
+        self.actions = columns_of(shape.action_space, shape.num_envs, allocate)
+        self.observations = columns_of(shape.observation_space, shape.num_envs, allocate)
+        self.rewards = allocate((shape.num_envs,), np.float64)
+        self.terminations = allocate((shape.num_envs,), np.bool_)
+        self.truncations = allocate((shape.num_envs,), np.bool_)
         self.at_work = allocate((shape.workers,), np.int64)
         """One more than the row that each worker is busy with; what tells it if the worker dies."""
 
@@ -93,3 +96,24 @@ class StepArrays:
             self.rewards[rows] = rewards
             self.terminations[rows] = terminations
             self.truncations[rows] = truncations
+
+
+class SharedMemory:
+    """A block of the heap that goes to other processes of this host."""
+
+    def __init__(self, block: heap.Block) -> None:
+        self._block = block
+        self.view = block.view
+        self.host = client.host()
+
+    @classmethod
+    def allocate(cls, size: int) -> SharedMemory:
+        """Memory of ``size`` bytes, all zero."""
+        return cls(heap.allocate(size))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _attach, (handles.handle_for_block(ObjectKind.MEMORY, self._block),)
+
+
+def _attach(handle: BlockHandle) -> SharedMemory:
+    return SharedMemory(handle.block())

@@ -107,8 +107,8 @@ class ArrayColumn:
 class ObjectColumn:
     """Values of any kind."""
 
-    def __init__(self, count: int) -> None:
-        self._values: list[Any] = [None] * count
+    def __init__(self, values: Array) -> None:
+        self._values = values
 
     def put(self, row: int, value: Any) -> None:
         self._values[row] = value
@@ -120,11 +120,13 @@ class ObjectColumn:
         return False  # it would have to travel all the same
 
     def fill(self, rows: Rows, batch: Iterable[Any]) -> None:
-        for row, value in zip(self._numbers(rows), batch, strict=True):
+        numbers = range(len(self._values))[rows] if isinstance(rows, slice) else rows
+        # One by one: NumPy would look into values that are sequences.
+        for row, value in zip(numbers, batch, strict=True):
             self._values[row] = value
 
     def batch(self, rows: Rows) -> tuple[Any, ...]:
-        return tuple(self._values[row] for row in self._numbers(rows))
+        return tuple(self._values[rows].tolist())
 
     def pack(self, rows: Rows, *, shared: bool) -> tuple[Any, ...]:
         return self.batch(rows)
@@ -133,10 +135,7 @@ class ObjectColumn:
         self.fill(rows, packed)
 
     def part(self, first: int, count: int) -> ObjectColumn:
-        return ObjectColumn(count)
-
-    def _numbers(self, rows: Rows) -> Sequence[int]:
-        return range(len(self._values))[rows] if isinstance(rows, slice) else rows
+        return ObjectColumn(self._values[first : first + count])
 
 
 class DictColumns:
@@ -226,8 +225,8 @@ def columns_of(space: Space[Any], count: int, allocate: Allocate) -> Columns:
     if isinstance(space, spaces.Tuple):
         return TupleColumns([columns_of(part, count, allocate) for part in space.spaces])
     if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
-        return ArrayColumn(allocate((count, *space.shape), space.dtype))
-    return ObjectColumn(count)
+        return ArrayColumn(allocate((count, *(space.shape or ())), space.dtype))
+    return ObjectColumn(np.empty(count, object))
 
 
 class Carver:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 from gymnasium import Env
@@ -62,8 +62,18 @@ class Slot:
         """Begin an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         arrays.put(self.row, observation, 0.0, False, False)
-        self._over, self._lost = False, None
-        return Note(self.row, info) if info else None
+        lost, self._lost = self._lost, None
+        self._over = False
+        return Note(self.row, info, lost=lost) if info or lost else None
+
+    def call(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+        """What a method of the environment returns, or the value of an attribute."""
+        attribute = self.env.get_wrapper_attr(name)
+        return attribute(*args, **kwargs) if callable(attribute) else attribute
+
+    def set_attr(self, name: str, value: Any) -> None:
+        """Set an attribute where a wrapper or the environment has it."""
+        self.env.set_wrapper_attr(name, value)
 
     def lose(self, why: str) -> None:
         """Its episode cannot go on."""

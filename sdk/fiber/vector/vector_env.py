@@ -9,14 +9,15 @@ from typing import Any, TypeAlias, TypeVar
 import gymnasium.vector
 import numpy as np
 import numpy.typing as npt
-from gymnasium import Space, logger
+from gymnasium import logger
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.async_vector_env import AsyncState
+from gymnasium.vector.utils import iterate
 
-from fiber.vector import batching, calls
-from fiber.vector.setting import Setting
 from fiber.vector.slot import MakeEnv, Note
+from fiber.vector.spaces import ObservationMode
+from fiber.vector.sub_environments import SubEnvironments
 
 _Result = TypeVar("_Result")
 
@@ -58,7 +59,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         shared_memory: bool = True,
         copy: bool = True,
         context: str | None = None,
-        observation_mode: str | tuple[Space[Any], Space[Any]] = "same",
+        observation_mode: ObservationMode = "same",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         on_error: str = "raise",
         timeout: float | None = None,
@@ -66,7 +67,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         self.closed = True  # until there is something to close
         self.copy = copy
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self._setting = setting = Setting(
+        self._sub_environments = sub_environments = SubEnvironments(
             env_fns,
             owner=type(self).__name__,
             num_workers=num_workers,
@@ -78,14 +79,14 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             timeout=timeout,
         )
         self.num_envs = len(env_fns)
-        self.metadata = setting.metadata | {"autoreset_mode": self.autoreset_mode}
-        self.render_mode = setting.render_mode
-        self.single_observation_space = setting.spaces.single_observation_space
-        self.observation_space = setting.spaces.observation_space
-        self.single_action_space = setting.spaces.single_action_space
-        self.action_space = setting.spaces.action_space
-        self._arrays = setting.arrays
-        self._dispatcher = setting.dispatcher
+        self.metadata = sub_environments.metadata | {"autoreset_mode": self.autoreset_mode}
+        self.render_mode = sub_environments.render_mode
+        self.single_observation_space = sub_environments.spaces.single_observation_space
+        self.observation_space = sub_environments.spaces.observation_space
+        self.single_action_space = sub_environments.spaces.single_action_space
+        self.action_space = sub_environments.spaces.action_space
+        self._arrays = sub_environments.arrays
+        self._dispatcher = sub_environments.dispatcher
         self._state = AsyncState.DEFAULT
         self._received: Sequence[int] | None = None
         """The environments of the last ``recv``; None: all."""
@@ -98,7 +99,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         """The seed of each environment."""
         return self.get_attr("np_random_seed")
 
-    @property
+    @property  # type: ignore[misc]  # it cannot be set here, as in AsyncVectorEnv
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """A copy of each environment's generator."""
         return self.get_attr("np_random")
@@ -128,7 +129,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         numbers = None if mask is None else np.flatnonzero(mask).tolist()
         if numbers is not None:
             seeds = [seeds[number] for number in numbers]
-        self._dispatcher.reset(numbers, seeds, [options] * len(seeds), together=False)
+        self._dispatcher.reset(numbers, seeds, [options] * len(seeds))
         self._state = AsyncState.WAITING_RESET
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
@@ -220,9 +221,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         self._check_idle("call_async")
         if name in ("reset", "step", "close"):
             raise ValueError(f"call {name}() of the vector environment, not of each environment")
-        given = (name, args, kwargs)
-        self._dispatcher.apply(calls.call, dict.fromkeys(range(self.num_envs), given))
-        self._state = AsyncState.WAITING_CALL
+        self._call("call", [(name, args, kwargs)] * self.num_envs)
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
         """What ``call`` returns; TimeoutError after ``timeout`` seconds."""
@@ -243,9 +242,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
                 f"values for {self.num_envs} environments are needed, one for each, not "
                 f"{len(values)}"
             )
-        given = {number: (name, value) for number, value in enumerate(values)}
-        self._dispatcher.apply(calls.set_wrapper_attr, given)
-        self._dispatcher.results()
+        self._call("set_attr", [(name, value) for value in values])
+        self.call_wait()
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
         """Close the environments and end their processes.
@@ -257,7 +255,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             logger.warn(
                 f"Calling `close` while waiting for a pending call to `{state.value}` to complete."
             )
-        self._setting.close(0 if terminate else timeout)
+        self._sub_environments.close(0 if terminate else timeout)
 
     def __del__(self) -> None:
         if not getattr(self, "closed", True):
@@ -272,8 +270,16 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             columns.fill(slice(None) if numbers is None else numbers, actions)
             self._dispatcher.step(numbers, None, together=together)
         else:
-            chosen = batching.each(self.action_space, actions, count)
+            chosen = list(iterate(self.action_space, actions))
+            if len(chosen) != count:
+                raise ValueError(
+                    f"actions for {count} environments are needed, one for each, not {len(chosen)}"
+                )
             self._dispatcher.step(numbers, chosen, together=together)
+
+    def _call(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> None:
+        self._dispatcher.call(range(self.num_envs), method, arguments)
+        self._state = AsyncState.WAITING_CALL
 
     def _observations(self) -> Any:
         batch = self._arrays.observations.batch(slice(None))
@@ -384,11 +390,15 @@ def _without_mask(
     if options is None or "reset_mask" not in options:
         return None, options
     mask = options["reset_mask"]
-    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
-        kind = f"{mask.dtype} array" if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise TypeError(f"`options['reset_mask']` must be a NumPy array of bool, not a {kind}")
+    if not isinstance(mask, np.ndarray):
+        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
     if mask.shape != (count,):
-        raise ValueError(f"`options['reset_mask']` must have shape {(count,)}, not {mask.shape}")
+        raise ValueError(f"`options['reset_mask']` must have shape `{(count,)}`, got {mask.shape}")
+    if mask.dtype != np.bool_:
+        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
     if not mask.any():
-        raise ValueError("`options['reset_mask']` must be True for at least one environment")
+        raise ValueError(
+            "`options['reset_mask']` must contain a boolean array with at least one True value, "
+            f"got reset_mask={mask}"
+        )
     return mask, {key: value for key, value in options.items() if key != "reset_mask"}

@@ -1,20 +1,14 @@
 """The worker: a process with many environments, which steps them as it is told.
 
-It is told by tuples ``(operation, generation, ...)`` and answers with tuples
-``(generation, rows, results, notes, failures)``: which environments are done, what travels of what
-they gave (nothing, where memory is shared), what else there is to say, and which of them failed.  A
-command has one answer or, where ``together`` is not asked for, several: what is done does not wait
-for an environment that is slow.
+A command is a tuple ``(operation, generation, rows, ...)``.  It has one answer or, where
+``together`` is not asked for, several: what is done does not wait for an environment that is slow.
 """
 
 from __future__ import annotations
 
-import faulthandler
-import pickle
-import signal
+import contextlib
 import time
-import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from gymnasium.vector import AutoresetMode
@@ -22,19 +16,24 @@ from gymnasium.vector import AutoresetMode
 from fiber import reduction
 from fiber._hub import client
 from fiber.connection import Connection
-from fiber.errors import FiberError, UnpicklableError
-from fiber.vector.arrays import Packed, Shape, StepArrays
-from fiber.vector.memory import SharedMemory
+from fiber.errors import UnpicklableError
+from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays
+from fiber.vector.failures import Failure, summary
 from fiber.vector.slot import MakeEnv, Note, Slot
+from fiber.vector.time_limit import TimeLimit
 
 REPORT_AFTER = 200e-6
 """Seconds that what is done may wait for more, so that many quick steps make one message."""
 
 
+MEMORY = 0.99
+"""What is left, a step later, of how slow an environment was."""
+
+
 class Setup(NamedTuple):
     """What a worker is to be."""
 
-    index: int
+    worker: int
     first: int
     """The number of its first environment; rows count from there."""
     makes: Sequence[MakeEnv]
@@ -67,39 +66,40 @@ class Begin(NamedTuple):
     """What became of that worker."""
 
 
-class Failure(NamedTuple):
-    """An operation of one environment that raised."""
+class Answer(NamedTuple):
+    """What it says of steps and resets."""
 
-    row: int
-    doing: str
-    error: bytes
-    """The pickled exception."""
-    trace: str
+    generation: int
+    rows: Sequence[int] | None
+    """Which environments are done; None for all of the worker's."""
+    packed: Packed | None
+    notes: Sequence[Note]
+    failures: Sequence[Failure]
+    """Of environments that are not among ``rows``."""
 
-    @classmethod
-    def of(cls, row: int, doing: str, error: BaseException) -> Failure:
-        """The failure that ``error`` is."""
-        trace = "".join(traceback.format_exception(error))
-        return cls(row, doing, _pickled(error), trace)
+
+class Results(NamedTuple):
+    """What it says of a call."""
+
+    generation: int
+    values: list[Any]
+    failures: Sequence[Failure]
 
 
 def serve(connection: Connection, setup: Setup) -> None:
     """The target of a worker process."""
-    if setup.timeout is not None:
-        _die_of_alarms()
     slots: list[Slot] = []
-    for row, make in enumerate(setup.makes):
-        try:
-            slots.append(Slot(row, make, setup.autoreset))
-        except Exception as error:
-            connection.send(Failure.of(row, "being made", error))
-            return
     try:
+        for row, make in enumerate(setup.makes):
+            try:
+                slots.append(Slot(row, make, setup.autoreset))
+            except Exception as error:
+                connection.send(Failure.of(row, "the making", error))
+                return
         connection.send(_hello(slots))
-        begin: Begin = connection.recv()
-        Worker(connection, setup, slots, begin).run()
+        Worker(connection, setup, slots, connection.recv()).run()
     except (EOFError, BrokenPipeError):
-        pass  # whoever wants them stepped is gone
+        pass  # whoever wanted them stepped is gone, or has closed them
     finally:
         for slot in slots:
             slot.env.close()
@@ -116,33 +116,33 @@ class Worker:
         self._slots = slots
         self._all = range(len(slots))
         self._took = [0.0] * len(slots)
-        """Seconds that each environment's last step took."""
+        """Seconds that each environment's steps take, if they are slow: that is slowly forgotten."""
+        self._limit: contextlib.AbstractContextManager[None] = (
+            contextlib.nullcontext() if setup.timeout is None else TimeLimit(setup.timeout)
+        )
         self._shared = begin.memory is not None
         if begin.memory is None:
             self._arrays = StepArrays.private(begin.shape)
-            self._at_work = None
         else:
             arrays = StepArrays.of_memory(begin.shape, begin.memory.view)
             self._arrays = arrays.part(setup.first, len(slots))
-            self._at_work = arrays.at_work
         self._arrays.unpack(slice(None), begin.last)
+        # Where nobody else sees it, it does no harm.
+        self._at_work = self._arrays.at_work
         if begin.lost is not None:
             for slot in slots:
                 slot.lose(begin.lost)
         self._operations: dict[str, Callable[..., None]] = {
-            "apply": self._apply,
+            "call": self._call,
             "reset": self._reset,
             "step": self._step,
         }
 
     def run(self) -> None:
-        """Until the end of the connection, or until told."""
+        """Until EOFError: the end of the connection."""
         while True:
             operation, *arguments = self._connection.recv()
-            if operation == "close":
-                break
             self._operations[operation](*arguments)
-            self._rest()
 
     # Operations
 
@@ -152,20 +152,18 @@ class Worker:
         """``actions``: None where they are in the arrays already, a list, or packed."""
         arrays, slots = self._arrays, self._slots
         if isinstance(actions, list):
-            chosen = dict(zip(self._all if rows is None else rows, actions, strict=True))
-
-            def step(row: int) -> Note | None:
-                return slots[row].step(chosen[row], arrays)
+            chosen = dict(zip(self._each(rows), actions, strict=True))
+            action_of: Callable[[int], Any] = chosen.__getitem__
         else:
             if actions is not None:
                 (packed,) = actions
                 arrays.actions.unpack(slice(None) if rows is None else rows, packed)
             action_of = arrays.actions.get
 
-            def step(row: int) -> Note | None:
-                return slots[row].step(action_of(row), arrays)
+        def step(row: int) -> Note | None:
+            return slots[row].step(action_of(row), arrays)
 
-        self._each(generation, rows, step, "step", together)
+        self._do(_Report(generation), rows, step, "step", together)
 
     def _reset(
         self,
@@ -173,116 +171,107 @@ class Worker:
         rows: Sequence[int] | None,
         seeds: Sequence[int | None],
         options: Sequence[dict[str, Any] | None],
-        together: bool,
     ) -> None:
-        arguments = dict(
-            zip(
-                self._all if rows is None else rows,
-                zip(seeds, options, strict=True),
-                strict=True,
-            )
-        )
+        arguments = dict(zip(self._each(rows), zip(seeds, options, strict=True), strict=True))
 
         def reset(row: int) -> Note | None:
             return self._slots[row].reset(self._arrays, *arguments[row])
 
-        self._each(generation, rows, reset, "reset", together)
+        self._do(_Report(generation), rows, reset, "reset", together=False)
 
-    def _apply(
+    def _call(
         self,
         generation: int,
-        rows: Sequence[int],
-        function: Callable[..., Any],
+        rows: Sequence[int] | None,
+        method: str,
         arguments: Sequence[tuple[Any, ...]],
     ) -> None:
-        """``function(environment, ...)`` for each: the results are what it returns."""
-        results, failures = [], []
-        for row, mine in zip(rows, arguments, strict=True):
+        """A method of each slot: the results are what it returns."""
+        values, failures = [], []
+        for row, mine in zip(self._each(rows), arguments, strict=True):
             try:
-                results.append(function(self._slots[row].env, *mine))
+                values.append(getattr(self._slots[row], method)(*mine))
             except Exception as error:
                 failures.append(Failure.of(row, "a call", error))
         try:
-            self._connection.send((generation, rows, results, [], failures))
+            self._connection.send(Results(generation, values, failures))
         except UnpicklableError as error:
-            told = Failure.of(rows[0], "a call", error)
-            self._connection.send((generation, rows, [], [], [told]))
+            failures.append(Failure.of(self._each(rows)[0], "a call", error))
+            self._connection.send(Results(generation, [], failures))
 
     # What they have in common
 
-    def _each(
+    def _each(self, rows: Sequence[int] | None) -> Sequence[int]:
+        return self._all if rows is None else rows
+
+    def _do(
         self,
-        generation: int,
+        report: _Report,
         rows: Sequence[int] | None,
         operation: Callable[[int], Note | None],
         doing: str,
         together: bool,
     ) -> None:
-        report = _Report(generation)
+        """An operation of each environment; what is done is told as soon as the next one is
+        expected to keep it waiting, or at the end if they are wanted ``together``.
+        """
         clock = time.perf_counter
-        for row in self._all if rows is None else rows:
-            began = clock()
+        worker, at_work, limit = self._setup.worker, self._at_work, self._limit
+        now = clock()
+        for row in self._each(rows):
+            began = now
             if report.rows and not together and began + self._took[row] > report.due:
-                self._send(report)
-                report = _Report(generation)
-            self._note_work(row)
+                self._send(report, whole=False)
+                report = _Report(report.generation)
+            at_work[worker] = row + 1
             try:
-                note = operation(row)
+                with limit:
+                    note = operation(row)
             except Exception as error:
-                note = self._failed(row, operation, doing, error, report)
-            if note is not None:
-                report.notes.append(note)
+                self._retry(row, operation, doing, error, report)
+            else:
+                report.add(row, note)
             now = clock()
-            self._took[row] = now - began
-            if not report.rows:
+            self._took[row] = max(now - began, MEMORY * self._took[row])
+            if len(report.rows) == 1:
                 report.due = now + REPORT_AFTER
-            report.rows.append(row)
+        at_work[worker] = 0
         self._send(report, whole=rows is None and len(report.rows) == len(self._all))
 
-    def _failed(
+    def _retry(
         self,
         row: int,
         operation: Callable[[int], Note | None],
         doing: str,
         error: Exception,
         report: _Report,
-    ) -> Note | None:
+    ) -> None:
         """Try again with a new environment, if that is wished; else tell."""
         if self._setup.restart:
-            why = "".join(traceback.format_exception_only(error)).strip()
             try:
-                self._slots[row].make_anew(f"{doing} raised {why}")
-                return operation(row)
+                self._slots[row].make_anew(f"{doing} raised {summary(error)}")
+                with self._limit:
+                    note = operation(row)
             except Exception as again:
                 again.__cause__ = error
                 error = again
+            else:
+                report.add(row, note)
+                return
         report.failures.append(Failure.of(row, doing, error))
-        return None
 
-    def _note_work(self, row: int) -> None:
-        if self._at_work is not None:
-            self._at_work[self._setup.index] = row + 1
-        if self._setup.timeout is not None:
-            signal.setitimer(signal.ITIMER_REAL, self._setup.timeout)
-
-    def _rest(self) -> None:
-        if self._at_work is not None:
-            self._at_work[self._setup.index] = 0
-        if self._setup.timeout is not None:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-
-    def _send(self, report: _Report, *, whole: bool = False) -> None:
+    def _send(self, report: _Report, *, whole: bool) -> None:
         try:
-            self._connection.send(report.message(self._arrays, whole=whole, shared=self._shared))
+            self._connection.send(report.answer(self._arrays, whole=whole, shared=self._shared))
         except UnpicklableError:
             self._blame(report)
-            self._connection.send(report.message(self._arrays, whole=False, shared=self._shared))
+            self._connection.send(report.answer(self._arrays, whole=False, shared=self._shared))
 
     def _blame(self, report: _Report) -> None:
         """Some of it does not pickle: those environments have failed."""
         notes = {note.row: note for note in report.notes}
         for row in list(report.rows):
-            told = notes.get(row), self._arrays.observations.pack([row], shared=True)
+            told = notes.get(row), self._arrays.observations.pack([row], shared=self._shared)
             try:
                 reduction.dumps(told)
             except Exception as error:
@@ -301,36 +290,26 @@ class _Report:
         self.failures: list[Failure] = []
         self.due = 0.0
 
+    def add(self, row: int, note: Note | None) -> None:
+        """An environment is done."""
+        self.rows.append(row)
+        if note is not None:
+            self.notes.append(note)
+
     def fail(self, failure: Failure) -> None:
         """One of them cannot be told."""
         self.rows.remove(failure.row)
         self.notes = [note for note in self.notes if note.row != failure.row]
         self.failures.append(failure)
 
-    def message(self, arrays: StepArrays, *, whole: bool, shared: bool) -> tuple[Any, ...]:
-        """The answer; ``whole``: all environments of the worker are in it."""
+    def answer(self, arrays: StepArrays, *, whole: bool, shared: bool) -> Answer:
+        """What is told; ``whole``: all environments of the worker are in it."""
         packed = arrays.pack(slice(None) if whole else self.rows, shared=shared)
         rows = None if whole else self.rows
-        return self.generation, rows, packed, self.notes, self.failures
+        return Answer(self.generation, rows, packed, self.notes, self.failures)
 
 
-def _hello(slots: Iterable[Slot]) -> Hello:
+def _hello(slots: Sequence[Slot]) -> Hello:
     envs = [slot.env for slot in slots]
     spaces = [(env.observation_space, env.action_space) for env in envs]
     return Hello(client.host(), dict(envs[0].metadata), envs[0].render_mode, spaces)
-
-
-def _die_of_alarms() -> None:
-    """An alarm ends this process, whatever holds the interpreter, and shows where it was."""
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    faulthandler.register(signal.SIGALRM, file=2, all_threads=True, chain=True)
-
-
-def _pickled(error: BaseException) -> bytes:
-    """The exception, or what can be said of one that does not survive pickling."""
-    try:
-        data = reduction.dumps(error)
-        pickle.loads(data)
-    except Exception:
-        return pickle.dumps(FiberError("".join(traceback.format_exception_only(error)).strip()))
-    return data

@@ -1,25 +1,23 @@
-"""What a vector environment is made of, whichever face it has."""
+"""What both vector environments are made of: Gymnasium's and stable-baselines3's."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
-from gymnasium import Space
 from gymnasium.vector import AutoresetMode
 
 import fiber
 from fiber import cpu
-from fiber.vector import batching
-from fiber.vector.arrays import Shape, StepArrays
+from fiber.vector.arrays import Shape, SharedMemory, StepArrays
 from fiber.vector.dispatcher import Dispatcher
-from fiber.vector.memory import SharedMemory
 from fiber.vector.slot import MakeEnv
-from fiber.vector.worker import Hello, Setup
+from fiber.vector.spaces import ObservationMode, Spaces
+from fiber.vector.worker import Setup
+from fiber.vector.worker_process import WorkerProcess
 from fiber.vector.worker_set import WorkerSet
 
 
-class Setting:
+class SubEnvironments:
     """Workers with their environments, the arrays of a step, and the spaces of both."""
 
     def __init__(
@@ -30,7 +28,7 @@ class Setting:
         num_workers: int | None,
         shared_memory: bool,
         context: str | None,
-        observation_mode: str | tuple[Space[Any], Space[Any]],
+        observation_mode: ObservationMode,
         autoreset: AutoresetMode,
         on_error: str,
         timeout: float | None,
@@ -49,21 +47,24 @@ class Setting:
             Setup(index, rows.start, env_fns[rows], autoreset, on_error == "restart", timeout)
             for index, rows in enumerate(_divided(count, min(wanted, count)))
         ]
-        self._workers = WorkerSet(setups, fiber.get_context(context), owner)
-        self.dispatcher = Dispatcher(setups, self._workers)
+        chosen = fiber.get_context(context)
+        workers = [WorkerProcess(setup, chosen, owner) for setup in setups]
+        self.dispatcher = Dispatcher(WorkerSet(workers), restart=on_error == "restart")
         try:
             self.dispatcher.start()
-            hellos: list[Hello] = [self.dispatcher.hellos[setup.index] for setup in setups]
+            hellos = [worker.hello for worker in workers if worker.hello is not None]
             self.metadata = hellos[0].metadata
             self.render_mode = hellos[0].render_mode
-            self.spaces = batching.spaces_of(
+            self.spaces = Spaces.of(
                 [pair for hello in hellos for pair in hello.spaces],
                 observation_mode,
                 self.dispatcher.name,
             )
-            spaces = self.spaces
             shape = Shape(
-                spaces.single_observation_space, spaces.single_action_space, count, len(setups)
+                self.spaces.single_observation_space,
+                self.spaces.single_action_space,
+                count,
+                len(setups),
             )
             memory = SharedMemory.allocate(shape.size()) if shared_memory else None
             self.arrays = (
