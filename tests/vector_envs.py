@@ -64,8 +64,10 @@ class Faulty(gymnasium.Env[Any, Any]):
 
     GOOD, RAISE, EXIT, SEGFAULT, HANG, HANG_NATIVE, WAIT, UNPICKLABLE, SLOW = range(9)
 
-    def __init__(self, gate: Path | None = None) -> None:
-        """``gate``: what ``WAIT`` waits for to exist."""
+    def __init__(self, gate: Path | None = None, *, last: Path | None = None) -> None:
+        """``gate``: what ``WAIT`` waits for to exist; once ``last`` does, none can be made."""
+        if last is not None and last.exists():
+            os._exit(3)
         self._gate = gate
         self.steps = 0.0
 
@@ -104,3 +106,7 @@ class Faulty(gymnasium.Env[Any, Any]):
 
     def pid(self) -> int:
         return os.getpid()
+
+    def exit(self, row: float) -> None:
+        if self.steps == row:
+            os._exit(4)

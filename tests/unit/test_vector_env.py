@@ -134,9 +134,7 @@ def test_spaces_that_differ(vector_env: Make) -> None:
     makes = [partial(Sampling, spaces.Box(0, high, (2,))) for high in (1, 2, 3)]
     env = vector_env(makes, observation_mode="different")
     play_both(env, SyncVectorEnv(makes, observation_mode="different"))
-    with pytest.raises(
-        RuntimeError, match=r"equivalent\. environment 1, of worker .*worker-1'"
-    ):
+    with pytest.raises(RuntimeError, match=r"equivalent\. environment 1, of worker .*worker-1'"):
         VectorEnv(makes, num_workers=2)
     makes[2] = partial(Sampling, spaces.Box(0, 1, (3,)))
     with pytest.raises(RuntimeError, match=r"share a common shape .*environment 2, of .*worker-1'"):

@@ -50,7 +50,7 @@ class Dispatcher:
         """Start the workers and wait until each has its environments."""
         for worker in self._workers:
             self._workers.start(worker)
-        self._wait(lambda: all(worker.hello for worker in self._workers) or self._failed(), None)
+        self._wait(lambda: all(worker.hello or worker.error for worker in self._workers), None)
 
     def begin(self, shape: Shape, arrays: StepArrays, memory: SharedMemory | None) -> None:
         """Give them the arrays: those of this host share them, if they lie in ``memory``."""
@@ -116,16 +116,13 @@ class Dispatcher:
 
     def wait_for(self, count: int, timeout: float | None = None) -> list[int]:
         """The numbers of the ``count`` environments that answered first."""
-        self._wait(lambda: len(self._ready) >= count or self._failed(), timeout)
+        self._wait(lambda: len(self._ready) >= count or bool(self._failures), timeout)
         return [self._ready.popleft() for _ in range(count)]
 
     def results(self, timeout: float | None = None) -> list[Any]:
         """What the methods of ``call`` returned, in its order."""
         calls = self._calls
-        self._wait(
-            lambda: all(group.worker.results is not None for group in calls) or self._failed(),
-            timeout,
-        )
+        self._wait(lambda: all(group.worker.results is not None for group in calls), timeout)
         by_position: dict[int, Any] = {}
         for group in calls:
             by_position |= zip(group.positions, group.worker.results or (), strict=True)
@@ -199,7 +196,6 @@ class Dispatcher:
         shape = self._shape if memory else self._shape._replace(num_envs=len(worker.numbers))
         last = worker.arrays.pack(slice(None), shared=bool(memory)) if worker.lost else None
         begin = Begin(shape, memory, last, worker.lost)
-        worker.lost = None
         self._workers.send(worker, reduction.dumps(begin))
 
     def _shares(self, worker: WorkerProcess) -> bool:
@@ -255,15 +251,12 @@ class Dispatcher:
         for note in answer.notes:
             self._notes[first + note.row] = note
             if note.lost not in (None, worker.lost):
-                self._warn(f"environment {first + note.row} is made anew: {note.lost}")
+                self._warn(f"environment {first + note.row} made anew: {note.lost}")
         self._set_deadline(worker)
 
     def _told(self, worker: WorkerProcess, failure: Failure) -> tuple[int, Exception]:
         number = worker.setup.first + failure.row
         return number, failure.exception(self.name(number))
-
-    def _failed(self) -> bool:
-        return bool(self._failures)
 
     def _raise_failure(self) -> None:
         if self._failures:
@@ -286,10 +279,10 @@ class Dispatcher:
             self._lose(worker, error)
             return
         if any(group.worker is worker and worker.results is None for group in self._calls):
-            self._failures.append(
-                (worker.setup.first, error)
-            )  # nobody knows what of the call was done
-        self._warn(f"{worker.whose()}: worker {worker.name!r} is started anew: {error}")
+            # Nobody knows what of the call was done.
+            worker.results = []
+            self._failures.append((worker.setup.first, error))
+        self._warn(f"{worker.whose()} made anew: {error}")
         self._workers.drop(worker)
         worker.hello, worker.lost, worker.deadline = None, str(error), None
         self._workers.start(worker)
@@ -297,6 +290,7 @@ class Dispatcher:
     def _lose(self, worker: WorkerProcess, error: Exception) -> None:
         """There is no worker for its environments any more."""
         worker.error = error
+        worker.results = []
         worker.pending.clear()
         worker.deadline = None
         self._failures.append((worker.setup.first, error))

@@ -43,7 +43,7 @@ class Spaces(NamedTuple):
         environment is called in it.
         """
         observations, actions = zip(*pairs, strict=True)
-        single, batch = _observation_spaces(observations, mode)
+        single = mode[1] if isinstance(mode, tuple) else observations[0]
         equivalent = _equal if mode == "same" else is_space_dtype_shape_equiv
         for number, (observation, action) in enumerate(pairs):
             # Those of one worker are often one object, as pickling keeps them.
@@ -56,27 +56,29 @@ class Spaces(NamedTuple):
                     "the sub-environments action spaces are not equivalent, and one batch of "
                     f"actions is for all. {name(number)}, has {action}, not {actions[0]}"
                 )
+        batch = _batch_space(observations, mode)
         return cls(single, batch, actions[0], batch_space(actions[0], len(actions)))
 
 
-def _observation_spaces(
-    observations: Sequence[Space[Any]], mode: ObservationMode
-) -> tuple[Space[Any], Space[Any]]:
-    """The space of one observation, and of a batch of them."""
+def check_mode(mode: ObservationMode) -> None:
+    """TypeError or ValueError if there is no such mode."""
     if isinstance(mode, tuple):
         kinds = [type(part) for part in mode]
         if not all(issubclass(kind, Space) for kind in kinds):
             raise TypeError(f"Expected both elements of observation_mode to be Spaces, got {kinds}")
-        batch, single = mode
-        return single, batch
+    elif mode not in ("same", "different"):
+        raise ValueError(
+            "Invalid `observation_mode`, expected: 'same' or 'different' or tuple of single and "
+            f"batch observation space, actual got {mode}"
+        )
+
+
+def _batch_space(observations: Sequence[Space[Any]], mode: ObservationMode) -> Space[Any]:
+    if isinstance(mode, tuple):
+        return mode[0]
     if mode == "same":
-        return observations[0], batch_space(observations[0], len(observations))
-    if mode == "different":
-        return observations[0], batch_differing_spaces(list(observations))
-    raise ValueError(
-        "Invalid `observation_mode`, expected: 'same' or 'different' or tuple of single and batch "
-        f"observation space, actual got {mode}"
-    )
+        return batch_space(observations[0], len(observations))
+    return batch_differing_spaces(list(observations))
 
 
 def _equal(one: Space[Any], other: Space[Any]) -> bool:

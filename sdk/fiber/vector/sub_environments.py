@@ -11,7 +11,7 @@ from fiber import cpu
 from fiber.vector.arrays import Shape, SharedMemory, StepArrays
 from fiber.vector.dispatcher import Dispatcher
 from fiber.vector.slot import MakeEnv
-from fiber.vector.spaces import ObservationMode, Spaces
+from fiber.vector.spaces import ObservationMode, Spaces, check_mode
 from fiber.vector.worker import Setup
 from fiber.vector.worker_process import WorkerProcess
 from fiber.vector.worker_set import WorkerSet
@@ -41,6 +41,7 @@ class SubEnvironments:
             raise ValueError(f"timeout is a number of seconds above 0, not {timeout!r}")
         if num_workers is not None and num_workers < 1:
             raise ValueError(f"num_workers is at least 1, not {num_workers}")
+        check_mode(observation_mode)
         count = len(env_fns)
         wanted = cpu.cpu_count() if num_workers is None else num_workers
         setups = [

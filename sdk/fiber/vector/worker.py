@@ -116,7 +116,7 @@ class Worker:
         self._slots = slots
         self._all = range(len(slots))
         self._took = [0.0] * len(slots)
-        """Seconds that each environment's steps take, if they are slow: that is slowly forgotten."""
+        """Seconds that a step of each environment takes, if it is slow: slowly forgotten."""
         self._limit: contextlib.AbstractContextManager[None] = (
             contextlib.nullcontext() if setup.timeout is None else TimeLimit(setup.timeout)
         )

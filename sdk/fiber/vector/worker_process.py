@@ -50,7 +50,7 @@ class WorkerProcess:
         self.deaths = 0
         """Since it answered anything."""
         self.lost: str | None = None
-        """What became of the process before this one, if this one was not told yet."""
+        """What became of the process before this one."""
         self.error: Exception | None = None
         """Why there is none any more."""
 
@@ -76,7 +76,7 @@ class WorkerProcess:
 
     def death(self, row: int | None) -> Exception:
         """The error that tells of its end; ``row`` was at work then, if that is known."""
-        told = next(iter(self.pending.values()), None)
+        told = next(iter(self.pending.values()), None) if self.hello else None
         doing = told.operation if told else "a call" if self.hello else "the making"
         whose = self.whose() if row is None else f"environment {self.numbers[row]}"
         self.process.join(NEWS)
