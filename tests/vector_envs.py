@@ -100,7 +100,7 @@ class Faulty(gymnasium.Env[Any, Any]):
             case self.SLOW:
                 time.sleep(0.01)
             case self.UNPICKLABLE:
-                info["it"] = (each for each in ())
+                info["it"] = iter(int, 1)
         self.steps += 1
         return np.array([self.steps]), 1.0, False, False, info
 
