@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from copy import deepcopy
 from pathlib import Path
@@ -100,7 +101,7 @@ class Faulty(gymnasium.Env[Any, Any]):
             case self.SLOW:
                 time.sleep(0.01)
             case self.UNPICKLABLE:
-                info["it"] = iter(int, 1)
+                info["it"] = threading.Lock()
         self.steps += 1
         return np.array([self.steps]), 1.0, False, False, info
 
