@@ -60,10 +60,6 @@ class BaseContext:
     # What multiprocessing has and Fiber has not yet: each says what to use instead.
     Condition = staticmethod(unsupported("Condition"))
     Barrier = staticmethod(unsupported("Barrier"))
-    Value = staticmethod(unsupported("Value"))
-    Array = staticmethod(unsupported("Array"))
-    RawValue = staticmethod(unsupported("RawValue"))
-    RawArray = staticmethod(unsupported("RawArray"))
     Manager = staticmethod(unsupported("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
@@ -143,6 +139,42 @@ class BaseContext:
 
         config.use()
         return BoundedSemaphore(value)
+
+    # Shared memory
+
+    def Value(self, typecode_or_type: Any, *args: Any, lock: Any = True) -> Any:
+        """A ctypes object in shared memory, with a lock."""
+        from fiber.sharedctypes import Value
+
+        config.use()
+        return Value(typecode_or_type, *args, lock=lock)
+
+    def Array(
+        self,
+        typecode_or_type: Any,
+        size_or_initializer: int | Sequence[Any],
+        *,
+        lock: Any = True,
+    ) -> Any:
+        """A ctypes array in shared memory, with a lock."""
+        from fiber.sharedctypes import Array
+
+        config.use()
+        return Array(typecode_or_type, size_or_initializer, lock=lock)
+
+    def RawValue(self, typecode_or_type: Any, *args: Any) -> Any:
+        """A ctypes object in shared memory."""
+        from fiber.sharedctypes import RawValue
+
+        config.use()
+        return RawValue(typecode_or_type, *args)
+
+    def RawArray(self, typecode_or_type: Any, size_or_initializer: int | Sequence[Any]) -> Any:
+        """A ctypes array in shared memory."""
+        from fiber.sharedctypes import RawArray
+
+        config.use()
+        return RawArray(typecode_or_type, size_or_initializer)
 
     # Work
 

@@ -48,6 +48,10 @@ CLASSES = (
     "TestLock",
     "TestSemaphore",
     "TestEvent",
+    "TestValue",
+    "TestArray",
+    "TestSharedCTypes",
+    "TestSharedMemory",
 )
 # An agent on another host cannot share a pid or a file with the master.
 TIERS = {"local": ("core", "local"), "loopback": ("core",), "kubernetes": ("core",)}

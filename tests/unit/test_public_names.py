@@ -97,14 +97,12 @@ def test_classes_serve_in_annotations_and_isinstance(name: str) -> None:
 
 
 def test_whoever_makes_an_object_that_is_not_there_is_told_what_to_use() -> None:
-    class Own(fiber.shared_memory.ShareableList):
+    class Own(fiber.synchronize.Barrier):
         pass
 
-    for make in (Own, fiber.shared_memory.ShareableList, fiber.Manager):
-        with pytest.raises(fiber.NotInFiber, match=r"no .* yet.*Pipe or Queue"):
+    for make in (Own, fiber.synchronize.Barrier, fiber.Barrier, fiber.get_context("spawn").Barrier):
+        with pytest.raises(fiber.NotInFiber, match=r"no Barrier yet.*Semaphore"):
             make()
-    with pytest.raises(fiber.NotInFiber, match=r"no SharedMemory yet.*Pipe or Queue"):
-        fiber.shared_memory.SharedMemory(create=True, size=16)
 
 
 @pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])

@@ -11,7 +11,6 @@ import contextlib
 import errno
 import os
 import secrets
-import shutil
 import socket
 import struct
 import tempfile
@@ -22,6 +21,7 @@ from queue import Empty, SimpleQueue
 from fiber._hub import protocol
 from fiber._hub.client import NoHub, Unreachable
 from fiber._hub.client_handler import ClientHandler
+from fiber._hub.directory import remove_directory
 from fiber._hub.doorbell import Doorbell
 from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter
 from fiber._hub.local import QuietSocket, without_timeout
@@ -221,11 +221,6 @@ class Hub:
         if shared.kind is ObjectKind.CHANNEL:
             return HostedChannel(self._poller, fd)
         return HostedCounter(self._poller, fd)
-
-
-def remove_directory(path: str) -> None:
-    """Remove a hub's directory, also after its process was killed; nothing if it is gone."""
-    shutil.rmtree(path, ignore_errors=True)
 
 
 def _listen(parent: str | None) -> tuple[socket.socket, str]:

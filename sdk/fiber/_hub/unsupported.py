@@ -10,14 +10,6 @@ from fiber.errors import NotInFiber
 _INSTEAD = {
     "Condition": "use an Event, or a Queue that carries what is waited for",
     "Barrier": "use a Semaphore for arrivals and an Event for the release",
-    "Value": "send the value through a Pipe or Queue",
-    "Array": "send the array through a Pipe or Queue; NumPy arrays are not copied into the pickle",
-    "RawValue": "send the value through a Pipe or Queue",
-    "RawArray": "send the array through a Pipe or Queue",
-    "copy": "send the object through a Pipe or Queue",
-    "synchronized": "send the object through a Pipe or Queue",
-    "SharedMemory": "send the buffer through a Pipe or Queue",
-    "ShareableList": "send the list through a Pipe or Queue",
     "Manager": "keep the object in one process and talk to it through a Pipe or Queue",
 }
 
