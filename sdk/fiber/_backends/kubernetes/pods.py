@@ -63,13 +63,7 @@ class Pods:
             loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
         )
         self._waiting = Waiting(
-            loop,
-            output,
-            api,
-            self.agents,
-            self._placement,
-            config.pod_timeout,
-            on_begin=self._warn_anew,
+            self.agents, output, api, config.pod_timeout, on_begin=self._warn_anew
         )
         self.over = False
         """Nothing comes of its pool any more, and it was given back."""

@@ -11,9 +11,7 @@ from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.problems import PoolName, failure, new_problems, overdue, summary
 from fiber._backends.kubernetes.progress import Progress
 from fiber._backends.output import Output
-from fiber._backends.remote import RemoteAgent, RemoteChild
-from fiber._engine.placement import Placement
-from fiber._transport.loop import Loop, Timer
+from fiber._transport.link import Timer
 from fiber.errors import FiberError
 
 
@@ -25,11 +23,9 @@ class Waiting:
 
     def __init__(
         self,
-        loop: Loop,
+        agents: AgentSet,
         output: Output,
         api: Api,
-        agents: AgentSet,
-        placement: Placement[RemoteAgent, RemoteChild],
         timeout: float,
         *,
         on_begin: Callable[[], None],
@@ -40,16 +36,15 @@ class Waiting:
         """The pool's, as it is now."""
         self.attached = False
         """Whether the pool is there, and this program its master."""
-        self._loop = loop
         self._output = output
         self._api = api
         self._agents = agents
-        self._placement = placement
+        self._placement = agents.placement
         self._timeout = timeout
         self._on_begin = on_begin
         self._patience: Timer | None = None
         self._told_of_limit = False
-        self._progress = Progress(loop, output, self._describe)
+        self._progress = Progress(agents.loop, output, self._describe)
 
     def stop(self) -> None:
         """Nobody waits any more."""
@@ -85,7 +80,7 @@ class Waiting:
             self.stop()
         elif self._patience is None:
             self._progress.start()
-            self._patience = self._loop.call_later(self._timeout, self._give_up)
+            self._patience = self._agents.loop.call_later(self._timeout, self._give_up)
             self._on_begin()
 
     def look_at_limit(self, most: int) -> None:
