@@ -182,9 +182,7 @@ class Pods:
             self._timer = None
         if desired.wake_at < float("inf"):
             self._timer = self._loop.call_later(desired.wake_at - self._loop.now(), self._decide)
-        if self._prepared is not None:
-            self._waiting.look_at_limit(self._demand.maximum)
-        self._waiting.look()
+        self._waiting.look(self._demand.maximum)
 
     # -- Agents
 
