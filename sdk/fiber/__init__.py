@@ -64,6 +64,7 @@ _SUBMODULES = frozenset(
         "spawn",
         "synchronize",
         "util",
+        "vector",
     }
 )
 

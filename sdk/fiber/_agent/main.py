@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 import signal
 import socket
 import sys
@@ -14,6 +13,7 @@ from typing import NoReturn
 from fiber import config
 from fiber._agent.agent import Agent
 from fiber._agent.service import AgentService
+from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
@@ -172,7 +172,7 @@ class Main:
         # At once and by force: nobody is left to tell or to wait for.
         directory = os.environ.get(_INHERITS)
         if directory:
-            shutil.rmtree(directory, ignore_errors=True)
+            remove_directory(directory)
         os._exit(0)
 
 
