@@ -19,7 +19,8 @@ from fiber._engine.worker_set import (
     Member,
     StartFailure,
 )
-from fiber._runtime.executor import TICK, Executor
+from fiber._runtime.executor import Executor
+from fiber._runtime.host import TICK
 from fiber._runtime.input_stream import AHEAD, InputStream
 from fiber._runtime.work_items import WorkItem
 from simulation.oracle import require

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fiber._engine.ledger import Batch, Ledger, Worker
+from fiber._engine.ledger import Batch, Job, Ledger, Worker
 from fiber._runtime.background import BackgroundThread
 from fiber._runtime.host import Loop, Timer
 from fiber._runtime.jobs import Jobs
@@ -17,6 +17,7 @@ from fiber._runtime.work_items import (
     Encoded,
     WorkItem,
     blame_items,
+    claim,
     encode,
     pack,
     pickles_without_user_code,
@@ -52,6 +53,9 @@ class Sender:
         """Send a batch, or have it encoded where the user's code may run."""
         assert batch.job is not None
         item: WorkItem = batch.job.owner
+        if item.cancellable and not claim(batch):
+            self._drop_cancelled(batch, batch.job)
+            return
         if not pickles_without_user_code(item, batch):
             self._unsent.add(batch.seq)
             try:
@@ -113,6 +117,11 @@ class Sender:
         self._unsent.discard(batch.seq)
         self.settled(batch.seq)
         self.split(batch.seq, Failure(error))
+        self._advance()
+
+    def _drop_cancelled(self, batch: Batch, job: Job) -> None:
+        self._ledger.drop(batch, lambda call: call.future.claim(), self._loop.now())
+        self._jobs.check_finished(job)
         self._advance()
 
     def split(self, seq: int, failure: object) -> None:
