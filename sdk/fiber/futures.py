@@ -208,7 +208,8 @@ class Executor(concurrent.futures.Executor):
         except Exception as error:  # it does not pickle
             engine.reject(results._buffer, error)
             return _taken(results, engine, None, deadline)
-        results._begin(engine, item, zip(*iterables) if several else iterables[0], ahead)
+        source = zip(*iterables, strict=False) if several else iterables[0]
+        results._begin(engine, item, source, ahead)
         return _taken(results, engine, item, deadline)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -219,7 +220,7 @@ class Executor(concurrent.futures.Executor):
         self._workers.shut_down(wait, cancel_futures)
 
     def terminate_workers(self) -> None:
-        """End the workers at once, as ``shutdown`` for good; their tasks raise BrokenProcessPool."""
+        """End the workers at once and for good; what is not done raises BrokenProcessPool."""
         self._workers.terminate()
 
     def __exit__(

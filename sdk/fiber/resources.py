@@ -62,9 +62,7 @@ def meta(
     return decorate
 
 
-def wished(
-    cpu: float | str | None, memory: int | str | None, gpu: int | None
-) -> Resources:
+def wished(cpu: float | str | None, memory: int | str | None, gpu: int | None) -> Resources:
     """Wishes as a person spells them: see ``meta``."""
     return Resources(cpu=_cpu(cpu), memory=_memory(memory), gpu=_gpu(gpu))
 

@@ -212,9 +212,7 @@ class Executor:
             return outcome
         return future.get()
 
-    def _enqueue(
-        self, call: Call, timeout: float | None, queue: CallQueue | None = None
-    ) -> None:
+    def _enqueue(self, call: Call, timeout: float | None, queue: CallQueue | None = None) -> None:
         if timeout is None:
             self.calls.put(call, queue)
         else:
