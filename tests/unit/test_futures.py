@@ -273,7 +273,7 @@ def test_options_are_those_of_what_is_submitted_through_them(
 
 def test_options_that_are_dropped_leave_nothing_in_the_engine(executor: fiber.Executor) -> None:
     executor.submit(tasks.square, 1).result(PATIENCE)
-    (engine,) = executor._workers.engines()
+    (engine,) = executor._group.executors()
     before = len(engine._ledger.jobs)
     for n in range(5):
         assert executor.options(retries=n).submit(tasks.square, n).result(PATIENCE) == n * n
@@ -301,8 +301,9 @@ def test_workers_come_with_the_work_and_are_replaced() -> None:
     [
         ({"max_workers": 0}, ValueError, "max_workers must be greater than 0"),
         ({"max_workers": "2"}, TypeError, "max_workers must be a whole number"),
-        ({"max_tasks_per_child": 0}, ValueError, "max_tasks_per_child must be >= 1"),
+        ({"max_tasks_per_child": 0}, ValueError, "max_tasks_per_child must be greater than 0"),
         ({"initializer": 3}, TypeError, "initializer must be a callable"),
+        ({"mp_context": "spawn"}, TypeError, "mp_context must be what fiber.get_context"),
         ({"retries": -1}, ValueError, "retries"),
     ],
 )
@@ -320,7 +321,7 @@ def test_forgotten_it_ends_after_its_tasks() -> None:
     executor = fiber.Executor(2)
     results = executor.map(tasks.square, range(10))
     future = executor.submit(tasks.square, 11)
-    (engine,) = executor._workers.engines()
+    (engine,) = executor._group.executors()
     del executor
     assert list(results) == [n * n for n in range(10)]
     assert future.result(PATIENCE) == 121

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 
 from fiber._engine.chunks import FLOOR
+from fiber._engine.ledger import Job
 from fiber._engine.scheduler import Scheduler
 from fiber._runtime.host import TICK, Loop
 from fiber._runtime.jobs import Jobs
@@ -63,19 +64,11 @@ class Calls:
         self._advance = advance
         self._wake_at = wake_at
         self._queues: dict[CallQueue, None] = {}
+        """Those with open jobs."""
         self._without_options = CallQueue()
-        self._open(self._without_options)
         self._took = -math.inf
 
     # Any thread
-
-    def open(self, queue: CallQueue) -> None:
-        """Take calls of one more queue, until it or the pool is closed."""
-        self._loop.call_soon(self._open, queue)
-
-    def close(self, queue: CallQueue) -> None:
-        """No call of it will come any more."""
-        self._loop.call_soon(self._close, queue)
 
     def put(self, call: Call, queue: CallQueue | None = None) -> None:
         """One more call; None: without options."""
@@ -89,6 +82,10 @@ class Calls:
         if not queue.stale:
             queue.stale = True
             self._loop.call_soon(self._drop_cancelled, queue)
+
+    def close(self, queue: CallQueue) -> None:
+        """No call of it will come any more."""
+        self._loop.call_soon(self._close, queue)
 
     # The loop's thread
 
@@ -111,11 +108,6 @@ class Calls:
                     call.future.cancel()
                 self._drop_cancelled(queue)
 
-    def _open(self, queue: CallQueue) -> None:
-        if self._refusal() is None:
-            self._queues[queue] = None
-            self._jobs.open(queue.item)
-
     def _close(self, queue: CallQueue) -> None:
         if queue in self._queues:
             self._take(queue)
@@ -135,14 +127,15 @@ class Calls:
 
         Each would else wake a worker, which costs more than the call.
         """
-        called, job = queue.called, queue.item.job
+        called = queue.called
         calls = [called.popleft() for _ in range(len(called))]
         refusal = self._refusal()
         if refusal is not None:
             for call in calls:
                 call.future.set_exception(refusal)
-        if not calls or refusal is not None or job is None:
+        if not calls or refusal is not None:
             return
+        job = self._job(queue)
         now = self._loop.now()
         hurried = now - self._took < FLOOR and job.pace.short
         self._took = now
@@ -158,3 +151,10 @@ class Calls:
             self._wake_at(now + TICK)
         else:
             self._advance()
+
+    def _job(self, queue: CallQueue) -> Job:
+        if queue not in self._queues:
+            self._queues[queue] = None
+            self._jobs.open(queue.item)
+        assert queue.item.job is not None
+        return queue.item.job

@@ -82,6 +82,16 @@ def sizes(processes: int | None, low: int | None, high: int | None) -> tuple[int
     return low, high
 
 
+def positive(name: str, value: Any) -> int | None:
+    """``value`` as an int of at least 1; None as it is."""
+    if value is None:
+        return None
+    count = whole(name, value)
+    if count < 1:
+        raise ValueError(f"{name} must be greater than 0, not {value!r}")
+    return count
+
+
 def max_tasks(value: Any) -> int | None:
     """Tasks that a worker may run."""
     if value is not None and (not isinstance(value, int) or value <= 0):

@@ -180,8 +180,8 @@ def _blame_call(
 
 
 def claim(batch: Batch) -> bool:
-    """Whether all calls of a batch are still wanted; those that are cannot be cancelled any more."""
-    return all([call.future.claim() for call in batch.items])
+    """Whether all calls of a batch are still wanted: then none can be cancelled any more."""
+    return all(call.future.claim() for call in batch.items)
 
 
 def blame_items(item: WorkItem, batch: Batch, error: Exception) -> Exception:
