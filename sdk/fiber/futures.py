@@ -143,7 +143,7 @@ class Executor(concurrent.futures.Executor):
         """
         other = object.__new__(type(self))
         vars(other).update(vars(self))
-        other._wishes = merged(self._wishes, wished(cpu, memory, gpu))
+        other._wishes = merged(self._wishes, wished("Executor.options", cpu, memory, gpu))
         if retries is not None:
             other._retries = options.retries(retries)
         if timeout is not None:

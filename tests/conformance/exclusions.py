@@ -22,3 +22,6 @@ EXCLUSIONS: dict[str, dict[str, str]] = {
     "loopback": {**_MANAGERS, **_CLOSED_AT_ONCE},
     "kubernetes": {**_MANAGERS, **_CLOSED_AT_ONCE},
 }
+
+# Tests of process pool executors; with every backend.  id of the test -> reason
+EXECUTORS: dict[str, str] = {}

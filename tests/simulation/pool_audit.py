@@ -273,7 +273,7 @@ class PoolAudit:
             executor._sender._deadlines,
             executor._sender._unsent,
             executor._jobs._streams,
-            executor.calls._queues,
+            *(queue.called for queue in executor.calls._queues),
             executor._exits,
             executor._receiver._last_words,
             executor._leases._lent,

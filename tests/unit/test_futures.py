@@ -310,7 +310,7 @@ def test_workers_come_with_the_work_and_are_replaced() -> None:
 def test_bad_options(options: Any, error: type[Exception], says: str) -> None:
     with pytest.raises(error, match=says):
         fiber.Executor(**options)
-    with pytest.raises(ValueError, match="cpu=-1: expected CPUs above 0"):
+    with pytest.raises(ValueError, match=r"Executor\.options\(cpu=-1\): expected CPUs above 0"):
         fiber.Executor(1).options(cpu=-1)
 
 
