@@ -261,17 +261,23 @@ def _taken(
 ) -> Iterator[Any]:
     """The results of a map, up to the first error."""
     try:
-        while True:
-            left = None if deadline is None else deadline - time.monotonic()
-            try:
-                outcome = results._take(left)
-            except StopIteration:
-                return
-            except WaitedTooLong:
-                raise TimeoutError("the next result of the map was not there in time") from None
-            if type(outcome) is Failure:
-                raise translated(outcome.error, engine)
-            yield outcome
+        # In a list, so that nothing here keeps a result that the user has let go of.
+        while held := _next(results, engine, deadline):
+            yield held.pop()
     finally:
         if item is not None:
             engine.cancel(item)
+
+
+def _next(results: IMapIterator, engine: Engine, deadline: float | None) -> list[Any]:
+    """The next result of a map; none at its end."""
+    left = None if deadline is None else deadline - time.monotonic()
+    try:
+        outcome = results._take(left)
+    except StopIteration:
+        return []
+    except WaitedTooLong:
+        raise TimeoutError("the next result of the map was not there in time") from None
+    if type(outcome) is Failure:
+        raise translated(outcome.error, engine)
+    return [outcome]

@@ -20,6 +20,7 @@ from pathlib import Path
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from conformance.cpython_suite.tiers import EXECUTORS_NOT_APPLICABLE
 from conformance.exclusions import EXECUTORS
 from conformance.runner import Target, list_cases, run_groups
 from conformance.verdict import Verdict
@@ -42,7 +43,7 @@ def run_once(backend: str, substring: str = "") -> Verdict:
     groups: dict[str, list[str]] = {}
     for case in list_cases(target):
         id_ = f"{case['class_name']}.{case['method']}"
-        if substring in id_:
+        if substring in id_ and case["tier"] in target.tiers:
             groups.setdefault(case["class_name"], []).append(id_)
     with ExitStack() as stack:
         if backend == "kubernetes":
@@ -52,7 +53,8 @@ def run_once(backend: str, substring: str = "") -> Verdict:
             target = replace(target, lend=pools.lend)
         report = run_groups(target, list(groups.values()), JOBS)
     title = f"fiber.Executor, {backend}"
-    return Verdict(title, report, EXECUTORS, time.monotonic() - started)
+    seconds = time.monotonic() - started
+    return Verdict(title, report, EXECUTORS[backend], seconds, EXECUTORS_NOT_APPLICABLE)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,6 +7,7 @@ import contextlib
 import os
 import pickle
 import threading
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,7 @@ def test_what_has_not_begun_can_be_cancelled_and_never_runs(tmp_path: Path) -> N
         last = executor.submit(tasks.square, 3)
         cancelled = [future for future in queued if future.cancel()]
         assert len(cancelled) >= 8  # a worker may have been given some ahead
-        done, _ = futures.wait(cancelled, 0)
+        done, _ = futures.wait(cancelled, PATIENCE)
         assert done == set(cancelled)
         wait_until(running.running, "the first task runs")
         assert not running.cancel()
@@ -193,6 +194,13 @@ def test_map_of_what_does_not_pickle(executor: fiber.Executor) -> None:
         next(results)
     with pytest.raises(RuntimeError, match="cannot be pickled"):
         next(executor.map(tasks.identity, [tasks.Unpicklable()]))
+
+
+def test_map_keeps_no_result(executor: fiber.Executor) -> None:
+    for taken in executor.map(tasks.identity, [{1}, {2}]):
+        held = weakref.ref(taken)
+        del taken
+        assert held() is None
 
 
 @pytest.mark.parametrize("wrong", [{"chunksize": 0}, {"buffersize": 0}, {"chunksize": -1}])
@@ -312,6 +320,13 @@ def test_bad_options(options: Any, error: type[Exception], says: str) -> None:
         fiber.Executor(**options)
     with pytest.raises(ValueError, match=r"Executor\.options\(cpu=-1\): expected CPUs above 0"):
         fiber.Executor(1).options(cpu=-1)
+
+
+def test_its_use_during_the_import_of_main_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    executor = fiber.Executor(1)
+    monkeypatch.setattr(fiber.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(RuntimeError, match='if __name__ == "__main__"'):
+        executor.submit(os.getpid)
 
 
 # Its end

@@ -38,10 +38,9 @@ class CallFuture(Future[Any]):
         self._claimed: bool | None = None
 
     def cancel(self) -> bool:
-        """As in concurrent.futures, but that ``wait`` and ``as_completed`` hear of it at once."""
+        """As in concurrent.futures; ``wait`` and ``as_completed`` hear of it in a moment."""
         if not super().cancel():
             return False
-        self.claim()
         self._executor.calls.drop_cancelled(self._queue)
         return True
 
@@ -50,10 +49,8 @@ class CallFuture(Future[Any]):
     def claim(self) -> bool:
         """It is about to run, unless it was cancelled."""
         if self._claimed is None:
-            with self._condition:  # who cancels may be here as well
-                if self._claimed is None:
-                    self._claimed = self.set_running_or_notify_cancel()
-        return bool(self._claimed)
+            self._claimed = self.set_running_or_notify_cancel()
+        return self._claimed
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take the outcome."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from fiber._engine.chunks import FLOOR
 from fiber._engine.ledger import Job
@@ -118,7 +119,7 @@ class Calls:
         queue.stale = False
         job = queue.item.job
         if job is not None:
-            self._ledger.drop_waiting(job, lambda call: not call.future.cancelled())
+            self._ledger.drop_waiting(job, _is_wanted)
             self._jobs.check_finished(job)
             self._advance()
 
@@ -158,3 +159,7 @@ class Calls:
             self._jobs.open(queue.item)
         assert queue.item.job is not None
         return queue.item.job
+
+
+def _is_wanted(call: Any) -> bool:
+    return not call.future.cancelled() or call.future.claim()

@@ -12,6 +12,7 @@ from multiprocessing import util
 from multiprocessing.process import BaseProcess
 from typing import Any
 
+from fiber._runtime import methods
 from fiber._runtime.call_future import broken
 from fiber._runtime.executor import Executor
 from fiber._runtime.options import PoolOptions
@@ -58,6 +59,7 @@ class ExecutorGroup:
         return executor
 
     def _start(self, kind: Resources) -> Executor:
+        methods.check_main()
         with self._lock:
             executor = self._executors.get(kind)
             if executor is None:

@@ -16,6 +16,7 @@ from typing import Any
 import fiber
 
 from .build import Case
+from .tiers import EXECUTORS_NOT_APPLICABLE
 
 SOURCE = "test.test_concurrent_futures"
 
@@ -79,7 +80,8 @@ def build() -> None:
         built = type(name, (found[name], with_fiber, unittest.TestCase), {"__module__": __name__})
         globals()[name] = built
         for method in unittest.TestLoader().getTestCaseNames(built):
-            CASES.append(Case(name, name, None, method, "core"))
+            left_out = f"{name}.{method}" in EXECUTORS_NOT_APPLICABLE
+            CASES.append(Case(name, name, None, method, "na" if left_out else "core"))
 
 
 build()
