@@ -451,31 +451,17 @@ class Ledger:
         if len(worker.queue) > 1:
             self._load.sort(worker)
 
-    def drop(self, batch: Batch, wanted: Callable[[Any], bool], now: float) -> None:
-        """``batch`` is not sent, since not all of its tasks are ``wanted`` any more.
-
-        Those that are not are done by that; the others wait again.
-        """
-        job = batch.job
-        self._withdraw(batch, now)
-        if job is not None:
-            for span in reversed(self._wanted(job, batch.rest(), wanted)):
-                self._return(job, span)
-
     def drop_waiting(self, job: Job, wanted: Callable[[Any], bool]) -> None:
         """Tasks that wait and are not ``wanted`` any more are done by that."""
         waiting, job.waiting = job.waiting, Waiting()
         while waiting:
-            for span in self._wanted(job, waiting.take(len(waiting)), wanted):
-                job.waiting.append(span)
-
-    def _wanted(self, job: Job, span: Span, wanted: Callable[[Any], bool]) -> list[Span]:
-        kept = [at for at, item in enumerate(span.items, span.start) if wanted(item)]
-        self._did(job, len(span.items) - len(kept))
+            span = waiting.take(len(waiting))
+            kept = [at for at, item in enumerate(span.items, span.start) if wanted(item)]
+            self._did(job, len(span.items) - len(kept))
+            whole = len(kept) == len(span.items)
+            for part in [span] if whole else [span.part(at, at + 1) for at in kept]:
+                job.waiting.append(part)
         self._finish(job)
-        if len(kept) == len(span.items):
-            return [span]
-        return [span.part(at, at + 1) for at in kept]
 
     def split(self, seq: int, now: float) -> Receipt | None:
         """The worker cannot read the message: send its tasks again, one by one.

@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 from fiber._engine.chunks import FLOOR
 from fiber._engine.ledger import Job
 from fiber._engine.scheduler import Scheduler
 from fiber._runtime.host import TICK, Loop
 from fiber._runtime.jobs import Jobs
-from fiber._runtime.work_items import Call, WorkItem
+from fiber._runtime.work_items import Call, WorkItem, is_wanted
 from fiber._wire import work
 
 
@@ -119,7 +118,7 @@ class Calls:
         queue.stale = False
         job = queue.item.job
         if job is not None:
-            self._ledger.drop_waiting(job, _is_wanted)
+            self._ledger.drop_waiting(job, is_wanted)
             self._jobs.check_finished(job)
             self._advance()
 
@@ -159,7 +158,3 @@ class Calls:
             self._jobs.open(queue.item)
         assert queue.item.job is not None
         return queue.item.job
-
-
-def _is_wanted(call: Any) -> bool:
-    return not call.future.cancelled() or call.future.claim()

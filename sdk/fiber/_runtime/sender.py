@@ -19,6 +19,7 @@ from fiber._runtime.work_items import (
     blame_items,
     claim,
     encode,
+    is_wanted,
     pack,
     pickles_without_user_code,
 )
@@ -120,7 +121,9 @@ class Sender:
         self._advance()
 
     def _drop_cancelled(self, batch: Batch, job: Job) -> None:
-        self._ledger.drop(batch, lambda call: call.future.claim(), self._loop.now())
+        """Give the others to whoever has time for them."""
+        self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
+        self._ledger.drop_waiting(job, is_wanted)
         self._jobs.check_finished(job)
         self._advance()
 

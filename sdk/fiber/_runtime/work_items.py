@@ -179,6 +179,11 @@ def _blame_call(
     return reduction.blame(parts, error, f"the call of {name}()")
 
 
+def is_wanted(call: Any) -> bool:
+    """Whether a call that waits was not cancelled; who waits for one that was hears so."""
+    return not call.future.cancelled() or call.future.claim()
+
+
 def claim(batch: Batch) -> bool:
     """Whether all calls of a batch are still wanted: then none can be cancelled any more."""
     return all(call.future.claim() for call in batch.items)
