@@ -66,6 +66,7 @@ _SUBMODULES = frozenset(
         "spawn",
         "synchronize",
         "util",
+        "vector",
     }
 )
 

@@ -45,6 +45,13 @@ CLASSES = (
     "TestTimeouts",
     "TestIgnoreEINTR",
     "TestLogging",
+    "TestLock",
+    "TestSemaphore",
+    "TestEvent",
+    "TestValue",
+    "TestArray",
+    "TestSharedCTypes",
+    "TestSharedMemory",
 )
 # An agent on another host cannot share a pid or a file with the master.
 TIERS = {"local": ("core", "local"), "loopback": ("core",), "kubernetes": ("core",)}

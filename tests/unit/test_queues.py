@@ -479,15 +479,6 @@ def test_a_simple_queue_among_processes() -> None:
 # What is not there
 
 
-@pytest.mark.parametrize("name", ["Value", "Array", "RawValue", "RawArray"])
-def test_shared_values_are_refused_by_name(name: str) -> None:
-    from fiber import sharedctypes
-
-    with pytest.raises(NotInFiber, match=f"no {name} yet.*Pipe or Queue"):
-        getattr(sharedctypes, name)("i", 0)
-    assert isinstance(sharedctypes.SynchronizedArray, type)
-
-
 def test_managers_can_be_defined_but_not_made() -> None:
     from fiber import managers
 

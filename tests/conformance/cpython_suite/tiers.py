@@ -21,6 +21,7 @@ LOCAL = {
     "TestSubclassingProcess.test_sys_exit": "file shared with the child",
     "TestCondition.test_wait_result[processes]": "child signals the parent's pid",
     "TestListenerClient.*": "Listener and Client, AF_UNIX among them",
+    "TestSharedMemory.*": "names that processes of one host find",
     "TestPollEintr.*": "child signals the parent's pid",
     "TestWait.test_wait_socket": "raw sockets in wait()",
     "TestWait.test_wait_socket_slow": "raw sockets in wait()",
@@ -61,8 +62,13 @@ NOT_APPLICABLE = {
     "TestConnection.test_missing_fd_transfer": "passes descriptors",
     "TestListener.test_abstract_socket": "abstract AF_UNIX",
     "TestPicklingConnections.test_pickling": "pickles raw sockets",
-    "TestHeap.*": "mmap heap internals",
-    "TestSharedMemory.*": "memory shared on one host",
+    "TestHeap.*": "insides of multiprocessing's heap; of Fiber's: tests/unit/test_heap.py",
+    "TestSharedMemory.test_shared_memory_SharedMemoryManager_reuses_resource_tracker": (
+        "script uses the standard library"
+    ),
+    "TestSharedMemory.test_shared_memory_cleaned_after_process_termination": (
+        "script uses the standard library"
+    ),
     "TestFinalize.*": "util internals",
     "TestImportStar.*": "files of the standard library",
     "TestInvalidHandle.*": "Connection(fd) internals",
