@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fiber.errors import UnpicklableError as UnpicklableError
     from fiber.errors import VersionMismatch as VersionMismatch
     from fiber.errors import WorkerDied as WorkerDied
+    from fiber.futures import Executor as Executor
     from fiber.process import Process as Process
     from fiber.process import active_children as active_children
     from fiber.process import current_process as current_process
@@ -51,6 +52,7 @@ _SUBMODULES = frozenset(
         "cpu",
         "dummy",
         "errors",
+        "futures",
         "managers",
         "pool",
         "process",
@@ -110,6 +112,7 @@ _HOMES = {
     "Config": "config",
     "ConfigError": "errors",
     "ConnectionClosed": "errors",
+    "Executor": "futures",
     "FiberError": "errors",
     "FiberPoolError": "errors",
     "FileTooLarge": "errors",

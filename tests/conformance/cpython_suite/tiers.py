@@ -86,6 +86,24 @@ NOT_APPLICABLE = {
     "SemLockTests.*": "_multiprocessing.SemLock",
 }
 
+# The same for tests of process pool executors: some would hang, or pass now and then.
+EXECUTORS_NOT_APPLICABLE = {
+    "ProcessPoolExecutorTest.test_ressources_gced_in_workers": "its set-up makes a manager",
+    "ProcessPoolExecutorTest.test_saturation": "counts processes at once: they start meanwhile",
+    "ProcessPoolShutdownTest.test_processes_terminate": (
+        "counts processes at once: they start meanwhile"
+    ),
+    "ProcessPoolShutdownTest.test_cancel_futures": (
+        "says that some task had begun: if no worker was up yet, all are cancelled"
+    ),
+    "ProcessPoolShutdownTest.test_del_shutdown": "_executor_manager_thread",
+    "ProcessPoolShutdownTest.test_shutdown_no_wait": "_executor_manager_thread",
+    "ExecutorDeadlockTest.test_shutdown_deadlock_pickle": "_executor_manager_thread",
+    "ExecutorDeadlockTest.test_gh105829_should_not_deadlock_if_wakeup_pipe_full": (
+        "mocks internals of the standard library"
+    ),
+}
+
 KNOWN_CLASSES = frozenset(
     {
         "TestArray",
