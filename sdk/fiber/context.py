@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import logging
 
     from fiber.connection import Connection
+    from fiber.managers import SyncManager
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
     from fiber.synchronize import BoundedSemaphore, Event, Semaphore
@@ -66,7 +67,6 @@ class BaseContext:
     Array = staticmethod(unsupported("Array"))
     RawValue = staticmethod(unsupported("RawValue"))
     RawArray = staticmethod(unsupported("RawArray"))
-    Manager = staticmethod(unsupported("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)
@@ -131,6 +131,16 @@ class BaseContext:
 
         config.use()
         return BoundedSemaphore(value)
+
+    # Managers
+
+    def Manager(self) -> SyncManager:
+        """A manager that is started, with all that multiprocessing's serves."""
+        from fiber.managers import SyncManager
+
+        manager = SyncManager(ctx=self.get_context())
+        manager.start()
+        return manager
 
     # Work
 
