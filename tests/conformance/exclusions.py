@@ -6,10 +6,6 @@ list says what is so.
 
 from __future__ import annotations
 
-_MANAGERS = {
-    f"TestInitializers.test_{name}_initializer": "its set-up makes a manager: not in Fiber yet"
-    for name in ("manager", "pool")
-}
 _CLOSED_AT_ONCE = {
     "WithProcessesTestQueue.test_closed_queue_empty_exceptions": (
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
@@ -18,7 +14,7 @@ _CLOSED_AT_ONCE = {
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
-    "local": {**_MANAGERS, **_CLOSED_AT_ONCE},
-    "loopback": {**_MANAGERS, **_CLOSED_AT_ONCE},
-    "kubernetes": {**_MANAGERS, **_CLOSED_AT_ONCE},
+    "local": {**_CLOSED_AT_ONCE},
+    "loopback": {**_CLOSED_AT_ONCE},
+    "kubernetes": {**_CLOSED_AT_ONCE},
 }

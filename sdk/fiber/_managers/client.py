@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import os
 import pickle
-import time
 import warnings
 import weakref
 from collections import deque
 from multiprocessing import util
+from multiprocessing.managers import Token
 from multiprocessing.process import BaseProcess, current_process
 from threading import current_thread, main_thread
 from typing import Any
@@ -82,28 +82,18 @@ class Session:
         try:
             door = knock(address)
             try:
-                self._control = self._hand_over(door, "join", introduction())
+                self._control = _hand_over(door, "join", introduction())
             finally:
                 door.close()
         except (ConnectionClosed, BrokenPipeError) as error:
             raise self.gone() from error
 
-    def _hand_over(self, carrier: Channel, *about: str) -> LocalChannel:
-        """A new channel to the server, which has the other end and said so."""
-        ours, theirs = LocalChannel.pair()
-        # Taken back below: if nobody takes it out, its end is the end of ours.
-        with collecting_grants(reusable=False) as grants:
-            invitation = pickle.dumps((*about, theirs))
-        theirs.close()
+    def hand_over(self, kind: str, name: str) -> LocalChannel:
+        """A new channel to a new thread of the server, which is to be called ``name``."""
         try:
-            carrier.send(invitation)
-            while not ours.poll(_LOOK_AGAIN):
-                if carrier.poll(0):  # nothing ever comes there but the end
-                    raise ConnectionClosed()
-            ours.recv().release()
-        finally:
-            grants.release()
-        return ours
+            return _hand_over(self._control, kind, name)
+        except (ConnectionClosed, BrokenPipeError) as error:
+            raise self.gone() from error
 
     def line(self) -> Line:
         """A line of this thread on which no call is under way."""
@@ -113,10 +103,7 @@ class Session:
         for line in lines:
             if not line.busy:
                 return line
-        try:
-            line = Line(self._hand_over(self._control, "open", thread_name()))
-        except (ConnectionClosed, BrokenPipeError) as error:
-            raise self.gone() from error
+        line = Line(self.hand_over("line", thread_name()))
         lines.append(line)
         return line
 
@@ -174,6 +161,24 @@ class Session:
         """The error of whoever finds the server gone."""
         process = self.process and self.process()
         return ConnectionClosed(self.address.server, how_it_ended(process) if process else None)
+
+
+def _hand_over(carrier: Channel, *about: str) -> LocalChannel:
+    """A new channel to the server, which has the other end and said so."""
+    ours, theirs = LocalChannel.pair()
+    # Taken back below: if nobody takes it out, its end is the end of ours.
+    with collecting_grants(reusable=False) as grants:
+        invitation = pickle.dumps((*about, theirs))
+    theirs.close()
+    try:
+        carrier.send(invitation)
+        while not ours.poll(_LOOK_AGAIN):
+            if carrier.poll(0):  # nothing ever comes there but the end
+                raise ConnectionClosed()
+        ours.recv().release()
+    finally:
+        grants.release()
+    return ours
 
 
 class Request:
@@ -239,23 +244,13 @@ class Request:
         self, kind: str, result: Any, method: str, ident: str | None
     ) -> tuple[str, Any]:
         if kind == "#PROXY":
-            return "#RETURN", self._proxy(*result)
+            return "#RETURN", proxy_of(self._session, *result)
         if kind == "#WARNING":
             self._warn(*result, ident)
             return "#RETURN", result[1]
         if kind == "#RETURN" and ident is None and method in ("create", "incref"):
             self._session.got_reference()
         return kind, result
-
-    def _proxy(self, make: Any, token: Any, exposed: tuple[str, ...]) -> Any:
-        # multiprocessing asks the manager's own registry, which only one process has.
-        from fiber._managers import SERIALIZER
-
-        self._session.got_reference()
-        try:
-            return make(token, SERIALIZER, exposed=exposed)
-        finally:
-            self._session.let_go(token.id)
 
     def _warn(self, text: str, _result: Any, ident: str | None) -> None:
         try:
@@ -290,6 +285,21 @@ def connect(address: ManagerAddress, authkey: bytes | None = None) -> Request:
     The key is not asked for: only who was given the address can have it.
     """
     return Request(address)
+
+
+def proxy_of(session: Session, make: Any, token: Token, exposed: tuple[str, ...]) -> Any:
+    """The proxy of what a method has returned.
+
+    multiprocessing asks the manager's registry for its class, which only one process has.
+    """
+    from fiber._managers import SERIALIZER
+
+    attach = getattr(make, "attach", None)
+    session.got_reference()
+    try:
+        return attach(token) if attach else make(token, SERIALIZER, exposed=exposed)
+    finally:
+        session.let_go(token.id)
 
 
 def forget(address: ManagerAddress) -> None:

@@ -89,13 +89,16 @@ class Holdings:
         return self._abandoned.pop(lock, None) if self._abandoned else None
 
 
-class ThreadsLocks:
-    """The locks that one thread of the server owns on behalf of one thread of a client."""
+class ClientThread:
+    """What one thread of the server has on behalf of one thread of a client."""
 
     def __init__(self, holdings: Holdings, client: Client) -> None:
         self._holdings = holdings
         self._client = client
         self._owned: list[Any] = []
+        self.kept: Any = None
+        """The last result that has proxies in it: until the client has references of its own to
+        what they stand for, which it has when it asks for the next."""
 
     def note(self, obj: Any, method: str, result: Any) -> str | None:
         """A method of a lock was called; what its caller should be warned of."""

@@ -18,7 +18,7 @@ from traceback import format_exc
 from typing import Any
 
 from fiber import reduction
-from fiber._managers.holdings import Client, Holdings, ThreadsLocks
+from fiber._managers.holdings import Client, Holdings, ClientThread
 from fiber._transport.base import Channel
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
@@ -74,8 +74,10 @@ class Server(_Server):  # type: ignore[misc]
             self._let_go(client)
 
     def _heed(self, client: Client, what: str, *about: Any) -> None:
-        if what == "open":
+        if what == "line":
             _start(self._serve_line, client, *about)
+        elif what == "pipeline":
+            _start(self._serve_pipeline, client, *about)
         elif what == "decref":
             self.decref(client, *about)
         elif what == "bye":
@@ -93,31 +95,27 @@ class Server(_Server):  # type: ignore[misc]
 
     def _serve_line(self, client: Client, name: str, line: Channel) -> None:
         threading.current_thread().name = name
-        locks = ThreadsLocks(self._holdings, client)
+        thread = ClientThread(self._holdings, client)
         try:
             line.send(b"")
-            # The last result that has proxies in it: until the client has references of its own
-            # to what they stand for, which it has when it asks for the next.
-            kept = None
             for number in itertools.count(1):
                 message = line.recv()
-                kept = self._serve_call(client, locks, line, number, message)
+                thread.kept = self._serve_call(client, thread, line, number, message)
         except (OSError, ConnectionClosed):
             pass
         finally:
-            kept = None
             line.close()
-            locks.end()
+            thread.end()
 
     def _serve_call(
-        self, client: Client, locks: ThreadsLocks, line: Channel, number: int, message: Any
+        self, client: Client, thread: ClientThread, line: Channel, number: int, message: Any
     ) -> Any:
         try:
             ident, method, args, kwds = packet.loads(message)
             if ident is None:
                 answer = self._own(client, method, args, kwds)
             else:
-                answer = self._call(client, locks, ident, method, args, kwds)
+                answer = self._call(client, thread, ident, method, args, kwds)
         except Exception:
             answer = "#TRACEBACK", format_exc()
             method = ""
@@ -125,11 +123,32 @@ class Server(_Server):  # type: ignore[misc]
             kept = _reply(line, number, answer)
         except OSError:
             if answer[0] == "#RETURN" and ident is not None:
-                locks.take_back(self.id_to_obj[ident][0], method, answer[1])
+                thread.take_back(self.id_to_obj[ident][0], method, answer[1])
             raise
         if method == "shutdown" and ident is None:
             self.stop_event.set()
         return kept
+
+    def _serve_pipeline(self, client: Client, name: str, pipeline: Channel) -> None:
+        """The same for calls that nobody waits for, of one object that the first of them names."""
+        threading.current_thread().name = name
+        thread = ClientThread(self._holdings, client)
+        try:
+            pipeline.send(b"")
+            thread.ident, failure = self._begin(client, pipeline)
+            while True:
+                number, request = _numbered(pipeline.recv())
+                answer = failure or self._try_call(client, thread, request)
+                # Its client may have dropped its proxy, and mean what it asked for before.
+                with suppress(OSError):
+                    _send(pipeline, number, answer)
+        except ConnectionClosed:
+            pass
+        finally:
+            pipeline.close()
+            thread.end()
+            if thread.ident:
+                self.decref(client, thread.ident)
 
     def _own(self, client: Client, method: str, args: Any, kwds: Any) -> _Answer:
         if method not in self.public:
@@ -137,7 +156,7 @@ class Server(_Server):  # type: ignore[misc]
         return "#RETURN", getattr(self, method)(client, *args, **kwds)
 
     def _call(
-        self, client: Client, locks: ThreadsLocks, ident: str, method: str, args: Any, kwds: Any
+        self, client: Client, thread: ClientThread, ident: str, method: str, args: Any, kwds: Any
     ) -> _Answer:
         obj, exposed, typeids = self.id_to_obj[ident]
         function = getattr(obj, method, None) if method in exposed else None
@@ -158,7 +177,7 @@ class Server(_Server):  # type: ignore[misc]
         if typeids and method in typeids:
             return "#PROXY", self._made(client, typeids[method], result)
         if method in _OF_LOCKS:
-            warning = locks.note(obj, method, result)
+            warning = thread.note(obj, method, result)
             if warning is not None:
                 return "#WARNING", (warning, result)
         return "#RETURN", result
