@@ -246,13 +246,14 @@ class Request:
         if kind == "#PROXY":
             return "#RETURN", proxy_of(self._session, *result)
         if kind == "#WARNING":
-            self._warn(*result, ident)
-            return "#RETURN", result[1]
+            text, acquired = result
+            self._warn(text, ident)
+            return "#RETURN", acquired
         if kind == "#RETURN" and ident is None and method in ("create", "incref"):
             self._session.got_reference()
         return kind, result
 
-    def _warn(self, text: str, _result: Any, ident: str | None) -> None:
+    def _warn(self, text: str, ident: str | None) -> None:
         try:
             warnings.warn(text, RuntimeWarning, stacklevel=6)
         except BaseException:  # made an error by a filter: then it is not acquired
@@ -294,12 +295,11 @@ def proxy_of(session: Session, make: Any, token: Token, exposed: tuple[str, ...]
     """
     from fiber._managers import SERIALIZER
 
-    attach = getattr(make, "attach", None)
     session.got_reference()
     try:
-        return attach(token) if attach else make(token, SERIALIZER, exposed=exposed)
+        return make(token, SERIALIZER, exposed=exposed)
     finally:
-        session.let_go(token.id)
+        session.let_go(str(token.id))
 
 
 def forget(address: ManagerAddress) -> None:

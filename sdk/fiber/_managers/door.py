@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import pickle
+import time
 from multiprocessing.process import current_process
 from typing import Any, NamedTuple
 
@@ -11,7 +14,9 @@ from fiber._hub.handles import GrantSet, HubHandle
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
 from fiber._transport.base import Channel
-from fiber._wire import packet
+
+_UNTIL_FILES_CLOSE = 0.05
+"""Seconds between attempts of a process that may open no more files."""
 
 
 class ManagerAddress(NamedTuple):
@@ -41,20 +46,30 @@ class Door:
             handle,
         )
 
-    def accept(self) -> Channel:
-        """The end of a channel that the next client keeps the other end of."""
-        while True:
-            message = self._inbox.recv()
-            try:
-                channel: Channel = packet.loads(message)
-            except Exception:  # the client is gone already
-                continue
-            return channel
+    def accept(self) -> tuple[str, str, Channel]:
+        """Who comes next, and the end of a channel to it, after the word for that."""
+        invitation: tuple[str, str, Channel] = received(self._inbox)
+        return invitation
 
     def close(self) -> None:
         """Nobody can come in any more."""
         self._grants.release()
         self._inbox.close()
+
+
+def received(channel: Channel) -> Any:
+    """The next thing said on a channel; left out is what came from who has gone by now."""
+    while True:
+        said = channel.recv().tobytes()
+        while True:
+            try:
+                return pickle.loads(said)
+            except OSError as error:
+                if error.errno not in (errno.EMFILE, errno.ENFILE):
+                    break
+                time.sleep(_UNTIL_FILES_CLOSE)  # who sent it waits for an answer
+            except Exception:
+                break
 
 
 def knock(address: ManagerAddress) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections import Counter
+from collections.abc import Callable
 from queue import Queue
 from typing import Any
 
@@ -18,6 +19,8 @@ _ANYBODYS = (_LOCK, threading.Semaphore)
 """Any thread may release them."""
 _OWNED = (type(threading.RLock()), threading.Condition)
 """Only the thread that acquired them may."""
+SYNCHRONIZATION = (*_ANYBODYS, *_OWNED, threading.Barrier)
+"""What a client that dies would leave in the others' way."""
 
 
 class Client:
@@ -50,8 +53,8 @@ class Holdings:
             self._held.setdefault(id(lock), (lock, Counter()))[1][client] += 1
             return True
 
-    def released(self, lock: Any, client: Client) -> None:
-        """``client`` has released it."""
+    def releasing(self, lock: Any, client: Client) -> None:
+        """``client`` is about to release it: noted first, as then it can be somebody else's."""
         with self._mutex:
             holders = self._held.get(id(lock), (lock, Counter[Client]()))[1]
             if client in holders:
@@ -72,17 +75,22 @@ class Holdings:
             return
         for lock, count in mine:
             for _ in range(count):
-                self.abandon(lock, client)
-        for barrier in client.barriers:
+                self.abandon(lock, client.name)
+        for barrier in list(client.barriers):
             barrier.abort()
 
-    def abandon(self, lock: Any, client: Client) -> None:
-        """Release it for ``client``, and have the next one who acquires it know."""
-        self._abandoned[lock] = (
-            f"{client.name} ended while it held a {type(lock).__name__.lower()} of this manager, "
-            "which was released: what the lock protects may be half changed"
+    def abandon(self, lock: Any, holder: str) -> None:
+        """Release it for ``holder``, and have the next one who acquires it know."""
+        self.warn(
+            lock,
+            f"{holder} ended while it held a {type(lock).__name__.lower()} of this manager, "
+            "which was released: what the lock protects may be half changed",
         )
         lock.release()
+
+    def warn(self, lock: Any, text: str) -> None:
+        """What the next one who acquires it should know."""
+        self._abandoned[lock] = text
 
     def warning(self, lock: Any) -> str | None:
         """What whoever has just acquired it should know."""
@@ -100,40 +108,62 @@ class ClientThread:
         """The last result that has proxies in it: until the client has references of its own to
         what they stand for, which it has when it asks for the next."""
 
-    def note(self, obj: Any, method: str, result: Any) -> str | None:
-        """A method of a lock was called; what its caller should be warned of."""
-        if method == "release":
-            if isinstance(obj, _ANYBODYS):
-                self._holdings.released(obj, self._client)
-            elif isinstance(obj, _OWNED):
-                self._owned.remove(obj)
-        elif result and isinstance(obj, _OWNED):
-            self._owned.append(obj)
-            return self._holdings.warning(obj)
-        elif result and isinstance(obj, _ANYBODYS):
-            if not self._holdings.acquired(obj, self._client):
-                obj.release()
-                return None
-            return self._holdings.warning(obj)
-        return None
+    def call(
+        self, obj: Any, method: str, function: Callable[..., Any], args: Any, kwds: Any
+    ) -> tuple[str, Any]:
+        """The answer to a call of a lock's method, or of another ``SYNCHRONIZATION`` object's."""
+        if isinstance(obj, threading.Barrier):
+            self._client.barriers.append(obj)
+            try:
+                return "#RETURN", function(*args, **kwds)
+            finally:
+                self._client.barriers.remove(obj)
+        if method == "release" and isinstance(obj, _ANYBODYS):
+            self._holdings.releasing(obj, self._client)
+        result = function(*args, **kwds)
+        if method == "release" and isinstance(obj, _OWNED):
+            self._owned.remove(obj)
+        return (
+            self._acquired(obj, result) if method == "acquire" and result else ("#RETURN", result)
+        )
 
-    def take_back(self, obj: Any, method: str, result: Any) -> None:
+    def _acquired(self, lock: Any, result: Any) -> tuple[str, Any]:
+        if isinstance(lock, _OWNED):
+            self._owned.append(lock)
+        elif not self._holdings.acquired(lock, self._client):
+            lock.release()
+            return "#RETURN", False
+        warning = self._holdings.warning(lock)
+        return ("#RETURN", result) if warning is None else ("#WARNING", (warning, result))
+
+    def take_back(self, obj: Any, method: str, kind: str, result: Any) -> None:
         """The client will never know what it got: let others have it."""
+        if kind == "#WARNING":
+            self._holdings.warn(obj, result[0])
+        elif kind != "#RETURN":
+            return
         if method == "acquire" and result:
-            if isinstance(obj, _ANYBODYS):
-                self._holdings.released(obj, self._client)
-                obj.release()
-            elif isinstance(obj, _OWNED):
-                self._owned.remove(obj)
-                obj.release()
+            self._give_up(obj)
+        elif method == "wait" and result and isinstance(obj, threading.Condition):
+            obj.notify()
+            while obj in self._owned:  # it only waited: nothing is half changed
+                self._give_up(obj)
         elif method == "get" and type(obj) is Queue:
             with obj.mutex:
                 obj.queue.appendleft(result)
                 obj.not_empty.notify()
-        elif method == "wait" and result and isinstance(obj, threading.Condition):
-            obj.notify()
+
+    def _give_up(self, lock: Any) -> None:
+        if isinstance(lock, _OWNED):
+            self._owned.remove(lock)
+        elif isinstance(lock, _ANYBODYS):
+            self._holdings.releasing(lock, self._client)
+        else:
+            return
+        lock.release()
 
     def end(self) -> None:
         """The client's thread has ended: nobody else could release them."""
+        whose = "" if self._client.gone else "a thread of "
         while self._owned:
-            self._holdings.abandon(self._owned.pop(), self._client)
+            self._holdings.abandon(self._owned.pop(), whose + self._client.name)

@@ -18,22 +18,22 @@ from traceback import format_exc
 from typing import Any
 
 from fiber import reduction
-from fiber._managers.holdings import Client, Holdings, ClientThread
+from fiber._managers.door import received
+from fiber._managers.holdings import SYNCHRONIZATION, Client, ClientThread, Holdings
 from fiber._transport.base import Channel
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
 
-_Server: Any = mp_managers.Server  # type: ignore[attr-defined]  # typeshed has part of it
+_mp: Any = mp_managers  # typeshed has part of it
 
 _PROXY = b"RebuildProxy"
 """In the pickle of whatever has a proxy in it."""
 
-_OF_LOCKS = frozenset({"acquire", "release"})
-
 _Answer = tuple[str, Any]
+"""Of what kind it is, in multiprocessing's words, and what it is."""
 
 
-class Server(_Server):  # type: ignore[misc]
+class Server(_mp.Server):  # type: ignore[misc]
     """Serves a manager's objects to the processes of the program."""
 
     def __init__(self, *options: Any) -> None:
@@ -66,8 +66,8 @@ class Server(_Server):  # type: ignore[misc]
         try:
             control.send(b"")
             while True:
-                self._heed(client, *control.recv_object())
-        except Exception:  # its end, or as good as that: it cannot be understood
+                self._heed(client, *received(control))
+        except (OSError, ConnectionClosed):
             pass
         finally:
             control.close()
@@ -76,8 +76,6 @@ class Server(_Server):  # type: ignore[misc]
     def _heed(self, client: Client, what: str, *about: Any) -> None:
         if what == "line":
             _start(self._serve_line, client, *about)
-        elif what == "pipeline":
-            _start(self._serve_pipeline, client, *about)
         elif what == "decref":
             self.decref(client, *about)
         elif what == "bye":
@@ -110,6 +108,7 @@ class Server(_Server):  # type: ignore[misc]
     def _serve_call(
         self, client: Client, thread: ClientThread, line: Channel, number: int, message: Any
     ) -> Any:
+        ident, method = None, ""
         try:
             ident, method, args, kwds = packet.loads(message)
             if ident is None:
@@ -118,37 +117,15 @@ class Server(_Server):  # type: ignore[misc]
                 answer = self._call(client, thread, ident, method, args, kwds)
         except Exception:
             answer = "#TRACEBACK", format_exc()
-            method = ""
         try:
-            kept = _reply(line, number, answer)
+            return _reply(line, number, answer)
         except OSError:
-            if answer[0] == "#RETURN" and ident is not None:
-                thread.take_back(self.id_to_obj[ident][0], method, answer[1])
+            if ident in self.id_to_obj:
+                thread.take_back(self.id_to_obj[ident][0], method, *answer)
             raise
-        if method == "shutdown" and ident is None:
-            self.stop_event.set()
-        return kept
-
-    def _serve_pipeline(self, client: Client, name: str, pipeline: Channel) -> None:
-        """The same for calls that nobody waits for, of one object that the first of them names."""
-        threading.current_thread().name = name
-        thread = ClientThread(self._holdings, client)
-        try:
-            pipeline.send(b"")
-            thread.ident, failure = self._begin(client, pipeline)
-            while True:
-                number, request = _numbered(pipeline.recv())
-                answer = failure or self._try_call(client, thread, request)
-                # Its client may have dropped its proxy, and mean what it asked for before.
-                with suppress(OSError):
-                    _send(pipeline, number, answer)
-        except ConnectionClosed:
-            pass
         finally:
-            pipeline.close()
-            thread.end()
-            if thread.ident:
-                self.decref(client, thread.ident)
+            if ident is None and method == "shutdown":
+                self.stop_event.set()
 
     def _own(self, client: Client, method: str, args: Any, kwds: Any) -> _Answer:
         if method not in self.public:
@@ -168,18 +145,13 @@ class Server(_Server):  # type: ignore[misc]
                 )
             return "#RETURN", fallback(self, client, ident, obj, *args, **kwds)
         try:
-            if type(obj) is threading.Barrier:
-                result = _at_barrier(client, obj, function, args, kwds)
-            else:
-                result = function(*args, **kwds)
+            if isinstance(obj, SYNCHRONIZATION):
+                return thread.call(obj, method, function, args, kwds)
+            result = function(*args, **kwds)
         except Exception as error:
             return _error(error)
         if typeids and method in typeids:
             return "#PROXY", self._made(client, typeids[method], result)
-        if method in _OF_LOCKS:
-            warning = thread.note(obj, method, result)
-            if warning is not None:
-                return "#WARNING", (warning, result)
         return "#RETURN", result
 
     def _made(self, client: Client, typeid: str, obj: Any) -> tuple[Any, Token, tuple[str, ...]]:
@@ -200,7 +172,7 @@ class Server(_Server):  # type: ignore[misc]
         else:
             obj = args[0]
         if exposed is None:
-            exposed = mp_managers.public_methods(obj)  # type: ignore[attr-defined]
+            exposed = _mp.public_methods(obj)
         names = (*exposed, *(typeids or ()))
         # Not the object's own id, which the next one may have while this one is being dropped.
         ident = format(next(self._numbers), "x")
@@ -245,14 +217,6 @@ class Server(_Server):  # type: ignore[misc]
 
 def _start(target: Any, *args: Any) -> None:
     threading.Thread(target=target, args=args, daemon=True).start()
-
-
-def _at_barrier(client: Client, barrier: Any, function: Any, args: Any, kwds: Any) -> Any:
-    client.barriers.append(barrier)
-    try:
-        return function(*args, **kwds)
-    finally:
-        client.barriers.remove(barrier)
 
 
 def _error(error: Exception) -> _Answer:
