@@ -32,6 +32,7 @@ from fiber._managers.server import Server
 from fiber._runtime.state import runtime
 from fiber.connection import Connection, Pipe
 from fiber.process import Process
+from fiber.resources import Resources, largest, merged, resources_of, with_resources
 
 __all__ = [
     "AcquirerProxy",
@@ -82,6 +83,9 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
     Without an ``address`` any process of the program can use the manager and its proxies, and
     nobody else: ``address`` can be sent to one that should ``connect``.  With an address it is
     multiprocessing's listener there, and other programs can ``connect`` with the same ``authkey``.
+
+    What the process wishes of its host is what ``fiber.meta`` gave the class, and besides the most
+    of what it gave the registered callables.  ``pool`` is the FiberPool whose pods are meant.
     """
 
     _Server = staticmethod(_make_server)
@@ -94,7 +98,9 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
         ctx: Any = None,
         *,
         shutdown_timeout: float = 1.0,
+        pool: str | None = None,
     ) -> None:
+        self._pool = pool
         self._starting: Connection | None = None
         self._session: client.Session | None = None
         if serializer == "pickle" and (address is None or isinstance(address, ManagerAddress)):
@@ -125,7 +131,8 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
         reader, writer = Pipe(duplex=False)
         settings = self._registry, self._known_address, self._authkey, self._serializer
         process = self._process_type(
-            target=type(self)._run_server, args=(*settings, writer, initializer, tuple(initargs))
+            target=with_resources(type(self)._run_server, self._wishes()),
+            args=(*settings, writer, initializer, tuple(initargs)),
         )
         ident = ":".join(str(number) for number in process._identity)
         process.name = f"{type(self).__name__}-{ident}"
@@ -144,6 +151,11 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
         )
         if not runtime().elastic:
             self._wait_for_server()
+
+    def _wishes(self) -> Resources:
+        makers = [make for make, *_ in self._registry.values() if make is not None]
+        wishes = merged(largest(map(resources_of, makers)), resources_of(type(self)))
+        return merged(wishes, Resources(pool=self._pool))
 
     def _wait_for_server(self) -> None:
         if self._starting is None:

@@ -27,7 +27,7 @@ from fiber import reduction
 from fiber._hub.client import Unreachable, host
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel
-from fiber._managers.door import ManagerAddress, knock
+from fiber._managers.door import TAKE_BACK, ManagerAddress, knock
 from fiber._transport.base import Channel
 from fiber.connection import how_it_ended
 from fiber.errors import ConnectionClosed
@@ -38,9 +38,6 @@ _LOOK_AGAIN = 0.5
 _BEFORE_EXIT = -50
 """Exit priority: after the managers of this process have been shut down."""
 
-_BLOCKING = frozenset({"acquire", "get", "join", "wait"})
-"""Methods that wait for others.  Given up, their line is too: the server takes back what it got."""
-
 
 class Line:
     """A channel to a thread of the server."""
@@ -48,6 +45,7 @@ class Line:
     def __init__(self, channel: LocalChannel) -> None:
         self._channel = channel
         self._asked = 0
+        self._draining = False
         self.busy = False
 
     def ask(self, request: tuple[Any, ...]) -> None:
@@ -63,6 +61,23 @@ class Line:
             if number == self._asked:  # else an earlier call was interrupted
                 return kind, result
 
+    def take_back(self) -> None:
+        """Nobody waits for the last answer any more."""
+        self._draining = True
+        self.ask((None, TAKE_BACK, (), {}))
+
+    def is_free(self) -> bool:
+        """Whether a call may begin."""
+        while self._draining and self._channel.poll(0):
+            try:
+                number, *_ = self._channel.recv_object()
+            except ConnectionClosed:
+                return False
+            except Exception:  # nobody wants it
+                continue
+            self._draining = number != self._asked
+        return not (self.busy or self._draining)
+
     def close(self) -> None:
         """End it."""
         self._channel.close()
@@ -77,6 +92,7 @@ class Session:
         self.process: weakref.ref[BaseProcess] | None = None
         """The server's process, where it is a child of this one."""
         self._references = 0
+        self._ended = False
         self._said: deque[tuple[str, ...]] = deque()
         self._of_thread: Any = util.ForkAwareLocal()
         try:
@@ -97,11 +113,13 @@ class Session:
 
     def line(self) -> Line:
         """A line of this thread on which no call is under way."""
+        if self._ended:
+            raise self.gone()
         lines: list[Line] | None = getattr(self._of_thread, "lines", None)
         if lines is None:
             lines = self._of_thread.lines = []
         for line in lines:
-            if not line.busy:
+            if line.is_free():
                 return line
         line = Line(self.hand_over("line", thread_name()))
         lines.append(line)
@@ -129,7 +147,7 @@ class Session:
     def say(self, *words: str) -> None:
         """Tell the server, without waiting even for room."""
         self._said.append(words)
-        while self._said:
+        while self._said and not self._ended:
             try:
                 said = self._said.popleft()
             except IndexError:  # another thread says it
@@ -147,8 +165,9 @@ class Session:
         _sessions.pop(self.address, None)
         self.say("bye")
 
-    def disown(self) -> None:
-        """In a forked process: it is the parent's, which goes on with it."""
+    def end(self) -> None:
+        """The server is gone; or, in a forked process, the session is the parent's."""
+        self._ended = True
         self._control.close()
         for line in getattr(self._of_thread, "lines", []):
             line.close()
@@ -233,8 +252,7 @@ class Request:
         except Exception:
             raise  # it came, and does not unpickle
         except BaseException:
-            if method in _BLOCKING:
-                self._session.give_up(line)
+            line.take_back()
             raise
         finally:
             line.busy = False
@@ -304,8 +322,10 @@ def proxy_of(session: Session, make: Any, token: Token, exposed: tuple[str, ...]
 
 def forget(address: ManagerAddress) -> None:
     """The server has been shut down."""
-    _sessions.pop(address, None)
+    session = _sessions.pop(address, None)
     _held.pop(address, None)
+    if session is not None:
+        session.end()
 
 
 def introduction() -> str:
@@ -337,7 +357,7 @@ def _close_all() -> None:
 def _forget() -> None:
     """In a forked process: they are its parent's."""
     for one in list(_sessions.values()):
-        one.disown()
+        one.end()
     _sessions.clear()
     _held.clear()
 

@@ -15,6 +15,9 @@ from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
 from fiber._transport.base import Channel
 
+TAKE_BACK = "take_back"
+"""Asked of the server by whoever was interrupted: that others get what the last call got."""
+
 _UNTIL_FILES_CLOSE = 0.05
 """Seconds between attempts of a process that may open no more files."""
 

@@ -12,7 +12,7 @@ import weakref
 from collections import Counter
 from collections.abc import Callable
 from queue import Queue
-from typing import Any
+from typing import Any, TypeAlias
 
 _LOCK = type(threading.Lock())
 _ANYBODYS = (_LOCK, threading.Semaphore)
@@ -21,6 +21,11 @@ _OWNED = (type(threading.RLock()), threading.Condition)
 """Only the thread that acquired them may."""
 SYNCHRONIZATION = (*_ANYBODYS, *_OWNED, threading.Barrier)
 """What a client that dies would leave in the others' way."""
+WAITING = frozenset({"acquire", "get", "wait"})
+"""Methods that get something for which others may wait, too."""
+
+Got: TypeAlias = tuple[Any, str, tuple[str, Any]]
+"""An object, the method that was called, and the answer."""
 
 
 class Client:
@@ -104,6 +109,8 @@ class ClientThread:
         self._holdings = holdings
         self._client = client
         self._owned: list[Any] = []
+        self.got: Got | None = None
+        """What the last call brought, if others wait for such."""
         self.kept: Any = None
         """The last result that has proxies in it: until the client has references of its own to
         what they stand for, which it has when it asks for the next."""
@@ -111,7 +118,7 @@ class ClientThread:
     def call(
         self, obj: Any, method: str, function: Callable[..., Any], args: Any, kwds: Any
     ) -> tuple[str, Any]:
-        """The answer to a call of a lock's method, or of another ``SYNCHRONIZATION`` object's."""
+        """The answer to a call of a ``WAITING`` method, or of a ``SYNCHRONIZATION`` object's."""
         if isinstance(obj, threading.Barrier):
             self._client.barriers.append(obj)
             try:
@@ -123,25 +130,31 @@ class ClientThread:
         result = function(*args, **kwds)
         if method == "release" and isinstance(obj, _OWNED):
             self._owned.remove(obj)
-        return (
-            self._acquired(obj, result) if method == "acquire" and result else ("#RETURN", result)
-        )
+        answer = "#RETURN", result
+        if method == "acquire" and result:
+            answer = self._acquired(obj, result)
+        if method in WAITING:
+            self.got = obj, method, answer
+        return answer
 
     def _acquired(self, lock: Any, result: Any) -> tuple[str, Any]:
         if isinstance(lock, _OWNED):
             self._owned.append(lock)
+        elif not isinstance(lock, _ANYBODYS):
+            return "#RETURN", result
         elif not self._holdings.acquired(lock, self._client):
             lock.release()
             return "#RETURN", False
         warning = self._holdings.warning(lock)
         return ("#RETURN", result) if warning is None else ("#WARNING", (warning, result))
 
-    def take_back(self, obj: Any, method: str, kind: str, result: Any) -> None:
+    def take_back(self, got: Got | None) -> None:
         """The client will never know what it got: let others have it."""
+        if got is None:
+            return
+        obj, method, (kind, result) = got
         if kind == "#WARNING":
             self._holdings.warn(obj, result[0])
-        elif kind != "#RETURN":
-            return
         if method == "acquire" and result:
             self._give_up(obj)
         elif method == "wait" and result and isinstance(obj, threading.Condition):

@@ -18,8 +18,8 @@ from traceback import format_exc
 from typing import Any
 
 from fiber import reduction
-from fiber._managers.door import received
-from fiber._managers.holdings import SYNCHRONIZATION, Client, ClientThread, Holdings
+from fiber._managers.door import TAKE_BACK, received
+from fiber._managers.holdings import SYNCHRONIZATION, WAITING, Client, ClientThread, Holdings
 from fiber._transport.base import Channel
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
@@ -109,19 +109,23 @@ class Server(_mp.Server):  # type: ignore[misc]
         self, client: Client, thread: ClientThread, line: Channel, number: int, message: Any
     ) -> Any:
         ident, method = None, ""
+        got_before, thread.got = thread.got, None
+        answer: _Answer
         try:
             ident, method, args, kwds = packet.loads(message)
-            if ident is None:
-                answer = self._own(client, method, args, kwds)
-            else:
+            if ident is not None:
                 answer = self._call(client, thread, ident, method, args, kwds)
+            elif method == TAKE_BACK:
+                thread.take_back(got_before)
+                answer = "#RETURN", None
+            else:
+                answer = self._own(client, method, args, kwds)
         except Exception:
             answer = "#TRACEBACK", format_exc()
         try:
             return _reply(line, number, answer)
         except OSError:
-            if ident in self.id_to_obj:
-                thread.take_back(self.id_to_obj[ident][0], method, *answer)
+            thread.take_back(thread.got)
             raise
         finally:
             if ident is None and method == "shutdown":
@@ -145,7 +149,7 @@ class Server(_mp.Server):  # type: ignore[misc]
                 )
             return "#RETURN", fallback(self, client, ident, obj, *args, **kwds)
         try:
-            if isinstance(obj, SYNCHRONIZATION):
+            if method in WAITING or isinstance(obj, SYNCHRONIZATION):
                 return thread.call(obj, method, function, args, kwds)
             result = function(*args, **kwds)
         except Exception as error:
@@ -222,8 +226,8 @@ def _start(target: Any, *args: Any) -> None:
 def _error(error: Exception) -> _Answer:
     """An error of the object's own, which is raised as it is where that can be."""
     wrapped = ExceptionWithTraceback(error, error.__traceback__)
+    error.__traceback__ = None  # its frames hold the object, which is to go with its last proxy
     try:
-        reduction.dumps(wrapped)
         pickle.loads(reduction.dumps(wrapped))
     except Exception:
         return "#TRACEBACK", wrapped.tb
