@@ -28,6 +28,7 @@ from typing import Any
 from fiber._hub.unsupported import refuse
 from fiber._managers import SERIALIZER, client
 from fiber._managers.door import ManagerAddress
+from fiber._managers.rlock import RLock, condition
 from fiber._managers.server import Server
 from fiber._runtime.state import runtime
 from fiber.connection import Connection, Pipe
@@ -185,6 +186,12 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
         super().connect()
         self._hold_session()
 
+    def _create(self, typeid: str, /, *args: Any, **kwds: Any) -> tuple[Token, Any]:
+        token, exposed = super()._create(typeid, *args, **kwds)
+        if self._serializer == SERIALIZER:
+            token = client.TravellingToken(token.typeid, token.address, token.id)
+        return token, exposed
+
     def get_server(self) -> Any:
         """The server, to be run in this process: it has ``serve_forever`` and ``address``."""
         self._check_initial()
@@ -225,10 +232,12 @@ def _pool(*args: Any, **options: Any) -> Any:
     return Pool(*args, **options)
 
 
+_OURS = {"Condition": condition, "Pool": _pool, "RLock": RLock}
+
 for _typeid, (_callable, _exposed, _typeids, _proxytype) in _mp.SyncManager._registry.items():
     SyncManager.register(
         _typeid,
-        _pool if _typeid == "Pool" else _callable,
+        _OURS.get(_typeid, _callable),
         _proxytype,
         _exposed,
         _typeids,

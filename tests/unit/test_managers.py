@@ -233,7 +233,7 @@ def test_who_makes_an_error_of_the_warning_does_not_have_the_lock(manager: Any) 
     child.join(PATIENCE)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(RuntimeWarning, match=rf"{child.name}.*held a lock"):
+        with pytest.raises(RuntimeWarning, match=rf"{child.name}.*held this lock"):
             lock.acquire(True, PATIENCE)
     assert lock.acquire(False)
 

@@ -24,6 +24,7 @@ from threading import current_thread, main_thread
 from typing import Any
 
 from fiber import reduction
+from fiber._hub import handles
 from fiber._hub.client import Unreachable, host
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel
@@ -180,6 +181,34 @@ class Session:
         """The error of whoever finds the server gone."""
         process = self.process and self.process()
         return ConnectionClosed(self.address.server, how_it_ended(process) if process else None)
+
+
+class Reference:
+    """Keeps an object of a manager while this is alive.  Made and dropped without waiting."""
+
+    def __init__(self, session: Session, ident: str) -> None:
+        self._session = session
+        self._ident = ident
+        session.got_reference()
+        session.say("incref", ident)
+
+    def __del__(self) -> None:
+        if self._session.pid == os.getpid():
+            self._session.let_go(self._ident)
+
+
+class TravellingToken(Token):
+    """A token that keeps its object while it is on its way to another process, where that is known.
+
+    In multiprocessing the object may be gone before the process has a proxy of its own.
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        address: Any = self.address
+        known = _sessions.get(address)
+        if known is not None:
+            handles.keep_until_released(Reference(known, str(self.id)))
+        return type(self), (self.typeid, address, self.id)
 
 
 def _hand_over(carrier: Channel, *about: str) -> LocalChannel:

@@ -14,15 +14,14 @@ from collections.abc import Callable
 from queue import Queue
 from typing import Any, TypeAlias
 
+from fiber._managers.rlock import RLock
+
 _LOCK = type(threading.Lock())
 _ANYBODYS = (_LOCK, threading.Semaphore)
 """Any thread may release them."""
-_OWNED = (type(threading.RLock()), threading.Condition)
-"""Only the thread that acquired them may."""
-SYNCHRONIZATION = (*_ANYBODYS, *_OWNED, threading.Barrier)
-"""What a client that dies would leave in the others' way."""
-WAITING = frozenset({"acquire", "get", "wait"})
-"""Methods that get something for which others may wait, too."""
+_LOCKS = (*_ANYBODYS, RLock)
+CONTENDED = (*_LOCKS, threading.Condition, threading.Barrier, Queue)
+"""What has something for which several clients may wait."""
 
 Got: TypeAlias = tuple[Any, str, tuple[str, Any]]
 """An object, the method that was called, and the answer."""
@@ -40,6 +39,7 @@ class Client:
         self.mutex = threading.Lock()
         self.barriers: list[threading.Barrier] = []
         """At which its threads wait."""
+        self.threads: list[ClientThread] = []
 
 
 class Holdings:
@@ -48,13 +48,15 @@ class Holdings:
     def __init__(self) -> None:
         self._mutex = threading.Lock()
         self._held: dict[int, tuple[Any, Counter[Client]]] = {}
-        self._abandoned: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
+        self._warnings: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
 
     def acquired(self, lock: Any, client: Client) -> bool:
         """``client`` has it now; False if it cannot have anything any more."""
         with self._mutex:
             if client.gone:
                 return False
+            if isinstance(lock, RLock):  # that is known by its threads
+                return True
             self._held.setdefault(id(lock), (lock, Counter()))[1][client] += 1
             return True
 
@@ -62,13 +64,26 @@ class Holdings:
         """``client`` is about to release it: noted first, as then it can be somebody else's."""
         with self._mutex:
             holders = self._held.get(id(lock), (lock, Counter[Client]()))[1]
-            if client in holders:
-                holders[client] -= 1
-                holders += Counter()  # less those that have none
-            elif type(lock) is _LOCK:
-                holders.clear()  # it was handed over
-            if not holders:
-                self._held.pop(id(lock), None)
+            self._note_release(lock, client, holders)
+
+    def _note_release(self, lock: Any, client: Client, holders: Counter[Client]) -> None:
+        if client in holders:
+            holders[client] -= 1
+            if not holders[client]:
+                del holders[client]
+        elif type(lock) is _LOCK:
+            holders.clear()  # it was handed over
+        if not holders:
+            self._held.pop(id(lock), None)
+
+    def withdraw(self, lock: Any, client: Client) -> bool:
+        """``client`` is not to have it; False if it has not, as it is gone."""
+        with self._mutex:
+            holders = self._held.get(id(lock), (lock, Counter[Client]()))[1]
+            if client not in holders:
+                return False
+            self._note_release(lock, client, holders)
+            return True
 
     def end(self, client: Client) -> None:
         """It is gone; if not in good order, release what it had."""
@@ -80,26 +95,20 @@ class Holdings:
             return
         for lock, count in mine:
             for _ in range(count):
-                self.abandon(lock, client.name)
+                self.warn(lock, abandoned(lock, client.name))
+                lock.release()
+        for thread in list(client.threads):
+            thread.abandon()
         for barrier in list(client.barriers):
             barrier.abort()
 
-    def abandon(self, lock: Any, holder: str) -> None:
-        """Release it for ``holder``, and have the next one who acquires it know."""
-        self.warn(
-            lock,
-            f"{holder} ended while it held a {type(lock).__name__.lower()} of this manager, "
-            "which was released: what the lock protects may be half changed",
-        )
-        lock.release()
-
     def warn(self, lock: Any, text: str) -> None:
-        """What the next one who acquires it should know."""
-        self._abandoned[lock] = text
+        """Have the next one who acquires it know."""
+        self._warnings[lock] = text
 
     def warning(self, lock: Any) -> str | None:
         """What whoever has just acquired it should know."""
-        return self._abandoned.pop(lock, None) if self._abandoned else None
+        return self._warnings.pop(lock, None) if self._warnings else None
 
 
 class ClientThread:
@@ -108,41 +117,43 @@ class ClientThread:
     def __init__(self, holdings: Holdings, client: Client) -> None:
         self._holdings = holdings
         self._client = client
-        self._owned: list[Any] = []
+        self._ident = threading.get_ident()
+        self._owned: set[RLock] = set()
         self.got: Got | None = None
         """What the last call brought, if others wait for such."""
         self.kept: Any = None
         """The last result that has proxies in it: until the client has references of its own to
         what they stand for, which it has when it asks for the next."""
+        client.threads.append(self)
 
     def call(
         self, obj: Any, method: str, function: Callable[..., Any], args: Any, kwds: Any
     ) -> tuple[str, Any]:
-        """The answer to a call of a ``WAITING`` method, or of a ``SYNCHRONIZATION`` object's."""
+        """The answer to a call of a method of something ``CONTENDED``."""
         if isinstance(obj, threading.Barrier):
             self._client.barriers.append(obj)
             try:
                 return "#RETURN", function(*args, **kwds)
             finally:
                 self._client.barriers.remove(obj)
-        if method == "release" and isinstance(obj, _ANYBODYS):
-            self._holdings.releasing(obj, self._client)
+        lock = _lock_of(obj)
+        if method == "release" and isinstance(lock, _ANYBODYS):
+            self._holdings.releasing(lock, self._client)
         result = function(*args, **kwds)
-        if method == "release" and isinstance(obj, _OWNED):
-            self._owned.remove(obj)
         answer = "#RETURN", result
         if method == "acquire" and result:
-            answer = self._acquired(obj, result)
-        if method in WAITING:
-            self.got = obj, method, answer
+            answer = self._acquired(lock, result)
+        elif method == "release" and isinstance(lock, RLock) and not lock.owned_by(self._ident):
+            self._owned.discard(lock)
+        self.got = obj, method, answer
         return answer
 
     def _acquired(self, lock: Any, result: Any) -> tuple[str, Any]:
-        if isinstance(lock, _OWNED):
-            self._owned.append(lock)
-        elif not isinstance(lock, _ANYBODYS):
+        if not isinstance(lock, _LOCKS):
             return "#RETURN", result
-        elif not self._holdings.acquired(lock, self._client):
+        if isinstance(lock, RLock):
+            self._owned.add(lock)
+        if not self._holdings.acquired(lock, self._client):
             lock.release()
             return "#RETURN", False
         warning = self._holdings.warning(lock)
@@ -153,30 +164,42 @@ class ClientThread:
         if got is None:
             return
         obj, method, (kind, result) = got
-        if kind == "#WARNING":
-            self._holdings.warn(obj, result[0])
-        if method == "acquire" and result:
-            self._give_up(obj)
-        elif method == "wait" and result and isinstance(obj, threading.Condition):
-            obj.notify()
-            while obj in self._owned:  # it only waited: nothing is half changed
-                self._give_up(obj)
+        lock = _lock_of(obj)
+        if method == "acquire" and result and isinstance(lock, _LOCKS):
+            if kind == "#WARNING":
+                self._holdings.warn(lock, result[0])
+            if isinstance(lock, RLock):
+                lock.revoke(self._ident)
+            elif self._holdings.withdraw(lock, self._client):
+                lock.release()
+        elif method == "wait" and result and isinstance(lock, RLock):
+            with lock:
+                obj.notify()
+            lock.revoke(self._ident)  # without a warning: it only waited
         elif method == "get" and type(obj) is Queue:
             with obj.mutex:
                 obj.queue.appendleft(result)
                 obj.not_empty.notify()
 
-    def _give_up(self, lock: Any) -> None:
-        if isinstance(lock, _OWNED):
-            self._owned.remove(lock)
-        elif isinstance(lock, _ANYBODYS):
-            self._holdings.releasing(lock, self._client)
-        else:
-            return
-        lock.release()
+    def abandon(self) -> None:
+        """Nobody else could release what this thread has acquired."""
+        for lock in [lock for lock in self._owned if lock.owned_by(self._ident)]:
+            self._holdings.warn(lock, abandoned(lock, f"a thread of {self._client.name}"))
+            lock.revoke(self._ident)
 
     def end(self) -> None:
-        """The client's thread has ended: nobody else could release them."""
-        whose = "" if self._client.gone else "a thread of "
-        while self._owned:
-            self._holdings.abandon(self._owned.pop(), whose + self._client.name)
+        """The client's thread has ended."""
+        self._client.threads.remove(self)
+        self.abandon()
+
+
+def abandoned(lock: Any, holder: str) -> str:
+    """What is said of a lock that ``holder`` had."""
+    return (
+        f"{holder} ended while it held this {type(lock).__name__.lower()} of a manager, "
+        "which was released: what it protects may be half changed"
+    )
+
+
+def _lock_of(obj: Any) -> Any:
+    return vars(obj)["_lock"] if isinstance(obj, threading.Condition) else obj

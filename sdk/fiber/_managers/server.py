@@ -11,6 +11,7 @@ import itertools
 import pickle
 import sys
 import threading
+from contextlib import suppress
 from multiprocessing import managers as mp_managers
 from multiprocessing.managers import Token
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
@@ -18,8 +19,9 @@ from traceback import format_exc
 from typing import Any
 
 from fiber import reduction
+from fiber._managers.client import TravellingToken
 from fiber._managers.door import TAKE_BACK, received
-from fiber._managers.holdings import SYNCHRONIZATION, WAITING, Client, ClientThread, Holdings
+from fiber._managers.holdings import CONTENDED, Client, ClientThread, Holdings
 from fiber._transport.base import Channel
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
@@ -76,6 +78,9 @@ class Server(_mp.Server):  # type: ignore[misc]
     def _heed(self, client: Client, what: str, *about: Any) -> None:
         if what == "line":
             _start(self._serve_line, client, *about)
+        elif what == "incref":
+            with suppress(KeyError):
+                self.incref(client, *about)
         elif what == "decref":
             self.decref(client, *about)
         elif what == "bye":
@@ -139,7 +144,7 @@ class Server(_mp.Server):  # type: ignore[misc]
     def _call(
         self, client: Client, thread: ClientThread, ident: str, method: str, args: Any, kwds: Any
     ) -> _Answer:
-        obj, exposed, typeids = self.id_to_obj[ident]
+        obj, exposed, typeids = self._found(ident)
         function = getattr(obj, method, None) if method in exposed else None
         if function is None:
             fallback = self.fallback_mapping.get(method)
@@ -149,7 +154,7 @@ class Server(_mp.Server):  # type: ignore[misc]
                 )
             return "#RETURN", fallback(self, client, ident, obj, *args, **kwds)
         try:
-            if method in WAITING or isinstance(obj, SYNCHRONIZATION):
+            if isinstance(obj, CONTENDED):
                 return thread.call(obj, method, function, args, kwds)
             result = function(*args, **kwds)
         except Exception as error:
@@ -158,9 +163,18 @@ class Server(_mp.Server):  # type: ignore[misc]
             return "#PROXY", self._made(client, typeids[method], result)
         return "#RETURN", result
 
+    def _found(self, ident: str) -> Any:
+        try:
+            return self.id_to_obj[ident]
+        except KeyError:
+            raise KeyError(
+                f"the manager has no object {ident!r} any more: it went with its last proxy. Keep "
+                "a proxy until whoever was sent one has received it"
+            ) from None
+
     def _made(self, client: Client, typeid: str, obj: Any) -> tuple[Any, Token, tuple[str, ...]]:
         ident, exposed = self.create(client, typeid, obj)
-        return self.registry[typeid][-1], Token(typeid, self.address, ident), exposed
+        return self.registry[typeid][-1], TravellingToken(typeid, self.address, ident), exposed
 
     # What managers ask of the server itself; ``c`` is the client
 
