@@ -9,6 +9,7 @@ RuntimeWarning that names it.
 
 from __future__ import annotations
 
+import threading
 import weakref
 from collections.abc import Callable, Iterable
 from multiprocessing import managers as mp_managers
@@ -205,12 +206,15 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
             raise ProcessError("Manager has shut down")
 
     @staticmethod
-    def _end(process: Process, known: list[Any], authkey: bytes, state: Any, *rest: Any) -> None:
-        """What ``shutdown`` does, and the program's end."""
+    def _end(process: Process, known: list[Any], *rest: Any) -> None:
+        """What ``shutdown`` does, and the program's end, and the garbage collector."""
+        if runtime().loop.on_thread():  # collected there: the loop must not wait for itself
+            threading.Thread(target=BaseManager._end, args=(process, known, *rest)).start()
+            return
         address = known[0] if known else None
         if address is None:
             process.terminate()
-        _mp.BaseManager._finalize_manager(process, address, authkey, state, *rest)
+        _mp.BaseManager._finalize_manager(process, address, *rest)
         if isinstance(address, ManagerAddress):
             client.forget(address)
 

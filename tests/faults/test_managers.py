@@ -55,6 +55,7 @@ def tell(orders: Any, process: Any, method: str, *args: Any) -> Any:
 def test_its_death_is_an_error_that_says_who_and_why(manager: Any) -> None:
     shared, name = manager.dict(a=1), manager._process.name
     manager._process.kill()
+    manager._process.join(PATIENCE)
     with pytest.raises(ConnectionClosed, match=rf"manager '{name}'.*gone \(.*SIGKILL"):
         shared["a"]
     with pytest.raises(ConnectionClosed, match=rf"manager '{name}'.*gone \(.*SIGKILL"):

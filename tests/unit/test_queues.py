@@ -486,14 +486,3 @@ def test_shared_values_are_refused_by_name(name: str) -> None:
     with pytest.raises(NotInFiber, match=f"no {name} yet.*Pipe or Queue"):
         getattr(sharedctypes, name)("i", 0)
     assert isinstance(sharedctypes.SynchronizedArray, type)
-
-
-def test_managers_can_be_defined_but_not_made() -> None:
-    from fiber import managers
-
-    class Manager(managers.BaseManager):
-        pass
-
-    Manager.register("Thing", callable=dict)
-    with pytest.raises(NotInFiber, match="no Manager yet"):
-        Manager()

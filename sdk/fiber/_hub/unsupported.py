@@ -20,7 +20,6 @@ _INSTEAD = {
     "synchronized": "send the object through a Pipe or Queue",
     "SharedMemory": "send the buffer through a Pipe or Queue",
     "ShareableList": "send the list through a Pipe or Queue",
-    "Manager": "keep the object in one process and talk to it through a Pipe or Queue",
 }
 
 
