@@ -6,10 +6,6 @@ list says what is so.
 
 from __future__ import annotations
 
-_MANAGERS = {
-    f"TestInitializers.test_{name}_initializer": "its set-up makes a manager: not in Fiber yet"
-    for name in ("manager", "pool")
-}
 _MEMORY_MANAGERS = {
     f"WithProcessesTestSharedMemory.test_shared_memory_{name}": "SharedMemoryManager: not yet"
     for name in ("SharedMemoryManager_basics", "SharedMemoryServer_ignores_sigint")
@@ -36,9 +32,9 @@ _ONE_HOST = {
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
-    "local": {**_MANAGERS, **_MEMORY_MANAGERS, **_CLOSED_AT_ONCE},
-    "loopback": {**_MANAGERS, **_CLOSED_AT_ONCE, **_ONE_HOST},
-    "kubernetes": {**_MANAGERS, **_CLOSED_AT_ONCE, **_ONE_HOST},
+    "local": {**_MEMORY_MANAGERS, **_CLOSED_AT_ONCE},
+    "loopback": {**_CLOSED_AT_ONCE, **_ONE_HOST},
+    "kubernetes": {**_CLOSED_AT_ONCE, **_ONE_HOST},
 }
 
 _CONCERNS_ONE_TASK = "concerns one task, which gets the error itself: the executor is not broken"
