@@ -152,7 +152,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def step_async(self, actions: Any) -> None:
         """Begin to step: for ``step_wait``."""
         self._check_idle("step_async")
-        self._tell_step(None, actions, together=True)
+        self._sub_environments.step(None, actions, self._each_action, together=True)
         self._state = AsyncState.WAITING_STEP
 
     def step_wait(self, timeout: float | None = None) -> Step:
@@ -175,7 +175,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         By default those of the last ``recv``, or all after ``reset`` or ``step``.
         """
         self._check_running()
-        self._tell_step(self._chosen(env_ids), actions, together=False)
+        numbers = self._chosen(env_ids)
+        self._sub_environments.step(numbers, actions, self._each_action, together=False)
 
     def recv(self, batch_size: int | None = None, timeout: float | None = None) -> Step:
         """What ``step`` returns, of the ``batch_size`` environments that are ready first.
@@ -242,7 +243,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
                 f"values for {self.num_envs} environments are needed, one for each, not "
                 f"{len(values)}"
             )
-        self._call("set_attr", [(name, value) for value in values])
+        self._call("set_wrapper_attr", [(name, value) for value in values])
         self.call_wait()
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
@@ -263,23 +264,12 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     # What they have in common
 
-    def _tell_step(self, numbers: Sequence[int] | None, actions: Any, *, together: bool) -> None:
-        count = self.num_envs if numbers is None else len(numbers)
-        columns = self._arrays.actions
-        if columns.fits(actions, count):
-            columns.fill(slice(None) if numbers is None else numbers, actions)
-            self._dispatcher.step(numbers, None, together=together)
-        else:
-            chosen = list(iterate(self.action_space, actions))
-            if len(chosen) != count:
-                raise ValueError(
-                    f"actions for {count} environments are needed, one for each, not {len(chosen)}"
-                )
-            self._dispatcher.step(numbers, chosen, together=together)
-
     def _call(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> None:
         self._dispatcher.call(range(self.num_envs), method, arguments)
         self._state = AsyncState.WAITING_CALL
+
+    def _each_action(self, actions: Any) -> list[Any]:
+        return list(iterate(self.action_space, actions))
 
     def _observations(self) -> Any:
         batch = self._arrays.observations.batch(slice(None))
