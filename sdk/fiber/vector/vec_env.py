@@ -84,7 +84,7 @@ class VecEnv(vec_env.VecEnv):
         self._check_open()
         if self.waiting:
             raise AlreadyPendingCallError("step_async() before the last one's step_wait()", "step")
-        self._sub_environments.step(None, actions, list, together=True)
+        self._waited(lambda: self._sub_environments.step(None, actions, list, together=True))
         self.waiting = True
 
     def step_wait(
