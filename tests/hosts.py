@@ -10,8 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from fiber._hub import client, handles
-from fiber._hub.hub import Hub
-from fiber._hub.tunnel import Frame, Tunnels
+from fiber._hub.hub import Frame, Hub, HubLink
 from fiber._transport.loop import Loop
 from fiber._wire import messages
 
@@ -21,7 +20,7 @@ class Wire:
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop
-        self.to: Tunnels | None = None
+        self.to: HubLink | None = None
         self.held: deque[bytes] | None = None
         self.frames = 0
 
