@@ -15,7 +15,6 @@ import socket
 import struct
 import tempfile
 import weakref
-from collections.abc import Callable
 from functools import partial
 from queue import Empty, SimpleQueue
 
@@ -25,46 +24,23 @@ from fiber._hub.client_handler import ClientHandler
 from fiber._hub.directory import remove_directory
 from fiber._hub.doorbell import Doorbell
 from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter, HostedMemory
+from fiber._hub.hub_link import HubLink, Send
 from fiber._hub.local import QuietSocket, without_timeout
 from fiber._hub.poller import Poller
 from fiber._hub.protocol import HubAddress, ObjectKind
 from fiber._hub.registry import Registry, SharedObject
-from fiber._hub.replicas import MemoryLink, Replicas
+from fiber._hub.replicas import Replicas
 from fiber._hub.streams import SocketStream, Stream
-from fiber._hub.tunnel import Frame as TunnelFrame
-from fiber._hub.tunnel import Router, Tunnels
+from fiber._hub.tunnel import Router
 from fiber._transport.loop import DOZE, Loop
 from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire.descriptor import Descriptor, own
-from fiber._wire.messages import Memory
 from fiber.errors import TooManyOpenFiles
-
-Frame = TunnelFrame | Memory
-Send = Callable[[Frame], None]
 
 _PEER = struct.Struct("iII")  # pid, uid, gid
 
 _ACCEPT_AGAIN = 0.1
 """Seconds until the next try when no descriptor is free to accept a stream with."""
-
-
-class HubLink:
-    """What hubs say to each other over one link.  On the loop's thread."""
-
-    def __init__(self, tunnels: Tunnels, memory: MemoryLink) -> None:
-        self._tunnels = tunnels
-        self._memory = memory
-
-    def on_frame(self, frame: Frame) -> None:
-        """A frame of theirs that came over the link."""
-        if isinstance(frame, Memory):
-            self._memory.on_frame(frame)
-        else:
-            self._tunnels.on_frame(frame)
-
-    def flush(self) -> None:
-        """Before anything else is sent: send what has changed in shared memory."""
-        self._memory.flush()
 
 
 class Hub:
@@ -158,13 +134,10 @@ class Hub:
 
         None stands for every host that has no link of its own, as an agent's link to the master.
         """
-        memory = self.replicas.link(host, send, dialer=dialer)
-
-        def send_on(frame: Frame) -> None:
-            memory.flush()
-            send(frame)
-
-        return HubLink(self._router.link(host, send_on, dialer=dialer), memory)
+        link = HubLink(self._loop.call_soon, send)
+        link.memory = self.replicas.link(host, send, dialer=dialer)
+        link.tunnels = self._router.link(host, link.send, dialer=dialer)
+        return link
 
     def unlink(self, host: str | None, reason: str) -> None:
         """That link is over; whoever used it is told ``reason``."""

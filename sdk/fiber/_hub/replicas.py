@@ -5,7 +5,7 @@ makes a block of its own, a *replica*, and asks the next hub on the way to the h
 contents, which joins first if it is not the home itself.  So the hosts that have a block form a
 tree along the links, and what changes travels only there (``fiber._hub.coherence``).
 
-On a link each block has a number, given by the side that joins.  What is said of it, the kind first::
+On a link each block has a number, given by the side that joins.  What is said of it::
 
     JOIN      an Origin; the other side sends what is not zero, as patches, and READY
     READY     empty, or why it cannot be had
@@ -184,6 +184,10 @@ class MemoryLink:
         self._numbers = itertools.count(1 if dialer else 2, 2)
         self._shares: dict[int, _Share] = {}
         self._joining: dict[int, _Downstream] = {}
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self._shares)
 
     def flush(self) -> None:
         """Send what has changed here, ahead of what is about to be sent."""
