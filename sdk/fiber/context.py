@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fiber.connection import Connection
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
-    from fiber.synchronize import BoundedSemaphore, Event, Semaphore
+    from fiber.synchronize import BoundedSemaphore, Event, Lock, RLock, Semaphore
 
 __all__ = [
     "BaseContext",
@@ -105,26 +105,26 @@ class BaseContext:
 
     # Synchronization
 
-    def Event(self) -> Event:
-        """A flag to wait for."""
-        from fiber.synchronize import Event
-
-        config.use()
-        return Event()
-
-    def Lock(self) -> Any:
+    def Lock(self) -> Lock:
         """A mutex."""
         from fiber.synchronize import Lock
 
         config.use()
         return Lock()
 
-    def RLock(self) -> Any:
-        """A mutex that its holder may acquire again."""
+    def RLock(self) -> RLock:
+        """A mutex that its thread may acquire again."""
         from fiber.synchronize import RLock
 
         config.use()
         return RLock()
+
+    def Event(self) -> Event:
+        """A flag to wait for."""
+        from fiber.synchronize import Event
+
+        config.use()
+        return Event()
 
     def Semaphore(self, value: int = 1) -> Semaphore:
         """A semaphore."""

@@ -42,6 +42,7 @@ class ObjectKind(IntEnum):
     COUNTER = 2
     # What is a block of shared memory
     MEMORY = 3
+    SEMAPHORE = 4
 
 
 class Extent(NamedTuple):

@@ -16,9 +16,7 @@ _INSTEAD = {
 
 def refuse(name: str) -> NoReturn:
     """Raise the error for ``name``."""
-    raise NotInFiber(
-        f"Fiber has no {name} yet: it shares no memory and no locks. Please {_INSTEAD[name]}."
-    )
+    raise NotInFiber(f"Fiber has no {name} yet. Please {_INSTEAD[name]}.")
 
 
 def unsupported(name: str) -> Callable[..., Any]:

@@ -12,12 +12,21 @@ from functools import partial
 from typing import Protocol
 
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden, explain
-from fiber._backends.kubernetes.held_pool import HeldPool
+from fiber._backends.kubernetes.api_errors import (
+    ApiError,
+    Body,
+    Forbidden,
+    ServerError,
+    TooManyRequests,
+    Transient,
+    Unreachable,
+    explain,
+)
+from fiber._backends.kubernetes.attached_pool import AttachedPool
+from fiber._backends.kubernetes.informer import Informer
 from fiber._backends.kubernetes.lease import LeaseRenewer
 from fiber._backends.kubernetes.resources import PODS, POOLS
 from fiber._backends.kubernetes.scaling import Scaling
-from fiber._backends.kubernetes.watches import ObjectWatch
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
 from fiber_api import names
@@ -28,28 +37,34 @@ OPERATOR_SLOW, OPERATOR_ABSENT = 5.0, 30.0
 CLOSE_TIMEOUT = 10.0
 """Seconds that the API server may take to give a pool back."""
 
+_RENEW, _WATCH = "renew the Lease of", "watch"
+"""What cannot be done, in words that follow "cannot"."""
 
-class Tenure(Protocol):
+
+class Attachment(Protocol):
     """How a pool comes to have this program as its master, and how that ends."""
 
     name: str
     namespace: str
     doing: str
-    """What ``begin`` does, in words that follow "cannot"."""
+    """What ``attach`` does, in words that follow "cannot"."""
 
     @property
     def remedy(self) -> str:
-        """The command that does what ``end`` could not."""
+        """The command that does what ``detach`` could not."""
 
-    def begin(self, cancel: threading.Event) -> HeldPool:
+    def attach(self, cancel: threading.Event) -> AttachedPool:
         """Make this program the pool's master; ``ApiError``, FiberPoolError."""
 
-    def end(self, timeout: float) -> None:
-        """Undo it, whether or not ``begin`` succeeded; ``ApiError``."""
+    def detach(self, timeout: float) -> None:
+        """Undo it, whether or not ``attach`` succeeded; ``ApiError``."""
 
 
 class Observer(Protocol):
     """Who is told, on the loop's thread."""
+
+    def on_attached(self) -> None:
+        """Once: the pool is there, with this program as its master."""
 
     def on_status(self, status: Body) -> None:
         """The pool's status, as it is now."""
@@ -72,12 +87,13 @@ class FiberPoolClient:
     ``close``.  Any thread may call them.
     """
 
-    def __init__(self, api: Api, loop: Loop, tenure: Tenure, observer: Observer) -> None:
+    def __init__(self, api: Api, loop: Loop, attachment: Attachment, observer: Observer) -> None:
         self._api = api
         self._loop = loop
-        self._tenure = tenure
+        self._attachment = attachment
+        self._doing = attachment.doing
         self._observer = observer
-        self._scaling = Scaling(self._trouble)
+        self._scaling = Scaling(partial(self._trouble, "scale"))
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._close_timeout = CLOSE_TIMEOUT
@@ -92,7 +108,7 @@ class FiberPoolClient:
         """The operator has seen the pool with this program as its master."""
         self._began = 0.0
         """Since when the operator might have been heard."""
-        self._followers: list[ObjectWatch | LeaseRenewer] = []
+        self._followers: list[Informer | LeaseRenewer] = []
         self._thread = threading.Thread(target=self._run, name="fiber-kubernetes", daemon=True)
 
     def start(self) -> None:
@@ -130,10 +146,9 @@ class FiberPoolClient:
             if not self._ended.is_set():
                 self._say_what_stays(why)
 
-    @property
-    def made(self) -> bool:
-        """Whether the pool is there, with this program as its master."""
-        return bool(self._followers)
+    def warn_anew(self) -> None:
+        """Somebody begins to wait, and is to be told what was told before, if it is still so."""
+        self._warned.clear()
 
     # -- On the thread
 
@@ -143,13 +158,13 @@ class FiberPoolClient:
         except FiberPoolError as error:
             self._fail(error)
         except ApiError as error:
-            self._fail(self._explained(error, self._tenure.doing))
+            self._fail(self._explained(error, self._doing))
         except Exception as error:
             self._fault(error)
         for follower in self._followers:
             follower.stop()
         try:
-            self._tenure.end(self._close_timeout)
+            self._attachment.detach(self._close_timeout)
         except Exception as error:  # the program ends whatever comes
             self._say_what_stays(str(error))
         for follower in self._followers:
@@ -158,41 +173,43 @@ class FiberPoolClient:
             self._loop.call_soon(self._observer.on_end)
         self._ended.set()
 
-    def _begin(self) -> HeldPool:
-        held = self._tenure.begin(self._closing)
-        self._began, self._generation = time.monotonic(), held.generation
-        self._tenure.doing = f"scale the FiberPool {held.name!r}"
+    def _begin(self) -> AttachedPool:
+        attached = self._attachment.attach(self._closing)
+        self._began, self._generation = time.monotonic(), attached.generation
+        self._doing = f"scale {self._short_name}"
         renewer = LeaseRenewer(
-            held,
+            attached,
             on_lost=self._fail,
-            on_trouble=self._trouble,
-            on_refused=self._refused,
+            on_trouble=partial(self._trouble, _RENEW),
+            on_refused=partial(self._refused, _RENEW),
             on_fault=self._fault,
         )
-        pool = ObjectWatch(
+        pool = Informer(
             self._api,
-            POOLS.path(held.namespace),
-            {"fieldSelector": f"metadata.name={held.name}"},
-            on_change=partial(self._pool_changed, held, renewer),
+            POOLS.path(attached.namespace),
+            {"fieldSelector": f"metadata.name={attached.name}"},
+            known={attached.name},
+            on_change=partial(self._pool_changed, attached, renewer),
             on_trouble=self._pool_trouble,
             on_fault=self._fault,
         )
-        pods = ObjectWatch(
+        pods = Informer(
             self._api,
-            PODS.path(held.namespace),
-            {"labelSelector": f"{names.LABEL_POOL_UID}={held.uid}"},
+            PODS.path(attached.namespace),
+            {"labelSelector": f"{names.LABEL_POOL_UID}={attached.uid}"},
             on_change=self._pod_changed,
-            on_trouble=self._trouble,
+            on_trouble=partial(self._trouble, "watch the pods of"),
             on_fault=self._fault,
         )
         self._followers = [renewer, pool, pods]
+        self._loop.call_soon(self._observer.on_attached)
         for follower in self._followers:
             follower.start()
-        return held
+        return attached
 
-    def _serve(self, held: HeldPool) -> None:
+    def _serve(self, attached: AttachedPool) -> None:
         while not (self._closing.is_set() or self._over.is_set()):
-            pause = min(self._scaling.step(held), self._miss_operator())
+            pause = min(self._scaling.step(attached), self._miss_operator())
             self._wake.wait(None if pause == math.inf else pause)
             self._wake.clear()
 
@@ -217,9 +234,9 @@ class FiberPoolClient:
     # -- On the threads that follow it
 
     def _pool_changed(
-        self, held: HeldPool, renewer: LeaseRenewer, name: str, found: Body | None
+        self, attached: AttachedPool, renewer: LeaseRenewer, name: str, found: Body | None
     ) -> None:
-        if loss := held.loss(found):
+        if loss := attached.loss(found):
             self._fail(renewer.explain(loss))
             return
         assert found is not None
@@ -227,17 +244,17 @@ class FiberPoolClient:
         if not self._observed and status.get("observedGeneration", 0) >= self._generation:
             self._observed = True
             self._wake.set()
-        self._warned -= {"Unreachable", "Throttled"}
+        self._warned -= {kind.__name__ for kind in (Unreachable, ServerError, TooManyRequests)}
         if self._observed:  # else it may be about the master before
             self._loop.call_soon(self._observer.on_status, status)
 
     def _pool_trouble(self, error: ApiError) -> None:
         if isinstance(error, Forbidden) and not self._observed:
             # Its status would never be known, and silence be taken for the operator's.
-            self._refused(error)
+            self._refused(_WATCH, error)
             return
         self._began = time.monotonic()  # of an operator nothing could be heard either
-        self._trouble(error)
+        self._trouble(_WATCH, error)
 
     def _pod_changed(self, name: str, pod: Body | None) -> None:
         if pod is None and self._scaling.gone(name):
@@ -246,9 +263,13 @@ class FiberPoolClient:
 
     # -- On any of them
 
-    def _trouble(self, error: ApiError) -> None:
+    def _trouble(self, doing: str, error: ApiError) -> None:
+        """``doing``: what cannot be done, in words that the pool follows."""
         if not self._closing.is_set():
-            self._warn(type(error).__name__, str(self._explained(error, self._following)))
+            # One that fails in general fails in all that is done; of rights there are several.
+            kind = type(error).__name__
+            what = kind if isinstance(error, Transient) else f"{kind}: {doing}"
+            self._warn(what, str(self._explained(error, f"{doing} {self._short_name}")))
 
     def _warn(self, what: str, message: str) -> None:
         """Once, until it has passed."""
@@ -256,8 +277,8 @@ class FiberPoolClient:
             self._warned.add(what)
             self._loop.call_soon(self._observer.on_warning, message)
 
-    def _refused(self, error: ApiError) -> None:
-        self._fail(self._explained(error, self._following))
+    def _refused(self, doing: str, error: ApiError) -> None:
+        self._fail(self._explained(error, f"{doing} {self._short_name}"))
 
     def _fault(self, error: Exception) -> None:
         """A fault of ours must not leave anybody waiting."""
@@ -273,18 +294,18 @@ class FiberPoolClient:
         self._loop.call_soon(self._observer.on_error, error)
 
     @property
-    def _following(self) -> str:
-        return f"follow the FiberPool {self._tenure.name!r}"
+    def _short_name(self) -> str:
+        return f"the FiberPool {self._attachment.name!r}"
 
     @property
     def _pool(self) -> str:
-        return f"the FiberPool {self._tenure.name!r} in namespace {self._tenure.namespace!r}"
+        return f"{self._short_name} in namespace {self._attachment.namespace!r}"
 
     def _error(self, reason: str, what: str) -> FiberPoolError:
         return FiberPoolError(
             f"{self._pool} {what}",
-            pool=self._tenure.name,
-            namespace=self._tenure.namespace,
+            pool=self._attachment.name,
+            namespace=self._attachment.namespace,
             reason=reason,
         )
 
@@ -292,8 +313,8 @@ class FiberPoolClient:
         return explain(
             error,
             doing,
-            pool=self._tenure.name,
-            namespace=self._tenure.namespace,
+            pool=self._attachment.name,
+            namespace=self._attachment.namespace,
             server=self._api.server,
         )
 
@@ -301,5 +322,5 @@ class FiberPoolClient:
         with contextlib.suppress(Exception):  # stderr may be closed
             sys.stderr.write(
                 f"fiber: {self._pool} stays behind: {why}. The operator notices that this program "
-                f"is gone; to be quicker: {self._tenure.remedy}\n"
+                f"is gone; to be quicker: {self._attachment.remedy}\n"
             )
