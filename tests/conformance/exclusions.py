@@ -6,10 +6,6 @@ list says what is so.
 
 from __future__ import annotations
 
-_MEMORY_MANAGERS = {
-    f"WithProcessesTestSharedMemory.test_shared_memory_{name}": "SharedMemoryManager: not yet"
-    for name in ("SharedMemoryManager_basics", "SharedMemoryServer_ignores_sigint")
-}
 _CLOSED_AT_ONCE = {
     "WithProcessesTestQueue.test_closed_queue_empty_exceptions": (
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
@@ -26,7 +22,7 @@ _LOCKED = {
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
-    "local": {**_MEMORY_MANAGERS, **_CLOSED_AT_ONCE},
+    "local": _CLOSED_AT_ONCE,
     "loopback": {**_CLOSED_AT_ONCE, **_LOCKED},
     "kubernetes": {**_CLOSED_AT_ONCE, **_LOCKED},
 }

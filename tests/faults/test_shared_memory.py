@@ -16,6 +16,7 @@ from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 from fiber._hub import client
 from fiber._hub.client import Unreachable
+from fiber.managers import SharedMemoryManager
 
 
 def start(target: Any, *args: Any) -> Any:
@@ -43,6 +44,14 @@ def test_a_writer_that_is_killed_leaves_what_it_had_written(backend: str) -> Non
     child.join(PATIENCE)
     assert child.exitcode == -signal.SIGKILL
     assert list(array) == [1, 2, 0, 0]
+
+
+def test_a_manager_of_memory_on_another_host_says_what_to_use(agents: LoopbackBackend) -> None:
+    with (
+        SharedMemoryManager() as manager,
+        pytest.raises(RuntimeError, match=r"host 'loopback-0' .*fiber\.RawArray"),
+    ):
+        manager.SharedMemory(size=10)
 
 
 def test_the_home_of_an_array_is_gone(agents: LoopbackBackend) -> None:
