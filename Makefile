@@ -11,7 +11,8 @@ SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
 FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
 # What depends most on the interpreter: pickling, starting and ending processes, threads and locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback pool pool_deaths \
-	process queues reduction synchronize worker exit_functions) tests/faults/test_children.py
+	process queues reduction synchronize worker exit_functions futures) tests/faults/test_children.py \
+	tests/conformance/test_executors.py
 OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
@@ -68,9 +69,10 @@ bench-operator: $(VENV)/.with-dev
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
 
-## make conformance   CPython's own multiprocessing tests (BACKEND=local, loopback or kubernetes)
+## make conformance   CPython's tests of multiprocessing and executors (BACKEND=local, loopback or kubernetes)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(BIN)/python tests/conformance/run.py --backend $(BACKEND)
+	$(BIN)/python tests/conformance/executors.py --backend $(BACKEND)
 
 ## make crds          crds/fiberpools.yaml and the chart's copy, from the model
 crds: $(VENV)/.with-dev

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fiber.errors import UnpicklableError as UnpicklableError
     from fiber.errors import VersionMismatch as VersionMismatch
     from fiber.errors import WorkerDied as WorkerDied
+    from fiber.futures import Executor as Executor
     from fiber.managers import BaseManager as BaseManager
     from fiber.process import Process as Process
     from fiber.process import active_children as active_children
@@ -52,6 +53,7 @@ _SUBMODULES = frozenset(
         "cpu",
         "dummy",
         "errors",
+        "futures",
         "managers",
         "pool",
         "process",
@@ -65,6 +67,7 @@ _SUBMODULES = frozenset(
         "spawn",
         "synchronize",
         "util",
+        "vector",
     }
 )
 
@@ -111,6 +114,7 @@ _HOMES = {
     "Config": "config",
     "ConfigError": "errors",
     "ConnectionClosed": "errors",
+    "Executor": "futures",
     "FiberError": "errors",
     "FiberPoolError": "errors",
     "FileTooLarge": "errors",

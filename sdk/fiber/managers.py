@@ -227,7 +227,7 @@ class SharedMemoryManager(BaseManager):
     """The name to subclass; making one raises an error that says what to use."""
 
     def __init__(self, *_args: Any, **_options: Any) -> None:
-        refuse("SharedMemory")
+        refuse("SharedMemoryManager")
 
 
 class SyncManager(BaseManager):

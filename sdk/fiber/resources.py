@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-__all__ = ["Resources", "largest", "merged", "meta", "resources_of", "with_resources"]
+__all__ = ["Resources", "largest", "merged", "meta", "resources_of", "wished", "with_resources"]
 
 _ATTRIBUTE = "__fiber_meta__"
 _RUN_BY_A_MANAGER = "_run_server"
@@ -50,7 +50,7 @@ def meta(
 
     A manager's class may be given wishes too: they are those of the process that serves it.
     """
-    wishes = Resources(cpu=_cpu(cpu), memory=_memory(memory), gpu=_gpu(gpu))
+    wishes = wished("fiber.meta", cpu, memory, gpu)
     if wishes == Resources():
         raise TypeError("fiber.meta() needs at least one of cpu=, memory= and gpu=")
 
@@ -69,6 +69,13 @@ def meta(
         return result
 
     return decorate
+
+
+def wished(
+    where: str, cpu: float | str | None, memory: int | str | None, gpu: int | None
+) -> Resources:
+    """Wishes as a person spells them, see ``meta``; ``where`` is what errors call the place."""
+    return Resources(cpu=_cpu(cpu, where), memory=_memory(memory, where), gpu=_gpu(gpu, where))
 
 
 def resources_of(function: Callable[..., Any]) -> Resources:
@@ -176,7 +183,7 @@ class _FunctionWithWishes:
 # ---- reading --------------------------------------------------------------------------------
 
 
-def _cpu(value: float | str | None) -> float | None:
+def _cpu(value: float | str | None, where: str) -> float | None:
     if value is None:
         return None
     number: object = value
@@ -184,13 +191,13 @@ def _cpu(value: float | str | None) -> float | None:
         number = float(match[1]) / (1000 if match[2] else 1)
     if isinstance(number, int | float) and not isinstance(number, bool) and 0 < number < math.inf:
         return float(number)
-    raise ValueError(f"fiber.meta(cpu={value!r}): expected CPUs above 0, as 2, 0.5 or '500m'")
+    raise ValueError(f"{where}(cpu={value!r}): expected CPUs above 0, as 2, 0.5 or '500m'")
 
 
 _MIB_PER_UNIT = {"Mi": 1, "Gi": 1024, "Ti": 1024 * 1024}
 
 
-def _memory(value: int | str | None) -> int | None:
+def _memory(value: int | str | None, where: str) -> int | None:
     if value is None:
         return None
     number: object = value
@@ -199,15 +206,15 @@ def _memory(value: int | str | None) -> int | None:
     if isinstance(number, int) and not isinstance(number, bool) and number > 0:
         return number
     raise ValueError(
-        f"fiber.meta(memory={value!r}): expected MiB above 0 as a whole number, "
+        f"{where}(memory={value!r}): expected MiB above 0 as a whole number, "
         "or a text with unit Mi, Gi or Ti, as '512Mi' or '2Gi'"
     )
 
 
-def _gpu(value: int | None) -> int | None:
+def _gpu(value: int | None, where: str) -> int | None:
     if value is None:
         return None
     number: object = value
     if isinstance(number, int) and not isinstance(number, bool) and number >= 0:
         return number
-    raise ValueError(f"fiber.meta(gpu={value!r}): expected a whole number, 0 or more")
+    raise ValueError(f"{where}(gpu={value!r}): expected a whole number, 0 or more")

@@ -17,7 +17,6 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
-from fiber.errors import NotInFiber
 
 MORE_THAN_FITS = 3000
 """Items that no socket's buffer holds."""
@@ -474,15 +473,3 @@ def test_a_simple_queue_among_processes() -> None:
         assert back.get() == item
     there.put(None)
     process.join(PATIENCE)
-
-
-# What is not there
-
-
-@pytest.mark.parametrize("name", ["Value", "Array", "RawValue", "RawArray"])
-def test_shared_values_are_refused_by_name(name: str) -> None:
-    from fiber import sharedctypes
-
-    with pytest.raises(NotInFiber, match=f"no {name} yet.*Pipe or Queue"):
-        getattr(sharedctypes, name)("i", 0)
-    assert isinstance(sharedctypes.SynchronizedArray, type)

@@ -23,7 +23,7 @@ from fiber._wire.packet import BytesLike
 
 _SHUTDOWN_GRACE = 0.5
 
-_FATAL = (signal.SIGKILL, signal.SIGTERM)
+_FATAL = (signal.SIGINT, signal.SIGKILL, signal.SIGTERM)
 """Signals that end a child that has not begun."""
 
 _REMEMBERED = 1024

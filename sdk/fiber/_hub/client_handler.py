@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from fiber._hub import protocol
+from fiber._hub.doorbell import Doorbell
 from fiber._hub.hosted import HostedChannel, HostedCounter
-from fiber._hub.protocol import HEAD, ONE, TWO, GrantFlags, ObjectKind, Op, Status
+from fiber._hub.protocol import FOUR, HEAD, ONE, TWO, Extent, GrantFlags, ObjectKind, Op, Status
 from fiber._hub.registry import Entry, NoSuchObject, Registry
 from fiber._hub.streams import NullHandler, Stream
 from fiber._wire.packet import Message
@@ -20,6 +21,7 @@ class HandlerHub(Protocol):
 
     key: bytes
     registry: Registry
+    doorbell: Doorbell
 
     def connect(self, host: str, stream: Stream) -> None:
         """Go on with ``stream`` at the hub of ``host``."""
@@ -150,10 +152,11 @@ class ClientHandler:
 
     def register(self, message: Message) -> None:
         """Host a descriptor."""
-        _, number, kind, flags = TWO.unpack(message.payload)
+        _, number, kind, flags, *extent = FOUR.unpack(message.payload)
         (fd,) = message.fds
-        reusable = bool(flags & GrantFlags.REUSABLE)
-        entry, grant = self._home.registry.register(ObjectKind(kind), fd, reusable=reusable)
+        entry, grant = self._home.registry.register(
+            ObjectKind(kind), fd, Extent(*extent), reusable=bool(flags & GrantFlags.REUSABLE)
+        )
         self._granted(number, entry, grant, flags)
 
     def grant(self, message: Message) -> None:
@@ -185,6 +188,10 @@ class ClientHandler:
             raise RequestRefused("a stream is for one object")
         _, _, entry, grant = TWO.unpack(message.payload)
         self._entry = self._home.registry.attach(entry, grant)
+
+    def ring(self, message: Message) -> None:
+        """Look again at shared memory that somebody here waits for."""
+        self._home.doorbell.rung()
 
     def cancel(self, message: Message) -> None:
         """End the request that waits, with the answer NO."""

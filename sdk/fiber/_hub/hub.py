@@ -11,7 +11,6 @@ import contextlib
 import errno
 import os
 import secrets
-import shutil
 import socket
 import struct
 import tempfile
@@ -22,11 +21,13 @@ from queue import Empty, SimpleQueue
 from fiber._hub import protocol
 from fiber._hub.client import NoHub, Unreachable
 from fiber._hub.client_handler import ClientHandler
+from fiber._hub.directory import remove_directory
+from fiber._hub.doorbell import Doorbell
 from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter
 from fiber._hub.local import QuietSocket, without_timeout
 from fiber._hub.poller import Poller
 from fiber._hub.protocol import HubAddress, ObjectKind
-from fiber._hub.registry import Registry
+from fiber._hub.registry import Registry, SharedObject
 from fiber._hub.streams import SocketStream, Stream
 from fiber._hub.tunnel import Router, Send, Tunnels
 from fiber._transport.loop import DOZE, Loop
@@ -50,6 +51,7 @@ class Hub:
         self._parent = directory
         self._poller = Poller(loop)
         self.registry = Registry(self._host_object, loop.call_soon)
+        self.doorbell = Doorbell(loop.call_soon)
         self._router = Router(host, self._accept)
         self._handlers: set[ClientHandler] = set()
         self._streams: weakref.WeakSet[SocketStream] = weakref.WeakSet()
@@ -214,15 +216,11 @@ class Hub:
 
     # The objects
 
-    def _host_object(self, kind: ObjectKind, fd: int) -> Hosted:
-        if kind is ObjectKind.CHANNEL:
+    def _host_object(self, shared: SharedObject) -> Hosted:
+        fd = os.dup(shared.descriptor.fileno())
+        if shared.kind is ObjectKind.CHANNEL:
             return HostedChannel(self._poller, fd)
         return HostedCounter(self._poller, fd)
-
-
-def remove_directory(path: str) -> None:
-    """Remove a hub's directory, also after its process was killed; nothing if it is gone."""
-    shutil.rmtree(path, ignore_errors=True)
 
 
 def _listen(parent: str | None) -> tuple[socket.socket, str]:

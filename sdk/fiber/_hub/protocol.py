@@ -40,6 +40,20 @@ class ObjectKind(IntEnum):
 
     CHANNEL = 1
     COUNTER = 2
+    # What is a block of shared memory
+    MEMORY = 3
+    SEMAPHORE = 4
+
+
+class Extent(NamedTuple):
+    """Which part of what a descriptor refers to is the object: a block of a segment."""
+
+    offset: int = 0
+    size: int = 0
+
+
+WHOLE = Extent()
+"""Of a channel or counter."""
 
 
 class GrantFlags(IntFlag):
@@ -54,13 +68,14 @@ class Op(IntEnum):
 
     HELLO = 1  # version, key
     CONNECT = 2  # host
-    REGISTER = 3  # kind, flags; a descriptor beside it -> object, grant
+    REGISTER = 3  # kind, flags, offset, size; a descriptor beside it -> object, grant
     FETCH = 4  # object, grant -> a descriptor beside the reply
     ATTACH = 5  # object, grant
     GRANT = 6  # object, flags -> object, grant
     RELEASE = 7  # grant; silent
     CANCEL = 8  # answers the request of this number NO, if it is still waiting; otherwise silent
     SYNC = 9  # withdraws what is waiting -> nothing
+    RING = 30  # something in shared memory of this host has changed; silent
     # For an attached channel
     SEND = 10  # payload and buffers beside it
     RECV = 11  # -> more; payload and buffers beside it
@@ -91,6 +106,7 @@ class Status(IntEnum):
 HEAD = struct.Struct("<BI")
 HELLO = struct.Struct(f"<BIB{KEY_BYTES}s")
 TWO = struct.Struct("<BIQQ")
+FOUR = struct.Struct("<BIQQQQ")
 ONE = struct.Struct("<BIQ")
 
 
