@@ -14,6 +14,9 @@ from census import wait_until
 from fiber.managers import AsyncBaseProxy, AsyncManager, AsyncProxyResult, RemoteError
 
 PATIENCE = 15.0
+ALL = 100
+MEETING = threading.Barrier(ALL)
+"""In the manager's process: of all the objects there."""
 
 
 class Desk:
@@ -38,6 +41,10 @@ class Desk:
     def wait(self) -> str:
         self._open.wait()
         return "waited"
+
+    def meet(self) -> int:
+        MEETING.wait()
+        return self.value
 
     def open(self) -> None:
         self._open.set()
@@ -88,6 +95,13 @@ def test_calls_of_one_proxy_wait_for_each_other_and_others_do_not(manager: Any) 
     make, arguments = other
     make(*arguments).open().get(PATIENCE)
     assert (waiting.get(PATIENCE), behind.get(PATIENCE)) == ("waited", 1)
+
+
+def test_a_hundred_objects_work_side_by_side(manager: Any) -> None:
+    desks = [manager.Desk(number) for number in range(ALL)]
+    for _ in range(2):
+        results = [desk.meet() for desk in desks]  # none returns before all are called
+        assert [result.get(PATIENCE) for result in results] == list(range(ALL))
 
 
 def test_errors_are_raised_where_the_result_is_asked_for(manager: Any) -> None:
