@@ -71,7 +71,7 @@ def test_pods_are_no_part_of_what_needs_no_cluster() -> None:
     assert ON_PODS not in ALL
     assert BY_NAME[PODS] is ON_PODS
     assert not {each.contender for each in budgets.BUDGETS} & {PODS}
-    assert "pods" not in report.index({}, notes=False)
+    assert "pods" not in report.index({})
 
 
 @pytest.mark.parametrize("measure", ["kubernetes_start", "kubernetes_es"])
