@@ -32,11 +32,12 @@ def end(pool: Pool) -> None:
 
 WAITS: dict[str, Callable[[Pool], Any]] = {
     "apply": lambda pool: pool.apply(abs, (-1,)),
-    "apply_async": lambda pool: pool.apply_async(time.sleep, (0.5,)).get(),  # not there at once
+    # What is there already may be had, so these two ask for what ends with the pool alone.
+    "apply_async": lambda pool: pool.apply_async(time.sleep, (PATIENCE,)).get(),
     "broadcast": lambda pool: pool.broadcast(abs, -1),
     "map": lambda pool: pool.map(abs, [-1]),
     "map an iterator": lambda pool: pool.map(abs, iter([-1])),
-    "imap": lambda pool: next(pool.imap(abs, [-1])),
+    "imap": lambda pool: next(pool.imap(time.sleep, [PATIENCE])),
     "join": end,
 }
 
