@@ -16,6 +16,10 @@ from e2e.test_program_faults import LOST, RUNNING
 
 pytestmark = pytest.mark.timeout(300, func_only=True)
 
+ENDLESS = ("--seconds", 1)
+"""1,000 tasks on three workers: minutes."""
+LEASE = 30
+"""Seconds after which a program that does not renew its Lease counts as gone."""
 LOGIN = "client.authentication.k8s.io/v1"
 REVIEWS = "/apis/authentication.k8s.io/v1/tokenreviews"
 
@@ -76,16 +80,16 @@ def test_a_token_that_ends_is_asked_for_again(
 
 
 @pytest.mark.long
-def test_a_program_whose_token_ends_says_what_stays(
+def test_a_program_whose_token_ends_for_good_is_told_so(
     programs: Programs, scene: Scene, tmp_path: Path
 ) -> None:
-    """It ends its work, and the operator removes what it cannot."""
+    """Once it is due to count as gone; the operator then removes what it cannot."""
     token = Token(scene, "login")
     programs.kubeconfig = write_kubeconfig(scene, tmp_path / "config", {"token": token.text})
-    program = programs.start("outside", "mapping.py", *RUNNING)
+    program = programs.start("outside", "mapping.py", *ENDLESS)
     program.says("first")
     token.end()
-    assert program.says("done")["total"] == SQUARES
-    output = program.ends()
-    assert all(words in output for words in ("Unauthorized", "kubectl delete")), output
+    output = program.ends(status=1, seconds=LEASE + 30)
+    words = ("FiberPoolError", "Unauthorized", "kubectl auth whoami", "kubectl delete")
+    assert all(each in output for each in words), output
     leaves_nothing(program, seconds=LOST + 30)

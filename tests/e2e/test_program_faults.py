@@ -145,6 +145,7 @@ def test_a_map_ends_as_if_nothing_had_been(
     release: Release,
     scene: Scene,
 ) -> None:
+    programs.node = release.pod()["spec"]["nodeName"]  # the other ones are there for faults
     program = programs.start(place, "mapping.py", "--seconds", seconds)
     program.says("first")
     with fault(Site(cluster, release, scene, program)):
