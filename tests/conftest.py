@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 LIMITS = {
     "chart": 30,
     "conformance": 900,
-    "contract": 20,
+    "contract": 60,
     "e2e": 180,
     "examples": 180,
     "faults": 60,
     "simulation": 60,
-    "unit": 20,
+    "unit": 60,
 }
 
 _CALL = pytest.StashKey[pytest.CallInfo[None]]()

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import census
+from fiber._hub.heap import SIZES
 from fiber._wire.arena import RETAINED_BLOCKS
 
 SETTLE = 5.0  # seconds for what is ending to have ended
@@ -30,6 +31,10 @@ _NNG_OPENS = Counter(["anon_inode:[eventpoll]", "anon_inode:[eventfd]"])
 # Memory for large messages is kept for the next ones; each block holds two descriptors.
 _MESSAGE_MEMORY = "/memfd:fiber-message (deleted)"
 _MESSAGE_MEMORY_LIMIT = 2 * RETAINED_BLOCKS
+# So is memory for small shared objects: a segment for each size of them, and a full one of which
+# places are free again; each may hold two descriptors.
+_HEAP = "/memfd:fiber-heap (deleted)"
+_HEAP_LIMIT = 4 * len(SIZES)
 
 
 class Lasting(NamedTuple):
@@ -141,6 +146,9 @@ def _opened(before: Snapshot, now: Snapshot) -> list[str]:
     kept = sum(target == _MESSAGE_MEMORY for _, target in now.descriptors)
     if kept <= _MESSAGE_MEMORY_LIMIT:
         excused[_MESSAGE_MEMORY] = kept
+    kept = sum(target == _HEAP for _, target in now.descriptors)
+    if kept <= _HEAP_LIMIT:
+        excused[_HEAP] = kept
     opened = []
     for number, target in sorted(now.descriptors - before.descriptors):
         if excused[target]:

@@ -20,256 +20,30 @@ lost the master; stderr says why.  2: it was given arguments.
 
 from __future__ import annotations
 
-import math
-import os
-import shutil
 import signal
-import socket
 import sys
-import time
 from collections.abc import Sequence
-from typing import NoReturn
-
-from fiber import config
-from fiber._agent.agent import Agent
-from fiber._agent.service import AgentService
-from fiber._hub.hub import Hub
-from fiber._transport.credentials import Credentials
-from fiber._transport.dialer import AgentDialer
-from fiber._transport.handshake import Identity
-from fiber._transport.link import Link
-from fiber._transport.loop import Loop
-from fiber.errors import AuthenticationError, ConfigError, FiberError, LinkError
-
-_ADDRESS = "FIBER_AGENT_ADDRESS"
-_CREDENTIALS = "FIBER_AGENT_CREDENTIALS"
-_DESCRIPTOR = "fd:"
-_NAME = "FIBER_AGENT_NAME"
-_PARENT = "FIBER_AGENT_PARENT"
-_INHERITS = "FIBER_AGENT_INHERITS"
-_LOST_GRACE = "FIBER_AGENT_LOST_GRACE"
-_WAITS_UNTIL = "FIBER_AGENT_WAITS_UNTIL"  # time.monotonic(), from an agent to its next life
-
-_DRAIN_GRACE = 10.0
-"""Seconds that children have to end when this process is told to (SIGTERM)."""
-
-_REFUSED_PAUSE = 0.5
-"""Seconds before a master that refused this agent is asked again, or another in its place."""
 
 
-class Main:
-    """The life of an agent: dial, serve, end."""
-
-    def __init__(self) -> None:
-        # Until it can be heard it waits, where process 1 of a container would never see it.
-        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
-        self._environment = dict(os.environ)
-        self._credentials = _read(_required(_CREDENTIALS))  # before anything is started
-        self._name = os.environ.get(_NAME) or f"agent-{os.getpid()}"
-        self._lost_grace = _seconds(_LOST_GRACE)
-        self._waits_until = _seconds(_WAITS_UNTIL)
-        self._parent = _pid(_PARENT)
-        self._loop = Loop()
-        self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
-        self._agent = Agent(self._loop, self._name, self._hub)
-        self._service: AgentService | None = None
-        self._status = 0
-        self._again = False
-        self._told_to_end = False
-
-    def run(self) -> int:
-        """Serve until the end; the exit status."""
-        self._dialer = self._dial()
-        self._wake_by_signals()
-        signal.signal(signal.SIGTERM, self._on_sigterm)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # what an earlier life, or who began it, did
-        self._end_with_parent()
-        self._loop.run()
-        self._dialer.close()
-        self._agent.close()
-        self._hub.close()
-        # From here on it is for the next life, which hears of it when it is ready to.
-        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
-        if self._again and not self._is_told_to_end():
-            # Nothing of what the last master did or left may reach the next one.
-            self._hand_on_credentials()
-            os.execve(sys.executable, sys.orig_argv, self._environment)
-        return self._status
-
-    def _hand_on_credentials(self) -> None:
-        if _descriptor_in(self._environment[_CREDENTIALS]) is not None:
-            descriptor = self._credentials.to_descriptor()
-            os.set_inheritable(descriptor, True)
-            self._environment[_CREDENTIALS] = f"{_DESCRIPTOR}{descriptor}"
-
-    def _dial(self) -> AgentDialer:
-        return AgentDialer(
-            self._loop,
-            _required(_ADDRESS),
-            self._credentials,
-            Identity.of_this_process(self._name, pid=str(os.getpid())),
-            on_link=self._joined,
-            on_failed=self._failed,
-            timeout=self._timeout(),
-        )
-
-    def _timeout(self) -> float | None:
-        if self._lost_grace is None:
-            return config.current().start_timeout
-        if self._waits_until is None:
-            return None
-        return max(self._waits_until - time.monotonic(), 0.0)
-
-    def _complain(self, what: object) -> None:
-        print(f"fiber agent {self._name}: {what}", file=sys.stderr, flush=True)
-
-    def _joined(self, link: Link) -> None:
-        self._service = AgentService(self._loop, link, self._agent, self._hub, self._ended)
-        self._link = link
-        link.attach(self._service)
-
-    def _failed(self, error: Exception) -> None:
-        self._complain(error)
-        if self._lost_grace is None or not isinstance(error, LinkError):
-            self._status = 1
-        elif self._waits_until is None or self._timeout():
-            # It was there and refused us: it is ending, or took our name for another's.
-            self._again = True
-            self._loop.call_later(_REFUSED_PAUSE, self._loop.stop)
-            return
-        self._loop.stop()
-
-    def _ended(self, reason: str, lost: bool) -> None:
-        if lost:
-            self._complain(reason)
-        if self._lost_grace is not None and not self._told_to_end:
-            self._again = True
-            self._environment.pop(_WAITS_UNTIL, None)
-            if lost:
-                told = self._dialer.lost_grace
-                grace = self._lost_grace if told is None else told
-                self._environment[_WAITS_UNTIL] = str(time.monotonic() + grace)
-        elif lost:
-            self._status = 1
-        self._link.close("the agent ended", then=self._loop.stop)
-
-    def _is_told_to_end(self) -> bool:
-        """Also by a signal that another thread took, and of which Python has not told us yet."""
-        try:
-            return self._told_to_end or bool(self._signals[0].recv(1))
-        except BlockingIOError:
-            return False
-
-    def _wake_by_signals(self) -> None:
-        """A signal that strikes just before the loop sleeps is noted by Python, and slept over."""
-        reader, writer = socket.socketpair()
-        for end in (reader, writer):
-            end.setblocking(False)
-        self._signals = reader, writer  # for as long as this lives
-        self._loop.register(reader.fileno(), lambda: reader.recv(4096))
-        signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-
-    def _on_sigterm(self, *_: object) -> None:
-        self._told_to_end = True
-        self._loop.call_soon(self._drain)
-
-    def _drain(self) -> None:
-        if self._service is None:
-            self._loop.stop()
-        else:
-            self._service.stop("told to end by SIGTERM", _DRAIN_GRACE)
-
-    def _end_with_parent(self) -> None:
-        if self._parent is None:
-            return
-        try:
-            watched = os.pidfd_open(self._parent)
-        except ProcessLookupError:
-            self._parent_died()
-        self._loop.register(watched, self._parent_died)
-
-    def _parent_died(self) -> NoReturn:
-        # At once and by force: nobody is left to tell or to wait for.
-        directory = os.environ.get(_INHERITS)
-        if directory:
-            shutil.rmtree(directory, ignore_errors=True)
-        os._exit(0)
-
-
-def _read(credentials: str) -> Credentials:
-    descriptor = _descriptor_in(credentials)
-    if descriptor is not None:
-        return Credentials.from_descriptor(descriptor)
-    if os.path.isabs(credentials):
-        return Credentials.from_directory(credentials)
-    raise ConfigError(  # and does not repeat what may be a secret in the wrong place
-        f"{_CREDENTIALS} ({len(credentials)} characters) is neither an absolute path nor fd:N. It "
-        "says where the credentials are, a mounted directory for instance, and does not hold them."
-    )
-
-
-def _descriptor_in(credentials: str) -> int | None:
-    number = credentials.removeprefix(_DESCRIPTOR)
-    is_one = number != credentials and number.isascii() and number.isdigit() and len(number) < 10
-    return int(number) if is_one else None
-
-
-def _seconds(variable: str) -> float | None:
-    value = os.environ.pop(variable, None)
-    if value is None:
-        return None
-    try:
-        seconds = float(value)
-    except ValueError:
-        seconds = math.nan
-    if not (math.isfinite(seconds) and seconds >= 0):
-        raise ConfigError(f"{variable}={value!r} is not a number of seconds")
-    return seconds
-
-
-def _pid(variable: str) -> int | None:
-    value = os.environ.get(variable)
-    if value is None:
-        return None
-    if not (value.isascii() and value.isdigit() and 0 < int(value) < 2**31):
-        raise ConfigError(f"{variable}={value!r} is not the id of a process")
-    return int(value)
-
-
-def _required(variable: str) -> str:
-    # The children, who run anybody's code, shall not have it.
-    value = os.environ.pop(variable, "")
-    if not value:
-        raise ConfigError(
-            f"{variable} is not set. An agent is started by a Fiber backend, which hands it the "
-            "master's address and its credentials."
-        )
-    return value
-
-
-def main(arguments: Sequence[str] = ()) -> int:
-    """Run one agent to its end; the exit status."""
-    if arguments:
-        return _explain(arguments)
-    try:
-        return Main().run()
-    except (FiberError, AuthenticationError) as error:
-        print(f"fiber agent: {error}", file=sys.stderr)
-        return 1
-
-
-def _explain(arguments: Sequence[str]) -> int:
+def _run(arguments: Sequence[str]) -> int:
     if set(arguments) & {"-h", "--help"}:
         print(__doc__)
         return 0
-    print(
-        f"fiber agent: it takes no arguments, but was given {' '.join(arguments)!r}. It is "
-        "configured by its environment: see python -m fiber.agent --help",
-        file=sys.stderr,
-    )
-    return 2
+    if arguments:
+        print(
+            f"fiber agent: it takes no arguments, but was given {' '.join(arguments)!r}. It is "
+            "configured by its environment: see python -m fiber.agent --help",
+            file=sys.stderr,
+        )
+        return 2
+    # As process 1 of a container it does not get a SIGTERM that it has no handler for: the kernel
+    # drops it, and a pod that is deleted just then ends by force, after its grace period.  One that
+    # is blocked waits.  So this comes before the imports, which take most of the time.
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
+    from fiber._agent.main import main
+
+    return main()
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(_run(sys.argv[1:]))

@@ -29,9 +29,10 @@ if TYPE_CHECKING:
     import logging
 
     from fiber.connection import Connection
+    from fiber.managers import SyncManager
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
-    from fiber.synchronize import BoundedSemaphore, Event, Semaphore
+    from fiber.synchronize import BoundedSemaphore, Event, Lock, RLock, Semaphore
 
 __all__ = [
     "BaseContext",
@@ -58,15 +59,8 @@ class BaseContext:
     Process: type[Process] = Process
 
     # What multiprocessing has and Fiber has not yet: each says what to use instead.
-    Lock = staticmethod(unsupported("Lock"))
-    RLock = staticmethod(unsupported("RLock"))
     Condition = staticmethod(unsupported("Condition"))
     Barrier = staticmethod(unsupported("Barrier"))
-    Value = staticmethod(unsupported("Value"))
-    Array = staticmethod(unsupported("Array"))
-    RawValue = staticmethod(unsupported("RawValue"))
-    RawArray = staticmethod(unsupported("RawArray"))
-    Manager = staticmethod(unsupported("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)
@@ -111,6 +105,20 @@ class BaseContext:
 
     # Synchronization
 
+    def Lock(self) -> Lock:
+        """A mutex."""
+        from fiber.synchronize import Lock
+
+        config.use()
+        return Lock()
+
+    def RLock(self) -> RLock:
+        """A mutex that its thread may acquire again."""
+        from fiber.synchronize import RLock
+
+        config.use()
+        return RLock()
+
     def Event(self) -> Event:
         """A flag to wait for."""
         from fiber.synchronize import Event
@@ -131,6 +139,52 @@ class BaseContext:
 
         config.use()
         return BoundedSemaphore(value)
+
+    # Shared memory
+
+    def Value(self, typecode_or_type: Any, *args: Any, lock: Any = True) -> Any:
+        """A ctypes object in shared memory, with a lock."""
+        from fiber.sharedctypes import Value
+
+        config.use()
+        return Value(typecode_or_type, *args, lock=lock)
+
+    def Array(
+        self,
+        typecode_or_type: Any,
+        size_or_initializer: int | Sequence[Any],
+        *,
+        lock: Any = True,
+    ) -> Any:
+        """A ctypes array in shared memory, with a lock."""
+        from fiber.sharedctypes import Array
+
+        config.use()
+        return Array(typecode_or_type, size_or_initializer, lock=lock)
+
+    def RawValue(self, typecode_or_type: Any, *args: Any) -> Any:
+        """A ctypes object in shared memory."""
+        from fiber.sharedctypes import RawValue
+
+        config.use()
+        return RawValue(typecode_or_type, *args)
+
+    def RawArray(self, typecode_or_type: Any, size_or_initializer: int | Sequence[Any]) -> Any:
+        """A ctypes array in shared memory."""
+        from fiber.sharedctypes import RawArray
+
+        config.use()
+        return RawArray(typecode_or_type, size_or_initializer)
+
+    # Managers
+
+    def Manager(self) -> SyncManager:
+        """A manager that is started, with all that multiprocessing's serves."""
+        from fiber.managers import SyncManager
+
+        manager = SyncManager(ctx=self.get_context())
+        manager.start()
+        return manager
 
     # Work
 

@@ -33,6 +33,7 @@ from typing import Any, ClassVar, cast
 
 from fiber._agent import child
 from fiber._hub import handles
+from fiber._hub.heap import Segment
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor, opened
 from fiber.errors import UnpicklableError
@@ -71,6 +72,14 @@ class InheritedDescriptor:
         return child.take_descriptor(self._index)
 
 
+class InheritedSegment(InheritedDescriptor):
+    """The same for shared memory, of which each block has a handle."""
+
+    def detach(self) -> int:
+        """In the child: a duplicate of the descriptor, for each of them."""
+        return child.duplicate_descriptor(self._index)
+
+
 class Spawning:
     """What multiprocessing calls the spawning popen: collects descriptors while a Process is
     pickled.
@@ -81,6 +90,15 @@ class Spawning:
     def __init__(self, process: Any) -> None:
         self.process = process
         self.fds: list[Descriptor] = []
+        self._segments: dict[int, InheritedSegment] = {}
+
+    def inherit_segment(self, segment: Segment) -> InheritedSegment:
+        """Send its descriptor along, once."""
+        inherited = self._segments.get(segment.inode)
+        if inherited is None:
+            inherited = InheritedSegment(self.duplicate_for_child(segment.fileno()))
+            self._segments[segment.inode] = inherited
+        return inherited
 
     def duplicate_for_child(self, fd: int) -> int:
         """Send ``fd`` along; the index under which the child finds it."""
@@ -90,6 +108,7 @@ class Spawning:
     def forget(self) -> None:
         """It is pickled anew, in another way."""
         self.fds.clear()
+        self._segments.clear()
         handles.undo_pickling()
 
 

@@ -1,16 +1,28 @@
-"""multiprocessing's classes of shared values, for annotations and ``isinstance``.
+"""``Value``, ``Array`` and their raw forms: ctypes objects in memory that processes share.
 
-Fiber makes none of them yet: the functions refuse.
+The classes are multiprocessing's own.  The memory has no name and no file, goes when nobody uses it
+any more, and is not bounded by the size of ``/dev/shm``.  The objects pickle at any time and not
+only while a process is started: through a queue, as a task's argument, to another host.
 """
 
+from __future__ import annotations
+
+import copyreg
+import ctypes
+from collections.abc import Sequence
+from multiprocessing import sharedctypes as mp_sharedctypes
+from multiprocessing.reduction import ForkingPickler
 from multiprocessing.sharedctypes import (
     Synchronized,
     SynchronizedArray,
     SynchronizedBase,
     SynchronizedString,
 )
+from typing import Any
 
-from fiber._hub.unsupported import unsupported
+from fiber import synchronize
+from fiber._hub import shared_buffer
+from fiber._hub.shared_buffer import SharedBuffer
 
 __all__ = [
     "Array",
@@ -23,11 +35,114 @@ __all__ = [
     "Value",
     "copy",
     "synchronized",
+    "typecode_to_type",
 ]
 
-Value = unsupported("Value")
-Array = unsupported("Array")
-RawValue = unsupported("RawValue")
-RawArray = unsupported("RawArray")
-copy = unsupported("copy")
-synchronized = unsupported("synchronized")
+typecode_to_type: dict[str, type] = mp_sharedctypes.typecode_to_type  # type: ignore[attr-defined]
+
+
+def RawValue(typecode_or_type: Any, *args: Any) -> Any:
+    """A ctypes object in shared memory, made as ``type(*args)``; nothing guards it."""
+    value = _new(_type(typecode_or_type))
+    value.__init__(*args)
+    return value
+
+
+def RawArray(typecode_or_type: Any, size_or_initializer: int | Sequence[Any]) -> Any:
+    """A ctypes array in shared memory, of zeros or of the values given; nothing guards it."""
+    element = _type(typecode_or_type)
+    if isinstance(size_or_initializer, int):
+        return _new(element * size_or_initializer)
+    array = _new(element * len(size_or_initializer))
+    array.__init__(*size_or_initializer)
+    return array
+
+
+def Value(typecode_or_type: Any, *args: Any, lock: Any = True, ctx: Any = None) -> Any:
+    """A ctypes object in shared memory, with a lock.
+
+    ``lock``: True for a new ``RLock``, one of your own, or False for none, as ``RawValue``.
+    """
+    return _guarded(RawValue(typecode_or_type, *args), lock)
+
+
+def Array(
+    typecode_or_type: Any,
+    size_or_initializer: int | Sequence[Any],
+    *,
+    lock: Any = True,
+    ctx: Any = None,
+) -> Any:
+    """A ctypes array in shared memory, with a lock.
+
+    ``lock``: True for a new ``RLock``, one of your own, or False for none, as ``RawArray``.
+    """
+    return _guarded(RawArray(typecode_or_type, size_or_initializer), lock)
+
+
+def copy(obj: Any) -> Any:
+    """A copy of a ctypes object, in shared memory."""
+    new = _new(type(obj))
+    ctypes.pointer(new)[0] = obj
+    return new
+
+
+def synchronized(obj: Any, lock: Any = None, ctx: Any = None) -> Any:
+    """A ctypes object with a lock: ``lock``, or a new ``RLock``."""
+    guard: Any = synchronize.RLock() if lock is None else lock
+    wrapper = mp_sharedctypes.synchronized(obj, guard, ctx=synchronize)
+    copyreg.pickle(type(wrapper), _reduce_synchronized)
+    return wrapper
+
+
+def _guarded(obj: Any, lock: Any) -> Any:
+    if lock is False:
+        return obj
+    if lock is True:
+        lock = None
+    if lock is not None and not hasattr(lock, "acquire"):
+        raise AttributeError(f"{lock!r} has no method 'acquire'")
+    return synchronized(obj, lock)
+
+
+def _type(typecode_or_type: Any) -> Any:
+    return typecode_to_type.get(typecode_or_type, typecode_or_type)
+
+
+def _new(type_: Any) -> Any:
+    return _placed(type_, shared_buffer.allocate(ctypes.sizeof(type_)))
+
+
+def _placed(type_: Any, buffer: SharedBuffer) -> Any:
+    # multiprocessing notes the types of its own objects here, perhaps the same type as ours.
+    ForkingPickler.register(type_, _reduce_ctype)
+    copyreg.pickle(type_, _reduce_ctype)
+    obj = type_.from_buffer(buffer.view)
+    obj._wrapper = buffer
+    return obj
+
+
+# Pickling
+
+
+def _reduce_ctype(obj: Any) -> tuple[Any, ...]:
+    buffer = getattr(obj, "_wrapper", None)
+    if not isinstance(buffer, SharedBuffer):  # of a type that ours have, too
+        reduced: tuple[Any, ...] = (
+            obj.__reduce__() if buffer is None else mp_sharedctypes.reduce_ctype(obj)  # type: ignore[attr-defined]
+        )
+        return reduced
+    if isinstance(obj, ctypes.Array):
+        return _rebuild, (obj._type_, obj._length_, buffer)
+    return _rebuild, (type(obj), None, buffer)
+
+
+def _rebuild(type_: Any, length: int | None, buffer: SharedBuffer) -> Any:
+    return _placed(type_ if length is None else type_ * length, buffer)
+
+
+def _reduce_synchronized(wrapper: Any) -> tuple[Any, ...]:
+    if isinstance(getattr(wrapper._obj, "_wrapper", None), SharedBuffer):
+        return synchronized, (wrapper._obj, wrapper._lock)
+    reduced: tuple[Any, ...] = wrapper.__reduce__()
+    return reduced

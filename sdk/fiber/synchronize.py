@@ -1,23 +1,34 @@
-"""``Event``, ``Semaphore`` and ``BoundedSemaphore``: multiprocessing's, over counting events.
+"""Locks, semaphores and events: multiprocessing's, released when who holds them dies.
 
-A process that dies while it waits leaves nothing behind.  One that dies while it holds a semaphore
-does: what it acquired stays acquired, as in multiprocessing.
+::
+
+    with lock as acquired:
+        if isinstance(acquired, Abandoned):
+            repair(what_it_guards)  # a process died in the middle of changing it
 """
 
 from __future__ import annotations
 
+import threading
 import time
+from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any
 
+from fiber._hub import shared_semaphores
 from fiber._hub.local import LocalCounter
 from fiber._hub.unsupported import Unsupported
+from fiber._sync.abandonment import Abandoned
+from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX
 
 if TYPE_CHECKING:
     from types import TracebackType
 
+    from fiber._sync.semaphore import SharedSemaphore
     from fiber._transport.base import SharedCounter
 
 __all__ = [
+    "SEM_VALUE_MAX",
+    "Abandoned",
     "Barrier",
     "BoundedSemaphore",
     "Condition",
@@ -27,18 +38,8 @@ __all__ = [
     "Semaphore",
 ]
 
-SEM_VALUE_MAX = 2**31 - 1
-
 RECHECK = 1.0
 """Seconds after which whoever waits for a bell looks for itself: its ringer may have died."""
-
-
-class Lock(Unsupported):
-    pass
-
-
-class RLock(Unsupported):
-    pass
 
 
 class Condition(Unsupported):
@@ -47,6 +48,56 @@ class Condition(Unsupported):
 
 class Barrier(Unsupported):
     pass
+
+
+class SemLock:
+    """What all locks and semaphores are: tokens that are acquired and released.
+
+    They pickle at any time and not only while a process is started: through a queue, as a task's
+    argument.  What a process has when it dies is released for it, with a RuntimeWarning that names
+    it; whoever acquires it then gets an ``Abandoned`` in place of True.
+    """
+
+    def __init__(self, kind: int, value: int, maximum: int) -> None:
+        self._semlock = shared_semaphores.create(kind, value, maximum)
+
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
+        """Take a token; False if there is none, nor within ``timeout`` seconds."""
+        return self._semlock.acquire(block, timeout)
+
+    def release(self) -> None:
+        """Give a token back; ValueError if there would be more than there can be."""
+        self._semlock.release()
+
+    def __enter__(self) -> bool | Abandoned:
+        return self._semlock.acquire()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._semlock.release()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (type(self), self._semlock)
+
+    def _owner(self) -> str:
+        semlock = self._semlock
+        if semlock._is_mine():
+            name = current_process().name
+            thread = threading.current_thread().name
+            return name if thread == "MainThread" else f"{name}|{thread}"
+        if semlock._get_value() == 1:
+            return "None"
+        return "SomeOtherThread" if semlock._count() > 0 else "SomeOtherProcess"
+
+
+def _rebuild(cls: type[SemLock], semlock: SharedSemaphore) -> SemLock:
+    new = cls.__new__(cls)
+    new._semlock = semlock
+    return new
 
 
 class Semaphore:
@@ -105,6 +156,33 @@ class BoundedSemaphore(Semaphore):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}(value={self.get_value()}, maxvalue={self._maximum})>"
+
+
+class Lock(SemLock):
+    """A mutex that any thread of any process may release."""
+
+    def __init__(self, *, ctx: Any = None) -> None:
+        super().__init__(COUNTING, 1, 1)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}(owner={self._owner()})>"
+
+
+class RLock(SemLock):
+    """A mutex that its thread may acquire again, and that only its thread may release.
+
+    ``release`` raises AssertionError in any other.
+    """
+
+    def __init__(self, *, ctx: Any = None) -> None:
+        super().__init__(RECURSIVE, 1, 1)
+
+    def __repr__(self) -> str:
+        count = self._semlock._count()
+        owner = self._owner()
+        if owner.startswith("Some"):
+            return f"<{type(self).__name__}({owner}, nonzero)>"
+        return f"<{type(self).__name__}({owner}, {count})>"
 
 
 class Event:

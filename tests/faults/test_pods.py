@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import pytest
@@ -64,6 +65,18 @@ def own_pod(_: object = None) -> str:
     return os.environ[names.ENV_NAME]
 
 
+shared: list[Any] = []
+
+
+def share(*memory: Any) -> None:
+    shared[:] = memory
+
+
+def add_turn(index: int) -> None:
+    sums, turn = shared
+    sums[index] += turn.value
+
+
 def slow_square(number: int) -> int:
     time.sleep(0.02)
     return number * number
@@ -102,6 +115,16 @@ def test_a_pool_is_pods_that_come_with_the_work_and_go_with_the_program(
         assert sum(info.tasks for info in pool.workers()) == 100
 
 
+def test_pods_share_memory_with_the_program_and_each_other(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"):
+        sums, turn = fiber.RawArray("i", 20), fiber.RawValue("i", 0)
+        with fiber.Pool(2, share, (sums, turn)) as pool:
+            for number in range(1, 4):
+                turn.value = number
+                pool.map(add_turn, range(20), chunksize=1)
+        assert list(sums) == [6] * 20
+
+
 def test_the_next_pool_begins_on_pods_that_are_there(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"):
         with fiber.Pool(2) as pool:
@@ -138,6 +161,31 @@ def test_functions_that_wish_for_more_run_in_pods_of_their_own(cluster: FakeClus
             "None",
             "{'cpu': '500m', 'memory': '64Mi'}",
         }
+
+
+def test_an_executors_tasks_run_in_pods_as_their_options_say(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"), fiber.Executor(1) as executor:
+        large = executor.options(cpu=0.5, memory="64Mi")
+        pod, other = executor.submit(own_pod).result(PATIENCE), large.submit(own_pod)
+        assert {pod, other.result(PATIENCE)} == set(pods_of(cluster))
+        assert pod != other.result()
+        assert set(large.map(own_pod, range(5))) == {other.result()}
+        templates = [pool["spec"]["template"] for pool in cluster.objects("fiberpools")]
+        workers = [template["spec"]["containers"][0] for template in templates]
+        assert {"cpu": "500m", "memory": "64Mi"} in [
+            worker.get("resources", {}).get("limits") for worker in workers
+        ]
+
+
+def test_an_executors_task_that_dies_with_its_pod_says_so(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"), fiber.Executor(1) as executor:
+        pod = executor.submit(own_pod).result(PATIENCE)
+        future = executor.options(retries=0).submit(time.sleep, PATIENCE)
+        cluster.wait(future.running)
+        cluster.do(cluster.nodes.kill, pod)
+        with pytest.raises(BrokenProcessPool, match="OOMKilled") as caught:
+            future.result(PATIENCE)
+        assert isinstance(caught.value, WorkerDied)
 
 
 def test_processes_and_pipes(cluster: FakeCluster) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import re
 import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -209,3 +212,31 @@ def _handles(pid: int, signum: int) -> bool:
     status = Path(f"/proc/{pid}/status").read_text()
     caught = re.search(r"SigCgt:\t(\w+)", status)
     return caught is not None and bool(int(caught[1], 16) >> (signum - 1) & 1)
+
+
+MASK = "import signal; print(signal.SIGTERM in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
+
+
+def test_in_the_image_a_signal_waits_for_python_itself() -> None:
+    """Process 1 of a container would never get one that it is not ready for."""
+    dockerfile = Path(__file__).parents[2] / "sdk" / "Dockerfile"
+    (line,) = (line for line in dockerfile.read_text().splitlines() if "ENTRYPOINT" in line)
+    *before, python, m, module = json.loads(line.removeprefix("ENTRYPOINT"))
+    assert (python, m, module) == ("python", "-m", "fiber.agent")
+    ran = subprocess.run([*before, sys.executable, "-c", MASK], capture_output=True, text=True)
+    assert ran.stdout == "True\n", ran.stderr
+
+
+def test_elsewhere_it_waits_for_what_takes_long_to_import() -> None:
+    program = f"""
+import runpy, sys, types
+sys.argv = ["agent"]
+main = sys.modules["fiber._agent.main"] = types.ModuleType("main")
+def run():
+    print("fiber._transport" in sys.modules)
+    {MASK}
+main.main = run
+runpy.run_module("fiber.agent", run_name="__main__")
+"""
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ran.stdout == "False\nTrue\n", ran.stderr

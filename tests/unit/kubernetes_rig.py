@@ -15,8 +15,8 @@ import yaml
 from fakes.kubernetes_api import Call
 from fakes.served import Served, served
 from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.attached_pool import Master
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
-from fiber._backends.kubernetes.held_pool import Master
 from fiber._backends.kubernetes.own_pool import OwnPool
 from fiber._backends.kubernetes.secret import make_credentials
 from fiber._backends.kubernetes.warm_pool import WarmPool
@@ -64,12 +64,16 @@ def pool_body(name: str = "es-1") -> Body:
 class Told:
     """An observer that remembers."""
 
+    attached: list[bool] = field(default_factory=list)
     statuses: list[Body] = field(default_factory=list)
     pods: list[tuple[str, Body | None]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     errors: list[FiberPoolError] = field(default_factory=list)
     ended: bool = False
     _changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def on_attached(self) -> None:
+        self._note(self.attached, True)
 
     def on_status(self, status: Body) -> None:
         self._note(self.statuses, status)
@@ -138,8 +142,8 @@ class Rig:
     def own(self, told: Told, name: str = "es-1", owner: Body | None = None) -> FiberPoolClient:
         """A client that makes a pool."""
         credentials = make_credentials(name, NAMESPACE)
-        tenure = OwnPool(self.api, NAMESPACE, pool_body(name), credentials, MASTER, owner)
-        return self._client(tenure, told)
+        attachment = OwnPool(self.api, NAMESPACE, pool_body(name), credentials, MASTER, owner)
+        return self._client(attachment, told)
 
     def warm(self, told: Told, master: Master = MASTER, name: str = "warm") -> FiberPoolClient:
         """A client that attaches to one."""
@@ -173,8 +177,8 @@ class Rig:
             client.close()
         self.api.close()
 
-    def _client(self, tenure: OwnPool | WarmPool, told: Told) -> FiberPoolClient:
-        client = FiberPoolClient(self.api, self.loop, tenure, told)
+    def _client(self, attachment: OwnPool | WarmPool, told: Told) -> FiberPoolClient:
+        client = FiberPoolClient(self.api, self.loop, attachment, told)
         self._clients.append(client)
         client.start()
         return client

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from typing import Any
 
 import pytest
@@ -92,3 +93,16 @@ def test_an_agent_whose_pod_ends_gets_no_child_when_it_is_heard_again(site: Site
     assert child.waiting
     site.agents.withhold(agent, False, "ending")
     assert child.host == "a"
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGKILL, signal.SIGTERM])
+def test_a_signal_that_ends_a_process_ends_one_that_waits_for_an_agent(
+    site: Site, signum: signal.Signals
+) -> None:
+    child, owner = site.start()
+    child.signal(signum)
+    site.loop.run_for(0.0)
+    assert owner.report is not None
+    assert owner.report.exitcode == -signum
+    assert f"killed by {signum.name} before it had a host" in owner.report.reason
+    assert not site.placement.waiting

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from fiber import agent, config, inherited
+from fiber import config, inherited
+from fiber._agent import main as agent
 from fiber.config import Config, load
 from fiber.errors import ConfigError, FiberError
 

@@ -8,17 +8,18 @@ import math
 import ssl
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from kubernetes.config import incluster_config, kube_config
+from kubernetes.config import incluster_config
 
 from fakes.kubernetes_api import Fault
 from fakes.served import Served, served
-from fiber._backends.kubernetes import api as door
+from fiber._backends.kubernetes import session
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.api_errors import (
     ApiError,
@@ -27,9 +28,13 @@ from fiber._backends.kubernetes.api_errors import (
     Forbidden,
     Invalid,
     NotFound,
-    Throttled,
+    ServerError,
+    TooManyRequests,
+    Transient,
     Unauthorized,
     Unreachable,
+    error_of,
+    explain,
 )
 from fiber._backends.kubernetes.resources import LEASES, NODES, PODS, POOLS
 from fiber.errors import ConfigError
@@ -145,19 +150,60 @@ def test_a_login_plugin_is_asked_again_when_its_token_is_not_accepted(
         api.list(ALL)
 
 
-def test_certificates_of_a_kubeconfig_outlive_the_clients_files(
+def test_of_a_kubeconfigs_certificates_no_file_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At the exit of the interpreter the client deletes them before our pools are deleted."""
+    """The package would delete them when the interpreter exits: before our pools are deleted, and
+    never if it is killed.
+    """
     made = make_certificates("localhost", "nobody", valid_for=RUN_VALIDITY)
-    authority = base64.b64encode(made.authority.encode()).decode()
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     with served(_server_side(made, tmp_path)) as server:
         url = f"https://localhost:{server.api.port}"
-        file = kubeconfig(tmp_path, url, **{"certificate-authority-data": authority})
+        file = kubeconfig(
+            tmp_path,
+            url,
+            {
+                "client-certificate-data": _base64(made.agent.certificate),
+                "client-key-data": _base64(made.agent.key),
+            },
+            **{"certificate-authority-data": _base64(made.authority)},
+        )
         monkeypatch.setenv("KUBECONFIG", str(file))
+        for _ in range(2):  # the package remembers the names of its files
+            with contextlib.closing(Api.connect()) as api:
+                assert list(temporary.iterdir()) == []
+                api.list(ALL, timeout=0)
+        assert "Bearer one" not in server.api.tokens
+
+
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode()
+
+
+def test_a_kubeconfig_that_names_its_files_needs_no_folder_to_write_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_certificates("localhost", "nobody", valid_for=RUN_VALIDITY)
+    (tmp_path / "ca.crt").write_text(made.authority)
+    with served(_server_side(made, tmp_path)) as server:
+        url = f"https://localhost:{server.api.port}"
+        file = kubeconfig(tmp_path, url, **{"certificate-authority": str(tmp_path / "ca.crt")})
+        monkeypatch.setenv("KUBECONFIG", str(file))
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
         with contextlib.closing(Api.connect()) as api:
-            kube_config._cleanup_temp_files()
             api.list(ALL, timeout=0)
+
+
+def test_certificates_that_are_none_are_a_kubeconfig_that_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = kubeconfig(tmp_path, "https://localhost:1", **{"certificate-authority-data": "bm9uZQ=="})
+    monkeypatch.setenv("KUBECONFIG", str(file))
+    with pytest.raises(ConfigError, match=f"cannot log in to the cluster by {file}"):
+        Api.connect()
 
 
 # -- The account of a pod
@@ -174,7 +220,7 @@ def account(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[S
         monkeypatch.delenv("KUBECONFIG", raising=False)
         monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "localhost")
         monkeypatch.setenv("KUBERNETES_SERVICE_PORT", str(server.api.port))
-        monkeypatch.setattr(door, "_ACCOUNT", str(tmp_path))
+        monkeypatch.setattr(session, "_ACCOUNT", str(tmp_path))
         files = {"SERVICE_TOKEN_FILENAME": "token", "SERVICE_CERT_FILENAME": "ca.crt"}
         for constant, file in files.items():
             monkeypatch.setattr(incluster_config, constant, str(tmp_path / file))
@@ -295,7 +341,7 @@ def test_what_may_pass_is_tried_again(server: Served, api: Api, fault: Fault) ->
 
 def test_with_timeout_0_there_is_one_attempt(server: Served, api: Api) -> None:
     server.api.faults.append(Fault(status=503, times=9))
-    with pytest.raises(Unreachable):
+    with pytest.raises(ServerError):
         api.list(ALL, timeout=0.0)
     assert server.api.count("list", "pods") == 1
 
@@ -305,24 +351,62 @@ def test_who_is_asked_to_come_back_later_than_there_is_time_does_not_wait(
 ) -> None:
     server.api.faults.append(Fault(status=429, retry_after=20, times=9))
     started = time.monotonic()
-    with pytest.raises(Throttled) as caught:
+    with pytest.raises(TooManyRequests) as caught:
         api.list(ALL, timeout=5.0)
     assert caught.value.retry_after == 20
     assert time.monotonic() - started < 5.0
 
 
-def test_who_is_asked_to_come_back_later_does(server: Served, api: Api) -> None:
-    server.api.faults.append(Fault(status=429, retry_after=1))
+@pytest.mark.parametrize("status", [429, 503])
+def test_who_is_asked_to_come_back_later_does(server: Served, api: Api, status: int) -> None:
+    server.api.faults.append(Fault(status=status, retry_after=1))
     started = time.monotonic()
     api.list(ALL)
     assert time.monotonic() - started >= 1
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "reason", "said"),
+    [
+        (Fault(status=500), ServerError, "InternalError", "this is a test. The API server kube"),
+        (Fault(status=500), ServerError, "InternalError", "HTTP status 500.*/readyz"),
+        (Fault(status=503, reason=""), ServerError, "InternalError", "HTTP status 503"),
+        (Fault(status=502, text="<html>bad gateway"), ServerError, "InternalError", "bad gateway"),
+        (Fault(status=429, reason=""), TooManyRequests, "TooManyRequests", "try again later"),
+        (Fault(), Unreachable, "Unreachable", "cannot be reached.*kubectl cluster-info"),
+        (Fault(status=302, text=""), Unreachable, "Unreachable", "HTTP status 302"),
+    ],
+)
+def test_whoever_answers_is_not_out_of_reach(
+    server: Served, api: Api, fault: Fault, kind: type[Transient], reason: str, said: str
+) -> None:
+    fault.times = 99
+    server.api.faults.append(fault)
+    with pytest.raises(kind) as caught:
+        api.list(ALL, timeout=0.0)
+    assert api.trouble == str(caught.value)
+    told = explain(caught.value, "list", pool="es", namespace="lab", server="kube")
+    assert told.reason == reason
+    assert ("cannot be reached" in str(told)) == (kind is Unreachable)
+    with pytest.raises(type(told), match=said):
+        raise told
+    server.api.faults.clear()
+    api.list(ALL)
+    assert api.trouble is None
+
+
+def test_a_watch_that_is_put_off_says_until_when() -> None:
+    status = {"code": 503, "message": "starting", "details": {"retryAfterSeconds": 7}}
+    error = error_of(503, {}, status)
+    assert isinstance(error, ServerError)
+    assert error.retry_after == 7
 
 
 def test_attempts_end_when_they_are_cancelled(server: Served, api: Api) -> None:
     server.api.faults.append(Fault(status=503, times=math.inf))
     cancel = threading.Event()
     cancel.set()
-    with pytest.raises(Unreachable):
+    with pytest.raises(ServerError):
         api.list(ALL, timeout=60.0, cancel=cancel)
     assert server.api.count("list", "pods") == 1
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+import queue
 import signal
 import threading
 from collections.abc import Iterator
@@ -14,7 +15,8 @@ import pytest
 
 from fakes.kubernetes_api import Call, Fault
 from fakes.store import Failure
-from fiber._backends.kubernetes import fiber_pool, scaling, watches
+from fiber._backends.kubernetes import fiber_pool, informer, scaling
+from fiber._backends.kubernetes.api_errors import Forbidden
 from fiber._transport.credentials import MasterCredentials
 from fiber_api import names
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told
@@ -152,7 +154,8 @@ def test_a_demand_is_written_until_it_holds(
     rig.own(told).demand(4)
     replicas_become(rig, told, 4)
     assert not told.errors
-    assert "kubectl cluster-info" in told.warnings[0]
+    assert "cannot scale the FiberPool 'es-1'" in told.warnings[0]
+    assert "HTTP status 503" in told.warnings[0]
 
 
 def test_names_to_release_are_written_until_their_pods_are_gone(
@@ -207,6 +210,44 @@ def test_a_pool_that_somebody_deletes_is_an_error(rig: Rig, told: Told) -> None:
     error = told.error()
     assert (error.reason, error.pool, error.namespace) == ("Deleted", "es-1", NAMESPACE)
     assert "was deleted" in str(error)
+
+
+# -- What keeps it waiting
+
+
+def test_who_begins_to_wait_is_told_what_others_were_told_before(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries: queue.Queue[None] = queue.Queue()
+
+    def refuse(*_: object, **__: object) -> None:
+        tries.put(None)
+        raise Forbidden("no right", status=403)
+
+    monkeypatch.setattr(scaling, "_PAUSE_MAX", 0.01)
+    monkeypatch.setattr(rig.api, "apply", refuse)
+    client = rig.own(told)
+    client.demand(1)
+    for _ in range(4):
+        tries.get(timeout=10)
+    told.wait(lambda: told.warnings)
+    assert len(told.warnings) == 1
+    client.warn_anew()
+    told.wait(lambda: len(told.warnings) == 2)
+    assert told.warnings[0] == told.warnings[1]
+    assert "cannot scale the FiberPool 'es-1' in namespace 'lab': no right" in told.warnings[0]
+
+
+def test_each_right_that_is_missing_is_spoken_of(rig: Rig, told: Told) -> None:
+    for plural in (names.PLURAL, "pods"):
+        verb = "patch" if plural == names.PLURAL else "list"
+        fault = Fault(verb, plural, status=403, message=f"cannot {verb} {plural}", times=math.inf)
+        rig.server.do(rig.server.api.faults.append, fault)
+    rig.own(told).demand(1)
+    told.wait(lambda: len(told.warnings) == 2)
+    watching, scaling_ = sorted(told.warnings, key=lambda warning: "scale" in warning)
+    assert "cannot watch the pods of the FiberPool 'es-1'" in watching
+    assert "cannot scale the FiberPool 'es-1'" in scaling_
 
 
 # -- What keeps it from being born
@@ -315,7 +356,7 @@ def test_an_operator_of_which_nothing_could_be_heard(
 ) -> None:
     monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.2)
     monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.5)
-    monkeypatch.setattr(watches, "_PAUSE_MAX", 0.1)
+    monkeypatch.setattr(informer, "_PAUSE_MAX", 0.1)
     rig.server.api.faults.append(Fault("list", names.PLURAL, status=503, times=12))
     rig.own(told).demand(1)
     told.wait(lambda: told.statuses)

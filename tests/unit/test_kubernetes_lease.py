@@ -11,7 +11,7 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes import lease
-from fiber._backends.kubernetes.held_pool import HeldPool
+from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber._backends.kubernetes.lease import LeaseRenewer
 from fiber.errors import FiberPoolError
 from fiber_api import names
@@ -35,7 +35,7 @@ class Case:
         body = pool_body()
         body["spec"]["master"] = master.spec("es-1", 1)
         made = rig.server.do(rig.server.store.create, names.PLURAL, NAMESPACE, body)
-        self.pool = HeldPool(rig.api, made, master, 1)
+        self.pool = AttachedPool(rig.api, made, master, 1)
         self.pool.make_lease()
         self.renewer = LeaseRenewer(
             self.pool,
@@ -188,6 +188,14 @@ def test_the_thread_tells_what_keeps_it_from_renewing(rig: Rig) -> None:
     assert "this is a test" in str(case.troubles.get(timeout=10))
     case.renewer.stop()
     case.renewer.join(10)
+
+
+def test_a_busy_api_server_is_asked_later_and_in_time(case: Case) -> None:
+    for seconds, pause in ((7, 7), (25, 10)):  # after 25 s the Lease would be over
+        fault = Fault("patch", "leases", status=429, retry_after=seconds)
+        case.rig.server.api.faults.append(fault)
+        assert case.renewer._attempt() == pause
+        assert "this is a test" in str(case.troubles.get_nowait())
 
 
 @pytest.mark.parametrize("status", [401, 403])

@@ -13,7 +13,7 @@ import pytest
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._backends.kubernetes import program, progress
 from fiber._backends.kubernetes.pods import Pods
-from fiber._backends.kubernetes.program import Opened, Serve
+from fiber._backends.kubernetes.program import PreparedPool
 from fiber._backends.kubernetes.shape import Shape
 from fiber._backends.remote import RemoteChild
 from fiber._transport.loop import Loop
@@ -66,41 +66,47 @@ class Listener:
         then()
 
 
-class Tenure:
+class Attachment:
     """A pool that must not begin."""
 
     name, namespace, doing, remedy = "es-1", "lab", "make", "delete"
 
-    def begin(self, cancel: threading.Event) -> Any:
+    def attach(self, cancel: threading.Event) -> Any:
         raise AssertionError("it was made after the end")
 
-    def end(self, timeout: float) -> None:
+    def detach(self, timeout: float) -> None:
         raise AssertionError("there is none to end")
 
 
 class Site:
-    """Pods that are opened by ``open``."""
+    """Pods of the pool that ``prepare`` gives."""
 
     def __init__(self) -> None:
         self.loop = Loop()
         self.loop.start_thread("test-io")
         self.said = Said()
-        self.opens = 0
+        self.api = SimpleNamespace(server="kube", trouble=None)
 
-    def pods(self, open: Callable[[Serve], Opened]) -> Pods:
+    def pods(
+        self, prepare: Callable[[threading.Event], PreparedPool], config: Config | None = None
+    ) -> Pods:
+        """``prepare`` is called with the event that ends its calls."""
         nothing: Any = self.said
-
-        def counted(serve: Serve) -> Opened:
-            self.opens += 1
-            return open(serve)
-
-        self.made = Pods(self.loop, nothing, nothing, Config(), nothing, counted)
+        api: Any = self.api
+        self.made = Pods(
+            self.loop,
+            nothing,
+            nothing,
+            config or Config(),
+            api,
+            lambda observer, cancel: prepare(cancel),
+        )
         return self.made
 
-    def start(self) -> tuple[RemoteChild, Owner]:
+    def start(self, *, worker: bool = False) -> tuple[RemoteChild, Owner]:
         owner: Any = Owner(self.said)
         spec = ChildSpec(
-            name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=False
+            name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=worker
         )
         child = self.made.agents.child(spec, owner)
         self.loop.call_soon(child.start)
@@ -115,10 +121,10 @@ def site() -> Iterator[Site]:
 
 
 def test_what_nobody_foresaw_in_opening_ends_the_wait(site: Site) -> None:
-    def open(serve: Serve) -> Opened:
+    def prepare(cancel: threading.Event) -> PreparedPool:
         raise KeyError("containers")
 
-    site.pods(open)
+    site.pods(prepare)
     child, owner = site.start()
     assert owner.gone.wait(PATIENCE)
     assert owner.report is not None
@@ -131,7 +137,7 @@ def test_what_nobody_foresaw_in_opening_ends_the_wait(site: Site) -> None:
 def test_a_thread_that_the_system_has_no_room_for_ends_the_wait(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    site.pods(lambda serve: pytest.fail("it has no thread"))
+    site.pods(lambda cancel: pytest.fail("it has no thread"))
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", refuse_threads)
         _, owner = site.start()
@@ -146,15 +152,15 @@ def refuse_threads(thread: threading.Thread) -> None:
 
 
 def test_an_end_while_it_is_opened_makes_no_pool_and_closes_what_listens(site: Site) -> None:
-    asks, listener, tenure = threading.Event(), Listener(), Tenure()
+    asks, listener, attachment = threading.Event(), Listener(), Attachment()
 
-    def open(serve: Serve) -> Opened:
+    def prepare(cancel: threading.Event) -> PreparedPool:
         asks.set()
-        assert serve.cancel.wait(PATIENCE)  # so it is not asked again and again
+        assert cancel.wait(PATIENCE)  # so it is not asked again and again
         some_listener: Any = listener
-        return Opened(some_listener, tenure, 1, 0, 10)
+        return PreparedPool(some_listener, attachment, 1, 0, 10)
 
-    site.pods(open)
+    site.pods(prepare)
     site.start()
     assert asks.wait(PATIENCE)
     site.made.close()
@@ -162,9 +168,9 @@ def test_an_end_while_it_is_opened_makes_no_pool_and_closes_what_listens(site: S
     assert not [t for t in threading.enumerate() if t.name == "fiber-kubernetes"]
 
 
-def until_the_end(serve: Serve) -> Opened:
+def until_the_end(cancel: threading.Event) -> PreparedPool:
     """As an API server that does not answer."""
-    assert serve.cancel.wait(PATIENCE)
+    assert cancel.wait(PATIENCE)
     raise FiberError("the end")
 
 
@@ -183,7 +189,7 @@ def test_an_agent_whose_pod_is_about_to_go_is_not_let_in(site: Site) -> None:
     metadata = {"name": "a", "labels": {}, "deletionTimestamp": "2026-01-01T00:00:00Z"}
     pods.on_pod("a", {"metadata": metadata})
     link: Any = SimpleNamespace(peer=SimpleNamespace(name="a"))
-    assert pods._joined(link) == "a, whose pod is about to go"
+    assert pods.on_agent(link) == "a, whose pod is about to go"
     assert not pods.agents.agents
     pods.close()
 
@@ -193,7 +199,7 @@ def test_the_live_line_goes_before_anybody_is_refused(
 ) -> None:
     monkeypatch.setattr(progress, "_is_terminal", lambda: True)
     waits = threading.Event()
-    pods = site.pods(lambda serve: waits.set() or until_the_end(serve))
+    pods = site.pods(lambda cancel: waits.set() or until_the_end(cancel))
     _, owner = site.start()
     assert waits.wait(PATIENCE)
     error = FiberPoolError("it was deleted", pool="es-1", namespace="lab", reason="Deleted")
@@ -205,11 +211,14 @@ def test_the_live_line_goes_before_anybody_is_refused(
 
 def test_a_wait_for_the_api_server_says_so(site: Site) -> None:
     waits = threading.Event()
-    pods = site.pods(lambda serve: waits.set() or until_the_end(serve))
-    pods._config = Config(pod_timeout=0.1)
+    pods = site.pods(lambda cancel: waits.set() or until_the_end(cancel), Config(pod_timeout=0.1))
     child, owner = site.start()
     assert owner.gone.wait(PATIENCE)
-    assert "within 0.1 s: the API server" in str(child.start_error)
+    assert "within 0.1 s: the API server kube has not answered yet" in str(child.start_error)
+    site.api.trouble = "etcd has no leader"
+    child, owner = site.start()
+    assert owner.gone.wait(PATIENCE)
+    assert "kube is asked again and again: etcd has no leader" in str(child.start_error)
     pods.close()
 
 
@@ -217,16 +226,16 @@ def test_an_end_after_the_loop_has_failed(site: Site, monkeypatch: pytest.Monkey
     asks, failed = threading.Event(), threading.Event()
     monkeypatch.setattr(threading, "excepthook", lambda _: failed.set())
 
-    def open(serve: Serve) -> Opened:
+    def prepare(cancel: threading.Event) -> PreparedPool:
         asks.set()
         assert failed.wait(PATIENCE)
         listener: Any = Listener()
-        return Opened(listener, Tenure(), 1, 0, 10)
+        return PreparedPool(listener, Attachment(), 1, 0, 10)
 
     def damage() -> None:
         raise KeyboardInterrupt(DAMAGED)
 
-    site.pods(open)
+    site.pods(prepare)
     site.start()
     assert asks.wait(PATIENCE)
     site.loop.call_soon(damage)
@@ -246,12 +255,12 @@ def test_what_fails_while_a_pool_is_opened_leaves_nothing_that_listens(
     monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, "http://127.0.0.1:9")))
     monkeypatch.setattr(program, "reachable_address", lambda *args, **kwargs: "127.0.0.1")
     monkeypatch.setattr(program, "pod_template", refuse)
-    serve = Serve(lambda link: None, lambda reason: None, threading.Event())
-    opened = program.Program(Config())
+    nobody: Any = None
+    ours = program.Program(Config())
     with pytest.raises(FiberError, match="no template"):
-        opened.open_own(Shape(), site.loop, serve)
+        ours.prepare_own(Shape(), site.loop, nobody, threading.Event())
     assert not [t for t in threading.enumerate() if t.name == "fiber-accept"]
-    opened.api.close()
+    ours.api.close()
 
 
 class Dialled(SimpleNamespace):
@@ -264,7 +273,7 @@ class Dialled(SimpleNamespace):
 
 def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> None:
     """After this program was stopped for so long that its agents gave it up."""
-    pods = site.pods(lambda serve: pytest.fail("nothing is to be opened"))
+    pods = site.pods(lambda cancel: pytest.fail("nothing is to be opened"))
     pod: Any = {"metadata": {"name": "es-1-a", "labels": {}}, "status": {"phase": "Running"}}
     first, second = Dialled("es-1-a"), Dialled("es-1-a")
     done = threading.Event()
@@ -272,8 +281,8 @@ def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> Non
 
     def happen() -> None:
         pods.on_pod("es-1-a", pod)
-        told.append(pods._joined(first))  # type: ignore[arg-type]
-        told.append(pods._joined(second))  # type: ignore[arg-type]
+        told.append(pods.on_agent(first))  # type: ignore[arg-type]
+        told.append(pods.on_agent(second))  # type: ignore[arg-type]
         done.set()
 
     site.loop.call_soon(happen)
@@ -283,3 +292,41 @@ def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> Non
     assert agent._link is second  # type: ignore[comparison-overlap]
     assert pods._given_up == set()
     pods.close()
+
+
+@pytest.mark.parametrize(
+    ("worker", "told"),
+    [
+        (False, ["fiber: waiting for pods: 1 of 2 pods ready: QuotaExceeded: it is full"]),
+        (True, []),
+    ],
+    ids=["process", "pool"],
+)
+def test_a_process_that_waits_for_one_more_pod_is_told_what_for(
+    worker: bool, told: list[str], site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pool works with what it has; nothing else can do what a process is to do."""
+    monkeypatch.setattr(progress, "_FIRST_WRITTEN", 0.0)
+    pods = site.pods(until_the_end)
+    full = {"reason": "QuotaExceeded", "severity": "Error", "message": "it is full"}
+    status = {"observedGeneration": 1, "desiredReplicas": 2, "readyReplicas": 1}
+
+    def begin() -> None:
+        pods.on_agent(Dialled("es-1-a"))  # type: ignore[arg-type]
+        pods.on_attached()
+        pods.on_status({**status, "problems": [full]})
+
+    site.loop.call_soon(begin)
+    for _ in range(2):
+        site.start(worker=worker)
+    settled(site)
+    assert site.said.lines[1:] == told  # after the problem itself
+    pods.close()
+
+
+def settled(site: Site) -> None:
+    """Wait until what was asked of the loop is done, with what follows, timers of 0 s too."""
+    for _ in range(5):
+        done = threading.Event()
+        site.loop.call_later(0.0, done.set)
+        assert done.wait(PATIENCE)

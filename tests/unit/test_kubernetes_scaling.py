@@ -12,6 +12,8 @@ from fiber._backends.kubernetes.api_errors import (
     Conflict,
     Forbidden,
     Invalid,
+    ServerError,
+    TooManyRequests,
     Unauthorized,
     Unreachable,
 )
@@ -154,3 +156,10 @@ def test_a_pool_that_was_lost_is_why(case: Case, failure: ApiError) -> None:
     case.want(1)
     with pytest.raises(FiberPoolError, match="lost"):
         case.step()
+
+
+def test_who_is_asked_to_come_back_later_does(case: Case) -> None:
+    case.pool.failures = [TooManyRequests("busy", retry_after=12.0), ServerError("no leader")]
+    case.want(1)
+    assert case.step() == 12
+    assert case.step(12) < 12

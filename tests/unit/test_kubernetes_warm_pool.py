@@ -277,3 +277,30 @@ def test_credentials_that_the_pools_owner_brought(rig: Rig) -> None:
     patch = {"spec": {"credentialsSecretName": "brought"}}
     rig.server.do(rig.server.store.merge, names.PLURAL, NAMESPACE, "warm", patch)
     assert credentials(rig).key
+
+
+def test_one_that_was_deleted_is_not_begun_anew(rig: Rig, told: Told) -> None:
+    rig.warm(told)
+    has_master(rig, told, 1)
+    rig.remove(names.PLURAL, "warm")
+    error = told.error()
+    assert error.reason == "Deleted"
+    assert "whoever keeps it has to make it again" in str(error)
+    assert "begins anew" not in str(error)
+
+
+def test_one_that_another_program_took_says_what_to_wait_for(rig: Rig, told: Told) -> None:
+    rig.warm(told)
+    has_master(rig, told, 1)
+    leave_master(rig)
+    assert "Wait until that program ends" in str(told.error())
+
+
+def test_one_that_this_program_was_detached_from_can_be_attached_to_again(
+    rig: Rig, told: Told
+) -> None:
+    rig.warm(told)
+    has_master(rig, told, 1)
+    patch = {"spec": {"master": None}}
+    rig.server.do(rig.server.store.merge, names.PLURAL, NAMESPACE, "warm", patch)
+    assert "attach to it again" in str(told.error())

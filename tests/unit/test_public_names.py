@@ -97,14 +97,12 @@ def test_classes_serve_in_annotations_and_isinstance(name: str) -> None:
 
 
 def test_whoever_makes_an_object_that_is_not_there_is_told_what_to_use() -> None:
-    class Own(fiber.synchronize.Lock):
+    class Own(fiber.synchronize.Barrier):
         pass
 
-    for make in (Own, fiber.synchronize.Lock, fiber.Lock, fiber.get_context("spawn").Lock):
-        with pytest.raises(fiber.NotInFiber, match=r"no Lock yet.*Semaphore\(1\)"):
+    for make in (Own, fiber.synchronize.Barrier, fiber.Barrier, fiber.get_context("spawn").Barrier):
+        with pytest.raises(fiber.NotInFiber, match=r"no Barrier yet.*Semaphore"):
             make()
-    with pytest.raises(fiber.NotInFiber, match=r"no SharedMemory yet.*Pipe or Queue"):
-        fiber.shared_memory.SharedMemory(create=True, size=16)
 
 
 @pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])

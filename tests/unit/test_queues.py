@@ -17,7 +17,6 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
-from fiber.errors import NotInFiber
 
 MORE_THAN_FITS = 3000
 """Items that no socket's buffer holds."""
@@ -474,26 +473,3 @@ def test_a_simple_queue_among_processes() -> None:
         assert back.get() == item
     there.put(None)
     process.join(PATIENCE)
-
-
-# What is not there
-
-
-@pytest.mark.parametrize("name", ["Value", "Array", "RawValue", "RawArray"])
-def test_shared_values_are_refused_by_name(name: str) -> None:
-    from fiber import sharedctypes
-
-    with pytest.raises(NotInFiber, match=f"no {name} yet.*Pipe or Queue"):
-        getattr(sharedctypes, name)("i", 0)
-    assert isinstance(sharedctypes.SynchronizedArray, type)
-
-
-def test_managers_can_be_defined_but_not_made() -> None:
-    from fiber import managers
-
-    class Manager(managers.BaseManager):
-        pass
-
-    Manager.register("Thing", callable=dict)
-    with pytest.raises(NotInFiber, match="no Manager yet"):
-        Manager()

@@ -10,6 +10,7 @@ from fiber_api import names
 from fiber_api.names import ConditionType, Phase, Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
 from fiber_operator.planning import manifests
+from fiber_operator.planning.assessment import Assessment
 from fiber_operator.planning.conditions import (
     Counts,
     Finding,
@@ -26,24 +27,16 @@ from fiber_operator.planning.pods import PodView
 from fiber_operator.planning.situation import SECOND_LOOK
 
 
-def describe(
-    pool: FiberPool,
-    outlook: Outlook,
-    account: Account,
-    *,
-    address: str | None,
-    led: bool,
-    credentials: bool | None,
-    idle_since: float | None,
-    template_hash: str,
-    now: float,
-) -> FiberPoolStatus:
-    """The status that ``pool`` should have."""
+def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPoolStatus:
+    """The status that the pool should have.  ``account`` is that of ``facts``, or what the plan
+    has made of it.
+    """
+    pool, memory = facts.pool, facts.memory
     before, counts, master = pool.status, outlook.counts, pool.spec.master
-    found = conditions(pool, outlook, now)
-    epoch = master.epoch if master and led else 0
+    found = conditions(pool, outlook, facts.now)
+    epoch = master.epoch if master and memory.led else 0
     leads_to = names.address_of(master.host, master.port) if master else None
-    secret = pool.credentials_secret if credentials else None
+    secret = pool.credentials_secret if memory.credentials else None
     return FiberPoolStatus(
         observed_generation=pool.metadata.generation,
         phase=phase(pool, found, outlook),
@@ -54,12 +47,12 @@ def describe(
         terminating_replicas=counts.terminating,
         updated_replicas=counts.updated,
         selector=manifests.selector(pool),
-        endpoint=names.endpoint_of(address) if address else before.endpoint,
-        master=leads_to if led else before.master,
+        endpoint=names.endpoint_of(memory.address) if memory.address else before.endpoint,
+        master=leads_to if memory.led else before.master,
         master_epoch=max(epoch, before.master_epoch or 0) or None,
-        idle_since=idle_since,
-        credentials_secret=before.credentials_secret if credentials is None else secret,
-        template_hash=template_hash,
+        idle_since=facts.idleness.since,
+        credentials_secret=before.credentials_secret if memory.credentials is None else secret,
+        template_hash=facts.template_hash,
         proven_template_hash=account.proven,
         failures=account.failures,
         problems=outlook.problems,

@@ -97,6 +97,11 @@ def take_descriptor(index: int) -> int:
     return fd
 
 
+def duplicate_descriptor(index: int) -> int:
+    """A duplicate of one to which several handles refer; it is there until all are unpickled."""
+    return os.dup(_descriptors[index])
+
+
 def die_with_parent(parent: int) -> None:
     """Have the kernel kill this process when its zygote dies."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

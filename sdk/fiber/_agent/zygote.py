@@ -323,9 +323,10 @@ def _run_zygote(
         ).run()
     ours = folder if told_to else cleanup_directory
     if ours is not None:
-        import shutil  # rarely needed: whoever waits for the first child waits for our imports
+        # Rarely needed, and whoever waits for the first child waits for our imports.
+        from fiber._hub.directory import remove_directory
 
-        shutil.rmtree(ours, ignore_errors=True)
+        remove_directory(ours)
 
 
 def _pidfds(ancestors: tuple[int, ...]) -> list[int]:

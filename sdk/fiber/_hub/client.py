@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from fiber._hub import protocol
+from fiber._hub.doorbell import Doorbell
 from fiber._hub.local import QuietSocket, without_timeout
 from fiber._hub.protocol import HEAD, ONE, TWO, HubAddress, Op, Status
 from fiber._hub.registry import Registry
@@ -48,6 +49,7 @@ class LocalHub(Protocol):
     host: str
     key: bytes
     registry: Registry
+    doorbell: Doorbell
 
     @property
     def address(self) -> HubAddress:

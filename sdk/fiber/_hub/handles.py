@@ -24,8 +24,19 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from fiber._hub import client
 from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.heap import Block, block_of
 from fiber._hub.local import LocalChannel, LocalCounter
-from fiber._hub.protocol import ONE, TWO, GrantFlags, HubAddress, ObjectKind, Op
+from fiber._hub.protocol import (
+    FOUR,
+    ONE,
+    TWO,
+    WHOLE,
+    Extent,
+    GrantFlags,
+    HubAddress,
+    ObjectKind,
+    Op,
+)
 from fiber._hub.registry import NoSuchObject, Registry
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
 from fiber._transport.base import SharedChannel, SharedCounter
@@ -71,6 +82,29 @@ class HubHandle(NamedTuple):
 Handle: TypeAlias = InheritedDescriptor | HubHandle
 
 
+class BlockHandle(NamedTuple):
+    """Stands for a block of shared memory.
+
+    What it becomes on another host is the business of whoever pickled it.
+    """
+
+    segment: Handle
+    extent: Extent
+    inode: int
+    """Of the segment, on its own host."""
+
+    def elsewhere(self) -> HubHandle | None:
+        """How to reach the hub of its host, if that is not this one."""
+        segment = self.segment
+        return segment if isinstance(segment, HubHandle) and not segment.here() else None
+
+    def block(self) -> Block:
+        """On its own host: the block."""
+        segment = self.segment
+        owner = segment.fetch() if isinstance(segment, HubHandle) else own(segment.detach())
+        return block_of(owner, *self.extent)
+
+
 # Unpickling
 
 
@@ -97,15 +131,42 @@ def counter(handle: Handle) -> SharedCounter:
 
 def handle_for(end: Any) -> Handle:
     """What to pickle in place of a channel or counter."""
-    grants = _grants()
     if isinstance(end, RemoteObject):
-        return grants.for_remote(end)
-    spawning: Any = mp_context.get_spawning_popen()
-    if spawning is not None and not getattr(spawning, "other_host", False):
+        return _grants().for_remote(end)
+    spawning = _spawning_here()
+    if spawning is not None:
         handle: InheritedDescriptor = spawning.DupFd(spawning.duplicate_for_child(end.fileno()))
         return handle
     kind = ObjectKind.CHANNEL if isinstance(end, UnixChannel) else ObjectKind.COUNTER
-    return grants.for_local(kind, end.fileno())
+    return _grants().for_local(kind, end.fileno())
+
+
+def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
+    """What to pickle in place of a block of this host; ``kind`` is what its hub makes of it."""
+    block.give()
+    extent = Extent(block.offset, block.size)
+    spawning = _spawning_here()
+    inode = block.segment.inode
+    if spawning is None:
+        segment = _grants().for_local(kind, block.segment.fileno(), extent)
+        return BlockHandle(segment, extent, inode)
+    # multiprocessing's own Process duplicates the descriptor for each of the blocks.
+    inherit = getattr(spawning, "inherit_segment", None)
+    if inherit is None:
+        number = spawning.duplicate_for_child(block.segment.fileno())
+        return BlockHandle(spawning.DupFd(number), extent, inode)
+    return BlockHandle(inherit(block.segment), extent, inode)
+
+
+def handle_for_remote_block(end: RemoteObject, extent: Extent, inode: int) -> BlockHandle:
+    """What to pickle in place of a block of another host."""
+    return BlockHandle(_grants().for_remote(end), extent, inode)
+
+
+def _spawning_here() -> Any:
+    """The start of a process of this host that is in progress on this thread."""
+    spawning: Any = mp_context.get_spawning_popen()
+    return None if getattr(spawning, "other_host", False) else spawning
 
 
 class GrantSet:
@@ -115,26 +176,31 @@ class GrantSet:
     Otherwise each also ends with its first use, as what is given to a new process.
     """
 
-    __slots__ = ("_direct", "_reusable", "_streams")
+    __slots__ = ("_direct", "_kept", "_reusable", "_streams")
 
     def __init__(self, *, reusable: bool = True) -> None:
         self._reusable = reusable
         self._direct: dict[Registry, list[int]] = {}
         self._streams: dict[HubAddress, HubStream] = {}
+        self._kept: list[object] = []
 
     def __bool__(self) -> bool:
         """Whether there is anything to release."""
-        return bool(self._direct or self._streams)
+        return bool(self._direct or self._streams or self._kept)
 
-    def for_local(self, kind: ObjectKind, fd: int) -> HubHandle:
+    def keep(self, thing: object) -> None:
+        """Keep something alive that whoever unpickles the handles relies on."""
+        self._kept.append(thing)
+
+    def for_local(self, kind: ObjectKind, fd: int, extent: Extent = WHOLE) -> HubHandle:
         """A handle for an object of this host."""
         home = client.hub_address()
         hub = client.local_hub()
         if hub is not None:
-            number, grant = hub.registry.register(kind, fd, reusable=self._reusable)
+            number, grant = hub.registry.register(kind, fd, extent, reusable=self._reusable)
             self._direct.setdefault(hub.registry, []).append(grant)
             return HubHandle(home, number, grant)
-        return _register(self._stream(home), home, kind, fd, self._flags())
+        return _register(self._stream(home), home, kind, fd, extent, self._flags())
 
     def for_remote(self, end: RemoteObject) -> HubHandle:
         """A handle for an object of another host."""
@@ -146,6 +212,7 @@ class GrantSet:
         """Nobody unpickles the handles any more."""
         direct, self._direct = self._direct, {}
         streams, self._streams = self._streams, {}
+        self._kept.clear()
         for registry, grants in direct.items():
             registry.release(grants)
         for stream in streams.values():
@@ -177,17 +244,17 @@ class _SingleUse:
         # Each is for whoever takes it out, which a finalizer in the middle of that may be, too.
         self._streams: deque[tuple[HubAddress, HubStream]] = deque()
 
-    def for_local(self, kind: ObjectKind, fd: int) -> HubHandle:
+    def for_local(self, kind: ObjectKind, fd: int, extent: Extent = WHOLE) -> HubHandle:
         """A handle for an object of this host."""
         home = client.hub_address()
         hub = client.local_hub()
         if hub is None:
-            with self._stream(home) as stream:
-                handle = _register(stream, home, kind, fd, GrantFlags(0))
+            with self.stream(home) as stream:
+                handle = _register(stream, home, kind, fd, extent, GrantFlags(0))
             _undo_by(lambda: self._release(handle))
             return handle
         registry = hub.registry
-        number, grant = registry.register(kind, fd, reusable=False)
+        number, grant = registry.register(kind, fd, extent, reusable=False)
         _undo_by(lambda: registry.release([grant]))
         return HubHandle(home, number, grant)
 
@@ -200,7 +267,8 @@ class _SingleUse:
         return handle
 
     @contextlib.contextmanager
-    def _stream(self, home: HubAddress) -> Iterator[HubStream]:
+    def stream(self, home: HubAddress) -> Iterator[HubStream]:
+        """A stream to that hub, for one request."""
         try:
             to, stream = self._streams.pop()
         except IndexError:
@@ -217,14 +285,19 @@ class _SingleUse:
         self._streams.append((home, stream))
 
     def _release(self, handle: HubHandle) -> None:
-        with self._stream(handle.home) as stream:
+        with self.stream(handle.home) as stream:
             stream.say(Op.RELEASE, handle.grant, form=ONE)
 
 
 def _register(
-    stream: HubStream, home: HubAddress, kind: ObjectKind, fd: int, flags: GrantFlags
+    stream: HubStream,
+    home: HubAddress,
+    kind: ObjectKind,
+    fd: int,
+    extent: Extent,
+    flags: GrantFlags,
 ) -> HubHandle:
-    reply = stream.ask(Op.REGISTER, kind, flags, form=TWO, fds=[fd])
+    reply = stream.ask(Op.REGISTER, kind, flags, *extent, form=FOUR, fds=[fd])
     return HubHandle(home, *reply.values)
 
 
@@ -254,6 +327,20 @@ class Pickling:
         while self.undo:
             with contextlib.suppress(OSError, Unreachable):  # the hub is gone, and all with it
                 self.undo.pop()()
+
+
+def ring() -> None:
+    """Have this host's hub look at shared memory for which it waits on behalf of another host.
+
+    Waits for nothing.  A hub that cannot be told, or is killed meanwhile, looks of its own accord.
+    """
+    with contextlib.suppress(OSError, Unreachable):
+        hub = client.local_hub()
+        if hub is not None:
+            hub.doorbell.ring()
+            return
+        with _single_use.stream(client.hub_address()) as stream:
+            stream.say(Op.RING)
 
 
 class _ThisThread(threading.local):
@@ -310,6 +397,15 @@ def _grants() -> GrantSet | _SingleUse:
     if pickling.reusable and pickling.grants is None:
         pickling.grants = GrantSet()
     return pickling.grants if pickling.grants is not None else _single_use
+
+
+def keep_until_released(thing: object) -> None:
+    """Keep something alive while what is being pickled may be unpickled, where that is known: a
+    new process has its arguments until it ends, a task until it is done.
+    """
+    grants = _grants()
+    if isinstance(grants, GrantSet):
+        grants.keep(thing)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 
 from fiber._hub.hosted import Hosted
-from fiber._hub.protocol import ObjectKind
+from fiber._hub.protocol import WHOLE, Extent, ObjectKind
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.descriptor import Descriptor, opened
 
@@ -25,13 +25,14 @@ class NoSuchObject(LookupError):
 
 
 class SharedObject:
-    """A channel or counter of this host, while others may ask for it."""
+    """A channel, counter or block of this host, while others may ask for it."""
 
-    __slots__ = ("__weakref__", "attached", "descriptor", "hosted", "kind")
+    __slots__ = ("__weakref__", "attached", "descriptor", "extent", "hosted", "kind")
 
-    def __init__(self, kind: ObjectKind, descriptor: Descriptor) -> None:
+    def __init__(self, kind: ObjectKind, descriptor: Descriptor, extent: Extent) -> None:
         self.kind = kind
         self.descriptor = descriptor
+        self.extent = extent
         self.attached = 0
         self.hosted: Hosted | None = None
         """What serves those who are attached."""
@@ -70,7 +71,7 @@ class Registry:
     """
 
     def __init__(
-        self, host: Callable[[ObjectKind, int], Hosted], call_soon: Callable[..., None]
+        self, host: Callable[[SharedObject], Hosted], call_soon: Callable[..., None]
     ) -> None:
         self._host = host
         self._call_soon = call_soon
@@ -79,20 +80,22 @@ class Registry:
         self._registered: deque[tuple[Entry, int, bool]] = deque()
         # So that one descriptor does for an object, however often it is registered.  Of two threads
         # that share it for the first time each may keep one: as good, but one too many.
-        self._objects: weakref.WeakValueDictionary[tuple[int, int], SharedObject] = (
+        self._objects: weakref.WeakValueDictionary[tuple[int, ...], SharedObject] = (
             weakref.WeakValueDictionary()
         )
         self._entries: dict[int, Entry] = {}
         self._grants: dict[int, Entry] = {}
         self._reusable: set[int] = set()
 
-    def register(self, kind: ObjectKind, fd: int, *, reusable: bool) -> tuple[int, int]:
+    def register(
+        self, kind: ObjectKind, fd: int, extent: Extent = WHOLE, *, reusable: bool
+    ) -> tuple[int, int]:
         """Keep what ``fd`` refers to, which stays the caller's; a number for it and a grant."""
-        identity = _identity(kind, fd)
+        identity = (kind, _identity(kind, fd), extent.offset)
         shared = self._objects.get(identity)
         if shared is None:
             with naming_the_limit("sharing a pipe or queue with another process"):
-                shared = SharedObject(kind, opened(os.dup, fd))
+                shared = SharedObject(kind, opened(os.dup, fd), extent)
             self._objects[identity] = shared
         number, grant = next(self._numbers), next(self._numbers)
         self._registered.append((Entry(number, shared), grant, reusable))
@@ -134,11 +137,17 @@ class Registry:
         shared = entry.shared
         if shared.hosted is None:
             with naming_the_limit("serving a pipe or queue to another host"):
-                shared.hosted = self._host(shared.kind, os.dup(shared.descriptor.fileno()))
+                shared.hosted = self._host(shared)
         shared.attached += 1
         entry.attached += 1
         self._use(grant)
         return entry
+
+    def look_up(self, number: int, grant: int) -> SharedObject:
+        """What somebody is attached to, or is about to be by this grant."""
+        self._settle()
+        entry = self._entries.get(number)
+        return self._find(number, grant if entry and grant in entry.grants else 0).shared
 
     def detach(self, entry: Entry) -> None:
         """One user less."""
@@ -195,15 +204,21 @@ class Registry:
             self._entries.pop(entry.number, None)
 
 
-def _identity(kind: ObjectKind, fd: int) -> tuple[int, int]:
+def _identity(kind: ObjectKind, fd: int) -> int:
     """What two descriptors of one kernel object have in common, while it exists."""
-    if kind is ObjectKind.CHANNEL:
-        status = os.fstat(fd)
-        if not stat.S_ISSOCK(status.st_mode):
-            raise ValueError(f"descriptor {fd} is not a socket")
-        return kind, status.st_ino
+    if kind is ObjectKind.COUNTER:
+        return _event_counter(fd)
+    status = os.fstat(fd)
+    if kind is ObjectKind.CHANNEL and not stat.S_ISSOCK(status.st_mode):
+        raise ValueError(f"descriptor {fd} is not a socket")
+    if kind is not ObjectKind.CHANNEL and not stat.S_ISREG(status.st_mode):
+        raise ValueError(f"descriptor {fd} is not shared memory")
+    return status.st_ino
+
+
+def _event_counter(fd: int) -> int:
     with open(f"/proc/self/fdinfo/{fd}", "rb") as info:
         for line in info:
             if line.startswith(b"eventfd-id:"):
-                return kind, int(line.split()[1])
+                return int(line.split()[1])
     raise ValueError(f"descriptor {fd} is not an event counter")

@@ -8,27 +8,15 @@ from typing import Any, NoReturn
 from fiber.errors import NotInFiber
 
 _INSTEAD = {
-    "Lock": "use Semaphore(1)",
-    "RLock": "use Semaphore(1), acquired once by each holder",
     "Condition": "use an Event, or a Queue that carries what is waited for",
     "Barrier": "use a Semaphore for arrivals and an Event for the release",
-    "Value": "send the value through a Pipe or Queue",
-    "Array": "send the array through a Pipe or Queue; NumPy arrays are not copied into the pickle",
-    "RawValue": "send the value through a Pipe or Queue",
-    "RawArray": "send the array through a Pipe or Queue",
-    "copy": "send the object through a Pipe or Queue",
-    "synchronized": "send the object through a Pipe or Queue",
-    "SharedMemory": "send the buffer through a Pipe or Queue",
-    "ShareableList": "send the list through a Pipe or Queue",
-    "Manager": "keep the object in one process and talk to it through a Pipe or Queue",
+    "SharedMemoryManager": "make a SharedMemory and unlink it",
 }
 
 
 def refuse(name: str) -> NoReturn:
     """Raise the error for ``name``."""
-    raise NotInFiber(
-        f"Fiber has no {name} yet: it shares no memory and no locks. Please {_INSTEAD[name]}."
-    )
+    raise NotInFiber(f"Fiber has no {name} yet. Please {_INSTEAD[name]}.")
 
 
 def unsupported(name: str) -> Callable[..., Any]:

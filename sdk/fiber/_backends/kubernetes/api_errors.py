@@ -9,8 +9,10 @@
     ├── Conflict      409  the name is taken, or a precondition does not hold
     ├── Expired       410  a watch that cannot go on from where it was
     ├── Invalid       the rest of 4xx: asking again will not help
-    └── Unreachable   no answer that could be trusted: 5xx, no connection, too late, nonsense
-        └── Throttled  429: not now
+    └── Transient          perhaps later
+        ├── Unreachable      no answer that could be trusted: no connection, too late, nonsense
+        ├── ServerError      5xx  it, or what it depends on, has failed
+        └── TooManyRequests  429  not now
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from fiber.errors import FiberPoolError
 Body = dict[str, Any]
 
 _LONGEST_RETRY_AFTER = 30.0
+"""Seconds; who asks for more is asked all the same."""
+
 _MESSAGE_LIMIT = 2000
 
 
@@ -61,16 +65,27 @@ class Invalid(ApiError):
     """The API server cannot accept this, now or later."""
 
 
-class Unreachable(ApiError):
-    """It is not known whether the call was carried out."""
+class Transient(ApiError):
+    """Not now: asking again may help, no sooner than after ``retry_after`` seconds.
 
+    It is not known whether the call was carried out.
+    """
 
-class Throttled(Unreachable):
-    """The API server asks to come back after ``retry_after`` seconds."""
-
-    def __init__(self, message: str, *, retry_after: float, **about: Any) -> None:
+    def __init__(self, message: str, *, retry_after: float = 0.0, **about: Any) -> None:
         super().__init__(message, **about)
         self.retry_after = retry_after
+
+
+class Unreachable(Transient):
+    """There was no answer, or none of an API server."""
+
+
+class ServerError(Transient):
+    """The API server, or what it depends on, has failed."""
+
+
+class TooManyRequests(Transient):
+    """The API server has others to serve."""
 
 
 _KINDS: dict[int, type[ApiError]] = {
@@ -80,6 +95,7 @@ _KINDS: dict[int, type[ApiError]] = {
     408: Unreachable,
     409: Conflict,
     410: Expired,
+    429: TooManyRequests,
 }
 
 
@@ -102,18 +118,23 @@ def document_of(status: int, headers: Mapping[str, str], data: bytes) -> Body:
 def error_of(status: int, headers: Mapping[str, str], body: Body, text: str = "") -> ApiError:
     """The error that a Status document, or what came in its place, tells."""
     message = (str(body.get("message") or "") or text or f"HTTP status {status}")[:_MESSAGE_LIMIT]
-    reason = str(body.get("reason") or "")
-    if status == 429:
-        seconds = _retry_after(headers)
-        return Throttled(message, status=status, reason=reason, retry_after=seconds)
-    if not 400 <= status < 500:
-        return Unreachable(message, status=status, reason=reason)
-    return _KINDS.get(status, Invalid)(message, status=status, reason=reason)
+    kind = _kind_of(status)
+    about: dict[str, Any] = {"status": status, "reason": str(body.get("reason") or "")}
+    if issubclass(kind, Transient):
+        about["retry_after"] = _retry_after(headers, body)
+    return kind(message, **about)
 
 
-def _retry_after(headers: Mapping[str, str]) -> float:
-    text = headers.get("Retry-After", "")
-    return min(float(text), _LONGEST_RETRY_AFTER) if text.isdecimal() else 1.0
+def _kind_of(status: int) -> type[ApiError]:
+    if status >= 500:
+        return ServerError
+    return _KINDS.get(status, Invalid) if status >= 400 else Unreachable
+
+
+def _retry_after(headers: Mapping[str, str], body: Body) -> float:
+    """The header is what counts; in a watch there is only the Status document."""
+    text = headers.get("Retry-After") or str((body.get("details") or {}).get("retryAfterSeconds"))
+    return min(float(text), _LONGEST_RETRY_AFTER) if text.isdecimal() else 0.0
 
 
 def explain(
@@ -164,7 +185,18 @@ def _advice(error: ApiError, namespace: str, server: str) -> tuple[str, str]:
                 "fiberpool: upgrade the operator with its chart, or install the fiberpool that "
                 "belongs to it"
             )
-        case Unreachable():
+        case ServerError():
+            return error.reason or "InternalError", (
+                f"The API server {server} answers so, with HTTP status {error.status}: it or "
+                "something that it depends on has failed. Look with `kubectl get --raw "
+                "'/readyz?verbose'`, or try again later"
+            )
+        case TooManyRequests():
+            return error.reason or "TooManyRequests", (
+                f"The API server {server} has too much to do, or this account has its share: try "
+                "again later, or look with `kubectl get flowschemas,prioritylevelconfigurations`"
+            )
+        case Transient():
             return "Unreachable", (
                 f"The API server {server} cannot be reached or does not answer: look with "
                 "`kubectl cluster-info`"

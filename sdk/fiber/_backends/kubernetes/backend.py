@@ -53,12 +53,12 @@ class KubernetesBackend:
 
     def _make(self, key: Shape | str) -> Pods:
         program, loop = self._program, self._loop
-        opens = (
-            partial(program.open_warm, key, loop)
+        prepare = (
+            partial(program.prepare_warm, key, loop)
             if isinstance(key, str)
-            else partial(program.open_own, key, loop)
+            else partial(program.prepare_own, key, loop)
         )
-        return Pods(loop, self._hub, self._output, self._config, program.api, opens)
+        return Pods(loop, self._hub, self._output, self._config, program.api, prepare)
 
     def close(self) -> None:
         """End the pods, and the pools or their use."""

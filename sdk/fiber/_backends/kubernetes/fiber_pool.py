@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import sys
 import threading
 import time
 from collections.abc import Iterable
@@ -12,12 +10,14 @@ from functools import partial
 from typing import Protocol
 
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden, explain
-from fiber._backends.kubernetes.held_pool import HeldPool
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden
+from fiber._backends.kubernetes.attached_pool import AttachedPool
+from fiber._backends.kubernetes.informer import Informer
 from fiber._backends.kubernetes.lease import LeaseRenewer
+from fiber._backends.kubernetes.problems import PoolName
+from fiber._backends.kubernetes.reporter import Reporter
 from fiber._backends.kubernetes.resources import PODS, POOLS
 from fiber._backends.kubernetes.scaling import Scaling
-from fiber._backends.kubernetes.watches import ObjectWatch
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
 from fiber_api import names
@@ -28,28 +28,34 @@ OPERATOR_SLOW, OPERATOR_ABSENT = 5.0, 30.0
 CLOSE_TIMEOUT = 10.0
 """Seconds that the API server may take to give a pool back."""
 
+_RENEW, _WATCH = "renew the Lease of", "watch"
+"""What cannot be done, in words that the pool follows."""
 
-class Tenure(Protocol):
+
+class Attachment(Protocol):
     """How a pool comes to have this program as its master, and how that ends."""
 
     name: str
     namespace: str
     doing: str
-    """What ``begin`` does, in words that follow "cannot"."""
+    """What ``attach`` does, in words that the pool follows."""
 
     @property
     def remedy(self) -> str:
-        """The command that does what ``end`` could not."""
+        """The command that does what ``detach`` could not."""
 
-    def begin(self, cancel: threading.Event) -> HeldPool:
+    def attach(self, cancel: threading.Event) -> AttachedPool:
         """Make this program the pool's master; ``ApiError``, FiberPoolError."""
 
-    def end(self, timeout: float) -> None:
-        """Undo it, whether or not ``begin`` succeeded; ``ApiError``."""
+    def detach(self, timeout: float) -> None:
+        """Undo it, whether or not ``attach`` succeeded; ``ApiError``."""
 
 
 class Observer(Protocol):
     """Who is told, on the loop's thread."""
+
+    def on_attached(self) -> None:
+        """Once: the pool is there, with this program as its master."""
 
     def on_status(self, status: Body) -> None:
         """The pool's status, as it is now."""
@@ -72,27 +78,33 @@ class FiberPoolClient:
     ``close``.  Any thread may call them.
     """
 
-    def __init__(self, api: Api, loop: Loop, tenure: Tenure, observer: Observer) -> None:
+    def __init__(self, api: Api, loop: Loop, attachment: Attachment, observer: Observer) -> None:
         self._api = api
         self._loop = loop
-        self._tenure = tenure
+        self._attachment = attachment
+        self._doing = attachment.doing
         self._observer = observer
-        self._scaling = Scaling(self._trouble)
+        self._reporter = Reporter(
+            loop,
+            PoolName(attachment.name, attachment.namespace),
+            api.server,
+            on_warning=observer.on_warning,
+            on_error=observer.on_error,
+            on_failure=self._give_up,
+        )
+        self._scaling = Scaling(partial(self._reporter.trouble, "scale"))
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._close_timeout = CLOSE_TIMEOUT
-        self._failing = threading.Lock()
-        """Taken by whoever tells of the error; never given back: there is only one."""
         self._over = threading.Event()
         self._ended = threading.Event()
-        self._warned: set[str] = set()
         self._generation = 0
         """That of the spec which first had this program as its master."""
         self._observed = False
         """The operator has seen the pool with this program as its master."""
         self._began = 0.0
         """Since when the operator might have been heard."""
-        self._followers: list[ObjectWatch | LeaseRenewer] = []
+        self._followers: list[Informer | LeaseRenewer] = []
         self._thread = threading.Thread(target=self._run, name="fiber-kubernetes", daemon=True)
 
     def start(self) -> None:
@@ -111,6 +123,7 @@ class FiberPoolClient:
         """Begin to delete the pool, or to detach from it, and return at once."""
         self._close_timeout = timeout
         self._closing.set()
+        self._reporter.mute()
         self._wake.set()
 
     def close(self, timeout: float = CLOSE_TIMEOUT) -> None:
@@ -128,12 +141,11 @@ class FiberPoolClient:
             why = f"the API server did not answer within {timeout:g} s"
         finally:
             if not self._ended.is_set():
-                self._say_what_stays(why)
+                self._reporter.say_what_stays(why, self._attachment.remedy)
 
-    @property
-    def made(self) -> bool:
-        """Whether the pool is there, with this program as its master."""
-        return bool(self._followers)
+    def warn_anew(self) -> None:
+        """Somebody begins to wait, and is to be told what was told before, if it is still so."""
+        self._reporter.warn_anew()
 
     # -- On the thread
 
@@ -141,58 +153,60 @@ class FiberPoolClient:
         try:
             self._serve(self._begin())
         except FiberPoolError as error:
-            self._fail(error)
+            self._reporter.fail(error)
         except ApiError as error:
-            self._fail(self._explained(error, self._tenure.doing))
+            self._reporter.refused(self._doing, error)
         except Exception as error:
-            self._fault(error)
+            self._reporter.fault(error)
         for follower in self._followers:
             follower.stop()
         try:
-            self._tenure.end(self._close_timeout)
+            self._attachment.detach(self._close_timeout)
         except Exception as error:  # the program ends whatever comes
-            self._say_what_stays(str(error))
+            self._reporter.say_what_stays(str(error), self._attachment.remedy)
         for follower in self._followers:
             follower.join(1.0)
         if not self._closing.is_set():
             self._loop.call_soon(self._observer.on_end)
         self._ended.set()
 
-    def _begin(self) -> HeldPool:
-        held = self._tenure.begin(self._closing)
-        self._began, self._generation = time.monotonic(), held.generation
-        self._tenure.doing = f"scale the FiberPool {held.name!r}"
+    def _begin(self) -> AttachedPool:
+        attached = self._attachment.attach(self._closing)
+        self._began, self._generation = time.monotonic(), attached.generation
+        self._doing = "scale"
         renewer = LeaseRenewer(
-            held,
-            on_lost=self._fail,
-            on_trouble=self._trouble,
-            on_refused=self._refused,
-            on_fault=self._fault,
+            attached,
+            on_lost=self._reporter.fail,
+            on_trouble=partial(self._reporter.trouble, _RENEW),
+            on_refused=partial(self._reporter.refused, _RENEW),
+            on_fault=self._reporter.fault,
         )
-        pool = ObjectWatch(
+        pool = Informer(
             self._api,
-            POOLS.path(held.namespace),
-            {"fieldSelector": f"metadata.name={held.name}"},
-            on_change=partial(self._pool_changed, held, renewer),
+            POOLS.path(attached.namespace),
+            {"fieldSelector": f"metadata.name={attached.name}"},
+            known={attached.name},
+            on_change=partial(self._pool_changed, attached, renewer),
             on_trouble=self._pool_trouble,
-            on_fault=self._fault,
+            on_fault=self._reporter.fault,
         )
-        pods = ObjectWatch(
+        pods = Informer(
             self._api,
-            PODS.path(held.namespace),
-            {"labelSelector": f"{names.LABEL_POOL_UID}={held.uid}"},
+            PODS.path(attached.namespace),
+            {"labelSelector": f"{names.LABEL_POOL_UID}={attached.uid}"},
             on_change=self._pod_changed,
-            on_trouble=self._trouble,
-            on_fault=self._fault,
+            on_trouble=partial(self._reporter.trouble, "watch the pods of"),
+            on_fault=self._reporter.fault,
         )
         self._followers = [renewer, pool, pods]
+        self._loop.call_soon(self._observer.on_attached)
         for follower in self._followers:
             follower.start()
-        return held
+        return attached
 
-    def _serve(self, held: HeldPool) -> None:
+    def _serve(self, attached: AttachedPool) -> None:
         while not (self._closing.is_set() or self._over.is_set()):
-            pause = min(self._scaling.step(held), self._miss_operator())
+            pause = min(self._scaling.step(attached), self._miss_operator())
             self._wake.wait(None if pause == math.inf else pause)
             self._wake.clear()
 
@@ -201,105 +215,50 @@ class FiberPoolClient:
         if self._observed:
             return math.inf
         silent = time.monotonic() - self._began
-        what = f"was not looked at by an operator for {silent:.0f} s"
-        advice = (
-            "Look whether one runs and serves this namespace (`kubectl get deployments -A -l "
+        error = self._reporter.error(
+            "NoOperator",
+            f"was not looked at by an operator for {silent:.0f} s. Look whether one runs and "
+            "serves this namespace (`kubectl get deployments -A -l "
             "app.kubernetes.io/name=fiber-operator`), or install it: `helm install fiber-operator "
-            "charts/fiber-operator -n fiber-system --create-namespace`"
+            "charts/fiber-operator -n fiber-system --create-namespace`",
         )
         if silent >= OPERATOR_ABSENT:
-            raise self._error("NoOperator", f"{what}. {advice}")
+            raise error
         if silent < OPERATOR_SLOW:
             return OPERATOR_SLOW - silent
-        self._warn("no operator", f"{self._pool} {what}. {advice}")
+        self._reporter.warn("no operator", str(error))
         return OPERATOR_ABSENT - silent
 
     # -- On the threads that follow it
 
     def _pool_changed(
-        self, held: HeldPool, renewer: LeaseRenewer, name: str, found: Body | None
+        self, attached: AttachedPool, renewer: LeaseRenewer, name: str, found: Body | None
     ) -> None:
-        if loss := held.loss(found):
-            self._fail(renewer.explain(loss))
+        if loss := attached.loss(found):
+            self._reporter.fail(renewer.explain(loss))
             return
         assert found is not None
         status = found.get("status") or {}
         if not self._observed and status.get("observedGeneration", 0) >= self._generation:
             self._observed = True
             self._wake.set()
-        self._warned -= {"Unreachable", "Throttled"}
+        self._reporter.answered()
         if self._observed:  # else it may be about the master before
             self._loop.call_soon(self._observer.on_status, status)
 
     def _pool_trouble(self, error: ApiError) -> None:
         if isinstance(error, Forbidden) and not self._observed:
             # Its status would never be known, and silence be taken for the operator's.
-            self._refused(error)
+            self._reporter.refused(_WATCH, error)
             return
         self._began = time.monotonic()  # of an operator nothing could be heard either
-        self._trouble(error)
+        self._reporter.trouble(_WATCH, error)
 
     def _pod_changed(self, name: str, pod: Body | None) -> None:
         if pod is None and self._scaling.gone(name):
             self._wake.set()
         self._loop.call_soon(self._observer.on_pod, name, pod)
 
-    # -- On any of them
-
-    def _trouble(self, error: ApiError) -> None:
-        if not self._closing.is_set():
-            self._warn(type(error).__name__, str(self._explained(error, self._following)))
-
-    def _warn(self, what: str, message: str) -> None:
-        """Once, until it has passed."""
-        if what not in self._warned:
-            self._warned.add(what)
-            self._loop.call_soon(self._observer.on_warning, message)
-
-    def _refused(self, error: ApiError) -> None:
-        self._fail(self._explained(error, self._following))
-
-    def _fault(self, error: Exception) -> None:
-        """A fault of ours must not leave anybody waiting."""
-        failure = self._error("Internal", f"is given up after an unexpected {error!r}")
-        failure.__cause__ = error
-        self._fail(failure)
-
-    def _fail(self, error: FiberPoolError) -> None:
-        if self._closing.is_set() or not self._failing.acquire(blocking=False):
-            return
+    def _give_up(self) -> None:
         self._over.set()
         self._wake.set()
-        self._loop.call_soon(self._observer.on_error, error)
-
-    @property
-    def _following(self) -> str:
-        return f"follow the FiberPool {self._tenure.name!r}"
-
-    @property
-    def _pool(self) -> str:
-        return f"the FiberPool {self._tenure.name!r} in namespace {self._tenure.namespace!r}"
-
-    def _error(self, reason: str, what: str) -> FiberPoolError:
-        return FiberPoolError(
-            f"{self._pool} {what}",
-            pool=self._tenure.name,
-            namespace=self._tenure.namespace,
-            reason=reason,
-        )
-
-    def _explained(self, error: ApiError, doing: str) -> FiberPoolError:
-        return explain(
-            error,
-            doing,
-            pool=self._tenure.name,
-            namespace=self._tenure.namespace,
-            server=self._api.server,
-        )
-
-    def _say_what_stays(self, why: str) -> None:
-        with contextlib.suppress(Exception):  # stderr may be closed
-            sys.stderr.write(
-                f"fiber: {self._pool} stays behind: {why}. The operator notices that this program "
-                f"is gone; to be quicker: {self._tenure.remedy}\n"
-            )

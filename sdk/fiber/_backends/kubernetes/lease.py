@@ -11,9 +11,10 @@ from fiber._backends.kubernetes.api_errors import (
     Conflict,
     Forbidden,
     NotFound,
+    Transient,
     Unauthorized,
 )
-from fiber._backends.kubernetes.held_pool import HeldPool
+from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber.errors import FiberPoolError
 
 RENEWALS = 3
@@ -36,7 +37,7 @@ class LeaseRenewer:
 
     def __init__(
         self,
-        pool: HeldPool,
+        pool: AttachedPool,
         *,
         on_lost: Callable[[FiberPoolError], None],
         on_trouble: Callable[[ApiError], None],
@@ -111,6 +112,7 @@ class LeaseRenewer:
 
     def _attempt(self) -> float:
         """Seconds until the next one."""
+        pause = self._pool.master.lease_duration / RENEWALS
         try:
             self.renew()
         except ApiError as error:
@@ -118,8 +120,9 @@ class LeaseRenewer:
             if refused and self._late() > self._pool.master.lease_duration:
                 raise
             self._on_trouble(error)
-            return _RETRY
-        return self._pool.master.lease_duration / RENEWALS
+            asked = error.retry_after if isinstance(error, Transient) else 0.0
+            return max(_RETRY, min(asked, pause))  # who lives must be heard in time all the same
+        return pause
 
     def _late(self) -> float:
         return self._now() - self._renewed

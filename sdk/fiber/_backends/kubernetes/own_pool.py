@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import Body, Conflict, NotFound, Unreachable
-from fiber._backends.kubernetes.held_pool import HeldPool, Master, identity_in
+from fiber._backends.kubernetes.api_errors import Body, Conflict, NotFound, Transient
+from fiber._backends.kubernetes.attached_pool import AttachedPool, Master, identity_in
 from fiber._backends.kubernetes.resources import POOLS, SECRETS
 from fiber._backends.kubernetes.secret import secret_body
 from fiber._transport.credentials import MasterCredentials
@@ -36,37 +36,37 @@ class OwnPool:
         self._credentials = credentials
         self._master = master
         self._owner = owner
-        self._held: HeldPool | None = None
+        self._attached: AttachedPool | None = None
         self._may_exist = False
         self.name = str(body["metadata"]["name"])
         self.namespace = namespace
-        self.doing = f"make the FiberPool {self.name!r}"
+        self.doing = "make"
         self.remedy = f"kubectl delete fiberpool {self.name} -n {namespace}"
-        """What removes it when ``end`` does not."""
+        """What removes it when ``detach`` does not."""
 
-    def begin(self, cancel: threading.Event) -> HeldPool:
+    def attach(self, cancel: threading.Event) -> AttachedPool:
         """Make it, without pods; then its Secret and its Lease, which go when it goes.
 
         It has its master from the first moment: whoever dies between two of these calls leaves a
         pool whose master's Lease is absent or gets old, and that the operator deletes.
         """
-        self._held = HeldPool(self._api, self._create(cancel), self._master, _EPOCH)
-        secret = secret_body(names.secret_name(self.name), self._credentials, self._held.owner)
+        self._attached = AttachedPool(self._api, self._create(cancel), self._master, _EPOCH)
+        secret = secret_body(names.secret_name(self.name), self._credentials, self._attached.owner)
         try:
             self._api.create(SECRETS.path(self.namespace), secret, cancel=cancel)
         except Conflict:
             pass  # made by an attempt whose answer was lost: no other pool had this name
         try:
-            self._held.make_lease(cancel=cancel)
+            self._attached.make_lease(cancel=cancel)
         except Conflict:
             pass  # likewise
-        return self._held
+        return self._attached
 
-    def end(self, timeout: float) -> None:
+    def detach(self, timeout: float) -> None:
         """Delete it, if it may be there."""
-        if self._held is None and not self._may_exist:
+        if self._attached is None and not self._may_exist:
             return
-        uid = None if self._held is None else self._held.uid
+        uid = None if self._attached is None else self._attached.uid
         try:
             self._api.delete(POOLS.path(self.namespace, self.name), uid=uid, timeout=timeout)
         except (NotFound, Conflict):
@@ -91,6 +91,6 @@ class OwnPool:
             if identity_in(found) != self._master.identity:
                 raise
             return found  # made by an attempt whose answer was lost
-        except Unreachable:
+        except Transient:
             self._may_exist = True
             raise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,9 +10,9 @@ from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._backends.kubernetes.pod_reasons import node_of, pod_end
-from fiber._backends.kubernetes.problems import PoolName, failure, new_problems, overdue, summary
-from fiber._backends.kubernetes.program import Opened, Serve
-from fiber._backends.kubernetes.progress import Progress
+from fiber._backends.kubernetes.problems import PoolName
+from fiber._backends.kubernetes.program import ListenerObserver, PreparedPool
+from fiber._backends.kubernetes.waiting import Waiting
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.demand import Demand
@@ -36,8 +35,9 @@ Document = Mapping[str, Any]
 class Pods:
     """Begins with the first child, and asks for pods as children come and go.
 
-    ``open`` makes the pool, or attaches to it; it blocks and raises FiberError.  Everything but
-    ``agents.child`` and ``close`` happens on the loop's thread.
+    ``prepare`` says which pool that is and begins to listen for its agents; it blocks, until the
+    event that it is given is set, and raises FiberError.  Everything but ``agents.child`` and
+    ``close`` happens on the loop's thread.
     """
 
     def __init__(
@@ -47,13 +47,12 @@ class Pods:
         output: Output,
         config: Config,
         api: Api,
-        open: Callable[[Serve], Opened],
+        prepare: Callable[[ListenerObserver, threading.Event], PreparedPool],
     ) -> None:
         self._loop = loop
         self._output = output
-        self._config = config
         self._api = api
-        self._open = open
+        self._prepare = prepare
         self._placement: Placement[RemoteAgent, RemoteChild] = Placement(
             config.processes_per_pod, spread=False
         )
@@ -63,25 +62,24 @@ class Pods:
         self.agents = AgentSet(
             loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
         )
+        self._waiting = Waiting(
+            self.agents, output, api, config.pod_timeout, on_begin=self._warn_anew
+        )
         self.over = False
         """Nothing comes of its pool any more, and it was given back."""
-        self._opener: threading.Thread | None = None
-        self._opened: Opened | None = None
+        self._preparing: threading.Thread | None = None
+        self._prepared: PreparedPool | None = None
         self._client: FiberPoolClient | None = None
         self._closing = threading.Event()
         """Nothing more is to be asked of the API server than the end."""
         self._decision_is_due = False
         self._timer: Timer | None = None
-        self._patience: Timer | None = None
         self._wanted = 0
         self._pods: dict[str, Document] = {}
-        self._told_of_limit = False
         self._given_up: set[str] = set()
         """Pods that are there and of which nothing is expected any more."""
         self._back_again: RemoteAgent | None = None
         """Which agent is lost only to be there again."""
-        self._status: Document = {}
-        self._progress = Progress(loop, output, self._describe)
 
     def begin_close(self) -> None:
         """Begin to end; waits for nothing."""
@@ -93,14 +91,14 @@ class Pods:
         """End the children, and the pool or its use.  Not on the loop's thread."""
         self._closing.set()
         self._wait_for(lambda then: self._loop.call_soon(self._shut_down, then))
-        opener = self._opener  # from here on there will be no other
-        if opener is not None:
-            opener.join(_END_TIMEOUT)
-            self._wait_for(self._loop.call_soon)  # until what it opened is known
+        preparing = self._preparing  # from here on there will be no other
+        if preparing is not None:
+            preparing.join(_END_TIMEOUT)
+            self._wait_for(self._loop.call_soon)  # until what it prepared is known
         if self._client is not None:
             self._client.close(_END_TIMEOUT)
-        if self._opened is not None:
-            listener = self._opened.listener
+        if self._prepared is not None:
+            listener = self._prepared.listener
             self._wait_for(lambda then: listener.close("the master ended", then=then))
 
     def _wait_for(self, ask: Callable[[Callable[[], None]], None]) -> None:
@@ -111,10 +109,9 @@ class Pods:
             done.wait(_END_TIMEOUT)
 
     def _shut_down(self, then: Callable[[], None]) -> None:
-        for timer in (self._timer, self._patience):
-            if timer is not None:
-                timer.cancel()
-        self._progress.stop()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._waiting.stop()
         for agent in self.agents.agents.values():
             agent.close()
         then()
@@ -123,42 +120,43 @@ class Pods:
 
     def _begin(self) -> None:
         """Calls of the API server take their time: a thread makes them."""
-        opener = threading.Thread(target=self._run_open, name="fiber-open", daemon=True)
+        thread = threading.Thread(target=self._run_prepare, name="fiber-prepare", daemon=True)
         try:
-            opener.start()
+            thread.start()
         except RuntimeError as error:  # the system has no room for it
-            self._refuse(_unexpected(error))
+            self._waiting.refuse(_unexpected(error))
         else:
-            self._opener = opener
+            self._preparing = thread
 
-    def _run_open(self) -> None:
-        serve = Serve(
-            self._joined,
-            self._refused,
-            self._closing,
-        )
+    def _run_prepare(self) -> None:
         try:
-            opened = self._open(serve)
+            prepared = self._prepare(self, self._closing)
         except FiberError as error:
-            self._loop.call_soon(self._failed_to_open, error)
+            self._loop.call_soon(self._failed_to_prepare, error)
         except Exception as error:  # a fault of ours must not leave anybody waiting
-            self._loop.call_soon(self._failed_to_open, _unexpected(error))
+            self._loop.call_soon(self._failed_to_prepare, _unexpected(error))
         else:
-            self._loop.call_soon(self._began, opened)
+            self._loop.call_soon(self._begin_with, prepared)
 
-    def _failed_to_open(self, error: FiberError) -> None:
-        self._opener = None  # the next child may have more luck
-        self._refuse(error)
+    def _failed_to_prepare(self, error: FiberError) -> None:
+        self._preparing = None  # the next child may have more luck
+        self._waiting.refuse(error)
 
-    def _began(self, opened: Opened) -> None:
-        self._opened = opened
+    def _begin_with(self, prepared: PreparedPool) -> None:
+        self._prepared = prepared
         if self._closing.is_set():
             return  # there is no pool yet, and nobody who wants one
-        self._placement.slots = opened.slots
-        self._demand.floor, self._demand.maximum = opened.minimum, opened.maximum
-        self._client = FiberPoolClient(self._api, self._loop, opened.tenure, self)
+        self._placement.slots = prepared.slots
+        self._demand.floor, self._demand.maximum = prepared.min_pods, prepared.max_pods
+        attachment = prepared.attachment
+        self._waiting.pool = PoolName(attachment.name, attachment.namespace)
+        self._client = FiberPoolClient(self._api, self._loop, attachment, self)
         self._client.start()
         self._changed()
+
+    def _warn_anew(self) -> None:
+        if self._client is not None:
+            self._client.warn_anew()
 
     # -- What it needs
 
@@ -172,7 +170,7 @@ class Pods:
         if self._closing.is_set():
             return
         desired = self._demand.decide(self._loop.now())
-        if self._placement.waiting and self._opener is None:
+        if self._placement.waiting and self._preparing is None:
             self._begin()
         released = [agent.host for agent in desired.release]
         self._given_up.update(released)
@@ -184,71 +182,17 @@ class Pods:
             self._timer = None
         if desired.wake_at < float("inf"):
             self._timer = self._loop.call_later(desired.wake_at - self._loop.now(), self._decide)
-        self._watch_the_limit()
-        self._watch_the_wait()
-
-    def _watch_the_limit(self) -> None:
-        """Processes for which there is no room until others end are spoken of, once: these may
-        wait for them.  A pool works with the workers that it has.
-        """
-        placement, most = self._placement, self._demand.maximum
-        too_many = placement.children + len(placement.waiting) > most * placement.slots
-        if not too_many or self._opened is None:
-            self._told_of_limit = False
-        elif not self._told_of_limit and not all(child.is_worker for child in placement.waiting):
-            self._told_of_limit = True
-            self._output.write(
-                "fiber",
-                f"{len(placement.waiting)} processes wait until others end: there are to be no "
-                f"more than {most} pods with {placement.slots} processes each. Raise max_pods, for "
-                "a pool of somebody else's its maxReplicas, or processes_per_pod",
-            )
-
-    def _watch_the_wait(self) -> None:
-        """Somebody who waits for a first host is told what for, and not kept for ever."""
-        waits = bool(self._placement.waiting) and not self._placement.loads
-        known = self.agents.error or failure(self._name, self._status, 0)
-        if waits and known is not None:
-            self._refuse(known)  # it was heard before they came
-        elif not waits:
-            self._progress.stop()
-            if self._patience is not None:
-                self._patience.cancel()
-                self._patience = None
-        elif self._patience is None:
-            self._progress.start()
-            timeout = self._config.pod_timeout
-            self._patience = self._loop.call_later(timeout, self._give_up_waiting)
-
-    def _give_up_waiting(self) -> None:
-        self._patience = None
-        timeout = self._config.pod_timeout
-        if self._opened is not None:
-            self._refuse(overdue(self._name, self._status, timeout, time.time()))
-        else:
-            self._refuse(
-                FiberError(
-                    f"no pod could be asked for within {timeout:g} s: {self._asking}. Look with "
-                    "`kubectl get fiberpools` whether it answers, and whether its login waits for "
-                    "somebody"
-                )
-            )
-
-    def _refuse(self, error: Exception) -> None:
-        """Nobody is to wait any longer."""
-        self._progress.stop()  # first: whoever is refused may write where its line stands
-        if not all(child.is_worker for child in self._placement.waiting):
-            # Whoever started it has gone on.  Pools raise it to their callers.
-            self._output.write("fiber", str(error))
-        self.agents.refuse_waiting(error)
+        self._waiting.look(self._demand.maximum)
 
     # -- Agents
 
-    def _refused(self, why: str) -> None:
+    def on_refused(self, why: str) -> None:
+        """Somebody dialled who is not served."""
         if not self._closing.is_set():  # else that is how it is to be
             self._output.write("fiber", f"an agent was refused: {why}")
 
-    def _joined(self, link: Link) -> str | None:
+    def on_agent(self, link: Link) -> str | None:
+        """An agent has dialled; why it is not wanted, if it is not."""
         name = link.peer.name
         if name in self._given_up:
             return f"{name}, which had been given up"
@@ -283,7 +227,7 @@ class Pods:
         agent.node = node_of(pod)
         agent.ending = end.reason if end is not None else ""
         made_from = pod["metadata"]["labels"].get(names.LABEL_TEMPLATE_HASH)
-        if self._status.get("templateHash", made_from) != made_from:
+        if self._waiting.status.get("templateHash", made_from) != made_from:
             self._retire(agent)
 
     def _retire(self, agent: RemoteAgent) -> None:
@@ -312,19 +256,19 @@ class Pods:
 
     def on_status(self, status: Document) -> None:
         """The pool's status, as it is now."""
-        before, self._status = self._status, status
-        for problem in new_problems(self._name, before, status):
-            self._output.write("fiber", problem)
-        if self._opened is not None:
+        before = self._waiting.status
+        self._waiting.on_status(status)
+        if self._prepared is not None:
             # Somebody else's pool keeps so many, unless it finds this program forgotten.
-            self._demand.floor = min(self._opened.minimum, status.get("desiredReplicas") or 0)
+            self._demand.floor = min(self._prepared.min_pods, status.get("desiredReplicas") or 0)
         if before.get("templateHash") != status.get("templateHash"):
             for agent in self.agents.agents.values():
                 self._tell(agent)
         self._changed()
-        error = failure(self._name, status, len(self._placement.loads))
-        if error is not None:
-            self._refuse(error)
+
+    def on_attached(self) -> None:
+        """The pool is there, with this program as its master."""
+        self._waiting.attached = True
 
     def on_warning(self, message: str) -> None:
         """Something that keeps the pool waiting, and may pass."""
@@ -334,7 +278,7 @@ class Pods:
         """Nothing comes of the pool any more."""
         if not self._placement.waiting:
             self._output.write("fiber", str(error))  # nobody else says it
-        self._refuse(error)
+        self._waiting.refuse(error)
         self.agents.fail(error)
 
     def on_end(self) -> None:
@@ -343,23 +287,8 @@ class Pods:
         for agent in list(self.agents.agents.values()):
             agent.close()
             agent.lose("its FiberPool is not this program's any more")
-        if self._opened is not None:
-            self._opened.listener.close("its FiberPool is not this program's any more")
-
-    def _describe(self) -> str:
-        state = summary(self._status, time.time())
-        if self._client is None or not self._client.made:
-            state = self._asking
-        return f"waiting for pods: {state}"
-
-    @property
-    def _asking(self) -> str:
-        return f"the API server {self._api.server} has not answered yet"
-
-    @property
-    def _name(self) -> PoolName:
-        tenure = None if self._opened is None else self._opened.tenure
-        return PoolName("", "") if tenure is None else PoolName(tenure.name, tenure.namespace)
+        if self._prepared is not None:
+            self._prepared.listener.close("its FiberPool is not this program's any more")
 
 
 def _unexpected(error: Exception) -> FiberError:

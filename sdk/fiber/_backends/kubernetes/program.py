@@ -8,14 +8,13 @@ import secrets
 import socket
 import sys
 import threading
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from fiber._backends.kubernetes.address import reachable_address
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.api_errors import ApiError, Body, NotFound, explain
-from fiber._backends.kubernetes.fiber_pool import Tenure
-from fiber._backends.kubernetes.held_pool import Master
+from fiber._backends.kubernetes.attached_pool import Master
+from fiber._backends.kubernetes.fiber_pool import Attachment
 from fiber._backends.kubernetes.own_pool import OwnPool
 from fiber._backends.kubernetes.resources import PODS, POOLS
 from fiber._backends.kubernetes.secret import make_credentials
@@ -33,20 +32,33 @@ from fiber_api import names
 _SUFFIX_BYTES = 4
 
 
-class Opened(NamedTuple):
-    """A FiberPool that is about to have this program as its master."""
+class ListenerObserver(Protocol):
+    """Hears of agents that dial in, on the loop's thread."""
+
+    def on_agent(self, link: Link) -> str | None:
+        """One with the pool's credentials; why it is not wanted, if it is not."""
+
+    def on_refused(self, why: str) -> None:
+        """Somebody was turned away."""
+
+
+class PreparedPool(NamedTuple):
+    """A FiberPool that this program is about to be the master of, and listens for."""
 
     listener: MasterListener
-    tenure: Tenure
+    attachment: Attachment
     slots: int
     """Processes that each of its pods runs."""
-    minimum: int
+    min_pods: int
     """Pods that it keeps whatever is wanted."""
-    maximum: int
+    max_pods: int
 
 
 class Program:
-    """Opens FiberPools for one program.  Its methods ask the API server, and block."""
+    """Prepares FiberPools for one program.
+
+    Its methods ask the API server, and block until that has answered or ``cancel`` is set.
+    """
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -61,43 +73,47 @@ class Program:
         self._listens = False
         """Whether a pool of this program has begun to listen."""
 
-    def open_own(self, shape: Shape, loop: Loop, serve: Serve) -> Opened:
+    def prepare_own(
+        self, shape: Shape, loop: Loop, observer: ListenerObserver, cancel: threading.Event
+    ) -> PreparedPool:
         """A pool of this program's own, for pods of this shape."""
         number = next(self._numbers)
         suffix = self._suffix if not number else f"{self._suffix}-{number}"
         name = pool_name(self._name, shape, suffix)
         credentials = make_credentials(name, self.namespace)
-        own = self._find_own_pod(serve.cancel)
+        own = self._find_own_pod(cancel)
         container = own_container(own, _mountinfo()) if own is not None else ""
         template = pod_template(shape, own, container, sys.executable)
         body = fiber_pool_body(name, template, self._config)
         # Last: whatever fails before leaves nothing open.
-        host, listener = self._listen(name, credentials, loop, serve)
+        host, listener = self._listen(name, credentials, loop, observer)
         master = self._master(host, listener)
-        tenure = OwnPool(self._api, self.namespace, body, credentials, master, self._owner(own))
+        attachment = OwnPool(self._api, self.namespace, body, credentials, master, self._owner(own))
         slots = self._config.processes_per_pod
-        return Opened(listener, tenure, slots, 0, self._config.max_pods)
+        return PreparedPool(listener, attachment, slots, 0, self._config.max_pods)
 
-    def open_warm(self, name: str, loop: Loop, serve: Serve) -> Opened:
+    def prepare_warm(
+        self, name: str, loop: Loop, observer: ListenerObserver, cancel: threading.Event
+    ) -> PreparedPool:
         """A pool that somebody else keeps."""
         try:
             path = POOLS.path(self.namespace, name)
-            spec = self._api.get(path, cancel=serve.cancel)["spec"]
-            credentials = read_credentials(self._api, self.namespace, name, spec, serve.cancel)
+            spec = self._api.get(path, cancel=cancel)["spec"]
+            credentials = read_credentials(self._api, self.namespace, name, spec, cancel)
         except ApiError as error:
             raise self._explained(error, f"attach to the FiberPool {name!r}", name) from error
-        host, listener = self._listen(name, credentials, loop, serve)
-        tenure = WarmPool(self._api, self.namespace, name, self._master(host, listener))
-        return Opened(
+        host, listener = self._listen(name, credentials, loop, observer)
+        attachment = WarmPool(self._api, self.namespace, name, self._master(host, listener))
+        return PreparedPool(
             listener,
-            tenure,
+            attachment,
             int(spec.get("processesPerPod", 1)),
             int(spec.get("minReplicas", 0)),
             int(spec.get("maxReplicas", self._config.max_pods)),
         )
 
     def _listen(
-        self, pool: str, credentials: MasterCredentials, loop: Loop, serve: Serve
+        self, pool: str, credentials: MasterCredentials, loop: Loop, observer: ListenerObserver
     ) -> tuple[str, MasterListener]:
         config = self._config
         host = reachable_address(self._api, config.listen_host, pool=pool, namespace=self.namespace)
@@ -107,8 +123,8 @@ class Program:
                 loop,
                 names.address_of(config.listen_host or host, config.listen_port),
                 credentials,
-                on_agent=serve.on_agent,
-                on_refused=serve.on_refused,
+                on_agent=observer.on_agent,
+                on_refused=observer.on_refused,
                 keepalive=Keepalive(*patience),
                 lost_grace=Master.lost_grace,
             )
@@ -167,15 +183,6 @@ class Program:
             "name": metadata["name"],
             "uid": metadata["uid"],
         }
-
-
-class Serve(NamedTuple):
-    """Who hears of agents that dial in, on the loop's thread; and whether to go on opening."""
-
-    on_agent: Callable[[Link], str | None]
-    on_refused: Callable[[str], None]
-    cancel: threading.Event
-    """Set once the API server is not to be asked again and again any more."""
 
 
 def _mountinfo() -> str:

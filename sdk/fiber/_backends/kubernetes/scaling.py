@@ -12,10 +12,10 @@ from fiber._backends.kubernetes.api_errors import (
     ApiError,
     Conflict,
     Forbidden,
+    Transient,
     Unauthorized,
-    Unreachable,
 )
-from fiber._backends.kubernetes.held_pool import HeldPool
+from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber_api import names
 
 PATCH_INTERVAL = 1.0
@@ -75,7 +75,7 @@ class Scaling:
             self._changed = self._changed or waiting
             return waiting
 
-    def step(self, pool: HeldPool) -> float:
+    def step(self, pool: AttachedPool) -> float:
         """Write what is due; seconds until the next step is.
 
         ``ApiError`` and FiberPoolError where that will never succeed.
@@ -92,14 +92,14 @@ class Scaling:
         try:
             self._write(pool, replicas, release)
             self._due, self._pause, self._refused = now + PATCH_INTERVAL, _PAUSE_MIN, None
-        except (Conflict, Forbidden, Unauthorized, Unreachable) as error:
+        except (Conflict, Forbidden, Unauthorized, Transient) as error:
             self._put_off(error)
         return self._due - now
 
-    def _write(self, pool: HeldPool, replicas: int, release: list[str]) -> None:
+    def _write(self, pool: AttachedPool, replicas: int, release: list[str]) -> None:
         try:
             pool.apply(replicas, release, timeout=_TIMEOUT)
-        except (Forbidden, Unauthorized, Unreachable):
+        except (Forbidden, Unauthorized, Transient):
             raise
         except ApiError:
             pool.check()  # another's by now, or deleted: that says more
@@ -113,6 +113,7 @@ class Scaling:
                 raise error
         with self._lock:
             self._changed = True
-        self._due = now + self._pause
+        asked = error.retry_after if isinstance(error, Transient) else 0.0
+        self._due = now + max(self._pause, asked)
         self._pause = min(2 * self._pause, _PAUSE_MAX)
         self._on_trouble(error)

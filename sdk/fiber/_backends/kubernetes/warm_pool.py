@@ -8,7 +8,7 @@ import time
 
 from fiber._backends.kubernetes.api import TIMEOUT, Api
 from fiber._backends.kubernetes.api_errors import ApiError, Body, Conflict, Forbidden, NotFound
-from fiber._backends.kubernetes.held_pool import HeldPool, Master, identity_in
+from fiber._backends.kubernetes.attached_pool import AttachedPool, Master, identity_in
 from fiber._backends.kubernetes.resources import LEASES, POOLS, SECRETS
 from fiber._backends.kubernetes.secret import credentials_of
 from fiber._transport.credentials import MasterCredentials
@@ -57,84 +57,84 @@ class WarmPool:
     def __init__(self, api: Api, namespace: str, name: str, master: Master) -> None:
         self._api = api
         self._master = master
-        self._held: HeldPool | None = None
+        self._attached: AttachedPool | None = None
         self._replicas = 0
         """What the pool had before, and has again after."""
         self.name = name
         self.namespace = namespace
-        self.doing = f"attach to the FiberPool {name!r}"
+        self.doing = "attach to"
 
     @property
     def remedy(self) -> str:
-        """What detaches the program when ``end`` does not."""
+        """What detaches the program when ``detach`` does not."""
         patch = json.dumps({"spec": {"master": None, "replicas": self._replicas}})
         where = f"fiberpool {self.name} -n {self.namespace}"
         return f"kubectl patch {where} --type=merge -p '{patch}'"
 
-    def begin(self, cancel: threading.Event) -> HeldPool:
+    def attach(self, cancel: threading.Event) -> AttachedPool:
         """Be its master from now on; FiberPoolError if it has one."""
         deadline = time.monotonic() + TIMEOUT
-        while not self._attach(cancel):
+        while not self._try_to_attach(cancel):
             # Its status was written meanwhile, or another program was faster.
             if time.monotonic() > deadline or cancel.wait(_PAUSE):
                 raise Conflict("it changes faster than it can be attached to", status=409)
-        assert self._held is not None
+        assert self._attached is not None
         try:
-            self._held.make_lease(cancel=cancel)
+            self._attached.make_lease(cancel=cancel)
         except Conflict:
-            self._held.take_lease(cancel=cancel)  # the master before left it
-        return self._held
+            self._attached.take_lease(cancel=cancel)  # the master before left it
+        return self._attached
 
-    def end(self, timeout: float) -> None:
+    def detach(self, timeout: float) -> None:
         """Leave it as it was, if this program still is its master."""
-        held = self._held
-        if held is None:
+        attached = self._attached
+        if attached is None:
             return
         deadline = time.monotonic() + timeout
-        while not self._detach(held, left := max(deadline - time.monotonic(), 0.0)):
+        while not self._try_to_detach(attached, left := max(deadline - time.monotonic(), 0.0)):
             if not left:
                 raise Conflict("it changes faster than it can be detached from", status=409)
             time.sleep(min(_PAUSE, left))
 
-    def _detach(self, held: HeldPool, timeout: float) -> bool:
+    def _try_to_detach(self, attached: AttachedPool, timeout: float) -> bool:
         try:
-            found = self._api.get(held.path, timeout=timeout)
+            found = self._api.get(attached.path, timeout=timeout)
         except NotFound:
             return True
-        if held.loss(found) is not None:
+        if attached.loss(found) is not None:
             return True
         try:
             # While it is ours: afterwards it may be the next master's.
-            held.free_lease(timeout=timeout)
+            attached.free_lease(timeout=timeout)
             version = found["metadata"]["resourceVersion"]
-            held.apply(self._replicas, master=False, resource_version=version, timeout=timeout)
+            attached.apply(self._replicas, master=False, resource_version=version, timeout=timeout)
         except Conflict:
             return False
         return True
 
-    def _attach(self, cancel: threading.Event) -> bool:
+    def _try_to_attach(self, cancel: threading.Event) -> bool:
         found = self._api.get(POOLS.path(self.namespace, self.name), cancel=cancel)
         there = found["spec"].get("master") or {}
         epoch = int(there.get("epoch") or 0)
         if there and identity_in(found) == self._master.identity:
-            self._held = HeldPool(self._api, found, self._master, epoch)
+            self._attached = self._as_master(found, epoch)
             return True  # by an attempt whose answer was lost
         if there:
             self._check_lost(found, there)
-        held = HeldPool(
-            self._api,
-            found,
-            self._master,
-            1 + max(epoch, int((found.get("status") or {}).get("masterEpoch") or 0)),
-        )
+        seen = int((found.get("status") or {}).get("masterEpoch") or 0)
+        attached = self._as_master(found, 1 + max(epoch, seen))
         self._replicas = 0 if there else int(found["spec"].get("replicas") or 0)
         version = found["metadata"]["resourceVersion"]
-        self._held = held  # whatever becomes of the call, `end` looks whether the pool is ours
+        # Whatever becomes of the call, `detach` looks whether the pool is ours.
+        self._attached = attached
         try:
-            held.apply(self._replicas, resource_version=version, cancel=cancel)
+            attached.apply(self._replicas, resource_version=version, cancel=cancel)
         except Conflict:
             return False
         return True
+
+    def _as_master(self, found: Body, epoch: int) -> AttachedPool:
+        return AttachedPool(self._api, found, self._master, epoch, kept_by_others=True)
 
     def _check_lost(self, found: Body, there: Body) -> None:
         """Raise unless the operator says that the master that is there is gone."""

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
 from fakes.kubernetes_api import Call, Fault
-from fiber._backends.kubernetes import watches
+from fiber._backends.kubernetes import informer
+from fiber._backends.kubernetes.informer import Informer
 from fiber._backends.kubernetes.resources import PODS
-from fiber._backends.kubernetes.watches import ObjectWatch
 from unit.kubernetes_rig import NAMESPACE, Rig
 from unit.kubernetes_rig import rig as make_rig
 
@@ -25,10 +25,14 @@ class Case:
         self.told: queue.Queue[str] = queue.Queue()
         self.troubles: queue.Queue[Exception] = queue.Queue()
         self.faults: queue.Queue[Exception] = queue.Queue()
-        self.watch = ObjectWatch(
-            rig.api,
+        self.follow()
+
+    def follow(self, known: Iterable[str] = ()) -> None:
+        self.watch = Informer(
+            self.rig.api,
             PODS.path(NAMESPACE),
             {"labelSelector": "app=x"},
+            known=known,
             on_change=lambda name, found: self.told.put(f"{'-' if found is None else '+'}{name}"),
             on_trouble=self.troubles.put,
             on_fault=self.faults.put,
@@ -65,6 +69,13 @@ def test_it_tells_what_is_there_and_what_changes(case: Case) -> None:
     assert case.next() == ["+b"]
     case.remove("a")
     assert case.next() == ["-a"]
+
+
+def test_what_was_gone_before_it_looked_is_told(case: Case) -> None:
+    case.follow(known={"a", "b"})
+    case.add("b")
+    case.watch.start()
+    assert case.next(2) == ["-a", "+b"]
 
 
 @pytest.mark.parametrize("how", ["cut off", "refused once", "listed too late"])
@@ -140,14 +151,28 @@ def test_an_api_that_ends_every_watch_at_once_is_not_flooded(
         pauses.put(seconds)
         return pauses.qsize() >= 4 and case.watch._stopped.set() is None
 
-    monkeypatch.setattr(watches, "_EARLY", float("inf"))
+    monkeypatch.setattr(informer, "_EARLY", float("inf"))
     monkeypatch.setattr(case.watch._stopped, "wait", wait)
     case.server.api.faults.append(Fault("watch", "pods", text="", times=99))
     case.watch.start()
     case.watch.join(10)
     drawn = [pauses.get_nowait() for _ in range(4)]
-    assert drawn[0] <= watches._PAUSE_MIN
-    assert drawn[-1] >= 4 * watches._PAUSE_MIN
+    assert drawn[0] <= informer._PAUSE_MIN
+    assert drawn[-1] >= 4 * informer._PAUSE_MIN
+
+
+def test_who_is_asked_to_come_back_later_does(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: queue.Queue[float] = queue.Queue()
+
+    def wait(seconds: float) -> bool:
+        pauses.put(seconds)
+        return case.watch._stopped.set() is None
+
+    monkeypatch.setattr(case.watch._stopped, "wait", wait)
+    case.server.api.faults.append(Fault("list", "pods", status=429, retry_after=20))
+    case.watch.start()
+    case.watch.join(10)
+    assert pauses.get_nowait() == 20
 
 
 def test_an_event_that_no_api_server_sends_is_a_fault_and_not_a_silence(case: Case) -> None:
@@ -164,7 +189,7 @@ def test_one_that_was_never_started_is_stopped(case: Case) -> None:
 
 
 def test_a_long_list_comes_in_pages_and_what_changes_meanwhile_is_told(case: Case) -> None:
-    pods = [f"pod-{number:03}" for number in range(2 * watches._PAGE + 1)]
+    pods = [f"pod-{number:03}" for number in range(2 * informer._PAGE + 1)]
     for name in pods:
         case.add(name)
     api, store = case.server.api, case.server.store

@@ -40,11 +40,14 @@ class Master:
         }
 
 
-class HeldPool:
+class AttachedPool:
     """One FiberPool and what its master may do with it.  Calls block and raise ``ApiError``."""
 
-    def __init__(self, api: Api, found: Body, master: Master, epoch: int) -> None:
+    def __init__(
+        self, api: Api, found: Body, master: Master, epoch: int, *, kept_by_others: bool = False
+    ) -> None:
         self._api = api
+        self._kept_by_others = kept_by_others
         self.master = master
         self._epoch = epoch
         metadata = found["metadata"]
@@ -99,13 +102,26 @@ class HeldPool:
         """Why the pool, which is as ``found`` now, is this program's no more, if that is so."""
         metadata = {} if found is None else found["metadata"]
         if found is None or metadata["uid"] != self.uid or "deletionTimestamp" in metadata:
-            return self.error("Deleted", "was deleted, and its processes with it")
+            return self._loss(
+                "Deleted",
+                "was deleted, and its processes with it",
+                "It is not this program's own: whoever keeps it has to make it again. Or let this "
+                "program make one for itself: leave out pool=",
+            )
         holder = identity_in(found)
         if holder == self.master.identity:
             return None
         if holder is None:
-            return self.error("Replaced", "has no master any more: somebody detached this program")
-        return self.error("Replaced", f"has another master now: {holder}")
+            return self._loss(
+                "Replaced",
+                "has no master any more: somebody detached this program",
+                "Make a new Pool, or Process, to attach to it again",
+            )
+        return self._loss(
+            "Replaced",
+            f"has another master now: {holder}",
+            "Wait until that program ends, or use another FiberPool",
+        )
 
     def check(self) -> None:
         """Raise FiberPoolError if the pool is this program's no more."""
@@ -116,11 +132,12 @@ class HeldPool:
         if loss := self.loss(found):
             raise loss
 
-    def error(self, reason: str, what: str) -> FiberPoolError:
-        """An error that ends what was done with the pool."""
+    def _loss(self, reason: str, what: str, advice: str) -> FiberPoolError:
+        """``advice`` is for a pool that somebody else keeps; another is made as one is needed."""
+        if not self._kept_by_others:
+            advice = "Make a new Pool, or Process, to go on: it begins anew"
         return FiberPoolError(
-            f"the FiberPool {self.name!r} in namespace {self.namespace!r} {what}. "
-            "Make a new Pool, or Process, to go on: it begins anew",
+            f"the FiberPool {self.name!r} in namespace {self.namespace!r} {what}. {advice}",
             pool=self.name,
             namespace=self.namespace,
             reason=reason,

@@ -1,14 +1,14 @@
-"""A thread that follows some objects of the API server: a pool, or its pods."""
+"""A thread that knows how some objects of the API server are: a pool, or its pods."""
 
 from __future__ import annotations
 
 import random
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from fiber._backends.kubernetes.api import Api, Watch
-from fiber._backends.kubernetes.api_errors import ApiError, Body, Expired, Unreachable
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Expired, Transient
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 """Seconds before it goes on after an end that came early, growing."""
@@ -20,7 +20,7 @@ _PAGE = 50
 """Objects of one answer.  Parsing holds the interpreter, and a thousand pods are several MB."""
 
 
-class ObjectWatch:
+class Informer:
     """Lists once, then watches; where a watch ends the next goes on, and where that cannot be it
     lists again and tells what is different from before.
     """
@@ -31,11 +31,14 @@ class ObjectWatch:
         path: str,
         selector: Mapping[str, str],
         *,
+        known: Iterable[str] = (),
         on_change: Callable[[str, Body | None], None],
         on_trouble: Callable[[ApiError], None],
         on_fault: Callable[[Exception], None],
     ) -> None:
-        """``on_change`` is told the name and the object as it is, or None once it is gone;
+        """``known`` names what was there before: it is told if it is there no more.
+
+        ``on_change`` is told the name and the object as it is, or None once it is gone;
         ``on_trouble`` what keeps the watch from going on, while it does; ``on_fault`` of a fault of
         ours, which ends it.  All on the thread.
         """
@@ -47,7 +50,7 @@ class ObjectWatch:
         self._on_fault = on_fault
         self._version: str | None = None
         """Where the next watch goes on; None: with a list."""
-        self._known: set[str] = set()
+        self._known = set(known)
         self._failed = False
         """The last attempt brought nothing."""
         self._lock = threading.Lock()
@@ -78,17 +81,18 @@ class ObjectWatch:
         try:
             while not self._stopped.is_set():
                 started = time.monotonic()
-                self._attempt()
+                asked = self._attempt()
                 if time.monotonic() - started >= _EARLY:
-                    pause = _PAUSE_MIN
+                    pause, wait = _PAUSE_MIN, asked
                 else:
-                    self._stopped.wait(pause * random.uniform(0.5, 1.0))
+                    wait = max(pause * random.uniform(0.5, 1.0), asked)
                     pause = min(2 * pause, _PAUSE_MAX)
+                self._stopped.wait(wait)
         except Exception as error:
             self._on_fault(error)
 
-    def _attempt(self) -> None:
-        """Go on for as long as it goes."""
+    def _attempt(self) -> float:
+        """Go on for as long as it goes; the seconds that the API server then asks to wait."""
         try:
             if self._version is None:
                 self._version = self._list()
@@ -97,11 +101,13 @@ class ObjectWatch:
             self._version = None
         except ApiError as error:
             # A connection that breaks once is nothing to speak of: it is made again.
-            if self._failed or not isinstance(error, Unreachable):
+            if self._failed or not isinstance(error, Transient):
                 self._on_trouble(error)
             self._failed = True
+            return error.retry_after if isinstance(error, Transient) else 0.0
         else:
             self._failed = False
+        return 0.0
 
     def _list(self) -> str:
         found: dict[str, Body] = {}

@@ -1,0 +1,1 @@
+"""Semaphores in shared memory whose tokens outlive nobody who held them."""

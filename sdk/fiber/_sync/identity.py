@@ -1,0 +1,40 @@
+"""Which process is meant, in one word that shared memory can hold, and whether it still lives.
+
+A pid alone would not do: the kernel gives it to another process.  Beside it is the time at which
+the process started, as the kernel counts it.
+"""
+
+from __future__ import annotations
+
+import os
+
+_PID = (1 << 31) - 1
+_START = (1 << 32) - 1
+
+
+def own() -> int:
+    """The word for this process."""
+    pid = os.getpid()
+    start = _start_time(pid)
+    assert start is not None
+    return start << 31 | pid
+
+
+def pid(who: int) -> int:
+    """The pid in a word."""
+    return who & _PID
+
+
+def is_alive(who: int) -> bool:
+    """Whether that process still runs; one that has ended and that nobody reaped does not."""
+    return _start_time(who & _PID) == who >> 31
+
+
+def _start_time(pid: int) -> int | None:
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            # The name before it may have any character in it, the last parenthesis is its end.
+            fields = file.read().rpartition(b")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    return None if fields[0] in b"ZX" else int(fields[19]) & _START

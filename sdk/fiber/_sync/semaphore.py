@@ -1,0 +1,444 @@
+"""Semaphores in shared memory: the tokens of a process that dies come back.
+
+A token is a POSIX semaphore's, so to take one and to give it back is one step in C that the kernel
+can wait for.  What that does not say is who has it.  Beside it are *slots*, which belong to
+processes, one for each token that they have or are about to take::
+
+    semaphore │ mutex │ attention, … │ slot │ slot │ …          slot: state, process, its name
+
+Only the thread that has taken a slot out of its process's lists writes its state::
+
+    acquire                               release
+      state = BUSY                          state = BUSY
+      stop?  then not                       stop?  then not
+      take a token                          give the token back
+      state = HELD                          state = IDLE
+
+To revive is to give back the tokens of which no living process has a note.  One process at a time
+does it, which a robust mutex sees to:
+
+1. ``stop`` is set.  After a moment, longer than any processor keeps a store for itself, whoever
+   reads it sees it, and whoever read it before is seen to be busy.
+2. It waits until no living process is busy: all those have noted what they have, and none takes or
+   gives anything now.  (One that does not get on, since it is stopped, puts the revival off: it may
+   have the token.)
+3. Tokens that are neither there nor noted by the living are lost.  They are given back.
+4. The slots of the dead are free, and ``stop`` is cleared.
+
+So nobody has a token that another one has: only lost ones are made anew, and what makes them lost,
+that who had them is dead and all others have noted what they have, stays so.  A reviver that dies
+leaves ``stop`` and the mutex to the next one, who finds the same or less that is lost.
+
+Who is interrupted between two steps cannot tell how far it came, and leaves the slot as if it had
+died: state = LEFT.
+
+A process that gives back what it has not acquired gives another one's token, or makes one of
+nothing: who has which cannot be told any more.  From there on nothing is revived.
+
+No Python lock is taken: a finalizer, a signal's handler or a thread may come at any line.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+import warnings
+import weakref
+from _multiprocessing import SemLock  # type: ignore[import-not-found]  # it has no stub
+from collections.abc import Iterator
+from itertools import compress, starmap
+from multiprocessing import current_process
+from typing import Protocol
+
+from fiber._sync import identity
+from fiber._sync.abandonment import Abandoned
+from fiber._sync.robust_mutex import RobustMutex
+
+RECURSIVE, COUNTING = 0, 1  # SemLock's kinds, in its own numbers
+SEM_VALUE_MAX: int = SemLock.SEM_VALUE_MAX
+
+SIZE = 1 << 15
+"""Bytes of a semaphore.  The kernel gives memory for the pages that are used."""
+
+SLICE = 0.2
+"""Seconds that one wait in the kernel lasts: so long a signal may be slept over, and a token of a
+dead process lie unnoticed.
+"""
+
+_MOMENT = 0.002  # seconds until what is stored here is seen by all
+_QUIET = 1.0  # seconds that a revival waits for those who are busy, before it is put off
+_NAP = 0.001
+
+# Words of 8 bytes, which are read and written in one piece.  The first four are the semaphore.
+_MUTEX = 8
+_ATTENTION = 16
+_IS_UNTRACKED = 17
+_TOTAL = 18
+_DEAD = 22  # whose token was given back, as in a slot
+_SLOTS = range(32, SIZE // 8, 8)
+_NO_SLOT = 31
+"""In place of one, when there are no more: nobody reads it."""
+
+# Of a slot
+_WHO = 1  # the process, or 0: it is nobody's
+_NAME = 2
+_NAME_BYTES = 48
+_IDLE, _BUSY, _HELD, _LEFT = range(4)  # states
+
+# Bytes of the word ``attention``.  Who reads it reads them all at once.
+_STOP = 8 * _ATTENTION
+_ABANDONED = 8 * _ATTENTION + 1
+_IS_STOPPED = 0xFF
+
+_NO_WAIT = (False,)
+
+_libc = ctypes.PyDLL(None, use_errno=True)
+
+
+class Block(Protocol):
+    """Memory that processes of this host share."""
+
+    @property
+    def view(self) -> memoryview:
+        """All of it, to be written to."""
+
+    @property
+    def address(self) -> int:
+        """Where it is in this process."""
+
+
+class SharedSemaphore:
+    """A semaphore, as this process sees it; with the methods of multiprocessing's ``SemLock``."""
+
+    __slots__ = (
+        "__weakref__", "_bytes", "_candidates", "_count", "_get_value", "_give", "_held", "_idle",
+        "_is_mine", "_is_mutex", "_is_recursive", "_is_zero", "_me", "_mutex", "_next_look",
+        "_revivals", "_sem", "_take", "_words", "block", "kind", "maximum",
+    )  # fmt: skip
+
+    def __init__(self, block: Block, kind: int, maximum: int) -> None:
+        self.block = block
+        self.kind = kind
+        self.maximum = maximum
+        self._is_mutex = maximum == 1
+        self._is_recursive = kind == RECURSIVE
+        self._bytes = block.view
+        self._words = block.view.cast("q")
+        self._mutex = RobustMutex(block.address + 8 * _MUTEX)
+        self._sem = self._semlock(kind)
+        self._take = self._sem.acquire
+        self._give = self._sem.release
+        self._is_mine = self._sem._is_mine
+        self._count = self._sem._count
+        self._get_value = self._sem._get_value
+        self._is_zero = self._sem._is_zero
+        self._revivals = 0
+        self._next_look = 0.0
+        self._begin()
+        _all.add(self)
+
+    @classmethod
+    def create(cls, block: Block, kind: int, value: int, maximum: int) -> SharedSemaphore:
+        """Begin the life of one in zeroed memory."""
+        if _libc.sem_init(ctypes.c_void_p(block.address), 1, value):
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code))
+        new = cls(block, kind, maximum)
+        new._mutex.create()
+        new._words[_TOTAL] = value
+        return new
+
+    def _begin(self) -> None:
+        """In a new process, which may be a fork: what its parent has is not its own."""
+        self._me = identity.own()
+        self._idle: list[int] = []
+        self._held: list[int] = []
+        self._candidates: Iterator[int] = iter(_SLOTS)
+
+    def _after_fork(self) -> None:
+        self._sem._after_fork()
+        self._begin()
+
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
+        """Take a token; False if there is none, nor within ``timeout`` seconds."""
+        if self._is_recursive and self._is_mine():
+            return self._acquire_again()
+        if self._is_mutex:
+            # ``_try_acquire``, in the fewest steps.
+            words = self._words
+            try:
+                slot = self._idle.pop()
+            except IndexError:
+                return self._acquire(block, timeout)
+            try:
+                words[slot] = _BUSY
+                if not words[_ATTENTION] and self._take(False):
+                    # CPython looks for signals after a call, and there is none from here on.
+                    words[slot] = _HELD
+                    self._held += (slot,)
+                    return True
+                words[slot] = _IDLE
+                self._idle += (slot,)
+            except BaseException:
+                self._leave(slot)
+                raise
+        return self._acquire(block, timeout)
+
+    def release(self) -> None:
+        """Give a token back; ValueError if there are as many as there can be.
+
+        AssertionError if it is recursive and this thread has not acquired it.
+        """
+        if self._is_recursive and (not self._is_mine() or self._count() > 1):
+            self._give()
+            return
+        words = self._words
+        try:
+            slot = self._held.pop()
+        except IndexError:
+            self._mutex.run(self._give_untracked)
+            return
+        try:
+            words[slot] = _BUSY
+            while words[_ATTENTION] & _IS_STOPPED:
+                words[slot] = _HELD
+                self._park()
+                words[slot] = _BUSY
+            self._give()
+            words[slot] = _IDLE
+            self._idle += (slot,)
+        except BaseException:
+            self._leave(slot)
+            raise
+
+    # Steps
+
+    def _acquire(self, block: bool, timeout: float | None) -> bool | Abandoned:
+        taken: list[int] = []
+        try:
+            if self._try_acquire(_NO_WAIT, taken) or self._wait(block, timeout, taken):
+                return self._abandoned() if self._words[_ATTENTION] else True
+            return False
+        except BaseException:
+            if taken:
+                self.release()
+            raise
+
+    def _acquire_again(self) -> bool:
+        taken: list[bool] = []
+        try:
+            taken.extend(map(self._take, _NO_WAIT))
+            return True
+        except BaseException:
+            if taken:
+                self._give()
+            raise
+
+    def _try_acquire(self, wait: tuple[bool] | tuple[bool, float], taken: list[int]) -> bool:
+        """One try; ``taken`` gets the slot if it succeeds, and keeps it if it is interrupted."""
+        try:
+            slot = self._idle.pop()
+        except IndexError:
+            slot = self._mutex.run(self._claim)
+        words = self._words
+        try:
+            words[slot] = _BUSY
+            if not words[_ATTENTION] & _IS_STOPPED:
+                # In the step that takes it: no signal strikes in between.
+                taken.extend(compress((slot,), starmap(self._take, (wait,))))
+        except BaseException:
+            if taken:
+                words[slot] = _HELD
+                self._held += (slot,)
+            else:
+                self._leave(slot)
+            raise
+        if not taken:
+            words[slot] = _IDLE
+            self._idle += (slot,)
+            return False
+        words[slot] = _HELD
+        self._held += (slot,)
+        return True
+
+    def _give_untracked(self) -> None:
+        """Give back what this process has not acquired.  With the mutex."""
+        self._give()
+        self._words[_IS_UNTRACKED] = True
+
+    def _leave(self, slot: int) -> None:
+        """What was done last was interrupted: a revival will see whether a token is lost."""
+        if self._is_recursive and self._is_mine():
+            self._sem._after_fork()  # it is not: the count is zero
+        self._words[slot] = _LEFT
+
+    def _abandoned(self) -> Abandoned | bool:
+        """What the one who acquires it after a revival is told, and nobody else."""
+        if not self._bytes[_ABANDONED]:
+            return True
+        self._bytes[_ABANDONED] = 0
+        return Abandoned(self._named(_DEAD))
+
+    # Waiting
+
+    def _wait(self, block: bool, timeout: float | None, taken: list[int]) -> bool:
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            left = SLICE if deadline is None else min(SLICE, deadline - time.monotonic())
+            waits = block and left > 0
+            if self._is_stopped():
+                self._park()
+            elif not self._look_after_the_dead() and not waits:
+                return False
+            if self._try_acquire((True, left) if waits else _NO_WAIT, taken):
+                return True
+            if not waits:
+                return False
+
+    def _is_stopped(self) -> bool:
+        return bool(self._words[_ATTENTION] & _IS_STOPPED)
+
+    def _park(self) -> None:
+        """Wait until a revival is over, and go on with it if its process died."""
+        self._warn(self._mutex.run(lambda: self._revive() if self._is_stopped() else []))
+
+    def _look_after_the_dead(self) -> bool:
+        """Now and then: whether tokens were lost, which are given back."""
+        now = time.monotonic()
+        if now < self._next_look:
+            return False
+        self._next_look = now + SLICE
+        if not self._is_suspicious():
+            return False
+        self._warn(self._mutex.run(self._revive))
+        return True
+
+    # Reviving
+
+    def _is_suspicious(self) -> bool:
+        """Whether somebody who is gone has a token, or may have."""
+        words = self._words
+        if words[_IS_UNTRACKED] or self._get_value():
+            return False
+        states = [(words[slot], slot) for slot in self._used()]
+        noted = sum(state == _HELD for state, _ in states)
+        # If all are noted, nobody who is only busy has one: most of those wait for it.
+        least = _HELD if noted == words[_TOTAL] else _BUSY
+        return any(self._is_gone(slot) for state, slot in states if state >= least)
+
+    def _revive(self) -> list[str]:
+        """Give back the tokens of those who are gone; the names of the dead.  With the mutex."""
+        self._revivals += 1
+        revival = self._revivals
+        words = self._words
+        released: list[str] = []
+        self._bytes[_STOP] = 1
+        try:
+            time.sleep(_MOMENT)
+            gone = self._wait_until_quiet()
+            time.sleep(_MOMENT)
+            lost = words[_TOTAL] - self._get_value()
+            lost -= sum(words[slot] == _HELD for slot in self._used() if slot not in gone)
+            if gone and lost > 0 and not words[_IS_UNTRACKED]:
+                released = self._abandon(gone)
+                # By another view of it: ours counts what this process has.
+                give = self._semlock(COUNTING).release
+                for _ in range(lost):
+                    if self._revivals != revival:
+                        break  # a signal's handler has done it all, in the middle of this
+                    give()
+            for slot, who in gone.items():
+                if words[slot + _WHO] == who:
+                    words[slot + _WHO] = 0
+        finally:
+            self._bytes[_STOP] = 0
+        return released
+
+    def _wait_until_quiet(self) -> dict[int, int]:
+        """Wait until nobody who is there is busy: the slots of all who are not.
+
+        None of them if that takes too long.
+        """
+        words = self._words
+        deadline = time.monotonic() + _QUIET
+        while True:
+            owners = {slot: words[slot + _WHO] for slot in self._used()}
+            gone = {slot: who for slot, who in owners.items() if self._is_gone(slot)}
+            if all(words[slot] != _BUSY for slot in owners.keys() - gone.keys()):
+                return gone
+            if time.monotonic() > deadline:
+                return {}
+            time.sleep(_NAP)
+
+    def _abandon(self, gone: dict[int, int]) -> list[str]:
+        """Have the next one who acquires it know whose it was; the names of all who are dead."""
+        words, bytes_ = self._words, self._bytes
+        dead = [slot for slot in gone if words[slot] in (_BUSY, _HELD)]
+        dead = [slot for slot in dead if words[slot] == _HELD] or dead
+        for slot in dead[-1:]:
+            bytes_[8 * _DEAD : 8 * _DEAD + 64] = bytes_[8 * slot : 8 * slot + 64]
+            bytes_[_ABANDONED] = 1
+        return list(map(self._named, dead))
+
+    def _warn(self, released: list[str]) -> None:
+        for process in dict.fromkeys(released):
+            warnings.warn(
+                f"{process} ended while it held a lock or semaphore, which is released: what it "
+                "guards may be half changed",
+                RuntimeWarning,
+                stacklevel=7,  # who called acquire()
+            )
+
+    # Slots
+
+    def _used(self) -> Iterator[int]:
+        """All slots that belong to somebody."""
+        return compress(_SLOTS, self._words[_SLOTS.start + _WHO :: _SLOTS.step].tolist())
+
+    def _is_gone(self, slot: int) -> bool:
+        who = self._words[slot + _WHO]
+        return self._words[slot] == _LEFT or not (who == self._me or identity.is_alive(who))
+
+    def _named(self, slot: int) -> str:
+        start = 8 * (slot + _NAME)
+        name = bytes(self._bytes[start : start + _NAME_BYTES]).rstrip(b"\0")
+        pid = identity.pid(self._words[slot + _WHO])
+        return f"{name.decode(errors='replace')} (pid {pid})"
+
+    def _claim(self) -> int:
+        """One more slot for this process.  With the mutex."""
+        for _ in range(0 if self._words[_IS_UNTRACKED] else 2):
+            # One iterator for all: whoever interrupts this search looks at other slots.
+            for slot in self._candidates:
+                if not self._words[slot + _WHO]:
+                    return self._settle(slot)
+            self._revive()
+            self._candidates = iter(_SLOTS)
+        # More tokens are taken, or waited for, than can be told apart.
+        self._words[_IS_UNTRACKED] = True
+        return _NO_SLOT
+
+    def _settle(self, slot: int) -> int:
+        words, start = self._words, 8 * (slot + _NAME)
+        words[slot] = _IDLE
+        name = current_process().name.encode()[:_NAME_BYTES]
+        self._bytes[start : start + _NAME_BYTES] = name.ljust(_NAME_BYTES, b"\0")
+        words[slot + _WHO] = self._me  # last: from here on it is ours
+        return slot
+
+    def _semlock(self, kind: int) -> SemLock:
+        # Without a name it takes the handle, an address here, as it is.  What it does at its end,
+        # ``sem_close``, is refused for an address that ``sem_open`` never gave.
+        return SemLock._rebuild(self.block.address, kind, self.maximum, None)
+
+
+_all: weakref.WeakSet[SharedSemaphore] = weakref.WeakSet()
+
+
+def _after_fork() -> None:
+    for semaphore in _all:
+        semaphore._after_fork()
+
+
+os.register_at_fork(after_in_child=_after_fork)

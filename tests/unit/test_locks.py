@@ -1,0 +1,307 @@
+"""Lock and RLock on one host, and the shared semaphore below them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import fiber
+from fiber._hub import shared_semaphores
+from fiber._sync import semaphore as module
+from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, SharedSemaphore
+from fiber.errors import NotInFiber
+from fiber.synchronize import Abandoned
+from hosts import PATIENCE, Hosts
+from unit.interrupting import LINES, is_interrupted
+
+KINDS = {"mutex": (COUNTING, 1), "recursive": (RECURSIVE, 1), "counting": (COUNTING, SEM_VALUE_MAX)}
+
+
+@pytest.fixture(params=KINDS.values(), ids=KINDS.keys())
+def one(request: pytest.FixtureRequest) -> SharedSemaphore:
+    kind, maximum = request.param
+    return shared_semaphores.create(kind, 1, maximum)
+
+
+def take_turn(semaphore: SharedSemaphore) -> None:
+    semaphore.acquire()
+    semaphore.release()
+
+
+def in_fork(action: Callable[[], object]) -> None:
+    """Do it in a process of its own, which ends by that as if it were killed."""
+    pid = os.fork()
+    if not pid:
+        try:
+            action()
+        finally:
+            os._exit(0)
+    os.waitpid(pid, 0)
+
+
+def elsewhere(action: Callable[[], Any]) -> Any:
+    """Its result on another thread."""
+    results: list[Any] = []
+    thread = threading.Thread(target=lambda: results.append(action()))
+    thread.start()
+    thread.join(PATIENCE)
+    return results[0]
+
+
+@contextlib.contextmanager
+def held_elsewhere(lock: Any) -> Iterator[None]:
+    """Another process has it in the block."""
+    ready, stop = os.pipe(), os.pipe()
+    pid = os.fork()
+    if not pid:
+        os.close(stop[1])
+        lock.acquire()
+        os.write(ready[1], b"1")
+        os.read(stop[0], 1)
+        os._exit(0)
+    os.read(ready[0], 1)
+    try:
+        yield
+    finally:
+        for end in (*ready, *stop):
+            os.close(end)
+        os.waitpid(pid, 0)
+
+
+@pytest.mark.parametrize("make", [fiber.Lock, fiber.RLock])
+def test_one_at_a_time(make: Callable[[], Any]) -> None:
+    lock = make()
+    with held_elsewhere(lock):
+        assert not lock.acquire(False)
+        assert not lock.acquire(timeout=0.01)
+        assert not lock.acquire(timeout=-1)
+        assert "SomeOtherProcess" in repr(lock)
+
+
+def test_a_lock_says_who_has_it() -> None:
+    lock = fiber.Lock()
+    assert repr(lock) == "<Lock(owner=None)>"
+    with lock as acquired:
+        assert acquired is True
+        assert repr(lock) == "<Lock(owner=MainProcess)>"
+        assert elsewhere(lambda: repr(lock)) == "<Lock(owner=SomeOtherThread)>"
+        assert not lock.acquire(False)
+    with pytest.raises(ValueError, match="too many times"):
+        lock.release()
+
+
+def test_an_rlock_is_its_threads() -> None:
+    lock = fiber.RLock()
+    assert repr(lock) == "<RLock(None, 0)>"
+    with lock, lock:
+        assert repr(lock) == "<RLock(MainProcess, 2)>"
+        assert elsewhere(lambda: repr(lock)) == "<RLock(SomeOtherThread, nonzero)>"
+        assert not elsewhere(lambda: lock.acquire(False))
+    with pytest.raises(AssertionError, match="not owned by thread"):
+        lock.release()
+    assert elsewhere(lambda: lock.acquire(False))
+
+
+def add(lock: Any, count: Any, times: int) -> None:
+    for _ in range(times):
+        with lock:
+            count.put(count.get() + 1)
+
+
+def test_who_waits_gets_it() -> None:
+    lock, count = fiber.Lock(), fiber.SimpleQueue()
+    count.put(0)
+    processes = [fiber.Process(target=add, args=(lock, count, 100)) for _ in range(3)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(PATIENCE)
+    assert count.get() == 300
+
+
+def test_pickled_anywhere_it_is_the_same() -> None:
+    lock, queue = fiber.RLock(), fiber.Queue()
+    queue.put(lock)
+    with lock, queue.get(timeout=PATIENCE) as again:
+        assert again
+    with fiber.Pool(1) as pool:
+        assert pool.apply(repr, (lock,)) == "<RLock(None, 0)>"
+
+
+def test_on_another_host_it_says_what_to_use() -> None:
+    hosts = Hosts()
+    try:
+        hosts.link("b", "a")
+        with hosts.at("a"):
+            data = pickle.dumps(fiber.Lock())
+        with hosts.at("b"), pytest.raises(NotInFiber, match=r"another host.*Queue"):
+            pickle.loads(data)
+    finally:
+        hosts.close()
+
+
+# Holders that die
+
+
+def test_what_a_dead_process_holds_is_released(one: SharedSemaphore) -> None:
+    in_fork(one.acquire)
+    with pytest.warns(RuntimeWarning, match=r"MainProcess \(pid \d+\) ended while it held"):
+        acquired = one.acquire(timeout=PATIENCE)
+    assert isinstance(acquired, Abandoned)
+    assert acquired == True  # noqa: E712 - as callers may compare it
+    assert "MainProcess (pid " in pickle.loads(pickle.dumps(acquired)).holder
+    one.release()
+    assert one.acquire() is True, "only the first one is told"
+
+
+def test_whoever_does_not_wait_gets_it_as_well(one: SharedSemaphore) -> None:
+    in_fork(one.acquire)
+    with pytest.warns(RuntimeWarning, match="ended"):
+        assert one.acquire(False)
+
+
+@pytest.mark.parametrize("call", ["_take", "_give"])
+def test_one_that_dies_between_two_steps(one: SharedSemaphore, call: str) -> None:
+    def dies_after(step: Callable[..., object]) -> Callable[..., object]:
+        return lambda *args: (step(*args), os._exit(0))
+
+    step = getattr(one, call)
+    setattr(one, call, dies_after(step))
+    in_fork(lambda: take_turn(one))
+    setattr(one, call, step)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        assert one.acquire(timeout=PATIENCE)
+    assert not one._get_value()
+    one.release()
+    assert one._get_value() == 1
+
+
+def test_a_dead_reviver_is_followed_by_another(
+    one: SharedSemaphore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_fork(one.acquire)
+    monkeypatch.setattr(one.__class__, "_wait_until_quiet", lambda _: os._exit(0))
+    in_fork(one.acquire)
+    monkeypatch.undo()
+    with pytest.warns(RuntimeWarning, match="ended"):
+        assert one.acquire(timeout=PATIENCE)
+
+
+def test_all_that_it_had_is_released() -> None:
+    semaphore = shared_semaphores.create(COUNTING, 3, 3)
+    in_fork(lambda: [semaphore.acquire() for _ in range(3)])
+    with pytest.warns(RuntimeWarning, match="ended"):
+        assert semaphore.acquire(timeout=PATIENCE)
+    assert semaphore._get_value() == 2
+
+
+def test_what_the_living_hold_is_not() -> None:
+    semaphore = shared_semaphores.create(COUNTING, 2, 2)
+    semaphore.acquire()
+    in_fork(semaphore.acquire)
+    with pytest.warns(RuntimeWarning, match="ended"):
+        assert semaphore.acquire(timeout=PATIENCE)
+    assert not semaphore.acquire(timeout=2 * module.SLICE)
+
+
+def test_a_semaphore_that_carries_signals_is_not_revived() -> None:
+    semaphore = shared_semaphores.create(COUNTING, 1, SEM_VALUE_MAX)
+    in_fork(semaphore.acquire)
+    semaphore.release()  # what another one acquired
+    assert semaphore.acquire() is True
+    assert not semaphore.acquire(timeout=2 * module.SLICE)
+
+
+def test_more_tokens_than_can_be_told_apart() -> None:
+    semaphore = shared_semaphores.create(COUNTING, 1000, SEM_VALUE_MAX)
+    assert all(semaphore.acquire(False) is True for _ in range(1000))
+    assert not semaphore.acquire(False)
+    for _ in range(1000):
+        semaphore.release()
+    assert semaphore._get_value() == 1000
+
+
+def test_the_slots_of_the_dead_are_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    semaphore = shared_semaphores.create(COUNTING, 1, 1)
+    for _ in range(len(module._SLOTS) // 64):
+        in_fork(lambda: [semaphore._mutex.run(semaphore._claim) for _ in range(64)])
+    in_fork(lambda: [semaphore._mutex.run(semaphore._claim) for _ in range(64)])
+    assert semaphore.acquire()
+    assert not semaphore._words[module._IS_UNTRACKED]
+
+
+def test_a_fork_has_nothing_of_what_its_parent_has(one: SharedSemaphore) -> None:
+    one.acquire()
+    in_fork(one.release if one.kind == COUNTING else (lambda: None))
+    assert one._get_value() == (one.kind == COUNTING)
+
+
+# Interruptions
+
+
+@pytest.mark.parametrize("call", ["_take", "_give"])
+@pytest.mark.parametrize("again", [False, True])
+def test_ctrl_c_after_a_step_costs_nobody_a_token(
+    one: SharedSemaphore, call: str, again: bool
+) -> None:
+    if again:  # the first time it goes the longer way
+        take_turn(one)
+    step = getattr(one, call)
+
+    def strike(*args: Any) -> None:
+        setattr(one, call, step)
+        step(*args)
+        raise KeyboardInterrupt
+
+    setattr(one, call, strike)
+    with pytest.raises(KeyboardInterrupt):
+        take_turn(one)
+    assert one.acquire(timeout=PATIENCE) is True
+    assert not elsewhere(lambda: one.acquire(False))
+    one.release()
+    assert one._get_value() == 1
+
+
+def test_a_handler_that_uses_it_within_its_own_use(one: SharedSemaphore) -> None:
+    claim = one._claim
+    inner: list[Any] = []
+
+    def interrupted() -> int:
+        if not inner:
+            inner.append(None)
+            inner.append(one.acquire(False))
+            one.release()
+        return claim()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SharedSemaphore, "_claim", lambda _: interrupted())
+        assert one.acquire() is True
+    assert inner == [None, True]
+
+
+def test_ctrl_c_at_any_line_of_a_revival_releases_once(one: SharedSemaphore) -> None:
+    steps = 0
+    while True:
+        in_fork(one.acquire)
+        one._next_look = 0.0
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            struck = is_interrupted(
+                lambda: one._mutex.run(one._revive), steps, {module.__file__}, steps=LINES
+            )
+            assert one.acquire(timeout=PATIENCE)
+        assert not elsewhere(lambda: one.acquire(False)), f"step {steps}"
+        one.release()
+        assert one._get_value() == 1
+        if not struck:
+            break
+        steps += 1
+    assert steps > 10, "it was hardly interrupted"

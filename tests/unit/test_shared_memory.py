@@ -1,0 +1,141 @@
+"""Named shared memory: who finds it, and that nothing of it outlives the program."""
+
+from __future__ import annotations
+
+import multiprocessing.shared_memory
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import fiber
+from census import wait_until
+from fiber.shared_memory import ShareableList, SharedMemory
+from hosts import Hosts
+
+PATIENCE = 15.0
+
+
+@pytest.fixture
+def memory() -> Iterator[SharedMemory]:
+    memory = SharedMemory(create=True, size=100)
+    yield memory
+    memory.close()
+    memory.unlink()
+
+
+def run(target: Callable[..., Any], *args: Any) -> None:
+    process = fiber.Process(target=target, args=args)
+    process.start()
+    process.join(PATIENCE)
+    assert process.exitcode == 0
+
+
+def write(memory: SharedMemory) -> None:
+    memory.buf[:3] = b"abc"
+
+
+def write_by_name(name: str) -> None:
+    memory = SharedMemory(name)
+    memory.buf[3:6] = b"def"
+    memory.close()
+
+
+def make(name: str) -> None:
+    memory = SharedMemory(name, create=True, size=10)
+    memory.buf[0] = 7
+
+
+def double(numbers: ShareableList) -> None:
+    numbers[0] *= 2
+
+
+def there_is(name: str) -> bool:
+    return os.path.exists(f"/dev/shm/{name}")
+
+
+def test_processes_find_it_by_name_and_as_an_argument(memory: SharedMemory) -> None:
+    run(write, memory)
+    run(write_by_name, memory.name)
+    assert bytes(memory.buf[:6]) == b"abcdef"
+
+
+def test_it_is_multiprocessings(memory: SharedMemory) -> None:
+    theirs = multiprocessing.shared_memory.SharedMemory
+    assert isinstance(memory, theirs)
+    memory.buf[0] = 5
+    again = pickle.loads(pickle.dumps(memory))
+    assert (again.buf[0], again.name, again.size) == (5, memory.name, memory.size)
+
+
+def test_what_a_process_made_outlives_it() -> None:
+    name = f"fiber-test-{os.getpid()}"
+    run(make, name)
+    memory = SharedMemory(name)
+    assert memory.buf[0] == 7
+    memory.close()
+    memory.unlink()
+    assert not there_is(name)
+
+
+def test_a_name_is_given_once(memory: SharedMemory) -> None:
+    with pytest.raises(FileExistsError):
+        SharedMemory(memory.name, create=True, size=1)
+    run(write_by_name, memory.name)  # it is still there
+    with pytest.raises(FileNotFoundError, match=r"no shared memory .* fiber\.Array"):
+        SharedMemory(memory.name + "-not")
+
+
+@pytest.mark.parametrize(
+    "options", [{"create": True}, {"create": True, "size": -1}, {"size": 5}, {}]
+)
+def test_bad_options(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError):
+        SharedMemory(**options)
+
+
+def test_a_list_is_shared() -> None:
+    numbers = ShareableList([21, "text", None, b"bytes"])
+    run(double, numbers)
+    assert list(numbers) == [42, "text", None, b"bytes"]
+    assert isinstance(numbers, multiprocessing.shared_memory.ShareableList)
+    numbers.shm.close()
+    numbers.shm.unlink()
+
+
+@pytest.mark.parametrize("end", ["pass", "os.kill(os.getpid(), signal.SIGKILL)"])
+def test_nothing_is_left_of_what_nobody_unlinked(end: str) -> None:
+    program = (
+        "import fiber, os, signal\n"
+        "from fiber.shared_memory import SharedMemory\n"
+        "if __name__ == '__main__':\n"
+        "    memory = SharedMemory(create=True, size=10)\n"
+        "    process = fiber.Process(target=print, args=(memory.name,))\n"
+        "    process.start()\n"
+        "    process.join()\n"
+        f"    {end}\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60)
+    name = done.stdout.decode().strip()
+    assert name, done.stderr
+    assert done.returncode in (0, -signal.SIGKILL)
+    assert wait_until(lambda: not there_is(name), PATIENCE)
+
+
+def test_another_host_is_told_what_to_use(memory: SharedMemory) -> None:
+    hosts = Hosts()
+    try:
+        with hosts.at("here"):
+            data = pickle.dumps(memory)
+        with (
+            hosts.at("there"),
+            pytest.raises(pickle.UnpicklingError, match=r"of host 'here' .*fiber\.Array"),
+        ):
+            pickle.loads(data)
+    finally:
+        hosts.close()
