@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from fiber.errors import VersionMismatch as VersionMismatch
     from fiber.errors import WorkerDied as WorkerDied
     from fiber.futures import Executor as Executor
+    from fiber.managers import BaseManager as BaseManager
     from fiber.process import Process as Process
     from fiber.process import active_children as active_children
     from fiber.process import current_process as current_process
@@ -109,6 +110,7 @@ _HOMES = {
     "AdoptionError": "errors",
     "AgentLost": "errors",
     "AuthenticationError": "errors",
+    "BaseManager": "managers",
     "BufferTooShort": "errors",
     "Config": "config",
     "ConfigError": "errors",

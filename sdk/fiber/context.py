@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import logging
 
     from fiber.connection import Connection
+    from fiber.managers import SyncManager
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
     from fiber.synchronize import BoundedSemaphore, Event, Lock, RLock, Semaphore
@@ -60,7 +61,6 @@ class BaseContext:
     # What multiprocessing has and Fiber has not yet: each says what to use instead.
     Condition = staticmethod(unsupported("Condition"))
     Barrier = staticmethod(unsupported("Barrier"))
-    Manager = staticmethod(unsupported("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)
@@ -175,6 +175,16 @@ class BaseContext:
 
         config.use()
         return RawArray(typecode_or_type, size_or_initializer)
+
+    # Managers
+
+    def Manager(self) -> SyncManager:
+        """A manager that is started, with all that multiprocessing's serves."""
+        from fiber.managers import SyncManager
+
+        manager = SyncManager(ctx=self.get_context())
+        manager.start()
+        return manager
 
     # Work
 

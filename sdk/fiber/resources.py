@@ -7,13 +7,15 @@ import math
 import re
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-__all__ = ["Resources", "merged", "meta", "resources_of", "wished", "with_resources"]
+__all__ = ["Resources", "largest", "merged", "meta", "resources_of", "wished", "with_resources"]
 
 _ATTRIBUTE = "__fiber_meta__"
+_RUN_BY_A_MANAGER = "_run_server"
+"""What a manager's class has in multiprocessing: the function that is run in its process."""
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -45,12 +47,19 @@ def meta(
     fiber.meta(cpu=8)(f)` may be used side by side. Wishes for a function that has some are
     added to them, the outer ones winning. What is returned behaves and pickles like the
     original.
+
+    A manager's class may be given wishes too: they are those of the process that serves it.
     """
     wishes = wished("fiber.meta", cpu, memory, gpu)
     if wishes == Resources():
         raise TypeError("fiber.meta() needs at least one of cpu=, memory= and gpu=")
 
     def decorate(function: _F) -> _F:
+        if isinstance(function, type) and hasattr(function, _RUN_BY_A_MANAGER):
+            attributes = {_ATTRIBUTE: merged(resources_of(function), wishes)}
+            for name in ("__module__", "__qualname__", "__doc__"):
+                attributes[name] = getattr(function, name)
+            return type(function)(function.__name__, (function,), attributes)
         if isinstance(function, type) or not callable(function):
             raise TypeError(
                 f"fiber.meta() is for functions, not for {function!r}: "
@@ -81,6 +90,16 @@ def with_resources(function: _F, wishes: Resources) -> _F:
     """`function` with these wishes, for whoever has them in hand."""
     result: _F = function if wishes == Resources() else _attach(function, wishes)
     return result
+
+
+def largest(wishes: Iterable[Resources]) -> Resources:
+    """Of each the most that any of them wishes; they have no pool."""
+    most: dict[str, Any] = {}
+    for one in wishes:
+        for name in ("cpu", "memory", "gpu"):
+            asked = [wish for wish in (most.get(name), getattr(one, name)) if wish is not None]
+            most[name] = max(asked, default=None)
+    return Resources(**most)
 
 
 def merged(inner: Resources, outer: Resources) -> Resources:

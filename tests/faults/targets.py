@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import select
@@ -9,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -138,6 +140,33 @@ def make_and_send_a_pipe(connection: Any) -> NoReturn:
     block()
 
 
+def square_each(array: Any, connection: Any) -> None:
+    with contextlib.suppress(EOFError):
+        while True:
+            number = connection.recv()
+            array[number] *= number
+            connection.send(number)
+
+
+def write_half_and_die(array: Any) -> NoReturn:
+    for index in range(len(array) // 2):
+        array[index] = index + 1
+    os.kill(os.getpid(), signal.SIGKILL)
+    raise AssertionError
+
+
+def make_and_send_an_array(connection: Any) -> NoReturn:
+    array = fiber.RawArray("i", [1, 2, 3])
+    connection.send(array)
+    block()
+
+
+def write_and_block(array: Any, connection: Any) -> NoReturn:
+    array[0] = 1
+    connection.send(None)
+    block()
+
+
 def slow_square(number: int) -> int:
     time.sleep(0.01)
     return number * number
@@ -169,3 +198,68 @@ def echo_bytes(connection: Any) -> None:
         except EOFError:
             return
         connection.send_bytes(message)
+
+
+def obey(orders: Any) -> None:
+    """Do what comes by a manager's queue, until killed."""
+    kept = []
+    while True:
+        method, args = orders.get()
+        kept.append(args)  # proxies live on
+        ORDERS[method](*args)
+
+
+def _acquire(lock: Any, done: Any) -> None:
+    lock.acquire()
+    done.set()
+
+
+def _queue_up(lock: Any, begun: Any) -> None:
+    begun.set()
+    lock.acquire()
+
+
+def _get(queue: Any, begun: Any) -> None:
+    begun.set()
+    queue.get()
+
+
+def _wait(barrier: Any) -> None:
+    barrier.wait()
+
+
+def _wait_notified(condition: Any, begun: Any) -> None:
+    with condition:
+        begun.set()
+        condition.wait()
+
+
+def _make(address: Any, proxies: Any) -> None:
+    from fiber.managers import SyncManager
+
+    manager = SyncManager(address)
+    manager.connect()
+    made = manager.list(["made"])
+    proxies.put(made)
+    block()
+
+
+ORDERS: dict[str, Callable[..., None]] = {
+    "acquire": _acquire,
+    "get": _get,
+    "make": _make,
+    "queue_up": _queue_up,
+    "wait": _wait,
+    "wait_notified": _wait_notified,
+}
+
+
+def touch_until_it_fails(shared: Any, connection: Any) -> None:
+    """Use a proxy until it raises, and send what it raised."""
+    shared.append(1)
+    connection.send("touched")
+    try:
+        while True:
+            len(shared)
+    except Exception as error:
+        connection.send(f"{type(error).__name__}: {error}")

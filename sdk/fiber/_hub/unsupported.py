@@ -10,7 +10,6 @@ from fiber.errors import NotInFiber
 _INSTEAD = {
     "Condition": "use an Event, or a Queue that carries what is waited for",
     "Barrier": "use a Semaphore for arrivals and an Event for the release",
-    "Manager": "keep the object in one process and talk to it through a Pipe or Queue",
 }
 
 
