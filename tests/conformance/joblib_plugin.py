@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import fiber.joblib  # noqa: F401  # registers the backend
 from conformance.exclusions import JOBLIB
 
 BACKEND = "fiber"

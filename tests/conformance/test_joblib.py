@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from conformance.runner import TESTS
 
 COMMAND = (
@@ -15,6 +17,8 @@ COMMAND = (
 )
 
 
+@pytest.mark.long
+@pytest.mark.timeout(600)
 def test_joblibs_tests(tmp_path: Path) -> None:
     done = subprocess.run(
         [*COMMAND, "--timeout", "120"],
@@ -22,7 +26,7 @@ def test_joblibs_tests(tmp_path: Path) -> None:
         env={**os.environ, "FIBER_BACKEND": "local", "PYTHONPATH": str(TESTS)},
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=580,
     )
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
