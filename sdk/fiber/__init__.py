@@ -54,6 +54,7 @@ _SUBMODULES = frozenset(
         "dummy",
         "errors",
         "futures",
+        "joblib",
         "managers",
         "pool",
         "process",
