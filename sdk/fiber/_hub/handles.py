@@ -41,7 +41,7 @@ from fiber._hub.registry import NoSuchObject, Registry
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
 from fiber._transport.base import SharedChannel, SharedCounter
 from fiber._transport.unix import UnixChannel, UnixCounter
-from fiber._wire.descriptor import Descriptor, own
+from fiber._wire.descriptor import Descriptor, opened, own
 
 
 class InheritedDescriptor(Protocol):
@@ -146,10 +146,12 @@ def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
     spawning = _spawning_here()
     if spawning is None:
         return BlockHandle(_grants().for_local(kind, block.segment.fileno(), extent), extent)
-    # multiprocessing's own Process duplicates the descriptor for each of the blocks.
     inherit = getattr(spawning, "inherit_segment", None)
     if inherit is None:
-        number = spawning.duplicate_for_child(block.segment.fileno())
+        # multiprocessing's own Process takes each descriptor once, and closes it in the child.
+        duplicate = opened(os.dup, block.segment.fileno())
+        vars(spawning).setdefault("_fiber_duplicates", []).append(duplicate)  # until it started
+        number = spawning.duplicate_for_child(duplicate.fileno())
         return BlockHandle(spawning.DupFd(number), extent)
     return BlockHandle(inherit(block.segment), extent)
 
