@@ -164,6 +164,14 @@ class Dispatcher:
     # Telling
 
     def _groups(self, numbers: Sequence[int] | None) -> list[_Group]:
+        """The parts of a command; the error of a worker that there is no more."""
+        groups = self._parts(numbers)
+        for group in groups:
+            if group.worker.error is not None:
+                raise group.worker.error
+        return groups
+
+    def _parts(self, numbers: Sequence[int] | None) -> list[_Group]:
         if numbers is None:
             return [_Group(worker, None, worker.numbers) for worker in self._workers]
         groups: dict[str, tuple[WorkerProcess, list[int], list[int]]] = {}
