@@ -194,7 +194,11 @@ class ClientThread:
         if method == "acquire" and result and isinstance(lock, _LOCKS):
             if kind == "#WARNING":
                 self._holdings.warn(lock, result[0])
-            if isinstance(lock, RLock) or self._holdings.withdraw(lock, self._client):
+            if isinstance(lock, RLock):
+                mine = lock.owned_by(self._ident)  # else its client is gone, and it was revoked
+            else:
+                mine = self._holdings.withdraw(lock, self._client)
+            if mine:
                 lock.release()
         elif method == "wait" and result and isinstance(lock, RLock):
             with lock:

@@ -101,6 +101,8 @@ class RLock:
     def undo_restore(self) -> None:
         """What this thread's last ``wait`` of a condition acquired is not to be had."""
         with self._mutex:
+            if self._owner != _me():
+                return  # its client is gone, and it was revoked
             self._count -= _acting.restored
             if not self._count:
                 self._owner = None
