@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copyreg
+import pickle
 import weakref
+from multiprocessing import context as mp_context
 from typing import Any
 
 from fiber._hub import heap
@@ -11,6 +13,11 @@ from fiber._hub.handles import BlockHandle, handle_for_block
 from fiber._hub.protocol import ObjectKind
 from fiber._sync.semaphore import SIZE, SharedSemaphore
 from fiber.errors import NotInFiber
+
+_ONE_HOST = (
+    "a lock or semaphore cannot be used on another host than the one that it was made on yet. "
+    "Please coordinate hosts by a Queue, an Event or the Lock of a manager"
+)
 
 # One object for each in a process, by the identity of its block: only so a recursive one knows
 # its thread again, however often it was unpickled.
@@ -28,10 +35,7 @@ def create(kind: int, value: int, maximum: int) -> SharedSemaphore:
 
 def _rebuild(handle: BlockHandle, kind: int, maximum: int) -> SharedSemaphore:
     if handle.elsewhere() is not None:
-        raise NotInFiber(
-            "a lock or semaphore cannot be used on another host than the one that it was made on "
-            "yet. Please coordinate hosts by a Queue or an Event."
-        )
+        raise NotInFiber(_ONE_HOST)
     block = handle.block()
     known = _known.get(block.identity)
     if known is None:
@@ -41,6 +45,9 @@ def _rebuild(handle: BlockHandle, kind: int, maximum: int) -> SharedSemaphore:
 
 def _reduce(semaphore: SharedSemaphore) -> tuple[Any, ...]:
     assert isinstance(semaphore.block, heap.Block)
+    spawning: Any = mp_context.get_spawning_popen()
+    if getattr(spawning, "other_host", False):
+        raise pickle.PicklingError(f"the process runs on another host, and {_ONE_HOST}")
     handle = handle_for_block(ObjectKind.SEMAPHORE, semaphore.block)
     return _rebuild, (handle, semaphore.kind, semaphore.maximum)
 
