@@ -31,7 +31,16 @@ if TYPE_CHECKING:
     from fiber.connection import Connection
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
-    from fiber.synchronize import BoundedSemaphore, Event, Lock, RLock, Semaphore
+    from fiber.synchronize import (
+        Barrier,
+        BoundedSemaphore,
+        Condition,
+        Event,
+        Lock,
+        RLock,
+        Semaphore,
+        SemLock,
+    )
 
 __all__ = [
     "BaseContext",
@@ -58,8 +67,6 @@ class BaseContext:
     Process: type[Process] = Process
 
     # What multiprocessing has and Fiber has not yet: each says what to use instead.
-    Condition = staticmethod(unsupported("Condition"))
-    Barrier = staticmethod(unsupported("Barrier"))
     Manager = staticmethod(unsupported("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
@@ -125,6 +132,25 @@ class BaseContext:
 
         config.use()
         return Event()
+
+    def Condition(self, lock: SemLock | None = None) -> Condition:
+        """A lock, and those who wait until others notify them."""
+        from fiber.synchronize import Condition
+
+        config.use()
+        return Condition(lock)
+
+    def Barrier(
+        self,
+        parties: int,
+        action: Callable[[], object] | None = None,
+        timeout: float | None = None,
+    ) -> Barrier:
+        """A point at which some threads or processes wait for each other."""
+        from fiber.synchronize import Barrier
+
+        config.use()
+        return Barrier(parties, action, timeout)
 
     def Semaphore(self, value: int = 1) -> Semaphore:
         """A semaphore."""

@@ -19,6 +19,17 @@ _CLOSED_AT_ONCE = {
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
     )
 }
+_COUNTED_BY_A_VALUE = (
+    "abort",
+    "abort_and_reset",
+    "action",
+    "barrier",
+    "barrier_10",
+    "default_timeout",
+    "reset",
+    "timeout",
+    "wait_return",
+)
 _ONE_HOST = {
     f"WithProcesses{test}": (
         "memory is shared by the processes of one host: to start one elsewhere with a shared value "
@@ -26,6 +37,9 @@ _ONE_HOST = {
     )
     for test in (
         "TestArray.test_array",
+        *(f"TestBarrier.test_{name}" for name in _COUNTED_BY_A_VALUE),
+        "TestCondition.test_waitfor",
+        "TestCondition.test_waitfor_timeout",
         "TestArray.test_rawarray",
         "TestSharedCTypes.test_sharedctypes",
         "TestSharedCTypes.test_synchronize",

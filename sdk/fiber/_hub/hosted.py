@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.poller import EDGE, IN, OUT, Poller
@@ -233,6 +233,3 @@ class HostedCounter:
         while self._takers and self._counter.take(0):
             self._takers.popleft().answer(Status.OK)
         self._watch()
-
-
-Hosted: TypeAlias = HostedChannel | HostedCounter

@@ -8,8 +8,6 @@ from typing import Any, NoReturn
 from fiber.errors import NotInFiber
 
 _INSTEAD = {
-    "Condition": "use an Event, or a Queue that carries what is waited for",
-    "Barrier": "use a Semaphore for arrivals and an Event for the release",
     "Manager": "keep the object in one process and talk to it through a Pipe or Queue",
 }
 
