@@ -11,7 +11,8 @@ SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
 FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
 # What depends most on the interpreter: pickling, starting and ending processes, threads and locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback pool pool_deaths \
-	process queues reduction synchronize worker exit_functions) tests/faults/test_children.py
+	process queues reduction synchronize worker exit_functions futures) tests/faults/test_children.py \
+	tests/conformance/test_executors.py
 OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
@@ -26,7 +27,7 @@ demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
 ## make test          every test
-test: $(VENV)/.with-dev $(VENV)/.with-testsuite
+test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-testsuite
 	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
 	$(CLUSTER) prepare
 	$(FAST)
@@ -34,7 +35,7 @@ test: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation
-test-fast: $(VENV)/.with-dev
+test-fast: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3
 	$(FAST)
 
 ## make test-pythons  the essential tests on every other supported Python that is found here
@@ -68,9 +69,10 @@ bench-operator: $(VENV)/.with-dev
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
 
-## make conformance   CPython's own multiprocessing tests (BACKEND=local, loopback or kubernetes)
+## make conformance   CPython's tests of multiprocessing and executors (BACKEND=local, loopback or kubernetes)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(BIN)/python tests/conformance/run.py --backend $(BACKEND)
+	$(BIN)/python tests/conformance/executors.py --backend $(BACKEND)
 
 ## make crds          crds/fiberpools.yaml and the chart's copy, from the model
 crds: $(VENV)/.with-dev
@@ -107,6 +109,11 @@ $(VENV)/.with-dev: EXTRAS := dev,rl
 $(VENV)/.with-bench: EXTRAS := bench,rl
 $(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench: $(VENV)/.made pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
+	touch $@
+
+# Without torch, which it needs to learn and is larger than all else together.
+$(VENV)/.with-stable-baselines3: $(VENV)/.with-dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
 	touch $@
 
 $(VENV)/.with-testsuite: $(VENV)/.made

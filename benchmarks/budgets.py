@@ -122,6 +122,17 @@ def _pool() -> Iterator[Budget]:
     yield from _overhead()
     for case in throughput.ARRAY_KINDS:
         yield Budget(case, "throughput", case, throughput.TIME.name, 0.25)
+    for case, what in (("map, chunksize 1", "map"), ("apply_async", "submit")):
+        yield Budget(
+            f"fiber.Executor: no-op tasks, {what}",
+            "throughput",
+            case,
+            rate,
+            5,
+            at_least=True,
+            contender="fiber-executor",
+            against="concurrent.futures",
+        )
     case, what = throughput.LONG_NAME, "one 1 s task among 10,000 no-ops"
     yield Budget(what, "throughput", case, throughput.TIME.name, 1.03, unit="s")
 

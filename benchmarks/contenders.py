@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
+_EXECUTOR = frozenset({"map", "stream", "submit", "apply"})
 _PROCESSES = frozenset({"pipes", "start", "cold start"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
@@ -67,6 +68,15 @@ ALL = (
         environment={"FIBER_BACKEND": "loopback"},
     ),
     Contender(
+        "fiber-executor",
+        "fiber.Executor",
+        ("fiber",),
+        _EXECUTOR,
+        "#0072B2",
+        "v",
+        environment={"FIBER_BACKEND": "local"},
+    ),
+    Contender(
         "multiprocessing",
         "multiprocessing, fork",
         (),
@@ -86,7 +96,7 @@ ALL = (
         "concurrent.futures",
         "concurrent.futures",
         (),
-        frozenset({"map", "stream", "submit", "apply"}),
+        _EXECUTOR,
         "#999999",
         "v",
     ),
@@ -95,7 +105,7 @@ ALL = (
         "dask",
         "Dask",
         ("distributed", "dask.bag"),
-        frozenset({"map", "stream", "submit", "apply"}),
+        _EXECUTOR,
         "#E69F00",
         "<",
         servers=True,

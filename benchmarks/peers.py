@@ -87,10 +87,10 @@ class Ray(PoolAdapter):
 
 
 class Futures(Adapter):
-    """concurrent.futures: its default chunk is one item."""
+    """concurrent.futures' executor and what has its methods: the default chunk is one item."""
 
-    def __init__(self, workers: int) -> None:
-        self.executor = futures.ProcessPoolExecutor(workers)
+    def __init__(self, executor: futures.Executor) -> None:
+        self.executor = executor
 
     def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
         return list(self.executor.map(function, items, chunksize=chunksize or 1))
@@ -260,7 +260,8 @@ def processes_of(contender: str) -> Any:
 
 
 _ADAPTERS: dict[str, Callable[[int], Adapter]] = {
-    "concurrent.futures": Futures,
+    "concurrent.futures": lambda workers: Futures(futures.ProcessPoolExecutor(workers)),
+    "fiber-executor": lambda workers: Futures(import_module("fiber").Executor(workers)),
     "joblib": Joblib,
     "dask": Dask,
     "ipyparallel": IPyParallel,

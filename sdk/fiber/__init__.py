@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from fiber.errors import UnpicklableError as UnpicklableError
     from fiber.errors import VersionMismatch as VersionMismatch
     from fiber.errors import WorkerDied as WorkerDied
+    from fiber.futures import Executor as Executor
+    from fiber.managers import BaseManager as BaseManager
     from fiber.process import Process as Process
     from fiber.process import active_children as active_children
     from fiber.process import current_process as current_process
@@ -51,6 +53,7 @@ _SUBMODULES = frozenset(
         "cpu",
         "dummy",
         "errors",
+        "futures",
         "managers",
         "pool",
         "process",
@@ -64,6 +67,7 @@ _SUBMODULES = frozenset(
         "spawn",
         "synchronize",
         "util",
+        "vector",
     }
 )
 
@@ -105,10 +109,12 @@ _HOMES = {
     "AdoptionError": "errors",
     "AgentLost": "errors",
     "AuthenticationError": "errors",
+    "BaseManager": "managers",
     "BufferTooShort": "errors",
     "Config": "config",
     "ConfigError": "errors",
     "ConnectionClosed": "errors",
+    "Executor": "futures",
     "FiberError": "errors",
     "FiberPoolError": "errors",
     "FileTooLarge": "errors",

@@ -38,7 +38,7 @@ def _run(arguments: Sequence[str]) -> int:
         return 2
     # As process 1 of a container it does not get a SIGTERM that it has no handler for: the kernel
     # drops it, and a pod that is deleted just then ends by force, after its grace period.  One that
-    # is blocked waits.  So this comes before the imports, which take ten times what came so far.
+    # is blocked waits.  So this comes before the imports, which take most of the time.
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
     from fiber._agent.main import main
 

@@ -138,14 +138,9 @@ class Connection:
             return error
         for reference in reversed(self._other_given_to):
             process = reference()
-            popen = getattr(process, "_popen", None)
-            # The kernel closes what a process held moments before its parent hears of its death.
-            if popen is None:
-                continue
-            if popen.wait(_LAST_MOMENT) is None and _is_dead(popen.pid):
-                popen.wait(_NEWS)
-            if popen.report is not None:
-                return ConnectionClosed(process.name, popen.report.describe())
+            reason = how_it_ended(process)
+            if reason is not None:
+                return ConnectionClosed(process.name, reason)
         return error
 
     # The end itself
@@ -218,6 +213,17 @@ def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
     second = Connection(other, readable=duplex)
     first._other_given_to, second._other_given_to = second._given_to, first._given_to
     return first, second
+
+
+def how_it_ended(process: Any) -> str | None:
+    """How a process of ours, whose end of a connection has closed, ended; None if it has not."""
+    popen = getattr(process, "_popen", None)
+    if popen is None:
+        return None
+    # The kernel closes what a process held moments before its parent hears of its death.
+    if popen.wait(_LAST_MOMENT) is None and _is_dead(popen.pid):
+        popen.wait(_NEWS)
+    return None if popen.report is None else popen.report.describe()
 
 
 def _is_dead(pid: int | None) -> bool:

@@ -21,7 +21,6 @@ from multiprocessing.context import (
 from typing import TYPE_CHECKING, Any
 
 from fiber import config, cpu
-from fiber._hub.unsupported import unsupported
 from fiber._runtime import early, methods
 from fiber.process import ForkProcess, ForkServerProcess, Process, SpawnProcess
 
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     import logging
 
     from fiber.connection import Connection
+    from fiber.managers import SyncManager
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
     from fiber.synchronize import (
@@ -65,9 +65,6 @@ class BaseContext:
     TimeoutError = TimeoutError
     AuthenticationError = AuthenticationError
     Process: type[Process] = Process
-
-    # What multiprocessing has and Fiber has not yet: each says what to use instead.
-    Manager = staticmethod(unsupported("Manager"))
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)
@@ -201,6 +198,16 @@ class BaseContext:
 
         config.use()
         return RawArray(typecode_or_type, size_or_initializer)
+
+    # Managers
+
+    def Manager(self) -> SyncManager:
+        """A manager that is started, with all that multiprocessing's serves."""
+        from fiber.managers import SyncManager
+
+        manager = SyncManager(ctx=self.get_context())
+        manager.start()
+        return manager
 
     # Work
 

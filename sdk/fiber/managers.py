@@ -1,13 +1,19 @@
-"""multiprocessing's manager classes by name; Fiber runs no manager yet.
+"""Managers: multiprocessing's, whose server is a Fiber process and can be reached from any other.
 
-Programs may import, subclass and register as they do there; whoever makes a manager is refused.
-The classes of proxies, of which nothing makes one here, are multiprocessing's.
+The proxies, ``RemoteError``, ``Token`` and ``Namespace`` are multiprocessing's classes.
+
+Differs from multiprocessing in what becomes of a process that is killed: the objects that only it
+referred to go, the locks that it held are released, and whoever acquires one of these next gets a
+RuntimeWarning that names it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+import weakref
+from collections.abc import Callable, Iterable
 from multiprocessing import managers as mp_managers
+from multiprocessing.context import ProcessError
 from multiprocessing.managers import (
     BaseProxy,
     DictProxy,
@@ -17,9 +23,18 @@ from multiprocessing.managers import (
     Token,
     ValueProxy,
 )
+from multiprocessing.util import Finalize
 from typing import Any
 
-from fiber._hub.unsupported import refuse, unsupported
+from fiber._hub.unsupported import refuse
+from fiber._managers import SERIALIZER, client
+from fiber._managers.door import ManagerAddress
+from fiber._managers.rlock import RLock, condition
+from fiber._managers.server import Server
+from fiber._runtime.state import runtime
+from fiber.connection import Connection, Pipe
+from fiber.process import Process
+from fiber.resources import Resources, largest, merged, resources_of, with_resources
 
 __all__ = [
     "AcquirerProxy",
@@ -34,10 +49,10 @@ __all__ = [
     "IteratorProxy",
     "ListProxy",
     "MakeProxyType",
-    "Manager",
     "Namespace",
     "NamespaceProxy",
     "PoolProxy",
+    "ProcessError",
     "RemoteError",
     "SharedMemoryManager",
     "SyncManager",
@@ -45,37 +60,190 @@ __all__ = [
     "ValueProxy",
 ]
 
-Manager = unsupported("Manager")
+_mp: Any = mp_managers  # typeshed has part of it
+AcquirerProxy = _mp.AcquirerProxy
+ArrayProxy = _mp.ArrayProxy
+AutoProxy = _mp.AutoProxy
+BarrierProxy = _mp.BarrierProxy
+ConditionProxy = _mp.ConditionProxy
+EventProxy = _mp.EventProxy
+IteratorProxy = _mp.IteratorProxy
+MakeProxyType = _mp.MakeProxyType
+NamespaceProxy = _mp.NamespaceProxy
+PoolProxy = _mp.PoolProxy
+State = _mp.State
 
-_untyped: Any = mp_managers  # typeshed has part of it
-AcquirerProxy = _untyped.AcquirerProxy
-ArrayProxy = _untyped.ArrayProxy
-AutoProxy = _untyped.AutoProxy
-BarrierProxy = _untyped.BarrierProxy
-ConditionProxy = _untyped.ConditionProxy
-EventProxy = _untyped.EventProxy
-IteratorProxy = _untyped.IteratorProxy
-MakeProxyType = _untyped.MakeProxyType
-NamespaceProxy = _untyped.NamespaceProxy
-PoolProxy = _untyped.PoolProxy
+
+def _make_server(registry: Any, address: Any, authkey: bytes, serializer: str) -> Any:
+    kind = Server if serializer == SERIALIZER else _mp.Server
+    return kind(registry, address, authkey, serializer)
 
 
-class BaseManager:
-    """The name to subclass; making one raises an error that says what to use."""
+class BaseManager(_mp.BaseManager):  # type: ignore[misc]
+    """multiprocessing's, whose server runs in a Fiber process: on a cluster, in a pod.
 
-    def __init__(self, *_args: Any, **_options: Any) -> None:
-        refuse("Manager")
+    Without an ``address`` any process of the program can use the manager and its proxies, and
+    nobody else: ``address`` can be sent to one that should ``connect``.  With an address it is
+    multiprocessing's listener there, and other programs can ``connect`` with the same ``authkey``.
 
-    @classmethod
-    def register(
-        cls, typeid: str, callable: Callable[..., Any] | None = None, **_options: Any
+    What the process wishes of its host is what ``fiber.meta`` gave the class, and besides the most
+    of what it gave the registered callables.  ``pool`` is the FiberPool whose pods are meant.
+    """
+
+    _Server = staticmethod(_make_server)
+
+    def __init__(
+        self,
+        address: Any = None,
+        authkey: bytes | None = None,
+        serializer: str = "pickle",
+        ctx: Any = None,
+        *,
+        shutdown_timeout: float = 1.0,
+        pool: str | None = None,
     ) -> None:
-        """Accepted, so that modules which define managers can be imported."""
+        self._pool = pool
+        self._starting: Connection | None = None
+        self._session: client.Session | None = None
+        if serializer == "pickle" and (address is None or isinstance(address, ManagerAddress)):
+            serializer = SERIALIZER
+        super().__init__(address, authkey, serializer, ctx, shutdown_timeout=shutdown_timeout)
+        self._process_type = Process if ctx is None else ctx.Process
 
+    @property
+    def _address(self) -> Any:
+        self._wait_for_server()
+        return self._known_address
 
-class SyncManager(BaseManager):
-    """As ``BaseManager``."""
+    @_address.setter
+    def _address(self, address: Any) -> None:
+        self._known_address = address
+
+    def start(
+        self, initializer: Callable[..., object] | None = None, initargs: Iterable[Any] = ()
+    ) -> None:
+        """Start the server's process.
+
+        EOFError if its ``initializer`` raises.  On Kubernetes it does not wait for a pod that is
+        yet to be made: whoever uses the manager first does.
+        """
+        self._check_initial()
+        if initializer is not None and not callable(initializer):
+            raise TypeError("initializer must be a callable")
+        reader, writer = Pipe(duplex=False)
+        settings = self._registry, self._known_address, self._authkey, self._serializer
+        process = self._process_type(
+            target=with_resources(type(self)._run_server, self._wishes()),
+            args=(*settings, writer, initializer, tuple(initargs)),
+        )
+        ident = ":".join(str(number) for number in process._identity)
+        process.name = f"{type(self).__name__}-{ident}"
+        self._process = process
+        process.start()
+        writer.close()
+        self._starting = reader
+        self._state.value = State.STARTED
+        known: list[Any] = []
+        self._tell = known.append
+        self.shutdown = Finalize(
+            self,
+            type(self)._end,
+            args=(process, known, self._authkey, self._state, self._Client, self._shutdown_timeout),
+            exitpriority=0,
+        )
+        if not runtime().elastic:
+            self._wait_for_server()
+
+    def _wishes(self) -> Resources:
+        makers = [make for make, *_ in self._registry.values() if make is not None]
+        wishes = merged(largest(map(resources_of, makers)), resources_of(type(self)))
+        return merged(wishes, Resources(pool=self._pool))
+
+    def _wait_for_server(self) -> None:
+        if self._starting is None:
+            return
+        reader = self._starting
+        try:
+            address = reader.recv()
+        except EOFError:
+            self._process.join()
+            self._state.value = State.INITIAL
+            raise
+        self._known_address = address
+        self._starting = None
+        self._tell(address)
+        reader.close()
+        self._hold_session()
+
+    def _hold_session(self) -> None:
+        if self._serializer == SERIALIZER:
+            self._session = client.session(self._known_address)
+            process = getattr(self, "_process", None)
+            if process is not None:
+                self._session.process = weakref.ref(process)
+
+    def connect(self) -> None:
+        """Use a server that runs already, at the address that was given."""
+        super().connect()
+        self._hold_session()
+
+    def _create(self, typeid: str, /, *args: Any, **kwds: Any) -> tuple[Token, Any]:
+        token, exposed = super()._create(typeid, *args, **kwds)
+        if self._serializer == SERIALIZER:
+            token = client.TravellingToken(token.typeid, token.address, token.id)
+        return token, exposed
+
+    def get_server(self) -> Any:
+        """The server, to be run in this process: it has ``serve_forever`` and ``address``."""
+        self._check_initial()
+        return self._Server(self._registry, self._address, self._authkey, self._serializer)
+
+    def _check_initial(self) -> None:
+        state = self._state.value
+        if state == State.STARTED:
+            raise ProcessError("Already started server")
+        if state == State.SHUTDOWN:
+            raise ProcessError("Manager has shut down")
+
+    @staticmethod
+    def _end(process: Process, known: list[Any], *rest: Any) -> None:
+        """What ``shutdown`` does, and the program's end, and the garbage collector."""
+        if runtime().loop.on_thread():  # collected there: the loop must not wait for itself
+            threading.Thread(target=BaseManager._end, args=(process, known, *rest)).start()
+            return
+        address = known[0] if known else None
+        if address is None:
+            process.terminate()
+        _mp.BaseManager._finalize_manager(process, address, *rest)
+        if isinstance(address, ManagerAddress):
+            client.forget(address)
 
 
 class SharedMemoryManager(BaseManager):
-    """As ``BaseManager``."""
+    """The name to subclass; making one raises an error that says what to use."""
+
+    def __init__(self, *_args: Any, **_options: Any) -> None:
+        refuse("SharedMemoryManager")
+
+
+class SyncManager(BaseManager):
+    """A manager of lists, dicts, queues, locks and all else that multiprocessing registers."""
+
+
+def _pool(*args: Any, **options: Any) -> Any:
+    from fiber.pool import Pool
+
+    return Pool(*args, **options)
+
+
+_OURS = {"Condition": condition, "Pool": _pool, "RLock": RLock}
+
+for _typeid, (_callable, _exposed, _typeids, _proxytype) in _mp.SyncManager._registry.items():
+    SyncManager.register(
+        _typeid,
+        _OURS.get(_typeid, _callable),
+        _proxytype,
+        _exposed,
+        _typeids,
+        create_method=hasattr(_mp.SyncManager, _typeid),
+    )

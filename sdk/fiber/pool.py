@@ -36,6 +36,7 @@ from fiber.errors import FiberError, TimeoutError
 from fiber.process import PoolProcess, process_type
 from fiber.resources import Resources
 from fiber.results import (
+    SLICEABLE,
     ApplyResult,
     AsyncResult,
     IMapIterator,
@@ -55,11 +56,6 @@ __all__ = [
     "ThreadPool",
     "WorkerInfo",
 ]
-
-IDLE_TIMEOUT = 60.0
-"""Seconds after which a worker above ``min_workers`` that has nothing to do leaves."""
-
-_SLICEABLE = (tuple, range, str, bytes)
 
 _Function = Callable[..., Any]
 _Callback = Callable[[Any], object]
@@ -102,7 +98,7 @@ class Pool:
         retry_exceptions: type[BaseException] | Sequence[type[BaseException]] = (),
         error_handling: bool = False,
         task_timeout: float | None = None,
-        idle_timeout: float | None = IDLE_TIMEOUT,
+        idle_timeout: float | None = options.IDLE_TIMEOUT,
         pool: str | None = None,
     ) -> None:
         minimum, maximum = options.sizes(processes, min_workers, max_workers)
@@ -316,7 +312,7 @@ class Pool:
         item = self._item(kind, func, result, chunksize, timeout)
         if item is not None:
             try:
-                if isinstance(iterable, (*_SLICEABLE, list)) or self._maxtasksperchild is not None:
+                if isinstance(iterable, (*SLICEABLE, list)) or self._maxtasksperchild is not None:
                     self._submit(item, iterable, chunksize)
                 else:
                     stream = self._executor.open_stream(item)
@@ -352,23 +348,10 @@ class Pool:
         buffersize: int | None,
     ) -> IMapIterator:
         buffersize = options.buffersize(buffersize)
-        buffer, executor = iterator._buffer, self._executor
-        item = self._item(work.MAP, func, buffer, options.chunksize(chunksize), timeout)
-        if item is None:
-            return iterator
-        buffer.resume = partial(executor.resume, item)
-        if buffersize is None and isinstance(iterable, (*_SLICEABLE, list)):
-            self._submit(item, iterable, chunksize)
-            return iterator
-        try:
-            stream = executor.open_stream(item, buffersize, buffer.consumed)
-            if buffersize is not None:
-                buffer.stream = stream
-                iterator._cancel = partial(executor.cancel, item)
-            executor.read(item, iterable)
-        except BaseException:  # a stream that nobody reads would be waited for
-            executor.cancel(item)
-            raise
+        chunksize = options.chunksize(chunksize)
+        item = self._item(work.MAP, func, iterator._buffer, chunksize, timeout)
+        if item is not None:
+            iterator._begin(self._executor, item, iterable, buffersize)
         return iterator
 
     def _item(
@@ -399,7 +382,7 @@ class Pool:
 
     def _submit(self, item: WorkItem, iterable: Iterable[Any], chunksize: int | None) -> None:
         try:
-            tasks = iterable if isinstance(iterable, _SLICEABLE) else tuple(iterable)
+            tasks = iterable if isinstance(iterable, SLICEABLE) else tuple(iterable)
         except Exception as error:
             if not hasattr(iterable, "__len__") or item.future is None:
                 raise
@@ -423,11 +406,7 @@ class Pool:
             return False
 
     def _check_may_wait(self) -> None:
-        if self._executor.pickles_here():
-            raise RuntimeError(
-                "what a pool pickles for its workers cannot wait for the same pool, which would "
-                "wait for the pickle: get the result before the map, or in the task"
-            )
+        self._executor.check_may_wait()
 
     # The pool itself
 

@@ -65,13 +65,14 @@ class Process(BaseProcess):
 
     def start(self) -> None:
         """Start it; returns when it has a pid, or waits for a pod that is yet to be made."""
+        from fiber._runtime.methods import check_main
+
         self._check_closed()  # type: ignore[attr-defined]
         assert self.pid is None, "cannot start a process twice"
         assert self._parent_pid == os.getpid(), (  # type: ignore[attr-defined]
             "can only start a process object created by current process"
         )
-        if getattr(current_process(), "_inheriting", False):
-            raise RuntimeError(UNGUARDED_MAIN)
+        check_main()
         _drop_ended()
         popen: Any = None
         try:
@@ -161,13 +162,3 @@ def _disown() -> None:
 
 
 os.register_at_fork(after_in_child=_disown)
-
-UNGUARDED_MAIN = """\
-a process was started while its own parent's main module was being imported.
-
-The program starts processes at the top level of its main module, and each of them imports that
-module first. Put what starts processes under
-
-    if __name__ == "__main__":
-        ...
-"""

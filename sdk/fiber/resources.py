@@ -7,13 +7,15 @@ import math
 import re
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-__all__ = ["Resources", "merged", "meta", "resources_of", "with_resources"]
+__all__ = ["Resources", "largest", "merged", "meta", "resources_of", "wished", "with_resources"]
 
 _ATTRIBUTE = "__fiber_meta__"
+_RUN_BY_A_MANAGER = "_run_server"
+"""What a manager's class has in multiprocessing: the function that is run in its process."""
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -45,12 +47,19 @@ def meta(
     fiber.meta(cpu=8)(f)` may be used side by side. Wishes for a function that has some are
     added to them, the outer ones winning. What is returned behaves and pickles like the
     original.
+
+    A manager's class may be given wishes too: they are those of the process that serves it.
     """
-    wishes = Resources(cpu=_cpu(cpu), memory=_memory(memory), gpu=_gpu(gpu))
+    wishes = wished("fiber.meta", cpu, memory, gpu)
     if wishes == Resources():
         raise TypeError("fiber.meta() needs at least one of cpu=, memory= and gpu=")
 
     def decorate(function: _F) -> _F:
+        if isinstance(function, type) and hasattr(function, _RUN_BY_A_MANAGER):
+            attributes = {_ATTRIBUTE: merged(resources_of(function), wishes)}
+            for name in ("__module__", "__qualname__", "__doc__"):
+                attributes[name] = getattr(function, name)
+            return type(function)(function.__name__, (function,), attributes)
         if isinstance(function, type) or not callable(function):
             raise TypeError(
                 f"fiber.meta() is for functions, not for {function!r}: "
@@ -60,6 +69,13 @@ def meta(
         return result
 
     return decorate
+
+
+def wished(
+    where: str, cpu: float | str | None, memory: int | str | None, gpu: int | None
+) -> Resources:
+    """Wishes as a person spells them, see ``meta``; ``where`` is what errors call the place."""
+    return Resources(cpu=_cpu(cpu, where), memory=_memory(memory, where), gpu=_gpu(gpu, where))
 
 
 def resources_of(function: Callable[..., Any]) -> Resources:
@@ -74,6 +90,16 @@ def with_resources(function: _F, wishes: Resources) -> _F:
     """`function` with these wishes, for whoever has them in hand."""
     result: _F = function if wishes == Resources() else _attach(function, wishes)
     return result
+
+
+def largest(wishes: Iterable[Resources]) -> Resources:
+    """Of each the most that any of them wishes; they have no pool."""
+    most: dict[str, Any] = {}
+    for one in wishes:
+        for name in ("cpu", "memory", "gpu"):
+            asked = [wish for wish in (most.get(name), getattr(one, name)) if wish is not None]
+            most[name] = max(asked, default=None)
+    return Resources(**most)
 
 
 def merged(inner: Resources, outer: Resources) -> Resources:
@@ -157,7 +183,7 @@ class _FunctionWithWishes:
 # ---- reading --------------------------------------------------------------------------------
 
 
-def _cpu(value: float | str | None) -> float | None:
+def _cpu(value: float | str | None, where: str) -> float | None:
     if value is None:
         return None
     number: object = value
@@ -165,13 +191,13 @@ def _cpu(value: float | str | None) -> float | None:
         number = float(match[1]) / (1000 if match[2] else 1)
     if isinstance(number, int | float) and not isinstance(number, bool) and 0 < number < math.inf:
         return float(number)
-    raise ValueError(f"fiber.meta(cpu={value!r}): expected CPUs above 0, as 2, 0.5 or '500m'")
+    raise ValueError(f"{where}(cpu={value!r}): expected CPUs above 0, as 2, 0.5 or '500m'")
 
 
 _MIB_PER_UNIT = {"Mi": 1, "Gi": 1024, "Ti": 1024 * 1024}
 
 
-def _memory(value: int | str | None) -> int | None:
+def _memory(value: int | str | None, where: str) -> int | None:
     if value is None:
         return None
     number: object = value
@@ -180,15 +206,15 @@ def _memory(value: int | str | None) -> int | None:
     if isinstance(number, int) and not isinstance(number, bool) and number > 0:
         return number
     raise ValueError(
-        f"fiber.meta(memory={value!r}): expected MiB above 0 as a whole number, "
+        f"{where}(memory={value!r}): expected MiB above 0 as a whole number, "
         "or a text with unit Mi, Gi or Ti, as '512Mi' or '2Gi'"
     )
 
 
-def _gpu(value: int | None) -> int | None:
+def _gpu(value: int | None, where: str) -> int | None:
     if value is None:
         return None
     number: object = value
     if isinstance(number, int) and not isinstance(number, bool) and number >= 0:
         return number
-    raise ValueError(f"fiber.meta(gpu={value!r}): expected a whole number, 0 or more")
+    raise ValueError(f"{where}(gpu={value!r}): expected a whole number, 0 or more")

@@ -11,27 +11,37 @@ import threading
 import time
 import types
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from multiprocessing import TimeoutError
 from typing import Any, Protocol
 
+from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.latch import Latch, Waiters, acquire
 from fiber._runtime.outcome import Failure, Pickled, decode, is_failure
+from fiber._runtime.work_items import WorkItem
 
 __all__ = ["ApplyResult", "AsyncResult", "IMapIterator", "IMapUnorderedIterator", "MapResult"]
+
+SLICEABLE = (tuple, range, str, bytes)
+"""What is mapped as it is: nobody changes it, and parts of it are cheap."""
 
 _Callback = Callable[[Any], object]
 
 
-class Owner(Protocol):
-    """What a result needs of its pool, which it keeps while there is something to wait for."""
-
-    def _call_back(self, action: Callable[[], None]) -> bool:
-        """Have a callback run; False if none runs any more."""
+class Keeper(Protocol):
+    """What an iterator needs of its pool, which it keeps while there is something to wait for."""
 
     def _check_may_wait(self) -> None:
         """RuntimeError where a result would wait for whoever waits for it."""
+
+
+class Owner(Keeper, Protocol):
+    """What a result needs of it."""
+
+    def _call_back(self, action: Callable[[], None]) -> bool:
+        """Have a callback run; False if none runs any more."""
 
 
 class ApplyResult:
@@ -139,7 +149,7 @@ class ApplyResult:
 AsyncResult = ApplyResult
 
 
-def _check_may_wait(pool: Owner | None, timeout: float | None) -> None:
+def _check_may_wait(pool: Keeper | None, timeout: float | None) -> None:
     if pool is not None and (timeout is None or timeout > 0):
         pool._check_may_wait()
 
@@ -208,12 +218,12 @@ them.  Then no more tasks are begun until half of the results are read."""
 class _Buffer:
     """Results on their way to an iterator: what the executor fills and the iterator empties."""
 
-    def __init__(self, pool: Owner) -> None:
+    def __init__(self, pool: Keeper) -> None:
         self.items: deque[Any] = deque()
         self.finished = False
         self.stream: InputStream | None = None
         """What reads no more than is consumed, if that was asked for."""
-        self.pool: Owner | None = pool
+        self.pool: Keeper | None = pool
         self.resume: Callable[[], None] | None = None
         """Has the executor look whether there is room, after ``add_results`` asked for no more."""
         self._waiters = Waiters()
@@ -333,7 +343,7 @@ class _Buffer:
 
 
 class _OrderedBuffer(_Buffer):
-    def __init__(self, pool: Owner) -> None:
+    def __init__(self, pool: Keeper) -> None:
         super().__init__(pool)
         self._early: dict[int, tuple[list[Any], int]] = {}
 
@@ -354,7 +364,7 @@ class IMapIterator:
     _buffer_type: type[_Buffer] = _OrderedBuffer
     _cancel: Callable[[], None] | None = None
 
-    def __init__(self, pool: Owner) -> None:
+    def __init__(self, pool: Keeper) -> None:
         self._buffer = self._buffer_type(pool)
 
     def __iter__(self) -> Iterator[Any]:
@@ -362,19 +372,42 @@ class IMapIterator:
 
     def next(self, timeout: float | None = None) -> Any:
         """The next result; TimeoutError if it takes longer than ``timeout`` seconds."""
+        outcome = self._take(timeout)
+        if type(outcome) is Failure:
+            raise outcome.error
+        return outcome
+
+    __next__ = next
+
+    def _take(self, timeout: float | None) -> Any:
+        """The next result or Failure; what is raised is not a task's."""
         buffer = self._buffer
         try:
             outcome = buffer.items.popleft()
         except IndexError:
             outcome = buffer.wait(timeout)
         buffer.ask()
-        if type(outcome) is Pickled:
-            outcome = outcome.decode()
-        if type(outcome) is Failure:
-            raise outcome.error
-        return outcome
+        return outcome.decode() if type(outcome) is Pickled else outcome
 
-    __next__ = next
+    def _begin(
+        self, executor: Executor, item: WorkItem, iterable: Iterable[Any], buffersize: int | None
+    ) -> None:
+        """Have ``item``, whose future the buffer is, map ``iterable``."""
+        buffer = self._buffer
+        buffer.resume = partial(executor.resume, item)
+        if buffersize is None and isinstance(iterable, (*SLICEABLE, list)):
+            tasks = tuple(iterable) if isinstance(iterable, list) else iterable
+            executor.submit(item, tasks)
+            return
+        try:
+            stream = executor.open_stream(item, buffersize, buffer.consumed)
+            if buffersize is not None:
+                buffer.stream = stream
+                self._cancel = partial(executor.cancel, item)
+            executor.read(item, iterable)
+        except BaseException:  # a stream that nobody reads would be waited for
+            executor.cancel(item)
+            raise
 
     def __del__(self) -> None:
         buffer: _Buffer | None = getattr(self, "_buffer", None)

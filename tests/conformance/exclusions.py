@@ -6,10 +6,6 @@ list says what is so.
 
 from __future__ import annotations
 
-_MANAGERS = {
-    f"TestInitializers.test_{name}_initializer": "its set-up makes a manager: not in Fiber yet"
-    for name in ("manager", "pool")
-}
 _MEMORY_MANAGERS = {
     f"WithProcessesTestSharedMemory.test_shared_memory_{name}": "SharedMemoryManager: not yet"
     for name in ("SharedMemoryManager_basics", "SharedMemoryServer_ignores_sigint")
@@ -50,7 +46,45 @@ _ONE_HOST = {
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
-    "local": {**_MANAGERS, **_MEMORY_MANAGERS, **_CLOSED_AT_ONCE},
-    "loopback": {**_MANAGERS, **_CLOSED_AT_ONCE, **_ONE_HOST},
-    "kubernetes": {**_MANAGERS, **_CLOSED_AT_ONCE, **_ONE_HOST},
+    "local": {**_MEMORY_MANAGERS, **_CLOSED_AT_ONCE},
+    "loopback": {**_CLOSED_AT_ONCE, **_ONE_HOST},
+    "kubernetes": {**_CLOSED_AT_ONCE, **_ONE_HOST},
+}
+
+_CONCERNS_ONE_TASK = "concerns one task, which gets the error itself: the executor is not broken"
+_DOES_NOT_PICKLE = "a result that does not pickle is a MaybeEncodingError, as for a pool"
+
+_EXECUTORS = {
+    "ExecutorDeadlockTest.test_error_at_task_unpickle": _CONCERNS_ONE_TASK,
+    "ExecutorDeadlockTest.test_exit_at_task_unpickle": _CONCERNS_ONE_TASK,
+    "ExecutorDeadlockTest.test_error_during_result_pickle_on_worker": _DOES_NOT_PICKLE,
+    "ExecutorDeadlockTest.test_exit_during_result_pickle_on_worker": _DOES_NOT_PICKLE,
+    "ExecutorDeadlockTest.test_error_during_result_unpickle_in_result_handler": _DOES_NOT_PICKLE,
+    "ExecutorDeadlockTest.test_exit_during_result_unpickle_in_result_handler": _DOES_NOT_PICKLE,
+    "FailingInitializerMixin.test_initializer": (
+        "what the initializer raised is told by the error, not by a log of the worker"
+    ),
+    "ProcessPoolExecutorTest.test_killed_child": "a task whose worker dies runs again elsewhere",
+    "ProcessPoolExecutorTest.test_max_tasks_per_child_defaults_to_spawn_context": "_mp_context",
+    "ProcessPoolExecutorTest.test_python_finalization_error": "no thread starts that could fail",
+    "ProcessPoolExecutorTest.test_traceback": (
+        "the cause is multiprocessing's RemoteTraceback, not that of concurrent.futures"
+    ),
+}
+_ELSEWHERE = {
+    "ProcessPoolShutdownTest.test_interpreter_shutdown": (
+        "what a worker on another host writes comes on stderr, with its name before it"
+    ),
+}
+_ONE_PORT = {
+    "ProcessPoolShutdownTest.test_submit_after_interpreter_shutdown": (
+        "starts another program, and the one port that is reserved for programs is taken"
+    ),
+}
+
+# Of process pool executors: backend -> id of the test -> reason
+EXECUTORS: dict[str, dict[str, str]] = {
+    "local": _EXECUTORS,
+    "loopback": {**_EXECUTORS, **_ELSEWHERE},
+    "kubernetes": {**_EXECUTORS, **_ELSEWHERE, **_ONE_PORT},
 }

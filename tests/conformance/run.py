@@ -54,6 +54,11 @@ CLASSES = (
     "TestArray",
     "TestSharedCTypes",
     "TestSharedMemory",
+    "TestListener",
+    "TestListenerClient",
+    "OtherTest",
+    "TestSyncManagerTypes",
+    "TestManagerRestart",
 )
 # An agent on another host cannot share a pid or a file with the master.
 TIERS = {"local": ("core", "local"), "loopback": ("core",), "kubernetes": ("core",)}
@@ -100,7 +105,9 @@ def select(target: Target, substring: str = "") -> tuple[list[list[str]], dict[s
     left_out: dict[str, str] = {}
     for case in list_cases(target):
         id_ = f"{case['class_name']}.{case['method']}"
-        wanted = case["base_name"] in CLASSES and case["type"] in ("processes", None)
+        wanted = case["type"] == "manager" or (
+            case["base_name"] in CLASSES and case["type"] in ("processes", None)
+        )
         if not wanted or substring not in id_:
             continue
         if case["tier"] in target.tiers:

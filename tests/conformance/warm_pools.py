@@ -37,7 +37,7 @@ PODS = 4  # of each pool
 PROCESSES = 16  # of each pod: no test waits for room
 READY = 180.0  # seconds until all pods of a pool are there: an image may have to be pulled
 _LOOK = 0.05  # seconds between two looks at a pool
-_SUPPORT = ("__init__.py", "_test_multiprocessing.py", "support")
+_SUPPORT = ("__init__.py", "_test_multiprocessing.py", "support", "test_concurrent_futures*")
 
 
 @contextmanager
@@ -181,8 +181,9 @@ def _cpython_tests(folder: Path) -> Path:
     assert spec is not None
     assert spec.origin is not None
     (folder / "test").mkdir(parents=True)
-    for name in _SUPPORT:
-        source, copy = Path(spec.origin).parent / name, folder / "test" / name
+    tests = Path(spec.origin).parent
+    for source in itertools.chain.from_iterable(map(tests.glob, _SUPPORT)):
+        copy = folder / "test" / source.name
         if source.is_dir():
             shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
         else:

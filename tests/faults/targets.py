@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -169,3 +170,68 @@ def echo_bytes(connection: Any) -> None:
         except EOFError:
             return
         connection.send_bytes(message)
+
+
+def obey(orders: Any) -> None:
+    """Do what comes by a manager's queue, until killed."""
+    kept = []
+    while True:
+        method, args = orders.get()
+        kept.append(args)  # proxies live on
+        ORDERS[method](*args)
+
+
+def _acquire(lock: Any, done: Any) -> None:
+    lock.acquire()
+    done.set()
+
+
+def _queue_up(lock: Any, begun: Any) -> None:
+    begun.set()
+    lock.acquire()
+
+
+def _get(queue: Any, begun: Any) -> None:
+    begun.set()
+    queue.get()
+
+
+def _wait(barrier: Any) -> None:
+    barrier.wait()
+
+
+def _wait_notified(condition: Any, begun: Any) -> None:
+    with condition:
+        begun.set()
+        condition.wait()
+
+
+def _make(address: Any, proxies: Any) -> None:
+    from fiber.managers import SyncManager
+
+    manager = SyncManager(address)
+    manager.connect()
+    made = manager.list(["made"])
+    proxies.put(made)
+    block()
+
+
+ORDERS: dict[str, Callable[..., None]] = {
+    "acquire": _acquire,
+    "get": _get,
+    "make": _make,
+    "queue_up": _queue_up,
+    "wait": _wait,
+    "wait_notified": _wait_notified,
+}
+
+
+def touch_until_it_fails(shared: Any, connection: Any) -> None:
+    """Use a proxy until it raises, and send what it raised."""
+    shared.append(1)
+    connection.send("touched")
+    try:
+        while True:
+            len(shared)
+    except Exception as error:
+        connection.send(f"{type(error).__name__}: {error}")

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import pytest
@@ -138,6 +139,31 @@ def test_functions_that_wish_for_more_run_in_pods_of_their_own(cluster: FakeClus
             "None",
             "{'cpu': '500m', 'memory': '64Mi'}",
         }
+
+
+def test_an_executors_tasks_run_in_pods_as_their_options_say(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"), fiber.Executor(1) as executor:
+        large = executor.options(cpu=0.5, memory="64Mi")
+        pod, other = executor.submit(own_pod).result(PATIENCE), large.submit(own_pod)
+        assert {pod, other.result(PATIENCE)} == set(pods_of(cluster))
+        assert pod != other.result()
+        assert set(large.map(own_pod, range(5))) == {other.result()}
+        templates = [pool["spec"]["template"] for pool in cluster.objects("fiberpools")]
+        workers = [template["spec"]["containers"][0] for template in templates]
+        assert {"cpu": "500m", "memory": "64Mi"} in [
+            worker.get("resources", {}).get("limits") for worker in workers
+        ]
+
+
+def test_an_executors_task_that_dies_with_its_pod_says_so(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"), fiber.Executor(1) as executor:
+        pod = executor.submit(own_pod).result(PATIENCE)
+        future = executor.options(retries=0).submit(time.sleep, PATIENCE)
+        cluster.wait(future.running)
+        cluster.do(cluster.nodes.kill, pod)
+        with pytest.raises(BrokenProcessPool, match="OOMKilled") as caught:
+            future.result(PATIENCE)
+        assert isinstance(caught.value, WorkerDied)
 
 
 def test_processes_and_pipes(cluster: FakeCluster) -> None:

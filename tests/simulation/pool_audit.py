@@ -19,7 +19,8 @@ from fiber._engine.worker_set import (
     Member,
     StartFailure,
 )
-from fiber._runtime.executor import TICK, Executor
+from fiber._runtime.executor import Executor
+from fiber._runtime.host import TICK
 from fiber._runtime.input_stream import AHEAD, InputStream
 from fiber._runtime.work_items import WorkItem
 from simulation.oracle import require
@@ -272,7 +273,7 @@ class PoolAudit:
             executor._sender._deadlines,
             executor._sender._unsent,
             executor._jobs._streams,
-            executor._called,
+            *(queue.called for queue in executor.calls._queues),
             executor._exits,
             executor._receiver._last_words,
             executor._leases._lent,

@@ -11,6 +11,7 @@ from fiber._engine import worker_set
 from fiber._engine.ledger import Batch, Job, Loss, Receipt, Worker
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import Member, StartFailure
+from fiber._runtime.calls import CallQueue, Calls
 from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.jobs import Jobs
@@ -216,13 +217,13 @@ def holds_nothing_back(patch: Patch) -> None:
 def acts_later(patch: Patch) -> None:
     """Feeds calls, and leaves it to whatever happens next to give them out."""
 
-    def _take_calls(self: Executor) -> None:
-        self._acting = True
-        real(self)
-        self._acting = False
+    def _take(self: Calls, queue: CallQueue) -> None:
+        advance, self._advance = self._advance, lambda: None
+        real(self, queue)
+        self._advance = advance
 
-    real = Executor._take_calls
-    patch.setattr(Executor, "_take_calls", _take_calls)
+    real = Calls._take
+    patch.setattr(Calls, "_take", _take)
 
 
 def lends_what_is_needed(patch: Patch) -> None:

@@ -103,10 +103,10 @@ class Site:
         )
         return self.made
 
-    def start(self) -> tuple[RemoteChild, Owner]:
+    def start(self, *, worker: bool = False) -> tuple[RemoteChild, Owner]:
         owner: Any = Owner(self.said)
         spec = ChildSpec(
-            name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=False
+            name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=worker
         )
         child = self.made.agents.child(spec, owner)
         self.loop.call_soon(child.start)
@@ -292,3 +292,41 @@ def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> Non
     assert agent._link is second  # type: ignore[comparison-overlap]
     assert pods._given_up == set()
     pods.close()
+
+
+@pytest.mark.parametrize(
+    ("worker", "told"),
+    [
+        (False, ["fiber: waiting for pods: 1 of 2 pods ready: QuotaExceeded: it is full"]),
+        (True, []),
+    ],
+    ids=["process", "pool"],
+)
+def test_a_process_that_waits_for_one_more_pod_is_told_what_for(
+    worker: bool, told: list[str], site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pool works with what it has; nothing else can do what a process is to do."""
+    monkeypatch.setattr(progress, "_FIRST_WRITTEN", 0.0)
+    pods = site.pods(until_the_end)
+    full = {"reason": "QuotaExceeded", "severity": "Error", "message": "it is full"}
+    status = {"observedGeneration": 1, "desiredReplicas": 2, "readyReplicas": 1}
+
+    def begin() -> None:
+        pods.on_agent(Dialled("es-1-a"))  # type: ignore[arg-type]
+        pods.on_attached()
+        pods.on_status({**status, "problems": [full]})
+
+    site.loop.call_soon(begin)
+    for _ in range(2):
+        site.start(worker=worker)
+    settled(site)
+    assert site.said.lines[1:] == told  # after the problem itself
+    pods.close()
+
+
+def settled(site: Site) -> None:
+    """Wait until what was asked of the loop is done, with what follows, timers of 0 s too."""
+    for _ in range(5):
+        done = threading.Event()
+        site.loop.call_later(0.0, done.set)
+        assert done.wait(PATIENCE)

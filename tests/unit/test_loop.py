@@ -155,6 +155,33 @@ def test_what_was_asked_for_before_something_happened_is_done_first(
     assert seen == ["expected", "happened"]
 
 
+def test_of_many_descriptors_a_few_are_looked_at_at_a_time_and_each_gets_its_turn(
+    loop: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop_module, "_EVENTS", 2)
+    readable = [os.eventfd(1) for _ in range(6)]
+    calls: list[object] = []
+    all_called = threading.Event()
+
+    def call(fd: int) -> None:
+        if not calls:
+            loop.call_soon(calls.append, "asked for meanwhile")
+        calls.append(fd)
+        if set(readable) <= set(calls):
+            all_called.set()
+
+    def all_ready() -> None:
+        for fd in readable:
+            loop.register(fd, lambda fd=fd: call(fd))
+
+    loop.call_soon(all_ready)  # on its thread, so that one poll could see them all
+    assert all_called.wait(PATIENCE)
+    for fd in readable:
+        loop.unregister(fd)
+        os.close(fd)
+    assert calls.index("asked for meanwhile") <= 2
+
+
 def test_a_writer_is_called_until_it_is_taken_back(loop: Loop, pipe: tuple[int, int]) -> None:
     calls: list[int] = []
     enough = threading.Event()

@@ -74,7 +74,7 @@ def stop(*children: Any) -> None:
 
 def test_processes_go_to_the_agent_that_has_the_fewest(shared: Any) -> None:
     children = [start() for _ in range(3)]
-    counts = sorted(shared.agents._placement.loads.values())
+    counts = sorted(shared.agents.placement.loads.values())
     assert counts == [1, 2]
     stop(*children)
 

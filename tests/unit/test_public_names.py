@@ -97,11 +97,11 @@ def test_classes_serve_in_annotations_and_isinstance(name: str) -> None:
 
 
 def test_whoever_makes_an_object_that_is_not_there_is_told_what_to_use() -> None:
-    class Own(fiber.synchronize.Barrier):
+    class Own(fiber.managers.SharedMemoryManager):
         pass
 
-    for make in (Own, fiber.synchronize.Barrier, fiber.Barrier, fiber.get_context("spawn").Barrier):
-        with pytest.raises(fiber.NotInFiber, match=r"no Barrier yet.*Semaphore"):
+    for make in (Own, fiber.managers.SharedMemoryManager):
+        with pytest.raises(fiber.NotInFiber, match=r"no SharedMemoryManager yet.*SharedMemory"):
             make()
 
 

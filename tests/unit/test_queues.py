@@ -17,7 +17,6 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
-from fiber.errors import NotInFiber
 
 MORE_THAN_FITS = 3000
 """Items that no socket's buffer holds."""
@@ -474,17 +473,3 @@ def test_a_simple_queue_among_processes() -> None:
         assert back.get() == item
     there.put(None)
     process.join(PATIENCE)
-
-
-# What is not there
-
-
-def test_managers_can_be_defined_but_not_made() -> None:
-    from fiber import managers
-
-    class Manager(managers.BaseManager):
-        pass
-
-    Manager.register("Thing", callable=dict)
-    with pytest.raises(NotInFiber, match="no Manager yet"):
-        Manager()

@@ -32,13 +32,14 @@ class AgentSet:
         on_lost: Callable[[RemoteAgent, str], None] = lambda agent, reason: None,
     ) -> None:
         self.loop = loop
+        self.placement = placement
+        """Which of them runs which child."""
         self.agents: dict[str, RemoteAgent] = {}
         """Those that have joined and are not lost, by name."""
         self.error: Exception | None = None
         """Why no agent will come."""
         self._hub = hub
         self._output = output
-        self._placement = placement
         self._on_change = on_change
         self._on_lost = on_lost
         self._not_started: weakref.WeakSet[RemoteChild] = weakref.WeakSet()
@@ -46,7 +47,7 @@ class AgentSet:
     @property
     def children(self) -> int:
         """How many there are, waiting and about to be started ones included."""
-        placement = self._placement
+        placement = self.placement
         return placement.children + len(placement.waiting) + len(self._not_started)
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
@@ -58,15 +59,15 @@ class AgentSet:
     def start(self, child: RemoteChild) -> None:
         """Give it an agent, now or as soon as there is room."""
         self._not_started.discard(child)
-        if self.error is not None and not self._placement.loads:
+        if self.error is not None and not self.placement.loads:
             _refuse(child, self.error)
             return
-        self._placement.wait(child)
+        self.placement.wait(child)
         self._place()
 
     def withdraw(self, child: RemoteChild) -> bool:
         """It is not to be started any more; False if it has an agent already."""
-        waited = self._placement.leave(child)
+        waited = self.placement.leave(child)
         if waited:
             self._on_change()
         return waited
@@ -76,7 +77,7 @@ class AgentSet:
         agent = RemoteAgent(host, link, self.loop, self._hub, self._output, self)
         self.agents[host] = agent
         self.error = None
-        self._placement.add(agent, self.loop.now())
+        self.placement.add(agent, self.loop.now())
         link.attach(agent)
         self._place()
         return agent
@@ -84,19 +85,19 @@ class AgentSet:
     def fail(self, error: Exception) -> None:
         """No agent will come: if there is none, nobody has to wait."""
         self.error = error
-        if not self._placement.loads:
+        if not self.placement.loads:
             self.refuse_waiting(error)
 
     def refuse_waiting(self, error: Exception) -> None:
         """Nobody is to wait any longer."""
-        waiting = list(self._placement.waiting)
-        self._placement.waiting.clear()
+        waiting = list(self.placement.waiting)
+        self.placement.waiting.clear()
         for child in waiting:
             _refuse(child, error)
         self._on_change()
 
     def _place(self) -> None:
-        while (placed := self._placement.place()) is not None:
+        while (placed := self.placement.place()) is not None:
             child, agent = placed
             agent.start(child)
         self._on_change()
@@ -106,18 +107,18 @@ class AgentSet:
     def lost(self, agent: RemoteAgent, reason: str) -> None:
         """It is gone."""
         del self.agents[agent.host]
-        if agent in self._placement.loads:
-            self._placement.remove(agent)
+        if agent in self.placement.loads:
+            self.placement.remove(agent)
         self._on_lost(agent, reason)
-        if self.error is not None and not self._placement.loads:
+        if self.error is not None and not self.placement.loads:
             self.refuse_waiting(self.error)  # they waited for room that it would have had
         else:
             self._on_change()
 
     def child_gone(self, agent: RemoteAgent) -> None:
         """There is room for another."""
-        if agent in self._placement.loads:
-            self._placement.ended(agent, self.loop.now())
+        if agent in self.placement.loads:
+            self.placement.ended(agent, self.loop.now())
             self._place()
 
     def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
@@ -126,12 +127,12 @@ class AgentSet:
 
     def withhold(self, agent: RemoteAgent, withheld: bool, why: str) -> None:
         """Whether it is given no children for this reason."""
-        if agent not in self._placement.loads:
+        if agent not in self.placement.loads:
             return
         if withheld:
-            self._placement.withhold(agent, why)
+            self.placement.withhold(agent, why)
         else:
-            self._placement.restore(agent, why)
+            self.placement.restore(agent, why)
         self._place()
 
 

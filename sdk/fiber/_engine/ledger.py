@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from fiber._engine.chunks import Pace
@@ -450,6 +450,18 @@ class Ledger:
                 self._return(batch.job, batch.rest())
         if len(worker.queue) > 1:
             self._load.sort(worker)
+
+    def drop_waiting(self, job: Job, wanted: Callable[[Any], bool]) -> None:
+        """Tasks that wait and are not ``wanted`` any more are done by that."""
+        waiting, job.waiting = job.waiting, Waiting()
+        while waiting:
+            span = waiting.take(len(waiting))
+            kept = [at for at, item in enumerate(span.items, span.start) if wanted(item)]
+            self._did(job, len(span.items) - len(kept))
+            whole = len(kept) == len(span.items)
+            for part in [span] if whole else [span.part(at, at + 1) for at in kept]:
+                job.waiting.append(part)
+        self._finish(job)
 
     def split(self, seq: int, now: float) -> Receipt | None:
         """The worker cannot read the message: send its tasks again, one by one.

@@ -167,16 +167,21 @@ class GrantSet:
     Otherwise each also ends with its first use, as what is given to a new process.
     """
 
-    __slots__ = ("_direct", "_reusable", "_streams")
+    __slots__ = ("_direct", "_kept", "_reusable", "_streams")
 
     def __init__(self, *, reusable: bool = True) -> None:
         self._reusable = reusable
         self._direct: dict[Registry, list[int]] = {}
         self._streams: dict[HubAddress, HubStream] = {}
+        self._kept: list[object] = []
 
     def __bool__(self) -> bool:
         """Whether there is anything to release."""
-        return bool(self._direct or self._streams)
+        return bool(self._direct or self._streams or self._kept)
+
+    def keep(self, thing: object) -> None:
+        """Keep something alive that whoever unpickles the handles relies on."""
+        self._kept.append(thing)
 
     def for_local(self, kind: ObjectKind, fd: int, extent: Extent = WHOLE) -> HubHandle:
         """A handle for an object of this host."""
@@ -198,6 +203,7 @@ class GrantSet:
         """Nobody unpickles the handles any more."""
         direct, self._direct = self._direct, {}
         streams, self._streams = self._streams, {}
+        self._kept.clear()
         for registry, grants in direct.items():
             registry.release(grants)
         for stream in streams.values():
@@ -382,6 +388,15 @@ def _grants() -> GrantSet | _SingleUse:
     if pickling.reusable and pickling.grants is None:
         pickling.grants = GrantSet()
     return pickling.grants if pickling.grants is not None else _single_use
+
+
+def keep_until_released(thing: object) -> None:
+    """Keep something alive while what is being pickled may be unpickled, where that is known: a
+    new process has its arguments until it ends, a task until it is done.
+    """
+    grants = _grants()
+    if isinstance(grants, GrantSet):
+        grants.keep(thing)
 
 
 @contextlib.contextmanager

@@ -23,18 +23,17 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol
 
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
-from fiber._engine.chunks import FLOOR
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.worker_set import StartFailure
 from fiber._runtime.background import BackgroundThread
+from fiber._runtime.calls import CallQueue, Calls
 from fiber._runtime.functions import Function, FunctionCache
-from fiber._runtime.host import Host, Loop, Timer
+from fiber._runtime.host import TICK, Host, Loop, Timer
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.latch import Latch
@@ -51,9 +50,6 @@ from fiber._runtime.worker_view import WorkerView
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import FiberError
-
-TICK = 1e-4
-"""Seconds that any timer waits: less, by a rounding error, would be too early again and again."""
 
 
 class Waitable(Future, Protocol):
@@ -124,10 +120,15 @@ class Executor:
         self._exits: dict[WorkerHandle, ExitReport] = {}
         """Ends of workers that callers are using."""
         self._functions = FunctionCache()
-        self._calls = WorkItem(work.CALLS, exact=True)
-        self._jobs.open(self._calls)
-        self._called: deque[Call] = deque()
-        self._took_calls = -math.inf
+        self.calls = Calls(
+            self._loop,
+            self._scheduler,
+            self._jobs,
+            refusal=self._refusal,
+            advance=self._advance,
+            wake_at=self._wake_at,
+        )
+        """The calls of single functions."""
         self._wake: Timer | None = None
         self._ended_by: BaseException | None = None
         """What those hear whose calls are not done when the pool is terminated."""
@@ -175,14 +176,15 @@ class Executor:
         args: Iterable[Any],
         kwargs: Mapping[str, Any],
         timeout: float | None = None,
+        queue: CallQueue | None = None,
     ) -> None:
-        """One call of a function."""
+        """One call of a function; ``queue`` has the options of several, ``timeout`` this one's."""
         call = pickle_call(future, function, args, kwargs, self.reject)
         if call is None:
             return
         self._check()
         call.copy_buffers()
-        self._enqueue(call, timeout)
+        self._enqueue(call, timeout, queue)
 
     def call_and_wait(
         self,
@@ -210,10 +212,9 @@ class Executor:
             return outcome
         return future.get()
 
-    def _enqueue(self, call: Call, timeout: float | None) -> None:
+    def _enqueue(self, call: Call, timeout: float | None, queue: CallQueue | None = None) -> None:
         if timeout is None:
-            self._called.append(call)
-            self._loop.call_soon(self._take_calls)
+            self.calls.put(call, queue)
         else:
             item = WorkItem(work.CALLS, timeout=timeout)
             self._loop.call_soon(self._take, item, (call,))
@@ -272,6 +273,10 @@ class Executor:
         """Results of it are read again, after its future had asked for no more."""
         self._loop.call_soon(self._resume, item)
 
+    def cancel_all(self, error: BaseException) -> None:
+        """Nobody wants what has not begun any more: cancel calls, end maps with ``error``."""
+        self._loop.call_soon(self._cancel_all, error)
+
     def close(self) -> None:
         """Take no more requests; the workers leave once those that are there are done."""
         self._loop.call_soon(self._close)
@@ -295,6 +300,19 @@ class Executor:
         """Whether this is the thread that pickles its tasks, which must not wait for it."""
         return self._background.runs_here()
 
+    def check_may_wait(self) -> None:
+        """RuntimeError on that thread."""
+        if self.pickles_here():
+            raise RuntimeError(
+                "what a pool pickles for its workers cannot wait for the same pool, which would "
+                "wait for the pickle: get the result before the map, or in the task"
+            )
+
+    @property
+    def error(self) -> BaseException | None:
+        """Why no worker starts, once that is final."""
+        return self._scheduler.workers.error
+
     def _check(self) -> None:
         """Refuse at once what can be seen from here to be of no use."""
         error = self._refusal()
@@ -309,40 +327,11 @@ class Executor:
         return up
 
     def _refusal(self) -> BaseException | None:
-        if self._scheduler.workers.error is not None:
-            return self._scheduler.workers.error
+        if self.error is not None:
+            return self.error
         return ValueError("Pool not running") if self._scheduler.closing else None
 
     # Requests.  From here on all happens on the loop's thread.
-
-    def _take_calls(self) -> None:
-        """Calls have come.  Of many short ones in a row, several travel together.
-
-        Each would else wake a worker, which costs more than the call.
-        """
-        called, job = self._called, self._calls.job
-        calls = [called.popleft() for _ in range(len(called))]
-        refusal = self._refusal()
-        if refusal is not None:
-            for call in calls:
-                call.future.set_exception(refusal)
-        if not calls or refusal is not None or job is None:
-            return
-        now = self._loop.now()
-        hurried = now - self._took_calls < FLOOR and job.pace.short
-        self._took_calls = now
-        busy = job.fed - job.done >= self._scheduler.workers.size
-        # One for each who is idle: whoever turns out to be stuck then holds up no other.
-        alone = self._ledger.idle_count()
-        for call in calls[:alone]:
-            self._ledger.feed(job, [call])
-            self._advance()
-        together = calls[alone:]
-        self._ledger.feed(job, together)
-        if hurried and busy and not (together and together[-1].blocking):
-            self._wake_at(now + TICK)
-        else:
-            self._advance()
 
     def _take(self, item: WorkItem, tasks: Sequence[Any] | None) -> None:
         """A map, a call with a deadline, or (None) a stream."""
@@ -384,6 +373,13 @@ class Executor:
     def _cancel(self, item: WorkItem) -> None:
         for held in self._jobs.cancel(item):
             held.key.child.recall()
+        self._advance()
+
+    def _cancel_all(self, error: BaseException) -> None:
+        self.calls.cancel_all()
+        for job in list(self._ledger.jobs):
+            if job.owner.future is not None:
+                self._jobs.fail(job, error)
         self._advance()
 
     def _resume(self, item: WorkItem) -> None:
@@ -554,15 +550,15 @@ class Executor:
     # The end
 
     def _close(self) -> None:
-        self._take_calls()
+        self.calls.close_all()
         self._scheduler.close()
-        self._jobs.close(self._calls)
         self._advance()
 
     def _terminate(self, error: BaseException) -> None:
-        self._take_calls()
+        self.calls.take_all()
         self._ended_by = error
-        self.callbacks.stop()
+        if not self.options.calls_back_at_end:
+            self.callbacks.stop()
         for job in list(self._ledger.jobs):
             self._jobs.fail(job, error)
         self._launcher.end(self._scheduler.terminate())

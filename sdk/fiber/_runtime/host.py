@@ -7,6 +7,9 @@ from typing import Any, Protocol
 
 from fiber._runtime.shared_arguments import SharedArguments
 
+TICK = 1e-4
+"""Seconds that any timer waits: less, by a rounding error, would be too early again and again."""
+
 
 class Timer(Protocol):
     """A call that is due."""

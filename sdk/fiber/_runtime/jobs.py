@@ -35,7 +35,7 @@ class Jobs:
         item.job = job = self._ledger.open(
             item,
             pace=pace,
-            retries=self._retries,
+            retries=self._retries if item.retries is None else item.retries,
             unit=item.unit,
             alone=item.timeout is not None,
             exact=item.exact,

@@ -5,6 +5,8 @@ A child starts with its parent's.
 
 from __future__ import annotations
 
+from multiprocessing.process import current_process
+
 START_METHODS = ("forkserver", "spawn", "fork")
 """``forkserver`` and ``fork`` both fork from Fiber's zygote; the default comes first."""
 
@@ -36,3 +38,20 @@ def inherit(method: str | None, modules: list[str]) -> None:
 def zygote_method(method: str | None) -> str:
     """What the zygote is asked to do for a start method, None being the one in force."""
     return "spawn" if (method or settle()) == "spawn" else "fork"
+
+
+def check_main() -> None:
+    """RuntimeError if this process is still importing its parent's main module."""
+    if getattr(current_process(), "_inheriting", False):
+        raise RuntimeError(_UNGUARDED_MAIN)
+
+
+_UNGUARDED_MAIN = """\
+a process was started while its own parent's main module was being imported.
+
+The program starts processes at the top level of its main module, and each of them imports that
+module first. Put what starts processes under
+
+    if __name__ == "__main__":
+        ...
+"""

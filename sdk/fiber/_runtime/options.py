@@ -17,6 +17,9 @@ LARGEST_CHUNK = 2**32 - 1
 
 NO_WISHES = Resources()
 
+IDLE_TIMEOUT = 60.0
+"""Seconds after which a worker that is not needed and has nothing to do leaves."""
+
 
 class PoolOptions(NamedTuple):
     """What a pool promises its workers and callers; ``fiber.pool.Pool`` says what each means."""
@@ -31,9 +34,11 @@ class PoolOptions(NamedTuple):
     """Tasks, or chunks of them, after which a worker is replaced."""
     retries: int = 3
     retryable: tuple[type[BaseException], ...] = ()
-    idle_timeout: float = 60.0
+    idle_timeout: float = IDLE_TIMEOUT
     resources: Resources = NO_WISHES
     """What workers wish of their hosts, besides what the first task's function does."""
+    calls_back_at_end: bool = False
+    """Whether callbacks run for calls that termination fails; not in multiprocessing."""
 
 
 def whole(name: str, value: Any) -> int:
@@ -75,6 +80,16 @@ def sizes(processes: int | None, low: int | None, high: int | None) -> tuple[int
             "and max_workers >= 1"
         )
     return low, high
+
+
+def positive(name: str, value: Any) -> int | None:
+    """``value`` as an int of at least 1; None as it is."""
+    if value is None:
+        return None
+    count = whole(name, value)
+    if count < 1:
+        raise ValueError(f"{name} must be greater than 0, not {value!r}")
+    return count
 
 
 def max_tasks(value: Any) -> int | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fiber._engine.ledger import Batch, Ledger, Worker
+from fiber._engine.ledger import Batch, Job, Ledger, Worker
 from fiber._runtime.background import BackgroundThread
 from fiber._runtime.host import Loop, Timer
 from fiber._runtime.jobs import Jobs
@@ -17,7 +17,9 @@ from fiber._runtime.work_items import (
     Encoded,
     WorkItem,
     blame_items,
+    claim,
     encode,
+    is_wanted,
     pack,
     pickles_without_user_code,
 )
@@ -52,6 +54,9 @@ class Sender:
         """Send a batch, or have it encoded where the user's code may run."""
         assert batch.job is not None
         item: WorkItem = batch.job.owner
+        if item.cancellable and not claim(batch):
+            self._drop_cancelled(batch, batch.job)
+            return
         if not pickles_without_user_code(item, batch):
             self._unsent.add(batch.seq)
             try:
@@ -113,6 +118,13 @@ class Sender:
         self._unsent.discard(batch.seq)
         self.settled(batch.seq)
         self.split(batch.seq, Failure(error))
+        self._advance()
+
+    def _drop_cancelled(self, batch: Batch, job: Job) -> None:
+        """Give the others to whoever has time for them."""
+        self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
+        self._ledger.drop_waiting(job, is_wanted)
+        self._jobs.check_finished(job)
         self._advance()
 
     def split(self, seq: int, failure: object) -> None:

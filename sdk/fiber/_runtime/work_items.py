@@ -43,6 +43,19 @@ class Future(Protocol):
         """There will be no more, because of ``error``."""
 
 
+class Cancellable(Future, Protocol):
+    """The future of a call that may be cancelled until it is given to a worker."""
+
+    def claim(self) -> bool:
+        """It is about to be; False if it was cancelled.  May be asked again."""
+
+    def cancel(self) -> bool:
+        """Nobody wants it any more; False if it was claimed."""
+
+    def cancelled(self) -> bool:
+        """Whether nobody does."""
+
+
 class Call:
     """One function call, pickled: a task by itself."""
 
@@ -83,12 +96,14 @@ class WorkItem:
     """
 
     __slots__ = (
+        "cancellable",
         "exact",
         "function",
         "future",
         "grants",
         "job",
         "kind",
+        "retries",
         "stream",
         "timeout",
         "unit",
@@ -103,6 +118,8 @@ class WorkItem:
         unit: int = 1,
         exact: bool = False,
         timeout: float | None = None,
+        retries: int | None = None,
+        cancellable: bool = False,
     ) -> None:
         self.kind = kind
         self.function = function
@@ -110,6 +127,10 @@ class WorkItem:
         self.unit = unit
         self.exact = exact
         self.timeout = timeout
+        self.retries = retries
+        """None: as its pool says."""
+        self.cancellable = cancellable
+        """Whether the futures of its calls are."""
         self.job: Job | None = None
         """Once the executor has taken it."""
         self.stream: InputStream | None = None
@@ -156,6 +177,16 @@ def _blame_call(
     parts |= {f"argument {key!r} of {name}()": value for key, value in kwargs.items()}
     parts[f"the function {name}"] = function
     return reduction.blame(parts, error, f"the call of {name}()")
+
+
+def is_wanted(call: Any) -> bool:
+    """Whether a call that waits was not cancelled; who waits for one that was hears so."""
+    return not call.future.cancelled() or call.future.claim()
+
+
+def claim(batch: Batch) -> bool:
+    """Whether all calls of a batch are still wanted: then none can be cancelled any more."""
+    return all(call.future.claim() for call in batch.items)
 
 
 def blame_items(item: WorkItem, batch: Batch, error: Exception) -> Exception:

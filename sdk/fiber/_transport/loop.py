@@ -35,6 +35,11 @@ DOZE = 0.2
 may be slept over that comes just before the sleep (``fiber._runtime.latch`` says why).
 """
 
+_EVENTS = 128
+"""Descriptors that one turn looks at.  Of more, the kernel shows the others first the next time; in
+between timers are served, and what other threads ask for.
+"""
+
 _MANY_TIMERS = 1024
 
 _this_thread = threading.local()
@@ -212,7 +217,7 @@ class Loop:
             if self._ready:
                 timeout = 0.0
         try:
-            events = self._epoll.poll(timeout)
+            events = self._epoll.poll(timeout, _EVENTS)
         except InterruptedError:
             return
         finally:

@@ -3,12 +3,13 @@
     python -m conformance.cpython_suite.worker list
     python -m conformance.cpython_suite.worker run REPORT_FD ID...
 
-Reports are lines of JSON on the descriptor, because tests write to, close and redirect the
-standard streams.
+``$MP_CASES`` names the module that has them: `cases` (the default) or `executor_cases`. Reports are
+lines of JSON on the descriptor, because tests write to, close and redirect the standard streams.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import resource
@@ -70,16 +71,18 @@ def _id_of(test: unittest.TestCase) -> str:
     return ".".join(test.id().split(".")[-2:])
 
 
-def list_cases() -> None:
-    from . import cases
+def load_cases() -> Any:
+    return importlib.import_module(f".{os.environ.get('MP_CASES', 'cases')}", __package__)
 
+
+def list_cases() -> None:
+    cases = load_cases()
     for case in cases.CASES:
         print(json.dumps(case._asdict()))
 
 
 def run(descriptor: int, ids: list[str]) -> None:
-    from . import cases
-
+    cases = load_cases()
     os.set_inheritable(descriptor, False)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a hang is ended with SIGABRT
     reporter = Reporter(descriptor)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import sys
 import threading
 import time
 from collections.abc import Iterable
@@ -12,19 +10,12 @@ from functools import partial
 from typing import Protocol
 
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import (
-    ApiError,
-    Body,
-    Forbidden,
-    ServerError,
-    TooManyRequests,
-    Transient,
-    Unreachable,
-    explain,
-)
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden
 from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber._backends.kubernetes.informer import Informer
 from fiber._backends.kubernetes.lease import LeaseRenewer
+from fiber._backends.kubernetes.problems import PoolName
+from fiber._backends.kubernetes.reporter import Reporter
 from fiber._backends.kubernetes.resources import PODS, POOLS
 from fiber._backends.kubernetes.scaling import Scaling
 from fiber._transport.loop import Loop
@@ -38,7 +29,7 @@ CLOSE_TIMEOUT = 10.0
 """Seconds that the API server may take to give a pool back."""
 
 _RENEW, _WATCH = "renew the Lease of", "watch"
-"""What cannot be done, in words that follow "cannot"."""
+"""What cannot be done, in words that the pool follows."""
 
 
 class Attachment(Protocol):
@@ -47,7 +38,7 @@ class Attachment(Protocol):
     name: str
     namespace: str
     doing: str
-    """What ``attach`` does, in words that follow "cannot"."""
+    """What ``attach`` does, in words that the pool follows."""
 
     @property
     def remedy(self) -> str:
@@ -93,15 +84,20 @@ class FiberPoolClient:
         self._attachment = attachment
         self._doing = attachment.doing
         self._observer = observer
-        self._scaling = Scaling(partial(self._trouble, "scale"))
+        self._reporter = Reporter(
+            loop,
+            PoolName(attachment.name, attachment.namespace),
+            api.server,
+            on_warning=observer.on_warning,
+            on_error=observer.on_error,
+            on_failure=self._give_up,
+        )
+        self._scaling = Scaling(partial(self._reporter.trouble, "scale"))
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._close_timeout = CLOSE_TIMEOUT
-        self._failing = threading.Lock()
-        """Taken by whoever tells of the error; never given back: there is only one."""
         self._over = threading.Event()
         self._ended = threading.Event()
-        self._warned: set[str] = set()
         self._generation = 0
         """That of the spec which first had this program as its master."""
         self._observed = False
@@ -127,6 +123,7 @@ class FiberPoolClient:
         """Begin to delete the pool, or to detach from it, and return at once."""
         self._close_timeout = timeout
         self._closing.set()
+        self._reporter.mute()
         self._wake.set()
 
     def close(self, timeout: float = CLOSE_TIMEOUT) -> None:
@@ -144,11 +141,11 @@ class FiberPoolClient:
             why = f"the API server did not answer within {timeout:g} s"
         finally:
             if not self._ended.is_set():
-                self._say_what_stays(why)
+                self._reporter.say_what_stays(why, self._attachment.remedy)
 
     def warn_anew(self) -> None:
         """Somebody begins to wait, and is to be told what was told before, if it is still so."""
-        self._warned.clear()
+        self._reporter.warn_anew()
 
     # -- On the thread
 
@@ -156,17 +153,17 @@ class FiberPoolClient:
         try:
             self._serve(self._begin())
         except FiberPoolError as error:
-            self._fail(error)
+            self._reporter.fail(error)
         except ApiError as error:
-            self._fail(self._explained(error, self._doing))
+            self._reporter.refused(self._doing, error)
         except Exception as error:
-            self._fault(error)
+            self._reporter.fault(error)
         for follower in self._followers:
             follower.stop()
         try:
             self._attachment.detach(self._close_timeout)
         except Exception as error:  # the program ends whatever comes
-            self._say_what_stays(str(error))
+            self._reporter.say_what_stays(str(error), self._attachment.remedy)
         for follower in self._followers:
             follower.join(1.0)
         if not self._closing.is_set():
@@ -176,13 +173,13 @@ class FiberPoolClient:
     def _begin(self) -> AttachedPool:
         attached = self._attachment.attach(self._closing)
         self._began, self._generation = time.monotonic(), attached.generation
-        self._doing = f"scale {self._short_name}"
+        self._doing = "scale"
         renewer = LeaseRenewer(
             attached,
-            on_lost=self._fail,
-            on_trouble=partial(self._trouble, _RENEW),
-            on_refused=partial(self._refused, _RENEW),
-            on_fault=self._fault,
+            on_lost=self._reporter.fail,
+            on_trouble=partial(self._reporter.trouble, _RENEW),
+            on_refused=partial(self._reporter.refused, _RENEW),
+            on_fault=self._reporter.fault,
         )
         pool = Informer(
             self._api,
@@ -191,15 +188,15 @@ class FiberPoolClient:
             known={attached.name},
             on_change=partial(self._pool_changed, attached, renewer),
             on_trouble=self._pool_trouble,
-            on_fault=self._fault,
+            on_fault=self._reporter.fault,
         )
         pods = Informer(
             self._api,
             PODS.path(attached.namespace),
             {"labelSelector": f"{names.LABEL_POOL_UID}={attached.uid}"},
             on_change=self._pod_changed,
-            on_trouble=partial(self._trouble, "watch the pods of"),
-            on_fault=self._fault,
+            on_trouble=partial(self._reporter.trouble, "watch the pods of"),
+            on_fault=self._reporter.fault,
         )
         self._followers = [renewer, pool, pods]
         self._loop.call_soon(self._observer.on_attached)
@@ -218,17 +215,18 @@ class FiberPoolClient:
         if self._observed:
             return math.inf
         silent = time.monotonic() - self._began
-        what = f"was not looked at by an operator for {silent:.0f} s"
-        advice = (
-            "Look whether one runs and serves this namespace (`kubectl get deployments -A -l "
+        error = self._reporter.error(
+            "NoOperator",
+            f"was not looked at by an operator for {silent:.0f} s. Look whether one runs and "
+            "serves this namespace (`kubectl get deployments -A -l "
             "app.kubernetes.io/name=fiber-operator`), or install it: `helm install fiber-operator "
-            "charts/fiber-operator -n fiber-system --create-namespace`"
+            "charts/fiber-operator -n fiber-system --create-namespace`",
         )
         if silent >= OPERATOR_ABSENT:
-            raise self._error("NoOperator", f"{what}. {advice}")
+            raise error
         if silent < OPERATOR_SLOW:
             return OPERATOR_SLOW - silent
-        self._warn("no operator", f"{self._pool} {what}. {advice}")
+        self._reporter.warn("no operator", str(error))
         return OPERATOR_ABSENT - silent
 
     # -- On the threads that follow it
@@ -237,90 +235,30 @@ class FiberPoolClient:
         self, attached: AttachedPool, renewer: LeaseRenewer, name: str, found: Body | None
     ) -> None:
         if loss := attached.loss(found):
-            self._fail(renewer.explain(loss))
+            self._reporter.fail(renewer.explain(loss))
             return
         assert found is not None
         status = found.get("status") or {}
         if not self._observed and status.get("observedGeneration", 0) >= self._generation:
             self._observed = True
             self._wake.set()
-        self._warned -= {kind.__name__ for kind in (Unreachable, ServerError, TooManyRequests)}
+        self._reporter.answered()
         if self._observed:  # else it may be about the master before
             self._loop.call_soon(self._observer.on_status, status)
 
     def _pool_trouble(self, error: ApiError) -> None:
         if isinstance(error, Forbidden) and not self._observed:
             # Its status would never be known, and silence be taken for the operator's.
-            self._refused(_WATCH, error)
+            self._reporter.refused(_WATCH, error)
             return
         self._began = time.monotonic()  # of an operator nothing could be heard either
-        self._trouble(_WATCH, error)
+        self._reporter.trouble(_WATCH, error)
 
     def _pod_changed(self, name: str, pod: Body | None) -> None:
         if pod is None and self._scaling.gone(name):
             self._wake.set()
         self._loop.call_soon(self._observer.on_pod, name, pod)
 
-    # -- On any of them
-
-    def _trouble(self, doing: str, error: ApiError) -> None:
-        """``doing``: what cannot be done, in words that the pool follows."""
-        if not self._closing.is_set():
-            # One that fails in general fails in all that is done; of rights there are several.
-            kind = type(error).__name__
-            what = kind if isinstance(error, Transient) else f"{kind}: {doing}"
-            self._warn(what, str(self._explained(error, f"{doing} {self._short_name}")))
-
-    def _warn(self, what: str, message: str) -> None:
-        """Once, until it has passed."""
-        if what not in self._warned:
-            self._warned.add(what)
-            self._loop.call_soon(self._observer.on_warning, message)
-
-    def _refused(self, doing: str, error: ApiError) -> None:
-        self._fail(self._explained(error, f"{doing} {self._short_name}"))
-
-    def _fault(self, error: Exception) -> None:
-        """A fault of ours must not leave anybody waiting."""
-        failure = self._error("Internal", f"is given up after an unexpected {error!r}")
-        failure.__cause__ = error
-        self._fail(failure)
-
-    def _fail(self, error: FiberPoolError) -> None:
-        if self._closing.is_set() or not self._failing.acquire(blocking=False):
-            return
+    def _give_up(self) -> None:
         self._over.set()
         self._wake.set()
-        self._loop.call_soon(self._observer.on_error, error)
-
-    @property
-    def _short_name(self) -> str:
-        return f"the FiberPool {self._attachment.name!r}"
-
-    @property
-    def _pool(self) -> str:
-        return f"{self._short_name} in namespace {self._attachment.namespace!r}"
-
-    def _error(self, reason: str, what: str) -> FiberPoolError:
-        return FiberPoolError(
-            f"{self._pool} {what}",
-            pool=self._attachment.name,
-            namespace=self._attachment.namespace,
-            reason=reason,
-        )
-
-    def _explained(self, error: ApiError, doing: str) -> FiberPoolError:
-        return explain(
-            error,
-            doing,
-            pool=self._attachment.name,
-            namespace=self._attachment.namespace,
-            server=self._api.server,
-        )
-
-    def _say_what_stays(self, why: str) -> None:
-        with contextlib.suppress(Exception):  # stderr may be closed
-            sys.stderr.write(
-                f"fiber: {self._pool} stays behind: {why}. The operator notices that this program "
-                f"is gone; to be quicker: {self._attachment.remedy}\n"
-            )

@@ -40,7 +40,7 @@ class OwnPool:
         self._may_exist = False
         self.name = str(body["metadata"]["name"])
         self.namespace = namespace
-        self.doing = f"make the FiberPool {self.name!r}"
+        self.doing = "make"
         self.remedy = f"kubectl delete fiberpool {self.name} -n {namespace}"
         """What removes it when ``detach`` does not."""
 

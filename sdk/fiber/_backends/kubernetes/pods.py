@@ -63,13 +63,7 @@ class Pods:
             loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
         )
         self._waiting = Waiting(
-            loop,
-            output,
-            api,
-            self.agents,
-            self._placement,
-            config.pod_timeout,
-            on_begin=self._warn_anew,
+            self.agents, output, api, config.pod_timeout, on_begin=self._warn_anew
         )
         self.over = False
         """Nothing comes of its pool any more, and it was given back."""
@@ -188,9 +182,7 @@ class Pods:
             self._timer = None
         if desired.wake_at < float("inf"):
             self._timer = self._loop.call_later(desired.wake_at - self._loop.now(), self._decide)
-        if self._prepared is not None:
-            self._waiting.look_at_limit(self._demand.maximum)
-        self._waiting.look()
+        self._waiting.look(self._demand.maximum)
 
     # -- Agents
 

@@ -11,9 +11,7 @@ from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.problems import PoolName, failure, new_problems, overdue, summary
 from fiber._backends.kubernetes.progress import Progress
 from fiber._backends.output import Output
-from fiber._backends.remote import RemoteAgent, RemoteChild
-from fiber._engine.placement import Placement
-from fiber._transport.loop import Loop, Timer
+from fiber._transport.link import Timer
 from fiber.errors import FiberError
 
 
@@ -25,11 +23,9 @@ class Waiting:
 
     def __init__(
         self,
-        loop: Loop,
+        agents: AgentSet,
         output: Output,
         api: Api,
-        agents: AgentSet,
-        placement: Placement[RemoteAgent, RemoteChild],
         timeout: float,
         *,
         on_begin: Callable[[], None],
@@ -40,20 +36,22 @@ class Waiting:
         """The pool's, as it is now."""
         self.attached = False
         """Whether the pool is there, and this program its master."""
-        self._loop = loop
         self._output = output
         self._api = api
         self._agents = agents
-        self._placement = placement
+        self._placement = agents.placement
         self._timeout = timeout
         self._on_begin = on_begin
         self._patience: Timer | None = None
         self._told_of_limit = False
-        self._progress = Progress(loop, output, self._describe)
+        self._progress = Progress(agents.loop, output, self._describe)
 
     def stop(self) -> None:
         """Nobody waits any more."""
         self._progress.stop()
+        self._wait_no_more()
+
+    def _wait_no_more(self) -> None:
         if self._patience is not None:
             self._patience.cancel()
             self._patience = None
@@ -70,33 +68,46 @@ class Waiting:
     def refuse(self, error: Exception) -> None:
         """Nobody is to wait any longer."""
         self._progress.stop()  # first: whoever is refused may write where its line stands
-        if not all(child.is_worker for child in self._placement.waiting):
+        if self._has_processes:
             # Whoever started it has gone on.  Pools raise it to their callers.
             self._output.write("fiber", str(error))
         self._agents.refuse_waiting(error)
 
-    def look(self) -> None:
-        """Somebody has come or gone.  Who waits for a first agent is told what for."""
-        waits = bool(self._placement.waiting) and not self._placement.loads
+    def look(self, most: int) -> None:
+        """Somebody has come or gone; there are to be at most so many pods."""
+        placement = self._placement
+        alone = bool(placement.waiting) and not placement.loads
         known = self._agents.error or failure(self.pool, self.status, 0)
-        if waits and known is not None:
+        if alone and known is not None:
             self.refuse(known)  # it was heard before they came
-        elif not waits:
-            self.stop()
-        elif self._patience is None:
+            return
+        if self.pool.name:
+            self._look_at_limit(most)
+        # A pool works with the workers that it has: nobody waits for the others.
+        if alone or (len(placement.loads) < most and self._has_processes):
             self._progress.start()
-            self._patience = self._loop.call_later(self._timeout, self._give_up)
+        else:
+            self._progress.stop()
+        if not alone:
+            self._wait_no_more()
+        elif self._patience is None:
+            self._patience = self._agents.loop.call_later(self._timeout, self._give_up)
             self._on_begin()
 
-    def look_at_limit(self, most: int) -> None:
+    @property
+    def _has_processes(self) -> bool:
+        """Whether others than workers of pools wait: nobody else does what they are to do."""
+        return not all(child.is_worker for child in self._placement.waiting)
+
+    def _look_at_limit(self, most: int) -> None:
         """Processes for which there is no room in ``most`` pods until others end are spoken of,
-        once: these may wait for them.  A pool works with the workers that it has.
+        once: these may wait for them.
         """
         placement = self._placement
         too_many = placement.children + len(placement.waiting) > most * placement.slots
         if not too_many:
             self._told_of_limit = False
-        elif not self._told_of_limit and not all(child.is_worker for child in placement.waiting):
+        elif not self._told_of_limit and self._has_processes:
             self._told_of_limit = True
             self._output.write(
                 "fiber",

@@ -62,7 +62,7 @@ class WarmPool:
         """What the pool had before, and has again after."""
         self.name = name
         self.namespace = namespace
-        self.doing = f"attach to the FiberPool {name!r}"
+        self.doing = "attach to"
 
     @property
     def remedy(self) -> str:

@@ -1,0 +1,80 @@
+"""Where processes that want to talk to a manager's server knock, and how they find it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pickle
+import time
+from multiprocessing.process import current_process
+from typing import Any, NamedTuple
+
+from fiber._hub import handles
+from fiber._hub.handles import GrantSet, HubHandle
+from fiber._hub.local import LocalChannel
+from fiber._hub.protocol import ObjectKind
+from fiber._transport.base import Channel
+
+TAKE_BACK = "take_back"
+"""Asked of the server by whoever was interrupted: that others get what the last call got."""
+
+_UNTIL_FILES_CLOSE = 0.05
+"""Seconds between attempts of a process that may open no more files."""
+
+
+class ManagerAddress(NamedTuple):
+    """What ``manager.address`` is where none was chosen: any process of the program may use it.
+
+    Whoever has it may use every object of the manager, so it is not shown.
+    """
+
+    server: str
+    """The process, in words."""
+    door: HubHandle
+
+    def __repr__(self) -> str:
+        return f"<address of {self.server}>"
+
+
+class Door:
+    """A manager's Listener: a channel of which the hub lets in whoever has the address."""
+
+    def __init__(self, address: object = None, backlog: int = 0) -> None:
+        self._inbox, outbox = LocalChannel.pair()
+        self._grants = GrantSet()
+        handle = self._grants.for_local(ObjectKind.CHANNEL, outbox.fileno())
+        outbox.close()
+        self.address = ManagerAddress(
+            f"manager {current_process().name!r} (pid {os.getpid()} on host {handle.home.host!r})",
+            handle,
+        )
+
+    def accept(self) -> tuple[str, str, Channel]:
+        """Who comes next, and the end of a channel to it, after the word for that."""
+        invitation: tuple[str, str, Channel] = received(self._inbox)
+        return invitation
+
+    def close(self) -> None:
+        """Nobody can come in any more."""
+        self._grants.release()
+        self._inbox.close()
+
+
+def received(channel: Channel) -> Any:
+    """The next thing said on a channel; left out is what came from who has gone by now."""
+    while True:
+        said = channel.recv().tobytes()
+        while True:
+            try:
+                return pickle.loads(said)
+            except OSError as error:
+                if error.errno not in (errno.EMFILE, errno.ENFILE):
+                    break
+                time.sleep(_UNTIL_FILES_CLOSE)  # who sent it waits for an answer
+            except Exception:
+                break
+
+
+def knock(address: ManagerAddress) -> Any:
+    """The channel on which a client is let in; ``Unreachable`` if its manager is gone."""
+    return handles.channel(address.door)

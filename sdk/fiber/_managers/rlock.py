@@ -1,0 +1,89 @@
+"""The RLock of a manager: that of ``threading``, which can also be taken from its owner.
+
+The thread of a dead client may wait in a queue for ever, with a lock that only it could release.
+"""
+
+from __future__ import annotations
+
+import threading
+from types import TracebackType
+
+
+class RLock:
+    """As ``threading.RLock``."""
+
+    def __init__(self) -> None:
+        self._block = threading.Lock()
+        self._mutex = threading.Lock()
+        """Of what follows; never held by who waits."""
+        self._owner: int | None = None
+        self._count = 0
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        """As in ``threading``."""
+        me = threading.get_ident()
+        with self._mutex:
+            if self._owner == me:
+                self._count += 1
+                return True
+        if not self._block.acquire(blocking, timeout):
+            return False
+        with self._mutex:
+            self._owner, self._count = me, 1
+        return True
+
+    def release(self) -> None:
+        """As in ``threading``."""
+        with self._mutex:
+            if self._owner != threading.get_ident():
+                raise RuntimeError("cannot release un-acquired lock")
+            self._count -= 1
+            if not self._count:
+                self._owner = None
+                self._block.release()
+
+    def revoke(self, owner: int) -> bool:
+        """Release it for the thread ``owner``, which has ended or as good as that; False if that
+        has it not.
+        """
+        with self._mutex:
+            if self._owner != owner:
+                return False
+            self._owner, self._count = None, 0
+            self._block.release()
+            return True
+
+    def owned_by(self, thread: int) -> bool:
+        """Whether that thread has it."""
+        return self._owner == thread
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.release()
+
+    # What threading.Condition asks of an RLock
+
+    def _is_owned(self) -> bool:
+        return self.owned_by(threading.get_ident())
+
+    def _release_save(self) -> int:
+        count = self._count
+        if not self.revoke(threading.get_ident()):
+            raise RuntimeError("cannot release un-acquired lock")
+        return count
+
+    def _acquire_restore(self, count: int) -> None:
+        self.acquire()
+        self._count = count
+
+
+def condition(lock: object = None) -> threading.Condition:
+    """A ``threading.Condition`` on such a lock."""
+    return threading.Condition(RLock() if lock is None else lock)  # type: ignore[arg-type]

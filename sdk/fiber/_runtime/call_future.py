@@ -1,0 +1,121 @@
+"""The future of one call, as concurrent.futures has it, and the errors that its users know."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from typing import Any
+
+from fiber import errors
+from fiber._runtime.calls import CallQueue
+from fiber._runtime.executor import Executor
+from fiber._runtime.outcome import Failure, Pickled
+
+
+class WorkerDied(errors.WorkerDied, BrokenProcessPool):
+    """``fiber.WorkerDied``, and what concurrent.futures raises then.
+
+    It concerns this task alone: the executor goes on with another worker.
+    """
+
+
+WorkerDied.__module__ = "fiber.futures"  # where its users have it from
+
+
+class CallFuture(Future[Any]):
+    """The future of one call, as an executor sees it: ``work_items.Cancellable``.
+
+    What runs the user's code, unpicklers and callbacks, does not run on the loop's thread.
+    """
+
+    def __init__(self, executor: Executor, queue: CallQueue) -> None:
+        super().__init__()
+        self._executor = executor
+        self._queue = queue
+        self._claimed: bool | None = None
+
+    def cancel(self) -> bool:
+        """As in concurrent.futures; ``wait`` and ``as_completed`` hear of it in a moment."""
+        if not super().cancel():
+            return False
+        self._executor.calls.drop_cancelled(self._queue)
+        return True
+
+    # What the executor says, on the loop's thread
+
+    def claim(self) -> bool:
+        """It is about to run, unless it was cancelled."""
+        if self._claimed is None:
+            self._claimed = self.set_running_or_notify_cancel()
+        return self._claimed
+
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
+        """Take the outcome."""
+        outcome = outcomes[0]
+        if type(outcome) is Pickled:
+            self._elsewhere(partial(self._unpickle, outcome))
+        else:
+            self._settle(outcome)
+        return False
+
+    def set_done(self) -> None:
+        """It was with its outcome."""
+
+    def has_room(self) -> bool:
+        """Always: whoever wants it wants all of it."""
+        return True
+
+    def lift_bound(self) -> None:
+        """There is none."""
+
+    def set_exception(self, exception: BaseException | None) -> None:
+        """There will be no outcome, or this is it."""
+        if self.claim() and exception is not None:
+            super().set_exception(translated(exception, self._executor))
+
+    def _settle(self, outcome: Any) -> None:
+        if type(outcome) is Failure:
+            self.set_exception(outcome.error)
+        else:
+            self.set_result(outcome)
+
+    def _unpickle(self, outcome: Pickled) -> None:
+        try:
+            value = outcome.decode()
+        except BaseException as error:  # whatever the user's unpickler raises
+            value = Failure(error)
+        self._settle(value)
+
+    def _invoke_callbacks(self) -> None:
+        call = super()._invoke_callbacks  # type: ignore[misc]
+        if self._done_callbacks and self._executor.on_loop():  # type: ignore[attr-defined]
+            self._elsewhere(call)
+        else:
+            call()
+
+    def _elsewhere(self, action: Callable[[], None]) -> None:
+        with contextlib.suppress(RuntimeError):  # the system has no room for its thread
+            if self._executor.callbacks.submit(action):
+                return
+        action()  # else nobody would hear of it
+
+
+def translated(error: BaseException, executor: Executor) -> BaseException:
+    """An error of the executor's as concurrent.futures' users know it."""
+    if error is executor.error:
+        return broken(error)
+    if type(error) is errors.WorkerDied:
+        died = errors._rebuild(WorkerDied, error.args)
+        vars(died).update(vars(error))
+        return died
+    return error
+
+
+def broken(error: BaseException) -> BrokenProcessPool:
+    """What those hear whose calls no worker will run, because of ``error``."""
+    raised = BrokenProcessPool(f"the executor is broken: {error}")
+    raised.__cause__ = error
+    return raised

@@ -1,0 +1,119 @@
+"""The executors behind one ``fiber.Executor``: one for each kind of worker that its tasks need."""
+
+from __future__ import annotations
+
+import os
+import threading
+import weakref
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import util
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from fiber._runtime import methods
+from fiber._runtime.call_future import broken
+from fiber._runtime.executor import Executor
+from fiber._runtime.options import PoolOptions
+from fiber._runtime.state import Runtime
+from fiber.resources import Resources, merged, resources_of
+
+_EXIT_PRIORITY = 20
+"""Before pools are terminated, which its tasks may use."""
+
+
+class ExecutorGroup:
+    """Starts executors as tasks come, and ends all of them together.
+
+    Where hosts are made for workers, tasks with different wishes have different executors;
+    elsewhere there is one.
+    """
+
+    def __init__(self, template: PoolOptions, runtime: Runtime) -> None:
+        self._template = template
+        self._runtime = runtime
+        self._owner = os.getpid()
+        self._executors: dict[Resources, Executor] = {}
+        self._lock = threading.RLock()  # a finalizer may come back here
+        self._closed = False
+        # Forgotten with tasks under way, it ends after them.
+        util.Finalize(self, _close_all, args=(self._executors,))
+
+    def executor_for(self, function: Callable[..., Any], wishes: Resources) -> Executor:
+        """What runs ``function``; an error if nothing does any more."""
+        if os.getpid() != self._owner:
+            raise RuntimeError(
+                f"this executor belongs to process {self._owner}: a copy of it that came here by a "
+                "fork has no workers; make an executor in this process"
+            )
+        if self._closed or util.is_exiting():
+            when = "shutdown" if self._closed else "interpreter shutdown"
+            raise RuntimeError(f"cannot schedule new futures after {when}")
+        kind = self._template.resources
+        if self._runtime.elastic:
+            kind = merged(kind, merged(resources_of(function), wishes))
+        executor = self._executors.get(kind) or self._start(kind)
+        if executor.error is not None:
+            raise broken(executor.error)
+        return executor
+
+    def _start(self, kind: Resources) -> Executor:
+        methods.check_main()
+        with self._lock:
+            executor = self._executors.get(kind)
+            if executor is None:
+                executor = Executor(self._template._replace(resources=kind), self._runtime)
+                reference = weakref.ref(executor)
+                util.Finalize(executor, _finish, (reference,), exitpriority=_EXIT_PRIORITY)
+                executor.start()
+                self._executors[kind] = executor
+            return executor
+
+    def executors(self) -> list[Executor]:
+        """Those that there are."""
+        return list(self._executors.values())
+
+    def processes(self) -> list[BaseProcess]:
+        """Those of all workers."""
+        return [process for each in self.executors() for process in each.workers.processes()]
+
+    def shut_down(self, wait: bool, cancel: bool) -> None:
+        """Take no more tasks; ``cancel`` those that have not begun, ``wait`` for the rest."""
+        for executor in self._close():
+            if cancel:
+                executor.cancel_all(CancelledError())
+            executor.close()
+        if wait:
+            self._check_may_wait()
+            for executor in self._close():
+                executor.join()
+
+    def terminate(self) -> None:
+        """End the workers at once; who waits for a result hears so."""
+        for executor in self._close():
+            executor.terminate(BrokenProcessPool("terminate_workers() ended its worker"))
+
+    def _close(self) -> list[Executor]:
+        if os.getpid() != self._owner:
+            return []  # a copy that came here by a fork: nothing is here to end
+        with self._lock:
+            self._closed = True
+            return self.executors()
+
+    def _check_may_wait(self) -> None:
+        for executor in self.executors():
+            executor.check_may_wait()
+
+
+def _close_all(executors: dict[Resources, Executor]) -> None:
+    for executor in executors.values():
+        executor.close()
+
+
+def _finish(reference: weakref.ref[Executor]) -> None:
+    """The program ends: once its tasks are done, as in concurrent.futures."""
+    executor = reference()
+    if executor is not None:
+        executor.close()
+        executor.join()

@@ -1,0 +1,283 @@
+"""``Executor``: concurrent.futures', whose worker processes are Fiber's.
+
+``from fiber import futures`` instead of ``from concurrent import futures``: signatures, states of
+futures and errors are concurrent.futures'.  What is more is spelled by keywords and ``options``.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    ALL_COMPLETED,
+    FIRST_COMPLETED,
+    FIRST_EXCEPTION,
+    BrokenExecutor,
+    CancelledError,
+    Future,
+    InvalidStateError,
+    ThreadPoolExecutor,
+    TimeoutError,
+    as_completed,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from multiprocessing import TimeoutError as WaitedTooLong
+from multiprocessing import util
+from multiprocessing.process import BaseProcess
+from types import TracebackType
+from typing import Any, ParamSpec, TypeVar
+
+from fiber import cpu
+from fiber._runtime import methods, options
+from fiber._runtime.call_future import CallFuture, WorkerDied, translated
+from fiber._runtime.calls import CallQueue
+from fiber._runtime.executor import Executor as Engine
+from fiber._runtime.executor_group import ExecutorGroup
+from fiber._runtime.options import PoolOptions
+from fiber._runtime.outcome import Failure
+from fiber._runtime.state import runtime
+from fiber._runtime.work_items import WorkItem
+from fiber._wire import work
+from fiber.process import PoolProcess, process_type
+from fiber.resources import Resources, merged, wished
+from fiber.results import IMapIterator
+
+__all__ = [
+    "ALL_COMPLETED",
+    "FIRST_COMPLETED",
+    "FIRST_EXCEPTION",
+    "BrokenExecutor",
+    "BrokenProcessPool",
+    "CancelledError",
+    "Executor",
+    "Future",
+    "InvalidStateError",
+    "ProcessPoolExecutor",
+    "ThreadPoolExecutor",
+    "TimeoutError",
+    "WorkerDied",
+    "as_completed",
+    "wait",
+]
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+class Executor(concurrent.futures.Executor):
+    """A ``concurrent.futures.ProcessPoolExecutor`` that a worker's death does not break.
+
+    At most ``max_workers`` processes (by default ``cpu_count()``) start as there is work for them.
+    Each begins with ``initializer(*initargs)`` and is replaced after ``max_tasks_per_child`` tasks
+    (None: never).  ``mp_context`` is that of the start method.  Beyond concurrent.futures:
+
+    * A task whose worker dies runs again elsewhere, at most ``retries`` times (None: as
+      configured), then it raises ``WorkerDied``, which is a BrokenProcessPool; other tasks never
+      notice.  The executor is broken only when no worker starts.
+    * A task that raises one of ``retry_exceptions`` runs again, too, before the exception counts.
+    * A worker that has had nothing to do for ``idle_timeout`` seconds (None: for ever) leaves.
+    * On Kubernetes workers have what ``fiber.meta`` or ``options`` says that their tasks need;
+      ``pool`` is the name of a FiberPool that is there already, whose pods are used.
+
+    Left by Ctrl-C, a ``with`` block waits for the tasks that run and cancels those that do not.
+    """
+
+    def __init__(
+        self,
+        max_workers: int | None = None,
+        mp_context: Any = None,
+        initializer: Callable[..., object] | None = None,
+        initargs: Iterable[Any] = (),
+        *,
+        max_tasks_per_child: int | None = None,
+        retries: int | None = None,
+        retry_exceptions: type[BaseException] | Sequence[type[BaseException]] = (),
+        idle_timeout: float | None = options.IDLE_TIMEOUT,
+        pool: str | None = None,
+    ) -> None:
+        if initializer is not None and not callable(initializer):
+            raise TypeError("initializer must be a callable")
+        self._max_workers = options.positive("max_workers", max_workers) or cpu.cpu_count()
+        like = process_type(methods.settle()) if mp_context is None else _process(mp_context)
+        self._group = ExecutorGroup(
+            PoolOptions(
+                new_process=partial(PoolProcess, like=like),
+                initializer=initializer,
+                initargs=tuple(initargs),
+                minimum=0,
+                maximum=self._max_workers,
+                max_tasks=options.positive("max_tasks_per_child", max_tasks_per_child),
+                retries=options.retries(retries),
+                retryable=options.exceptions(retry_exceptions),
+                idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
+                resources=Resources(pool=pool),
+                calls_back_at_end=True,
+            ),
+            runtime(),
+        )
+        self._wishes = Resources()
+        self._retries: int | None = None
+        self._timeout: float | None = None
+        self._queues: dict[Engine, CallQueue] = {}
+
+    def options(
+        self,
+        *,
+        cpu: float | str | None = None,
+        memory: int | str | None = None,
+        gpu: int | None = None,
+        retries: int | None = None,
+        timeout: float | None = None,
+    ) -> Executor:
+        """This executor, with options for what is submitted through what this returns.
+
+        ``executor.options(memory="8Gi", retries=0).submit(f)``, as Ray spells it.  ``cpu``,
+        ``memory`` and ``gpu`` are wishes as in ``fiber.meta``; tasks with different wishes have
+        different workers, ``max_workers`` of each kind.  A task that runs for longer than
+        ``timeout`` seconds raises ``fiber.TimeoutError``, and its worker is replaced.  What is left
+        out is as it was.  To shut down either is to shut down both.
+        """
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        other._wishes = merged(self._wishes, wished("Executor.options", cpu, memory, gpu))
+        if retries is not None:
+            other._retries = options.retries(retries)
+        if timeout is not None:
+            other._timeout = options.seconds("timeout", timeout)
+        other._queues = {}
+        util.Finalize(other, _close_queues, args=(other._queues,))
+        return other
+
+    def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
+        """Have ``fn(*args, **kwargs)`` called in a worker; returns the future of its result.
+
+        The arguments are pickled at once: what happens to them later changes nothing.
+        """
+        engine = self._group.executor_for(fn, self._wishes)
+        queue = self._queues.get(engine) or self._queue(engine)
+        future = CallFuture(engine, queue)
+        engine.call(future, fn, args, kwargs, queue=queue)
+        return future
+
+    def map(
+        self,
+        fn: Callable[..., _T],
+        *iterables: Iterable[Any],
+        timeout: float | None = None,
+        chunksize: int = 1,
+        buffersize: int | None = None,
+    ) -> Iterator[_T]:
+        """An iterator over ``fn(*items) for items in zip(*iterables)``, in order.
+
+        It raises TimeoutError if a result is not there ``timeout`` seconds after this call, and
+        ends with the first error; what has not begun by then is cancelled.  ``chunksize``: so many
+        items go to one worker together.  Iterators are read in another thread, little faster than
+        they are worked off; with ``buffersize`` also at most so many items ahead of what was taken.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        ahead = options.buffersize(buffersize)
+        unit = options.chunksize(chunksize)
+        engine = self._group.executor_for(fn, self._wishes)
+        results = IMapIterator(self._group)
+        several = len(iterables) != 1
+        try:
+            item = WorkItem(
+                work.STAR if several else work.MAP,
+                function=engine.function(fn),
+                future=results._buffer,
+                unit=unit,
+                exact=unit == 1,
+                timeout=self._timeout,
+                retries=self._retries,
+            )
+        except Exception as error:  # it does not pickle
+            engine.reject(results._buffer, error)
+            return _taken(results, engine, None, deadline)
+        source = zip(*iterables, strict=False) if several else iterables[0]
+        results._begin(engine, item, source, ahead)
+        return _taken(results, engine, item, deadline)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Take no more tasks; the workers leave once those that are there are done.
+
+        ``wait``: return only then.  ``cancel_futures``: cancel those that have not begun.
+        """
+        self._group.shut_down(wait, cancel_futures)
+
+    def terminate_workers(self) -> None:
+        """End the workers at once and for good; what is not done raises BrokenProcessPool."""
+        self._group.terminate()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.shutdown(cancel_futures=isinstance(error, KeyboardInterrupt))
+
+    def __reduce__(self) -> str:
+        raise NotImplementedError("executors cannot be passed between processes or pickled")
+
+    def _queue(self, engine: Engine) -> CallQueue:
+        queue = CallQueue(retries=self._retries, timeout=self._timeout, cancellable=True)
+        return self._queues.setdefault(engine, queue)  # another thread may be here as well
+
+    # What libraries look at
+
+    @property
+    def _processes(self) -> dict[int | None, BaseProcess]:
+        return {process.pid: process for process in self._group.processes()}
+
+    @property
+    def _broken(self) -> bool:
+        return any(engine.error is not None for engine in self._group.executors())
+
+
+ProcessPoolExecutor = Executor
+"""What concurrent.futures' users look for."""
+
+
+def _close_queues(queues: dict[Engine, CallQueue]) -> None:
+    for engine, queue in queues.items():
+        engine.calls.close(queue)
+
+
+def _process(context: Any) -> Any:
+    try:
+        return context.Process
+    except AttributeError:
+        raise TypeError(
+            f"mp_context must be what fiber.get_context() returns, not {context!r}"
+        ) from None
+
+
+def _taken(
+    results: IMapIterator, engine: Engine, item: WorkItem | None, deadline: float | None
+) -> Iterator[Any]:
+    """The results of a map, up to the first error."""
+    try:
+        # In a list, so that nothing here keeps a result that the user has let go of.
+        while held := _next(results, engine, deadline):
+            yield held.pop()
+    finally:
+        if item is not None:
+            engine.cancel(item)
+
+
+def _next(results: IMapIterator, engine: Engine, deadline: float | None) -> list[Any]:
+    """The next result of a map; none at its end."""
+    left = None if deadline is None else deadline - time.monotonic()
+    try:
+        outcome = results._take(left)
+    except StopIteration:
+        return []
+    except WaitedTooLong:
+        raise TimeoutError("the next result of the map was not there in time") from None
+    if type(outcome) is Failure:
+        raise translated(outcome.error, engine)
+    return [outcome]

@@ -1,0 +1,250 @@
+"""Columns: the values of many environments, of one space, each in its row.
+
+A number, or an array of one shape, has its row in a NumPy array, which may lie in memory that
+processes share.  What has no fixed size (text, graphs, sequences, spaces that we do not know) is
+kept as objects, which travel in messages.  A Dict or Tuple is a tree of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import Space, spaces
+
+Array: TypeAlias = npt.NDArray[Any]
+Rows: TypeAlias = Sequence[int] | slice
+"""Which rows; a slice for those that lie side by side."""
+
+Allocate: TypeAlias = Callable[[tuple[int, ...], Any], Array]
+"""Makes the array of a shape and type."""
+
+ALIGNMENT = 64
+"""Of arrays in shared memory, in bytes: no two of them are in one line of a processor's cache."""
+
+
+class Columns(Protocol):
+    """What all kinds have in common."""
+
+    def put(self, row: int, value: Any) -> None:
+        """Set one environment's value."""
+
+    def get(self, row: int) -> Any:
+        """One environment's value, which nothing that happens later changes."""
+
+    def fits(self, batch: Any, count: int) -> bool:
+        """Whether ``fill`` takes this batch of ``count`` values without changing any."""
+
+    def fill(self, rows: Rows, batch: Any) -> None:
+        """Set the values of many environments from a batch of them."""
+
+    def batch(self, rows: Rows) -> Any:
+        """Those values, as Gymnasium batches them: views of the arrays where ``rows`` is a slice,
+        else copies.
+        """
+
+    def pack(self, rows: Rows, *, shared: bool) -> Any:
+        """What has to travel for another process to have these values.
+
+        ``shared``: it has the arrays, and None is enough where there are only arrays.
+        """
+
+    def unpack(self, rows: Rows, packed: Any) -> None:
+        """Set the values that another process has packed."""
+
+    def part(self, first: int, count: int) -> Columns:
+        """The columns of the environments from ``first`` on: of the same arrays."""
+
+
+class ArrayColumn:
+    """Numbers, or arrays of one shape."""
+
+    def __init__(self, array: Array) -> None:
+        self._array = array
+        self._shape = array.shape[1:]
+        # Views of single rows are made once: that takes as long as to write to one.
+        self._views = list(array) if self._shape else None
+
+    def put(self, row: int, value: Any) -> None:
+        if not hasattr(value, "shape"):
+            value = np.asarray(value)
+        if value.shape != self._shape:
+            raise ValueError(f"its shape is {value.shape}, and that of its space {self._shape}")
+        if self._views is None:
+            self._array[row] = value
+        else:
+            self._views[row][...] = value
+
+    def get(self, row: int) -> Any:
+        return self._array[row] if self._views is None else self._views[row].copy()
+
+    def fits(self, batch: Any, count: int) -> bool:
+        return (
+            isinstance(batch, np.ndarray)
+            and batch.dtype == self._array.dtype
+            and batch.shape == (count, *self._shape)
+        )
+
+    def fill(self, rows: Rows, batch: Array) -> None:
+        self._array[rows] = batch
+
+    def batch(self, rows: Rows) -> Array:
+        return self._array[rows]
+
+    def pack(self, rows: Rows, *, shared: bool) -> Array | None:
+        return None if shared else self._array[rows]
+
+    def unpack(self, rows: Rows, packed: Array | None) -> None:
+        if packed is not None:
+            self._array[rows] = packed
+
+    def part(self, first: int, count: int) -> ArrayColumn:
+        return ArrayColumn(self._array[first : first + count])
+
+
+class ObjectColumn:
+    """Values of any kind."""
+
+    def __init__(self, values: Array) -> None:
+        self._values = values
+
+    def put(self, row: int, value: Any) -> None:
+        self._values[row] = value
+
+    def get(self, row: int) -> Any:
+        return self._values[row]
+
+    def fits(self, batch: Any, count: int) -> bool:
+        return False  # it would have to travel all the same
+
+    def fill(self, rows: Rows, batch: Iterable[Any]) -> None:
+        numbers = range(len(self._values))[rows] if isinstance(rows, slice) else rows
+        # One by one: NumPy would look into values that are sequences.
+        for row, value in zip(numbers, batch, strict=True):
+            self._values[row] = value
+
+    def batch(self, rows: Rows) -> tuple[Any, ...]:
+        return tuple(self._values[rows].tolist())
+
+    def pack(self, rows: Rows, *, shared: bool) -> tuple[Any, ...]:
+        return self.batch(rows)
+
+    def unpack(self, rows: Rows, packed: tuple[Any, ...]) -> None:
+        self.fill(rows, packed)
+
+    def part(self, first: int, count: int) -> ObjectColumn:
+        return ObjectColumn(self._values[first : first + count])
+
+
+class DictColumns:
+    """Dictionaries with the same keys."""
+
+    def __init__(self, columns: dict[str, Columns]) -> None:
+        self._columns = columns
+
+    def put(self, row: int, value: Any) -> None:
+        for key, column in self._columns.items():
+            column.put(row, value[key])
+
+    def get(self, row: int) -> dict[str, Any]:
+        return {key: column.get(row) for key, column in self._columns.items()}
+
+    def fits(self, batch: Any, count: int) -> bool:
+        return isinstance(batch, dict) and all(
+            key in batch and column.fits(batch[key], count) for key, column in self._columns.items()
+        )
+
+    def fill(self, rows: Rows, batch: Any) -> None:
+        for key, column in self._columns.items():
+            column.fill(rows, batch[key])
+
+    def batch(self, rows: Rows) -> dict[str, Any]:
+        return {key: column.batch(rows) for key, column in self._columns.items()}
+
+    def pack(self, rows: Rows, *, shared: bool) -> list[Any] | None:
+        return _packed([column.pack(rows, shared=shared) for column in self._columns.values()])
+
+    def unpack(self, rows: Rows, packed: list[Any] | None) -> None:
+        if packed is not None:
+            for column, part in zip(self._columns.values(), packed, strict=True):
+                column.unpack(rows, part)
+
+    def part(self, first: int, count: int) -> DictColumns:
+        return DictColumns({key: part.part(first, count) for key, part in self._columns.items()})
+
+
+class TupleColumns:
+    """Tuples of the same length."""
+
+    def __init__(self, columns: Sequence[Columns]) -> None:
+        self._columns = columns
+
+    def put(self, row: int, value: Any) -> None:
+        for column, part in zip(self._columns, value, strict=True):
+            column.put(row, part)
+
+    def get(self, row: int) -> tuple[Any, ...]:
+        return tuple(column.get(row) for column in self._columns)
+
+    def fits(self, batch: Any, count: int) -> bool:
+        return (
+            isinstance(batch, tuple)
+            and len(batch) == len(self._columns)
+            and all(
+                column.fits(part, count) for column, part in zip(self._columns, batch, strict=True)
+            )
+        )
+
+    def fill(self, rows: Rows, batch: Any) -> None:
+        for column, part in zip(self._columns, batch, strict=True):
+            column.fill(rows, part)
+
+    def batch(self, rows: Rows) -> tuple[Any, ...]:
+        return tuple(column.batch(rows) for column in self._columns)
+
+    def pack(self, rows: Rows, *, shared: bool) -> list[Any] | None:
+        return _packed([column.pack(rows, shared=shared) for column in self._columns])
+
+    def unpack(self, rows: Rows, packed: list[Any] | None) -> None:
+        if packed is not None:
+            for column, part in zip(self._columns, packed, strict=True):
+                column.unpack(rows, part)
+
+    def part(self, first: int, count: int) -> TupleColumns:
+        return TupleColumns([column.part(first, count) for column in self._columns])
+
+
+def columns_of(space: Space[Any], count: int, allocate: Allocate) -> Columns:
+    """Columns for ``count`` values of a space."""
+    if isinstance(space, spaces.Dict):
+        return DictColumns(
+            {key: columns_of(part, count, allocate) for key, part in space.spaces.items()}
+        )
+    if isinstance(space, spaces.Tuple):
+        return TupleColumns([columns_of(part, count, allocate) for part in space.spaces])
+    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        return ArrayColumn(allocate((count, *(space.shape or ())), space.dtype))
+    return ObjectColumn(np.empty(count, object))
+
+
+class Carver:
+    """Cuts arrays out of memory; without any it only adds up how much they need."""
+
+    def __init__(self, memory: memoryview | None = None) -> None:
+        self._memory = memory
+        self.size = 0
+
+    def __call__(self, shape: tuple[int, ...], dtype: Any) -> Array:
+        """The next array."""
+        length = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        begin, self.size = self.size, self.size + -(-length // ALIGNMENT) * ALIGNMENT
+        if self._memory is None:
+            # No memory either: all its elements are one.
+            return np.broadcast_to(np.zeros((), dtype), shape)
+        return np.ndarray(shape, dtype, self._memory[begin : begin + length])
+
+
+def _packed(parts: list[Any]) -> list[Any] | None:
+    return None if all(part is None for part in parts) else parts

@@ -1,0 +1,373 @@
+"""Which environments were told what, what came back, and what becomes of those that failed."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from multiprocessing import TimeoutError as WaitedTooLong
+from typing import Any, NamedTuple
+
+from fiber import reduction
+from fiber._transport.loop import DOZE
+from fiber.vector.arrays import Shape, SharedMemory, StepArrays
+from fiber.vector.failures import Failure
+from fiber.vector.slot import Note
+from fiber.vector.worker import Answer, Begin, Hello, Results
+from fiber.vector.worker_process import Pending, WorkerProcess
+from fiber.vector.worker_set import Ended, WorkerSet
+
+ATTEMPTS = 3
+"""How often in a row a worker may die before it has answered anything."""
+
+GRACE = 5.0
+"""Seconds beyond what its environments may take, after which a worker is taken for stuck."""
+
+_STEP = Pending("step")
+
+
+class Dispatcher:
+    """Tells workers what to do.  Environments are known by their numbers."""
+
+    def __init__(self, workers: WorkerSet, *, restart: bool) -> None:
+        self._workers = workers
+        self._worker_of = [worker for worker in workers for _ in worker.numbers]
+        self._restart = restart
+        self._generation = 0
+        """Of commands: what came before it, nobody waits for any more."""
+        self._calls: list[_Group] = []
+        """Whose results are awaited."""
+        self._ready: deque[int] = deque()
+        self._notes: dict[int, Note] = {}
+        self._failures: list[tuple[int, Exception]] = []
+        """Each with the number of an environment."""
+        self._begun = False
+
+    # Beginning and end
+
+    def start(self) -> None:
+        """Start the workers and wait until each has its environments."""
+        for worker in self._workers:
+            self._workers.start(worker)
+        self._wait(self._all_there, None)
+
+    def begin(self, shape: Shape, arrays: StepArrays, memory: SharedMemory | None) -> None:
+        """Give them the arrays: those of this host share them, if they lie in ``memory``."""
+        self._shape, self._arrays, self._memory = shape, arrays, memory
+        self._begun = True
+        for worker in self._workers:
+            worker.arrays = arrays.part(worker.setup.first, len(worker.numbers))
+            self._begin(worker)
+
+    def close(self, timeout: float | None) -> None:
+        """End the workers; kill those that have not ended when ``timeout`` is over."""
+        self._workers.close(timeout)
+
+    # Commands: nobody is told anything before all of it is pickled.
+
+    def step(self, numbers: Sequence[int] | None, actions: Any, *, together: bool) -> None:
+        """Step some environments, or all.
+
+        ``actions``: a list with one for each, or None if they are in the arrays.  ``together``:
+        nobody asks for the first of them that are done.
+        """
+        commands = []
+        for group in self._groups(numbers):
+            if actions is not None:
+                payload: Any = [actions[position] for position in group.positions]
+            elif self._shares(group.worker):
+                payload = None
+            else:
+                where = slice(None) if group.rows is None else group.rows
+                payload = (group.worker.arrays.actions.pack(where, shared=False),)
+            told = dict.fromkeys(group.each(), _STEP)
+            commands.append((group, told, self._encoded("step", group.rows, payload, together)))
+        self._tell(commands)
+
+    def reset(
+        self,
+        numbers: Sequence[int] | None,
+        seeds: Sequence[int | None],
+        options: Sequence[dict[str, Any] | None],
+    ) -> None:
+        """Reset some environments, or all, with a seed and options for each."""
+        commands = []
+        for group in self._groups(numbers):
+            told = {
+                row: Pending("reset", seeds[position], options[position])
+                for row, position in zip(group.each(), group.positions, strict=True)
+            }
+            commands.append((group, told, self._reset_command(group.rows, told)))
+        self._tell(commands)
+
+    def call(
+        self, numbers: Sequence[int], method: str, arguments: Sequence[tuple[Any, ...]]
+    ) -> None:
+        """Have ``Slot.method(*arguments)`` called, with arguments for each environment."""
+        self._wait(self._all_there, None)
+        groups = self._groups(numbers)
+        commands = []
+        for group in groups:
+            mine = [arguments[position] for position in group.positions]
+            no_steps: dict[int, Pending] = {}
+            commands.append((group, no_steps, self._encoded("call", group.rows, method, mine)))
+        for group in groups:
+            group.worker.results = None
+        self._calls = groups
+        self._tell(commands)
+
+    # Answers
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Until all environments have answered; raises what the first that failed has raised."""
+        self._wait(lambda: not any(worker.pending for worker in self._workers), timeout)
+        self._ready.clear()
+
+    def wait_for(self, count: int, timeout: float | None = None) -> list[int]:
+        """The numbers of the ``count`` environments that answered first."""
+        self._wait(lambda: len(self._ready) >= count or bool(self._failures), timeout)
+        return [self._ready.popleft() for _ in range(count)]
+
+    def results(self, timeout: float | None = None) -> list[Any]:
+        """What the methods of ``call`` returned, in its order."""
+        calls = self._calls
+        self._wait(lambda: all(group.worker.results is not None for group in calls), timeout)
+        by_position: dict[int, Any] = {}
+        for group in calls:
+            by_position |= zip(group.positions, group.worker.results or (), strict=True)
+        return [by_position[position] for position in range(len(by_position))]
+
+    def under_way(self) -> int:
+        """How many environments have not answered, or were not asked for their answer."""
+        return len(self._ready) + sum(len(worker.pending) for worker in self._workers)
+
+    def busy(self, numbers: Iterable[int]) -> int | None:
+        """The first of these of which ``under_way`` is true; None if there is none."""
+        for number in numbers:
+            worker = self._worker_of[number]
+            if number - worker.setup.first in worker.pending or number in self._ready:
+                return number
+        return None
+
+    def notes(self, numbers: Iterable[int] | None = None) -> list[tuple[int, Note]]:
+        """What the environments had to say: all of them in order, or some as they are given."""
+        if numbers is None:
+            numbers = sorted(self._notes)
+        return [(number, self._notes.pop(number)) for number in numbers if number in self._notes]
+
+    def abandon(self) -> None:
+        """Nobody waits any more for what was asked for."""
+        self._generation += 1
+        for worker in self._workers:
+            worker.pending.clear()
+            worker.deadline = None
+        self._calls = []
+        self._ready.clear()
+        self._notes.clear()
+        self._failures.clear()
+
+    def name(self, number: int) -> str:
+        """An environment, for a person."""
+        return f"environment {number}, of worker {self._worker_of[number].name!r}"
+
+    def _all_there(self) -> bool:
+        return all(worker.hello or worker.error for worker in self._workers)
+
+    # Telling
+
+    def _groups(self, numbers: Sequence[int] | None) -> list[_Group]:
+        """A command's parts, by worker; raises what became of one that is there no more."""
+        if numbers is None:
+            groups = [_Group(worker, None, worker.numbers) for worker in self._workers]
+        else:
+            by_name: dict[str, tuple[WorkerProcess, list[int], list[int]]] = {}
+            for position, number in enumerate(numbers):
+                worker = self._worker_of[number]
+                _, rows, positions = by_name.setdefault(worker.name, (worker, [], []))
+                rows.append(number - worker.setup.first)
+                positions.append(position)
+            groups = [_Group(*group) for group in by_name.values()]
+        for group in groups:
+            if group.worker.error is not None:
+                raise group.worker.error
+        return groups
+
+    def _encoded(self, operation: str, rows: Sequence[int] | None, *rest: Any) -> bytes:
+        return reduction.dumps((operation, self._generation, rows, *rest))
+
+    def _reset_command(self, rows: Sequence[int] | None, told: dict[int, Pending]) -> bytes:
+        seeds = [each.seed for each in told.values()]
+        return self._encoded("reset", rows, seeds, [each.options for each in told.values()])
+
+    def _tell(self, commands: Iterable[tuple[_Group, dict[int, Pending], bytes]]) -> None:
+        for group, told, data in commands:
+            group.worker.pending.update(told)
+            # One that is being started anew is told once it has begun.
+            if group.worker.hello is not None:
+                self._send(group.worker, data)
+
+    def _send(self, worker: WorkerProcess, data: bytes) -> None:
+        self._workers.send(worker, data)
+        self._set_deadline(worker)
+
+    def _begin(self, worker: WorkerProcess) -> None:
+        """Tell a worker that has its environments where the arrays are."""
+        memory = self._memory if self._shares(worker) else None
+        shape = self._shape if memory else self._shape._replace(num_envs=len(worker.numbers))
+        last = worker.arrays.pack(slice(None), shared=bool(memory)) if worker.lost else None
+        begin = Begin(shape, memory, last, worker.lost)
+        self._workers.send(worker, reduction.dumps(begin))
+
+    def _shares(self, worker: WorkerProcess) -> bool:
+        memory, hello = self._memory, worker.hello
+        return memory is not None and hello is not None and hello.host == memory.host
+
+    # Hearing
+
+    def _wait(self, enough: Callable[[], bool], timeout: float | None) -> None:
+        """Until ``enough``; raises what has failed."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not enough():
+            left = DOZE if deadline is None else min(DOZE, deadline - time.monotonic())
+            if left < 0:
+                raise WaitedTooLong(f"not all environments answered within {timeout:g} s")
+            for worker, message in self._workers.receive(left):
+                self._hear(worker, message)
+            self._kill_stuck()
+        self._raise_failure()
+
+    def _hear(self, worker: WorkerProcess, message: Any) -> None:
+        match message:
+            case Ended():
+                self._mourn(worker)
+            case Hello():
+                worker.hello = message
+                if self._begun:
+                    self._stand_in(worker)
+            case Failure():
+                self._lose(worker, self._told(worker, message)[1])
+            case Answer() | Results():
+                worker.deaths = 0
+                if message.generation == self._generation:
+                    self._failures += [self._told(worker, each) for each in message.failures]
+                    if isinstance(message, Answer):
+                        self._answer(worker, message)
+                    else:
+                        worker.results = message.values
+
+    def _answer(self, worker: WorkerProcess, answer: Answer) -> None:
+        first, rows, pending = worker.setup.first, answer.rows, worker.pending
+        if rows is None:
+            worker.arrays.unpack(slice(None), answer.packed)
+            pending.clear()
+            self._ready.extend(worker.numbers)
+        else:
+            worker.arrays.unpack(rows, answer.packed)
+            for row in rows:
+                del pending[row]
+                self._ready.append(first + row)
+        for failure in answer.failures:
+            del pending[failure.row]
+        for note in answer.notes:
+            self._notes[first + note.row] = note
+            if note.lost not in (None, worker.lost):
+                self._warn(f"environment {first + note.row} made anew: {note.lost}")
+        self._set_deadline(worker)
+
+    def _told(self, worker: WorkerProcess, failure: Failure) -> tuple[int, Exception]:
+        number = worker.setup.first + failure.row
+        return number, failure.exception(self.name(number))
+
+    def _raise_failure(self) -> None:
+        if self._failures:
+            (_, error), *others = sorted(self._failures, key=lambda failure: failure[0])
+            for _, other in others:
+                for note in getattr(other, "__notes__", ()) or (str(other),):
+                    error.add_note(f"failed, too: {note}")
+            self._failures.clear()
+            raise error
+
+    # Ends
+
+    def _mourn(self, worker: WorkerProcess) -> None:
+        """A worker's process is gone."""
+        if worker.error is not None:
+            return  # it said why
+        error = worker.death(self._at_work(worker))
+        worker.deaths += 1
+        if not self._begun or not self._restart or worker.deaths > ATTEMPTS:
+            self._lose(worker, error)
+            return
+        if any(group.worker is worker and worker.results is None for group in self._calls):
+            # Nobody knows what of the call was done.
+            worker.results = []
+            self._failures.append((worker.setup.first, error))
+        self._warn(f"{worker.whose()} made anew: {error}")
+        self._workers.drop(worker)
+        worker.hello, worker.lost, worker.deadline = None, str(error), None
+        try:
+            self._workers.start(worker)
+        except BaseException:
+            self._lose(worker, error)
+            raise
+
+    def _lose(self, worker: WorkerProcess, error: Exception) -> None:
+        """There is no worker for its environments any more."""
+        worker.error = error
+        worker.results = []
+        worker.pending.clear()
+        worker.deadline = None
+        self._failures.append((worker.setup.first, error))
+
+    def _at_work(self, worker: WorkerProcess) -> int | None:
+        """The row that a worker of this host was busy with."""
+        if not self._begun or not self._shares(worker):
+            return None
+        at_work = self._arrays.at_work
+        row = int(at_work[worker.setup.worker]) - 1
+        at_work[worker.setup.worker] = 0
+        return None if row < 0 else row
+
+    def _stand_in(self, worker: WorkerProcess) -> None:
+        """A new process has its environments: tell it what the one before was told."""
+        self._begin(worker)
+        steps = [row for row, told in worker.pending.items() if told is _STEP]
+        resets = {row: told for row, told in worker.pending.items() if told is not _STEP}
+        if steps:
+            # Their episodes are lost, and no action goes on with them.
+            self._send(worker, self._encoded("step", steps, [None] * len(steps), False))
+        if resets:
+            self._send(worker, self._reset_command(list(resets), resets))
+
+    def _warn(self, message: str) -> None:
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
+
+    def _set_deadline(self, worker: WorkerProcess) -> None:
+        timeout, told = worker.setup.timeout, len(worker.pending)
+        worker.deadline = None
+        if timeout is not None and told:
+            worker.deadline = time.monotonic() + told * timeout + GRACE
+
+    def _kill_stuck(self) -> None:
+        """A worker's own alarm ends what takes too long, unless that keeps the interpreter, or the
+        worker is stopped or out of reach.
+        """
+        for worker in self._workers:
+            if worker.deadline is not None and worker.deadline < time.monotonic():
+                worker.deadline = None
+                worker.stuck = True
+                worker.process.kill()
+
+
+class _Group(NamedTuple):
+    """The part of a command that is one worker's."""
+
+    worker: WorkerProcess
+    rows: Sequence[int] | None
+    positions: Sequence[int]
+    """Of its environments in what the caller gave."""
+
+    def each(self) -> Sequence[int]:
+        """The rows, one by one."""
+        return range(len(self.worker.numbers)) if self.rows is None else self.rows

@@ -1,0 +1,148 @@
+"""One environment in its worker: steps, resets by itself when an episode ends, is made anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+from gymnasium import Env, Wrapper
+from gymnasium.vector import AutoresetMode
+
+from fiber.vector.arrays import StepArrays
+
+MakeEnv: TypeAlias = Callable[[], Env[Any, Any]]
+
+
+class Final(NamedTuple):
+    """How an episode ended whose environment was reset in the same step."""
+
+    observation: Any
+    info: dict[str, Any]
+
+
+class Note(NamedTuple):
+    """What a step or reset of one environment gave besides what is in the arrays."""
+
+    row: int
+    info: dict[str, Any]
+    final: Final | None = None
+    lost: str | None = None
+    """Why the environment was made anew, and its episode cut short."""
+
+
+class Slot:
+    """An environment, and what its autoreset has to remember.
+
+    ``lost`` says that an episode was under way in an environment that is no more: the next step
+    reports it as truncated.
+    """
+
+    def __init__(self, row: int, make: MakeEnv, mode: AutoresetMode) -> None:
+        self.row = row
+        self._make = make
+        self.env = make()
+        self._over = False
+        self._lost: str | None = None
+        self._step = {
+            AutoresetMode.NEXT_STEP: self._step_or_reset,
+            AutoresetMode.SAME_STEP: self._step_and_reset,
+            AutoresetMode.DISABLED: self._step_only,
+        }[mode]
+        self._same_step = mode is AutoresetMode.SAME_STEP
+
+    def step(self, action: Any, arrays: StepArrays) -> Note | None:
+        """One step; the note is None if there is nothing to say."""
+        if self._lost is not None:
+            return self._truncate(arrays)
+        return self._step(action, arrays)
+
+    def reset(
+        self, arrays: StepArrays, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> Note | None:
+        """Begin an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        arrays.put(self.row, observation, 0.0, False, False)
+        lost, self._lost = self._lost, None
+        self._over = False
+        return Note(self.row, info, lost=lost) if info or lost else None
+
+    def call(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
+        """What a method of the environment returns, or the value of an attribute."""
+        attribute = self.env.get_wrapper_attr(name)
+        return attribute(*args, **kwargs) if callable(attribute) else attribute
+
+    def get_attr(self, name: str) -> Any:
+        """An attribute of a wrapper or of the environment."""
+        return self.env.get_wrapper_attr(name)
+
+    def has_attr(self, name: str) -> bool:
+        """Whether there is one."""
+        return self.env.has_wrapper_attr(name)
+
+    def set_wrapper_attr(self, name: str, value: Any) -> None:
+        """Set an attribute where a wrapper or the environment has it."""
+        self.env.set_wrapper_attr(name, value)
+
+    def set_attr(self, name: str, value: Any) -> None:
+        """Set an attribute of the outermost wrapper."""
+        setattr(self.env, name, value)
+
+    def is_wrapped(self, wrapper_class: type[Wrapper[Any, Any, Any, Any]]) -> bool:
+        """Whether such a wrapper is around the environment."""
+        env = self.env
+        while isinstance(env, Wrapper) and not isinstance(env, wrapper_class):
+            env = env.env
+        return isinstance(env, wrapper_class)
+
+    def lose(self, why: str) -> None:
+        """Its episode cannot go on."""
+        self._lost = why
+
+    def make_anew(self, why: str) -> None:
+        """Another environment in place of this one, whose episode is lost."""
+        try:
+            self.env.close()
+        except Exception:
+            pass  # it failed before, and what it holds goes with it
+        self.env = self._make()
+        self.lose(why)
+
+    def _step_or_reset(self, action: Any, arrays: StepArrays) -> Note | None:
+        if self._over:
+            observation, info = self.env.reset()
+            self._over = False
+            arrays.put(self.row, observation, 0.0, False, False)
+        else:
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            self._over = bool(terminated or truncated)
+            arrays.put(self.row, observation, reward, terminated, truncated)
+        return Note(self.row, info) if info else None
+
+    def _step_and_reset(self, action: Any, arrays: StepArrays) -> Note | None:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        final = None
+        if terminated or truncated:
+            final = Final(observation, info)
+            observation, info = self.env.reset()
+        arrays.put(self.row, observation, reward, terminated, truncated)
+        return Note(self.row, info, final) if final or info else None
+
+    def _step_only(self, action: Any, arrays: StepArrays) -> Note | None:
+        assert not self._over, "its episode has ended, and autoreset is disabled: reset it first"
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._over = bool(terminated or truncated)
+        arrays.put(self.row, observation, reward, terminated, truncated)
+        return Note(self.row, info) if info else None
+
+    def _truncate(self, arrays: StepArrays) -> Note:
+        """The end of an episode whose environment is gone: where it was seen last."""
+        lost, last = self._lost, arrays.observations.get(self.row)
+        if self._same_step:
+            observation, info = self.env.reset()
+            final = Final(last, {})
+        else:
+            observation, info, final = last, {}, None
+            self._over = True
+        arrays.put(self.row, observation, 0.0, False, True)
+        self._lost = None
+        return Note(self.row, info, final, lost)

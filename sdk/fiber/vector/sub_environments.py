@@ -1,0 +1,113 @@
+"""What both vector environments are made of: Gymnasium's and stable-baselines3's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from gymnasium.vector import AutoresetMode
+
+import fiber
+from fiber import cpu
+from fiber.vector.arrays import Shape, SharedMemory, StepArrays
+from fiber.vector.dispatcher import Dispatcher
+from fiber.vector.slot import MakeEnv
+from fiber.vector.spaces import ObservationMode, Spaces, check_mode
+from fiber.vector.worker import Setup
+from fiber.vector.worker_process import WorkerProcess
+from fiber.vector.worker_set import WorkerSet
+
+
+class SubEnvironments:
+    """Workers with their environments, the arrays of a step, and the spaces of both."""
+
+    def __init__(
+        self,
+        env_fns: Sequence[MakeEnv],
+        *,
+        owner: str,
+        num_workers: int | None,
+        shared_memory: bool,
+        context: str | None,
+        observation_mode: ObservationMode,
+        autoreset: AutoresetMode,
+        on_error: str,
+        timeout: float | None,
+    ) -> None:
+        if not env_fns:
+            raise ValueError("a vector environment has at least one environment: env_fns is empty")
+        if on_error not in ("raise", "restart"):
+            raise ValueError(f"on_error is 'raise' or 'restart', not {on_error!r}")
+        if timeout is not None and timeout <= 0:
+            raise ValueError(f"timeout is a number of seconds above 0, not {timeout!r}")
+        if num_workers is not None and num_workers < 1:
+            raise ValueError(f"num_workers is at least 1, not {num_workers}")
+        check_mode(observation_mode)
+        count = len(env_fns)
+        wanted = cpu.cpu_count() if num_workers is None else num_workers
+        setups = [
+            Setup(index, rows.start, env_fns[rows], autoreset, on_error == "restart", timeout)
+            for index, rows in enumerate(_divided(count, min(wanted, count)))
+        ]
+        chosen = fiber.get_context(context)
+        workers = [WorkerProcess(setup, chosen, owner) for setup in setups]
+        self.dispatcher = Dispatcher(WorkerSet(workers), restart=on_error == "restart")
+        try:
+            self.dispatcher.start()
+            hellos = [worker.hello for worker in workers if worker.hello is not None]
+            self.metadata = hellos[0].metadata
+            self.render_mode = hellos[0].render_mode
+            self.spaces = Spaces.of(
+                [pair for hello in hellos for pair in hello.spaces],
+                observation_mode,
+                self.dispatcher.name,
+            )
+            shape = Shape(
+                self.spaces.single_observation_space,
+                self.spaces.single_action_space,
+                count,
+                len(setups),
+            )
+            memory = SharedMemory.allocate(shape.size()) if shared_memory else None
+            self.arrays = (
+                StepArrays.of_memory(shape, memory.view) if memory else StepArrays.private(shape)
+            )
+            self.dispatcher.begin(shape, self.arrays, memory)
+        except BaseException:
+            self.close(0)
+            raise
+
+    def step(
+        self,
+        numbers: Sequence[int] | None,
+        actions: Any,
+        split: Callable[[Any], list[Any]],
+        *,
+        together: bool,
+    ) -> None:
+        """Begin to step some environments, or all, with a batch of actions for them.
+
+        ``split`` makes a list of the batch; ``together``: nobody asks for the first that are done.
+        """
+        count = len(self.arrays.rewards) if numbers is None else len(numbers)
+        columns = self.arrays.actions
+        if columns.fits(actions, count):
+            columns.fill(slice(None) if numbers is None else numbers, actions)
+            self.dispatcher.step(numbers, None, together=together)
+            return
+        chosen = split(actions)
+        if len(chosen) != count:
+            raise ValueError(
+                f"actions for {count} environments are needed, one for each, not {len(chosen)}"
+            )
+        self.dispatcher.step(numbers, chosen, together=together)
+
+    def close(self, timeout: float | None) -> None:
+        """End the workers; kill those that have not ended when ``timeout`` is over."""
+        self.dispatcher.close(timeout)
+
+
+def _divided(count: int, parts: int) -> Iterator[slice]:
+    """So many pieces, as equal as can be, of so many environments."""
+    for part in range(parts):
+        yield slice(count * part // parts, count * (part + 1) // parts)

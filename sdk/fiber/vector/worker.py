@@ -1,0 +1,325 @@
+"""The worker: a process with many environments, which steps them as it is told.
+
+A command is a tuple ``(operation, generation, rows, ...)``.  It has one answer or, where
+``together`` is not asked for, several: what is done does not wait for an environment that is slow.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from gymnasium.vector import AutoresetMode
+
+from fiber import reduction
+from fiber._hub import client
+from fiber.connection import Connection
+from fiber.errors import UnpicklableError
+from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays
+from fiber.vector.failures import Failure, summary
+from fiber.vector.slot import MakeEnv, Note, Slot
+from fiber.vector.time_limit import TimeLimit
+
+REPORT_AFTER = 200e-6
+"""Seconds that what is done may wait for more, so that many quick steps make one message."""
+
+
+MEMORY = 0.99
+"""What is left, a step later, of how slow an environment was."""
+
+
+class Setup(NamedTuple):
+    """What a worker is to be."""
+
+    worker: int
+    first: int
+    """The number of its first environment; rows count from there."""
+    makes: Sequence[MakeEnv]
+    autoreset: AutoresetMode
+    restart: bool
+    """Whether an environment that raises is made anew."""
+    timeout: float | None
+    """Seconds for a step or reset of one environment."""
+
+
+class Hello(NamedTuple):
+    """What a worker says first."""
+
+    host: str
+    metadata: dict[str, Any]
+    render_mode: str | None
+    spaces: list[tuple[Any, Any]]
+    """Observation and action space of each environment."""
+
+
+class Begin(NamedTuple):
+    """What it is told then."""
+
+    shape: Shape
+    """That of its own environments, or of all if there is ``memory``."""
+    memory: SharedMemory | None
+    last: Packed | None = None
+    """What was last seen of the environments of a worker that this one stands in for."""
+    lost: str | None = None
+    """What became of that worker."""
+
+
+class Answer(NamedTuple):
+    """What it says of steps and resets."""
+
+    generation: int
+    rows: Sequence[int] | None
+    """Which environments are done; None for all of the worker's."""
+    packed: Packed | None
+    notes: Sequence[Note]
+    failures: Sequence[Failure]
+    """Of environments that are not among ``rows``."""
+
+
+class Results(NamedTuple):
+    """What it says of a call."""
+
+    generation: int
+    values: list[Any]
+    failures: Sequence[Failure]
+
+
+def serve(connection: Connection, setup: Setup) -> None:
+    """The target of a worker process."""
+    slots: list[Slot] = []
+    try:
+        for row, make in enumerate(setup.makes):
+            try:
+                slots.append(Slot(row, make, setup.autoreset))
+                _check_that_it_is_new(slots)
+            except Exception as error:
+                connection.send(Failure.of(row, "the making", error))
+                return
+        connection.send(_hello(slots))
+        Worker(connection, setup, slots, connection.recv()).run()
+    except (EOFError, BrokenPipeError):
+        pass  # whoever wanted them stepped is gone, or has closed them
+    finally:
+        for slot in slots:
+            slot.env.close()
+
+
+class Worker:
+    """Does what it is told until its connection ends."""
+
+    def __init__(
+        self, connection: Connection, setup: Setup, slots: Sequence[Slot], begin: Begin
+    ) -> None:
+        self._connection = connection
+        self._setup = setup
+        self._slots = slots
+        self._all = range(len(slots))
+        self._took = [0.0] * len(slots)
+        """Seconds that a step of each environment takes, if it is slow: slowly forgotten."""
+        self._limit: contextlib.AbstractContextManager[None] = (
+            contextlib.nullcontext() if setup.timeout is None else TimeLimit(setup.timeout)
+        )
+        self._shared = begin.memory is not None
+        if begin.memory is None:
+            self._arrays = StepArrays.private(begin.shape)
+        else:
+            arrays = StepArrays.of_memory(begin.shape, begin.memory.view)
+            self._arrays = arrays.part(setup.first, len(slots))
+        self._arrays.unpack(slice(None), begin.last)
+        # Where nobody else sees it, it does no harm.
+        self._at_work = self._arrays.at_work
+        if begin.lost is not None:
+            for slot in slots:
+                slot.lose(begin.lost)
+        self._operations: dict[str, Callable[..., None]] = {
+            "call": self._call,
+            "reset": self._reset,
+            "step": self._step,
+        }
+
+    def run(self) -> None:
+        """Until EOFError: the end of the connection."""
+        while True:
+            operation, *arguments = self._connection.recv()
+            self._operations[operation](*arguments)
+
+    # Operations
+
+    def _step(
+        self, generation: int, rows: Sequence[int] | None, actions: Any, together: bool
+    ) -> None:
+        """``actions``: None where they are in the arrays already, a list, or packed."""
+        arrays, slots = self._arrays, self._slots
+        if isinstance(actions, list):
+            chosen = dict(zip(self._each(rows), actions, strict=True))
+            action_of: Callable[[int], Any] = chosen.__getitem__
+        else:
+            if actions is not None:
+                (packed,) = actions
+                arrays.actions.unpack(slice(None) if rows is None else rows, packed)
+            action_of = arrays.actions.get
+
+        def step(row: int) -> Note | None:
+            return slots[row].step(action_of(row), arrays)
+
+        self._do(_Report(generation), rows, step, "step", together)
+
+    def _reset(
+        self,
+        generation: int,
+        rows: Sequence[int] | None,
+        seeds: Sequence[int | None],
+        options: Sequence[dict[str, Any] | None],
+    ) -> None:
+        arguments = dict(zip(self._each(rows), zip(seeds, options, strict=True), strict=True))
+
+        def reset(row: int) -> Note | None:
+            return self._slots[row].reset(self._arrays, *arguments[row])
+
+        self._do(_Report(generation), rows, reset, "reset", together=False)
+
+    def _call(
+        self,
+        generation: int,
+        rows: Sequence[int] | None,
+        method: str,
+        arguments: Sequence[tuple[Any, ...]],
+    ) -> None:
+        """A method of each slot: the results are what it returns."""
+        values, failures = [], []
+        for row, mine in zip(self._each(rows), arguments, strict=True):
+            try:
+                values.append(getattr(self._slots[row], method)(*mine))
+            except Exception as error:
+                failures.append(Failure.of(row, "a call", error))
+        try:
+            self._connection.send(Results(generation, values, failures))
+        except UnpicklableError as error:
+            failures.append(Failure.of(self._each(rows)[0], "a call", error))
+            self._connection.send(Results(generation, [], failures))
+
+    # What they have in common
+
+    def _each(self, rows: Sequence[int] | None) -> Sequence[int]:
+        return self._all if rows is None else rows
+
+    def _do(
+        self,
+        report: _Report,
+        rows: Sequence[int] | None,
+        operation: Callable[[int], Note | None],
+        doing: str,
+        together: bool,
+    ) -> None:
+        """An operation of each environment; what is done is told as soon as the next one is
+        expected to keep it waiting, or at the end if they are wanted ``together``.
+        """
+        clock = time.perf_counter
+        worker, at_work, limit = self._setup.worker, self._at_work, self._limit
+        now = clock()
+        for row in self._each(rows):
+            began = now
+            if report.rows and not together and began + self._took[row] > report.due:
+                self._send(report, whole=False)
+                report = _Report(report.generation)
+            at_work[worker] = row + 1
+            try:
+                with limit:
+                    note = operation(row)
+            except Exception as error:
+                self._retry(row, operation, doing, error, report)
+            else:
+                report.add(row, note)
+            now = clock()
+            self._took[row] = max(now - began, MEMORY * self._took[row])
+            if len(report.rows) == 1:
+                report.due = now + REPORT_AFTER
+        at_work[worker] = 0
+        self._send(report, whole=rows is None and len(report.rows) == len(self._all))
+
+    def _retry(
+        self,
+        row: int,
+        operation: Callable[[int], Note | None],
+        doing: str,
+        error: Exception,
+        report: _Report,
+    ) -> None:
+        """Try again with a new environment, if that is wished; else tell."""
+        if self._setup.restart:
+            try:
+                self._slots[row].make_anew(f"{doing} raised {summary(error)}")
+                with self._limit:
+                    note = operation(row)
+            except Exception as again:
+                again.__cause__ = error
+                error = again
+            else:
+                report.add(row, note)
+                return
+        report.failures.append(Failure.of(row, doing, error))
+
+    def _send(self, report: _Report, *, whole: bool) -> None:
+        try:
+            self._connection.send(report.answer(self._arrays, whole=whole, shared=self._shared))
+        except UnpicklableError:
+            self._blame(report)
+            self._connection.send(report.answer(self._arrays, whole=False, shared=self._shared))
+
+    def _blame(self, report: _Report) -> None:
+        """Some of it does not pickle: those environments have failed."""
+        notes = {note.row: note for note in report.notes}
+        for row in list(report.rows):
+            told = notes.get(row), self._arrays.observations.pack([row], shared=self._shared)
+            try:
+                reduction.dumps(told)
+            except Exception as error:
+                report.fail(Failure.of(row, "an answer that cannot be pickled", error))
+
+
+class _Report:
+    """What is done of a command and was not told yet."""
+
+    __slots__ = ("due", "failures", "generation", "notes", "rows")
+
+    def __init__(self, generation: int) -> None:
+        self.generation = generation
+        self.rows: list[int] = []
+        self.notes: list[Note] = []
+        self.failures: list[Failure] = []
+        self.due = 0.0
+
+    def add(self, row: int, note: Note | None) -> None:
+        """An environment is done."""
+        self.rows.append(row)
+        if note is not None:
+            self.notes.append(note)
+
+    def fail(self, failure: Failure) -> None:
+        """One of them cannot be told."""
+        self.rows.remove(failure.row)
+        self.notes = [note for note in self.notes if note.row != failure.row]
+        self.failures.append(failure)
+
+    def answer(self, arrays: StepArrays, *, whole: bool, shared: bool) -> Answer:
+        """What is told; ``whole``: all environments of the worker are in it."""
+        packed = arrays.pack(slice(None) if whole else self.rows, shared=shared)
+        rows = None if whole else self.rows
+        return Answer(self.generation, rows, packed, self.notes, self.failures)
+
+
+def _check_that_it_is_new(slots: Sequence[Slot]) -> None:
+    newest = slots[-1].env.unwrapped
+    if any(slot.env.unwrapped is newest for slot in slots[:-1]):
+        raise ValueError(
+            "it is the environment that the function has made before: have it make a new one at "
+            "every call (`lambda: gymnasium.make(...)` instead of `lambda: env`)"
+        )
+
+
+def _hello(slots: Sequence[Slot]) -> Hello:
+    envs = [slot.env for slot in slots]
+    spaces = [(env.observation_space, env.action_space) for env in envs]
+    return Hello(client.host(), dict(envs[0].metadata), envs[0].render_mode, spaces)

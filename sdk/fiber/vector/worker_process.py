@@ -1,0 +1,121 @@
+"""A worker as its learner sees it: its process, its connection, what it was told."""
+
+from __future__ import annotations
+
+from multiprocessing import TimeoutError as TookTooLong
+from typing import Any, NamedTuple
+
+from fiber import reduction
+from fiber.connection import Connection, Pipe
+from fiber.context import BaseContext
+from fiber.errors import UnpicklableError, WorkerDied
+from fiber.process import Process
+from fiber.vector.arrays import StepArrays
+from fiber.vector.worker import Hello, Setup, serve
+
+NEWS = 2.0
+"""Seconds that the news of a process's end may take after that of its connection."""
+
+
+class Pending(NamedTuple):
+    """What an environment was told and has not answered."""
+
+    operation: str
+    seed: int | None = None
+    options: dict[str, Any] | None = None
+
+
+class WorkerProcess:
+    """A worker, whose process is started anew if it dies."""
+
+    process: Process
+    connection: Connection
+    arrays: StepArrays
+    """Those of its environments, once all have said hello."""
+
+    def __init__(self, setup: Setup, context: BaseContext, owner: str) -> None:
+        self.setup = setup
+        self.name = f"{owner}-worker-{setup.worker}"
+        self.numbers = range(setup.first, setup.first + len(setup.makes))
+        """Its environments."""
+        self._context = context
+        self.hello: Hello | None = None
+        self.pending: dict[int, Pending] = {}
+        """By row."""
+        self.results: list[Any] | None = None
+        """Of the call of methods that it was told last; None while that is awaited."""
+        self.deadline: float | None = None
+        self.stuck = False
+        """Killed, since the deadline was over."""
+        self.deaths = 0
+        """Since it answered anything."""
+        self.lost: str | None = None
+        """What became of the process before this one."""
+        self.error: Exception | None = None
+        """Why there is none any more."""
+
+    def start(self) -> None:
+        """Start the process."""
+        self.connection, theirs = Pipe()
+        with theirs:
+            self.process = self._context.Process(
+                target=serve, args=(theirs, self.setup), name=self.name, daemon=True
+            )
+            try:
+                self.process.start()
+            except BaseException as error:
+                self.connection.close()
+                if isinstance(error, UnpicklableError):
+                    self._check_pickling()
+                raise
+
+    def whose(self) -> str:
+        """Its environments, for a person."""
+        first, last = self.numbers[0], self.numbers[-1]
+        return f"environment {first}" if first == last else f"environments {first} to {last}"
+
+    def death(self, row: int | None) -> Exception:
+        """The error that tells of its end; ``row`` was at work then, if that is known."""
+        told = next(iter(self.pending.values()), None) if self.hello else None
+        doing = told.operation if told else "a call" if self.hello else "the making"
+        whose = self.whose() if row is None else f"environment {self.numbers[row]}"
+        self.process.join(NEWS)
+        if self.process.exitcode is None:
+            self.process.kill()  # its connection is lost: nothing that it does reaches us
+            self.process.join(NEWS)
+        if self.stuck:
+            self.stuck = False
+            return TookTooLong(
+                f"{doing} of {whose} took longer than {self.setup.timeout:g} s (timeout) for each, "
+                f"and nothing but its end stopped worker {self.name!r}"
+            )
+        popen: Any = self.process._popen
+        report = popen.report
+        return WorkerDied(
+            task=f"{doing} of {whose}",
+            worker=self.name,
+            host=report.host if report else "?",
+            pid=self.process.pid,
+            exitcode=self.process.exitcode,
+            reason=report.reason if report else "its connection is lost",
+            log=report.log if report else (),
+            pod=(report and report.pod) or None,
+            node=(report and report.node) or None,
+        )
+
+    def close(self, timeout: float | None) -> None:
+        """Wait for its end; kill it when ``timeout`` is over."""
+        self.connection.close()
+        self.process.join(timeout)
+        if self.process.exitcode is None:
+            self.process.kill()
+            self.process.join()
+        self.process.close()
+
+    def _check_pickling(self) -> None:
+        for number, make in zip(self.numbers, self.setup.makes, strict=True):
+            try:
+                reduction.dumps(make)
+            except Exception as error:
+                what = f"the function that makes environment {number}, of worker {self.name!r},"
+                raise UnpicklableError(what, str(error)) from error

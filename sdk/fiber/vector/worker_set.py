@@ -1,0 +1,107 @@
+"""The workers of a vector environment, and what any of them says."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from fiber.vector.worker_process import WorkerProcess
+
+
+class Ended:
+    """In place of a message: there will be no more from this process."""
+
+
+class WorkerSet:
+    """Starts workers and listens to them all."""
+
+    def __init__(self, workers: Sequence[WorkerProcess]) -> None:
+        self._workers = workers
+        self._started: list[WorkerProcess] = []
+        """Those whose process has to be closed."""
+        self._ended: deque[WorkerProcess] = deque()
+        """Those of whose end we have heard, and not told."""
+        self._poller = select.epoll()
+        self._heard_by: dict[int, WorkerProcess] = {}
+        """By descriptor."""
+
+    def __iter__(self) -> Iterator[WorkerProcess]:
+        return iter(self._workers)
+
+    def __len__(self) -> int:
+        return len(self._workers)
+
+    def start(self, worker: WorkerProcess) -> None:
+        """Start a worker's process, and listen to it."""
+        worker.start()
+        self._started.append(worker)
+        # A process that an environment has started may hold the connection open beyond the end of
+        # the worker: that is told by the sentinel.
+        for descriptor in (worker.connection.fileno(), worker.process.sentinel):
+            self._heard_by[descriptor] = worker
+            self._poller.register(descriptor, select.EPOLLIN)
+
+    def drop(self, worker: WorkerProcess) -> None:
+        """Let go of a process that has ended."""
+        self._forget(worker)
+        self._started.remove(worker)
+        worker.close(0)
+
+    def send(self, worker: WorkerProcess, data: bytes) -> None:
+        """Send a pickled command; if the worker is gone, that is the next thing to be heard."""
+        try:
+            worker.connection.send_bytes(data)
+        except OSError:
+            self._ended.append(worker)
+
+    def receive(self, timeout: float) -> list[tuple[WorkerProcess, Any]]:
+        """What workers say; nothing after ``timeout`` seconds."""
+        heard: list[tuple[WorkerProcess, Any]] = []
+        for descriptor, _ in self._poller.poll(0 if self._ended else timeout):
+            worker = self._heard_by[descriptor]
+            if descriptor == worker.process.sentinel:
+                heard += [(worker, message) for message in _rest(worker)]
+                self._ended.append(worker)
+            elif worker not in self._ended:  # else all that it said was heard already
+                try:
+                    heard.append((worker, worker.connection.recv()))
+                except (EOFError, OSError):
+                    self._ended.append(worker)
+        while self._ended:
+            worker = self._ended.popleft()
+            if self._forget(worker):
+                heard.append((worker, Ended()))
+        return heard
+
+    def close(self, timeout: float | None) -> None:
+        """Wait until they have ended; kill those that have not when ``timeout`` is over."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        for worker in self._started:
+            self._forget(worker)
+            worker.connection.close()  # which they hear
+        while self._started:
+            worker = self._started.pop()
+            worker.close(None if deadline is None else max(0.0, deadline - time.monotonic()))
+        self._poller.close()
+
+    def _forget(self, worker: WorkerProcess) -> bool:
+        """Listen to it no more; False if that is so already."""
+        descriptors = [fd for fd, other in self._heard_by.items() if other is worker]
+        for descriptor in descriptors:
+            del self._heard_by[descriptor]
+            self._poller.unregister(descriptor)
+        return bool(descriptors)
+
+
+def _rest(worker: WorkerProcess) -> list[Any]:
+    """What a worker had said before it ended."""
+    messages = []
+    try:
+        while worker.connection.poll():
+            messages.append(worker.connection.recv())
+    except (EOFError, OSError):
+        pass
+    return messages

@@ -1,0 +1,202 @@
+"""Managers whose process, clients or proxies' owners are killed: an error or going on, no hang."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Iterator
+from threading import BrokenBarrierError
+from typing import Any
+
+import pytest
+
+import fiber
+from faults import targets
+from faults.program import PATIENCE, wait_for
+from fiber.errors import ConnectionClosed
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+
+@pytest.fixture
+def manager() -> Iterator[Any]:
+    with fiber.Manager() as manager:
+        yield manager
+    manager._process.close()  # pytest holds the manager
+
+
+@pytest.fixture
+def victim(manager: Any) -> Iterator[Any]:
+    """A process that does as it is told, to be killed."""
+    orders = manager.Queue()
+    process = fiber.Process(target=targets.obey, args=(orders,))
+    process.start()
+    yield lambda method, *args: tell(orders, process, method, *args)
+    process.kill()
+    process.join(PATIENCE)
+    process.close()
+
+
+def tell(orders: Any, process: Any, method: str, *args: Any) -> Any:
+    """Have the process do something, or have it killed."""
+    if method == "die":
+        process.kill()
+        process.join(PATIENCE)
+        return process.name
+    orders.put((method, args))
+    return None
+
+
+# The manager's process
+
+
+def test_its_death_is_an_error_that_says_who_and_why(manager: Any) -> None:
+    shared, name = manager.dict(a=1), manager._process.name
+    manager._process.kill()
+    manager._process.join(PATIENCE)
+    with pytest.raises(ConnectionClosed, match=rf"manager '{name}'.*gone \(.*SIGKILL"):
+        shared["a"]
+    with pytest.raises(ConnectionClosed, match=rf"manager '{name}'.*gone \(.*SIGKILL"):
+        manager.list()
+    with pytest.raises(ConnectionClosed, match=name):
+        len(shared)
+
+
+def test_who_waits_in_a_call_is_told(manager: Any) -> None:
+    queue, errors = manager.Queue(), []
+
+    def wait() -> None:
+        try:
+            queue.get()
+        except ConnectionClosed as error:
+            errors.append(error)
+
+    waiters = [threading.Thread(target=wait) for _ in range(3)]
+    for waiter in waiters:
+        waiter.start()
+    wait_for(lambda: manager._debug_info().count("refcount") == 1)
+    manager._process.kill()
+    for waiter in waiters:
+        waiter.join(PATIENCE)
+    assert len(errors) == 3
+
+
+def test_a_process_that_did_not_start_it_is_told_too(manager: Any) -> None:
+    ours, theirs = fiber.Pipe()
+    child = fiber.Process(target=targets.touch_until_it_fails, args=(manager.list(), theirs))
+    child.start()
+    theirs.close()
+    assert ours.recv() == "touched"
+    manager._process.kill()
+    told = ours.recv()
+    assert told.startswith("ConnectionClosed")
+    assert repr(manager._process.name) in told
+    child.join(PATIENCE)
+    assert child.exitcode == 0
+    child.close()
+    ours.close()
+
+
+# A client
+
+
+def test_what_only_a_dead_process_referred_to_goes(manager: Any, victim: Any) -> None:
+    made = manager.Queue()
+    objects = manager._number_of_objects()
+    victim("make", manager.address, made)
+    assert list(made.get(True, PATIENCE)) == ["made"]
+    assert manager._number_of_objects() == objects + 1
+    victim("die")
+    wait_for(lambda: manager._number_of_objects() == objects)
+
+
+@pytest.mark.parametrize("kind", ["Lock", "RLock", "Semaphore", "BoundedSemaphore", "Condition"])
+def test_a_lock_of_a_dead_process_is_released_with_a_warning(
+    manager: Any, victim: Any, kind: str
+) -> None:
+    # The victim waits for the next order meanwhile, so that its thread in the manager is not free.
+    lock, done = getattr(manager, kind)(), manager.Event()
+    victim("acquire", lock, done)
+    assert done.wait(PATIENCE)
+    assert not lock.acquire(False)
+    name = victim("die")
+    with pytest.warns(RuntimeWarning, match=rf"process '{name}' .*ended while it held this"):
+        assert lock.acquire(True, PATIENCE)
+    lock.release()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert lock.acquire(True, PATIENCE), "it is said once"
+
+
+@pytest.mark.parametrize("kind", ["Lock", "RLock"])
+def test_a_dead_waiter_gets_no_lock(manager: Any, victim: Any, kind: str) -> None:
+    lock, begun = getattr(manager, kind)(), manager.Event()
+    lock.acquire()
+    victim("queue_up", lock, begun)
+    assert begun.wait(PATIENCE)
+    victim("die")
+    lock.release()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # whether it had it for a moment, nobody can know
+        assert lock.acquire(True, PATIENCE)
+
+
+def test_a_dead_waiter_takes_no_item(manager: Any, victim: Any) -> None:
+    queue, done = manager.Queue(), manager.Event()
+    victim("get", queue, done)
+    assert done.wait(PATIENCE)
+    victim("die")
+    queue.put("kept")
+    assert queue.get(True, PATIENCE) == "kept"
+
+
+def test_a_barrier_whose_member_died_is_broken(manager: Any, victim: Any) -> None:
+    barrier = manager.Barrier(2)
+    victim("wait", barrier)
+    wait_for(lambda: barrier.n_waiting == 1)
+    victim("die")
+    wait_for(lambda: barrier.broken)
+    with pytest.raises(BrokenBarrierError):
+        barrier.wait(PATIENCE)
+
+
+def test_a_notification_is_not_a_dead_waiters(manager: Any, victim: Any) -> None:
+    condition, begun = manager.Condition(), manager.Event()
+    victim("wait_notified", condition, begun)
+    assert begun.wait(PATIENCE)
+    told: list[bool] = []
+
+    def wait() -> None:
+        with condition:
+            begun.clear()
+            told.append(condition.wait(PATIENCE))
+
+    waiter = threading.Thread(target=wait)
+    waiter.start()
+    wait_for(lambda: not begun.is_set())
+    victim("die")
+    with condition:  # both wait now
+        condition.notify()
+    waiter.join(PATIENCE)
+    assert told == [True]
+
+
+def test_a_proxy_outlives_the_process_that_made_its_object(manager: Any, victim: Any) -> None:
+    proxies = manager.Queue()
+    victim("make", manager.address, proxies)
+    made = proxies.get(True, PATIENCE)
+    victim("die")
+    made.append("more")
+    assert list(made) == ["made", "more"]
+
+
+def test_a_stopped_manager_holds_nobody_up_that_lets_go(manager: Any) -> None:
+    proxies = [manager.list() for _ in range(3)]
+    os.kill(manager._process.pid, signal.SIGSTOP)
+    try:
+        proxies.clear()
+    finally:
+        os.kill(manager._process.pid, signal.SIGCONT)
+    wait_for(lambda: manager._number_of_objects() == 0)

@@ -1,0 +1,407 @@
+"""Managers on one host: what their proxies can do, how long objects live, who may come in."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing.managers
+import re
+import subprocess
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from multiprocessing import AuthenticationError
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fiber
+from census import wait_until
+from fiber._managers.client import Line
+from fiber._runtime.state import runtime
+from fiber.managers import BaseManager, RemoteError, SyncManager
+from fiber.process import current_process
+from fiber.resources import Resources, resources_of
+
+PATIENCE = 15.0
+
+
+@pytest.fixture
+def manager() -> Iterator[Any]:
+    with fiber.Manager() as manager:
+        yield manager
+    manager._process.close()  # pytest holds the manager
+
+
+def background(function: Any, *args: Any) -> threading.Thread:
+    thread = threading.Thread(target=function, args=args, daemon=True)
+    thread.start()
+    return thread
+
+
+def call(function: Any, *args: Any) -> None:
+    """Call it in a process of its own."""
+    process = fiber.Process(target=function, args=args)
+    process.start()
+    process.join(PATIENCE)
+    assert process.exitcode == 0
+
+
+# What there is
+
+
+def test_every_type_of_multiprocessing_is_there_with_its_proxy() -> None:
+    theirs: Any = multiprocessing.managers.SyncManager
+    for typeid, (_, exposed, typeids, proxytype) in theirs._registry.items():
+        assert SyncManager._registry[typeid][1:] == (exposed, typeids, proxytype)
+        assert hasattr(SyncManager, typeid) == hasattr(theirs, typeid)
+
+
+def test_proxies_are_multiprocessings(manager: Any) -> None:
+    assert type(manager.dict()) is multiprocessing.managers.DictProxy
+    assert type(manager.list()) is multiprocessing.managers.ListProxy
+    assert isinstance(manager.Lock(), multiprocessing.managers.BaseProxy)
+
+
+def test_what_is_in_a_proxy_can_be_a_proxy(manager: Any) -> None:
+    objects = manager._number_of_objects()
+    outer = manager.list([manager.dict(a=1), manager.list()])
+    outer[0]["b"] = 2
+    outer[1].append(outer[0])
+    assert outer[1][0]["b"] == 2
+    assert [type(part).__name__ for part in outer] == ["DictProxy", "ListProxy"]
+    assert manager._number_of_objects() == objects + 3
+    del outer
+    gc.collect()  # of multiprocessing's own frames
+    assert wait_until(lambda: manager._number_of_objects() == objects, PATIENCE)
+
+
+def put(queue: Any, item: Any) -> None:
+    queue.put(item)
+
+
+def double(shared: Any, key: str) -> int:
+    shared[key] *= 2
+    value: int = shared[key]
+    return value
+
+
+def test_proxies_go_where_anything_goes(manager: Any) -> None:
+    shared, queue = manager.dict(a=1), manager.Queue()
+    call(put, queue, shared)
+    assert queue.get()["a"] == 1
+    with fiber.Pool(1) as pool:
+        assert pool.apply(double, (shared, "a")) == 2
+        assert pool.map(len, [shared, manager.list("abc")]) == [1, 3]
+    local = fiber.SimpleQueue()
+    local.put(shared)
+    assert local.get()["a"] == 2
+
+
+class Counter:
+    def __init__(self, start: int = 0) -> None:
+        self.value = start
+
+    def step(self, by: int = 1) -> int:
+        self.value += by
+        return self.value
+
+    def twin(self) -> Counter:
+        return Counter(self.value)
+
+    def fail(self) -> None:
+        raise KeyError("on purpose")
+
+    def lock(self) -> Any:
+        return threading.Lock()
+
+    def process(self) -> str:
+        return current_process().name
+
+
+def step(counter: Any) -> None:
+    counter.step()
+
+
+class CounterManager(BaseManager):
+    pass
+
+
+CounterManager.register("Counter", Counter, method_to_typeid={"twin": "Twin"})
+CounterManager.register("Twin", create_method=False)
+
+
+def test_objects_of_ones_own() -> None:
+    with CounterManager() as manager:
+        counter = manager.Counter(40)
+        assert counter.step(by=2) == 42
+        twin = counter.twin()
+        assert (twin.step(), counter.step(0)) == (43, 42)
+        assert counter.process() == manager._process.name
+        call(step, twin)
+        assert twin.step(0) == 44
+
+
+def test_an_error_comes_as_it_is_and_says_where_it_was(manager: Any) -> None:
+    with pytest.raises(KeyError, match="b") as caught:
+        manager.dict(a=1)["b"]
+    assert "Traceback" in str(caught.value.__cause__)
+
+
+def test_what_does_not_travel_is_an_error_of_the_call_alone() -> None:
+    with CounterManager() as manager:
+        counter = manager.Counter()
+        with pytest.raises(RemoteError, match=r"cannot pickle '_thread.lock' object"):
+            counter.lock()
+        with pytest.raises(fiber.UnpicklableError, match=r"arguments of step\(\)"):
+            counter.step(threading.Lock())
+        with pytest.raises(RemoteError, match="no_such_method"):
+            counter._callmethod("no_such_method")
+        assert counter.step() == 1
+
+
+# How long objects live
+
+
+def use_later(shared: Any, begun: Any, go_on: Any) -> None:
+    begun.set()
+    go_on.wait()
+    shared["used"] = True
+    go_on.clear()
+    assert shared["used"]
+
+
+def test_an_object_lives_as_long_as_any_process_has_a_proxy(manager: Any) -> None:
+    objects = manager._number_of_objects()
+    shared, begun, go_on = manager.dict(), fiber.Event(), fiber.Event()
+    child = fiber.Process(target=use_later, args=(shared, begun, go_on))
+    child.start()
+    assert begun.wait(PATIENCE)
+    del shared
+    assert manager._number_of_objects() == objects + 1
+    go_on.set()
+    child.join(PATIENCE)
+    assert child.exitcode == 0
+    assert wait_until(lambda: manager._number_of_objects() == objects, PATIENCE)
+
+
+def test_what_a_result_holds_lives_until_its_caller_has_it(manager: Any) -> None:
+    outer = manager.list([manager.dict(a=1)])
+    for _ in range(50):
+        part = outer.pop()
+        assert part["a"] == 1
+        outer.append(part)
+        del part
+
+
+# Locks
+
+
+def test_an_rlock_is_its_threads(manager: Any) -> None:
+    lock = manager.RLock()
+    with lock, lock:
+        got: list[bool] = []
+        other = background(lambda: got.append(lock.acquire(False)))
+        other.join(PATIENCE)
+        assert got == [False]
+    assert lock.acquire(False)
+    lock.release()
+
+
+def acquire(lock: Any) -> None:
+    lock.acquire()
+
+
+def test_a_process_that_ends_in_good_order_leaves_its_locks_to_others(manager: Any) -> None:
+    lock = manager.Lock()
+    call(acquire, lock)
+    assert not lock.acquire(False)
+    lock.release()
+    assert lock.acquire(False)
+
+
+def acquire_and_die(lock: Any) -> None:
+    import os
+
+    lock.acquire()
+    os._exit(3)
+
+
+def test_who_makes_an_error_of_the_warning_does_not_have_the_lock(manager: Any) -> None:
+    lock = manager.Lock()
+    child = fiber.Process(target=acquire_and_die, args=(lock,))
+    child.start()
+    child.join(PATIENCE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(RuntimeWarning, match=rf"{child.name}.*held this lock"):
+            lock.acquire(True, PATIENCE)
+    assert lock.acquire(False)
+
+
+# Ctrl-C
+
+
+def test_an_item_that_nobody_waits_for_any_more_is_the_next_ones(
+    manager: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue = manager.Queue()
+    with monkeypatch.context() as patch:
+        patch.setattr(Line, "answer", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            queue.get()
+    queue.put("kept")
+    assert queue.get(True, PATIENCE) == "kept"
+
+
+def interrupt(_line: Line) -> None:
+    raise KeyboardInterrupt
+
+
+def test_what_had_come_when_its_call_was_interrupted_is_the_next_ones(
+    manager: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt_late(line: Line) -> None:
+        line._channel.poll(PATIENCE)
+        raise KeyboardInterrupt
+
+    queue, lock, condition = manager.Queue(), manager.Lock(), manager.Condition()
+    queue.put(1)
+    queue.put(2)
+    for call in (queue.get, lock.acquire, condition.acquire):
+        with monkeypatch.context() as patch:
+            patch.setattr(Line, "answer", interrupt_late)
+            with pytest.raises(KeyboardInterrupt):
+                call()
+    assert [queue.get(), queue.get()] == [1, 2]
+    assert lock.acquire(True, PATIENCE)
+    assert condition.acquire(True, PATIENCE)
+
+
+def test_an_interruption_takes_nothing_of_an_earlier_call_back(
+    manager: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue = manager.Queue()
+    queue.put(1)
+    assert queue.get() == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(Line, "answer", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            queue.qsize()
+    assert queue.empty()
+
+
+# From elsewhere
+
+
+def test_a_process_connects_by_the_address(manager: Any) -> None:
+    shared = manager.dict()
+    call(connect_and_make, manager.address, shared)
+    assert shared["made"] == [1, 2]
+
+
+def connect_and_make(address: Any, shared: Any) -> None:
+    manager = SyncManager(address)
+    manager.connect()
+    shared["made"] = list(manager.list([1, 2]))
+
+
+def test_an_address_does_not_show_what_lets_one_in(manager: Any) -> None:
+    who = r"manager 'SyncManager-\d+' \(pid \d+ on host 'local'\)"
+    assert re.fullmatch(f"<address of {who}>", repr(manager.address))
+
+
+PROGRAM = """\
+import sys
+from MODULE.managers import BaseManager
+
+class Counters(BaseManager):
+    pass
+
+Counters.register("Counter")
+manager = Counters(("127.0.0.1", int(sys.argv[1])), authkey=sys.argv[2].encode())
+manager.connect()
+print(manager.Counter(7).step())
+"""
+
+
+@pytest.mark.parametrize("module", ["fiber", "multiprocessing"])
+def test_another_program_connects_by_address_and_key(module: str, tmp_path: Path) -> None:
+    script = tmp_path / "program.py"
+    script.write_text(PROGRAM.replace("MODULE", module))
+    with CounterManager(("127.0.0.1", 0), authkey=b"open sesame") as manager:
+        port = str(manager.address[1])
+        command = [sys.executable, str(script), port]
+        done = subprocess.run([*command, "open sesame"], capture_output=True, timeout=PATIENCE)
+        assert done.stdout == b"8\n"
+        refused = subprocess.run([*command, "sesame open"], capture_output=True, timeout=PATIENCE)
+        assert AuthenticationError.__name__.encode() in refused.stderr
+        assert refused.stdout == b""
+
+
+def test_a_server_can_run_in_the_program_itself() -> None:
+    server = CounterManager().get_server()
+    background(server.accepter)
+    manager = CounterManager(server.address)
+    manager.connect()
+    assert manager.Counter(1).step() == 2
+    server.listener.close()
+
+
+# Its own life
+
+
+def fail() -> None:
+    raise ValueError("on purpose")
+
+
+def test_an_initializer_that_raises_is_an_error_of_start(capfd: pytest.CaptureFixture[str]) -> None:
+    manager = SyncManager()
+    with pytest.raises(EOFError, match=r"SyncManager-.*is gone"):
+        manager.start(fail)
+    assert "ValueError: on purpose" in capfd.readouterr().err
+    with pytest.raises(TypeError, match="callable"):
+        manager.start(3)  # type: ignore[arg-type]
+
+
+def test_it_starts_once_and_ends_for_good() -> None:
+    manager = SyncManager()
+    manager.start()
+    shared = manager.dict()
+    with pytest.raises(fiber.ProcessError, match="Already started"):
+        manager.start()
+    manager.shutdown()
+    manager.shutdown()
+    assert manager._process.exitcode == 0
+    with pytest.raises(fiber.ProcessError, match="has shut down"):
+        manager.start()
+    with pytest.raises(fiber.ConnectionClosed, match=r"manager 'SyncManager-.* is gone"):
+        shared["a"] = 1
+
+
+def test_one_that_is_collected_on_fibers_own_thread_ends_too() -> None:
+    manager = SyncManager()
+    manager.start()
+    process = manager._process
+    runtime().loop.call_soon(manager.shutdown)
+    process.join(PATIENCE)
+    assert process.exitcode == 0
+
+
+def test_its_process_has_the_wishes_of_its_class_and_callables() -> None:
+    @fiber.meta(memory=512)
+    class Manager(BaseManager):
+        pass
+
+    Manager.register("Small", fiber.meta(cpu=1)(make_counter))
+    Manager.register("Large", fiber.meta(cpu=4, memory=100)(make_counter))
+    assert Manager.__name__ == "Manager"
+    assert resources_of(BaseManager) == Resources()
+    assert Manager(pool="warm")._wishes() == Resources(cpu=4, memory=512, pool="warm")
+    with Manager() as manager:
+        assert manager.Large(1).step() == 2
+
+
+def make_counter(start: int) -> Counter:
+    return Counter(start)
