@@ -6,49 +6,17 @@ list says what is so.
 
 from __future__ import annotations
 
-_MEMORY_MANAGERS = {
-    f"WithProcessesTestSharedMemory.test_shared_memory_{name}": "SharedMemoryManager: not yet"
-    for name in ("SharedMemoryManager_basics", "SharedMemoryServer_ignores_sigint")
-}
 _CLOSED_AT_ONCE = {
     "WithProcessesTestQueue.test_closed_queue_empty_exceptions": (
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
     )
 }
-_COUNTED_BY_A_VALUE = (
-    "abort",
-    "abort_and_reset",
-    "action",
-    "barrier",
-    "barrier_10",
-    "default_timeout",
-    "reset",
-    "timeout",
-    "wait_return",
-)
-_ONE_HOST = {
-    f"WithProcesses{test}": (
-        "memory is shared by the processes of one host: to start one elsewhere with a shared value "
-        "is an error that says what to use"
-    )
-    for test in (
-        "TestArray.test_array",
-        *(f"TestBarrier.test_{name}" for name in _COUNTED_BY_A_VALUE),
-        "TestCondition.test_waitfor",
-        "TestCondition.test_waitfor_timeout",
-        "TestArray.test_rawarray",
-        "TestSharedCTypes.test_sharedctypes",
-        "TestSharedCTypes.test_synchronize",
-        "TestValue.test_rawvalue",
-        "TestValue.test_value",
-    )
-}
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
-    "local": {**_MEMORY_MANAGERS, **_CLOSED_AT_ONCE},
-    "loopback": {**_CLOSED_AT_ONCE, **_ONE_HOST},
-    "kubernetes": {**_CLOSED_AT_ONCE, **_ONE_HOST},
+    "local": _CLOSED_AT_ONCE,
+    "loopback": _CLOSED_AT_ONCE,
+    "kubernetes": _CLOSED_AT_ONCE,
 }
 
 _CONCERNS_ONE_TASK = "concerns one task, which gets the error itself: the executor is not broken"

@@ -144,7 +144,7 @@ class World:
         """The robust mutex."""
         process = self.current
         process.step()
-        while self._owner not in (None, process) and self._owner is not None and self._owner.alive:
+        while (owner := self._owner) is not None and owner is not process and owner.alive:
             process.step()
         if self._owner is not process:
             self._owner, self._depth = process, 0

@@ -233,3 +233,14 @@ class HostedCounter:
         while self._takers and self._counter.take(0):
             self._takers.popleft().answer(Status.OK)
         self._watch()
+
+
+class HostedMemory:
+    """Shared memory, which is kept there: what changes does not travel on these streams."""
+
+    def withdraw(self, waiter: Waiter) -> bool:
+        """Nobody waits for it."""
+        return False
+
+    def close(self) -> None:
+        """The registry lets go of it."""

@@ -15,14 +15,14 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import TypeAlias
 
-from fiber._hub.hosted import HostedChannel, HostedCounter
+from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory
 from fiber._hub.hosted_semaphore import HostedSemaphore
 from fiber._hub.hosted_wait_list import HostedWaitList
 from fiber._hub.protocol import WHOLE, Extent, ObjectKind
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.descriptor import Descriptor, opened
 
-Hosted: TypeAlias = HostedChannel | HostedCounter | HostedSemaphore | HostedWaitList
+Hosted: TypeAlias = HostedChannel | HostedCounter | HostedMemory | HostedSemaphore | HostedWaitList
 
 
 class NoSuchObject(LookupError):
@@ -147,6 +147,12 @@ class Registry:
         entry.attached += 1
         self._use(grant)
         return entry
+
+    def look_up(self, number: int, grant: int) -> SharedObject:
+        """What somebody is attached to, or is about to be by this grant."""
+        self._settle()
+        entry = self._entries.get(number)
+        return self._find(number, grant if entry and grant in entry.grants else 0).shared
 
     def detach(self, entry: Entry) -> None:
         """One user less."""
