@@ -17,7 +17,7 @@ class Operation(NamedTuple):
 
     name: str
     argument: Hashable
-    result: Hashable
+    result: Any
     start: int
     """Of the clock that all processes of a machine share, in ns."""
     end: int
