@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
-_PROCESSES = frozenset({"pipes", "start", "cold start"})
+_PROCESSES = frozenset({"pipes", "sharing", "start", "cold start"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 
