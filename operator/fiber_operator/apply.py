@@ -26,9 +26,16 @@ from fiber_operator.dependents import Dependents
 from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics
-from fiber_operator.planning import error_conditions, manifests, problems
+from fiber_operator.planning import error_conditions, manifests
 from fiber_operator.planning.documents import mapping, text
-from fiber_operator.planning.plans import Deletion, Event, Obstacle, Plan, Refusal
+from fiber_operator.planning.plans import (
+    QUOTA_IS_FULL,
+    Deletion,
+    Event,
+    Obstacle,
+    Plan,
+    Refusal,
+)
 from fiber_operator.workqueue import GAP, Key, Result
 
 ENOUGH = 1.0
@@ -36,7 +43,7 @@ ENOUGH = 1.0
 DELETIONS = 50
 """Pods that are deleted at once."""
 
-_NO_VERDICTS = ("does not support dry run", problems.QUOTA_IS_FULL)
+_NO_VERDICTS = ("does not support dry run", QUOTA_IS_FULL)
 """Refusals of a dry run that say nothing about the template: a webhook's fault, a full quota."""
 
 log = logging.getLogger(__name__)

@@ -48,6 +48,8 @@ CLASSES = (
     "TestLock",
     "TestSemaphore",
     "TestEvent",
+    "TestCondition",
+    "TestBarrier",
     "TestValue",
     "TestArray",
     "TestSharedCTypes",

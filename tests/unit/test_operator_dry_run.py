@@ -16,7 +16,6 @@ from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.planning.plans import Refusal
 from fiber_operator.planning.podspec import pod
-from fiber_operator.planning.problems import refusal_reason
 from unit.operator_objects import MASTER, NOW, make_pool
 
 WORKER = {"name": "worker", "image": "registry/worker:1"}
@@ -141,7 +140,7 @@ WEBHOOK = 'admission webhook "images.example" denied the request: not signed yet
 def test_400_blames_the_template_in_a_dry_run_alone(
     status: int, message: str, dry_run: bool, reason: Reason
 ) -> None:
-    assert refusal_reason(Refusal("hash", status, message, NOW, dry_run=dry_run)) == reason
+    assert Refusal("hash", status, message, NOW, dry_run=dry_run).reason == reason
 
 
 @played

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.planning import cut_off, failures, problems, revisions
+from fiber_operator.planning import cut_off, failures, revisions
 from fiber_operator.planning.attachment import idleness, judge
 from fiber_operator.planning.plans import Memory
 from fiber_operator.planning.pods import PodView, State, Trouble
@@ -118,9 +118,9 @@ class Assessment:
         if refused is None or refused.template_hash != self.template_hash:
             return None
         wait = failures.delay(self.spec.failure_policy, refused.count, self.pool.metadata.uid)
-        if problems.refusal_reason(refused) == Reason.QUOTA_EXCEEDED:
+        if refused.reason == Reason.QUOTA_EXCEEDED:
             wait = min(wait, QUOTA_WAIT)
-        if problems.lacks_account(refused):
+        if refused.lacks_account:
             wait = min(wait, ACCOUNT_WAIT)
         return refused.at + wait
 

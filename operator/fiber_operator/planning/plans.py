@@ -12,6 +12,13 @@ from typing import Any
 
 from fiber_api.names import Reason
 
+QUOTA_IS_FULL = "exceeded quota"
+"""What the API server says where a quota allows no more."""
+_NAMESPACE_ENDS = "because it is being terminated"
+"""What it says where nothing new may be made because the namespace is deleted."""
+_NO_ACCOUNT_YET = "error looking up service account"
+"""What it says for a moment in a new namespace, whose accounts are made after it."""
+
 
 @dataclass(frozen=True)
 class Refusal:
@@ -32,6 +39,31 @@ class Refusal:
     """How often in a row, this one included: the next attempt waits longer each time."""
     dry_run: bool = False
     """Whether it was the dry run that was refused, which judges the template and nothing else."""
+
+    @property
+    def reason(self) -> Reason:
+        """Which problem it is."""
+        if self.status != 403 and not self.may_pass:
+            return Reason.INVALID_TEMPLATE
+        return Reason.QUOTA_EXCEEDED if QUOTA_IS_FULL in self.message else Reason.FORBIDDEN
+
+    @property
+    def may_pass(self) -> bool:
+        """Whether it is not the template that is to blame, which was good in the dry run.
+
+        400 is how admission webhooks refuse what they find wrong at the moment.
+        """
+        return self.lacks_account or (self.status not in (403, 422) and not self.dry_run)
+
+    @property
+    def lacks_account(self) -> bool:
+        """Whether the ServiceAccount of the template is not there, or not there yet."""
+        return _NO_ACCOUNT_YET in self.message
+
+    @property
+    def namespace_ends(self) -> bool:
+        """Whether all of the namespace is about to go."""
+        return _NAMESPACE_ENDS in self.message
 
 
 @dataclass(frozen=True)

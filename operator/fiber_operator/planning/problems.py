@@ -11,16 +11,9 @@ from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Problem
 from fiber_operator.planning import cut_off, error_conditions, wording
 from fiber_operator.planning.failed_pods import failed_pods
-from fiber_operator.planning.plans import Refusal
 from fiber_operator.planning.situation import Situation
 from fiber_operator.planning.starting_pods import pods_not_ready_any_more, pods_that_do_not_start
 
-QUOTA_IS_FULL = "exceeded quota"
-"""What the API server says where a quota allows no more."""
-_NAMESPACE_ENDS = "because it is being terminated"
-"""What the API server says where nothing new may be made because the namespace is deleted."""
-_NO_ACCOUNT_YET = "error looking up service account"
-"""What the API server says for a moment in a new namespace, whose accounts are made after it."""
 _WORKER_NAME = re.compile(f"[0-9a-f]{{{names.POD_SUFFIX_LENGTH}}}")
 
 
@@ -67,36 +60,16 @@ def _refusals(situation: Situation) -> Iterator[Problem]:
     refused = situation.memory.refusal
     if refused is None or refused.template_hash != situation.template_hash:
         return
-    if _NAMESPACE_ENDS in refused.message:
+    if refused.namespace_ends:
         return  # its pods went before the pool, which goes next
-    reason = refusal_reason(refused)
+    reason = refused.reason
     if situation.wants_more or reason == Reason.INVALID_TEMPLATE:
         yield situation.problem(
             reason,
             wording.refusal(reason, refused),
-            severity=situation.severity(reason) if lacks_account(refused) else "Error",
-            terminal=reason != Reason.QUOTA_EXCEEDED and not _may_pass(refused),
+            severity=situation.severity(reason) if refused.lacks_account else "Error",
+            terminal=reason != Reason.QUOTA_EXCEEDED and not refused.may_pass,
         )
-
-
-def refusal_reason(refused: Refusal) -> Reason:
-    """Which problem a refusal is."""
-    if refused.status != 403 and not _may_pass(refused):
-        return Reason.INVALID_TEMPLATE
-    return Reason.QUOTA_EXCEEDED if QUOTA_IS_FULL in refused.message else Reason.FORBIDDEN
-
-
-def _may_pass(refused: Refusal) -> bool:
-    """Whether it is not the template that is to blame, which was good in the dry run.
-
-    400 is how admission webhooks refuse what they find wrong at the moment.
-    """
-    return lacks_account(refused) or (refused.status not in (403, 422) and not refused.dry_run)
-
-
-def lacks_account(refused: Refusal) -> bool:
-    """Whether the ServiceAccount of the template is not there, or not there yet."""
-    return _NO_ACCOUNT_YET in refused.message
 
 
 def _masters(situation: Situation) -> Iterator[Problem]:
