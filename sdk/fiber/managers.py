@@ -29,6 +29,7 @@ from typing import Any
 
 from fiber._hub import client as hub_client
 from fiber._managers import SERIALIZER, client
+from fiber._managers.asynchronous import AsyncBaseProxy, AsyncProxyResult
 from fiber._managers.door import ManagerAddress
 from fiber._managers.rlock import RLock, condition
 from fiber._managers.server import Server
@@ -41,6 +42,9 @@ from fiber.shared_memory import ShareableList, SharedMemory
 __all__ = [
     "AcquirerProxy",
     "ArrayProxy",
+    "AsyncBaseProxy",
+    "AsyncManager",
+    "AsyncProxyResult",
     "AutoProxy",
     "BarrierProxy",
     "BaseManager",
@@ -298,6 +302,28 @@ def _pool(*args: Any, **options: Any) -> Any:
     from fiber.pool import Pool
 
     return Pool(*args, **options)
+
+
+class AsyncManager(BaseManager):
+    """A manager of whose objects every method returns an ``AsyncProxyResult`` at once.
+
+    Objects of different managers work side by side, those of one in threads of its process.  An
+    object is made before the manager's method for that returns.  It registers no types of its own,
+    and has no address that other programs could connect to.
+    """
+
+    def __init__(self, address: ManagerAddress | None = None, **options: Any) -> None:
+        super().__init__(address, **options)
+        if self._serializer != SERIALIZER:
+            raise ValueError(
+                f"an AsyncManager cannot serve at {address!r} or by serializer "
+                f"{self._serializer!r}: leave them out, or use BaseManager"
+            )
+
+    @classmethod
+    def register(cls, typeid: str, callable: Any = None, proxytype: Any = None, **how: Any) -> None:
+        """As ``BaseManager.register``; ``proxytype`` is ``AsyncBaseProxy`` or a subclass."""
+        super().register(typeid, callable, proxytype or AsyncBaseProxy, **how)
 
 
 _OURS = {"Condition": condition, "Pool": _pool, "RLock": RLock}

@@ -129,9 +129,9 @@ class Server(_mp.Server):  # type: ignore[misc]
             answer = "#TRACEBACK", format_exc()
         try:
             return _reply(line, number, answer)
-        except OSError:
+        except BrokenPipeError:  # it is not there any more, or waits for no answer
             thread.take_back(thread.got)
-            raise
+            return None
         finally:
             if ident is None and method == "shutdown":
                 self.stop_event.set()
@@ -252,7 +252,10 @@ def _reply(line: Channel, number: int, answer: _Answer) -> Any:
     """Send an answer; the result, if it has proxies in it."""
     try:
         payload, buffers = reduction.encode((number, *answer))
-    except Exception:
+        line.send(payload, buffers)
+    except BrokenPipeError:
+        raise
+    except Exception:  # it does not pickle, or there is no memory for it
         payload, buffers = reduction.encode((number, "#UNSERIALIZABLE", format_exc()))
-    line.send(payload, buffers)
+        line.send(payload, buffers)
     return answer[1] if _PROXY in payload else None
