@@ -11,6 +11,7 @@ _CLOSED_AT_ONCE = {
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
     )
 }
+
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
     "local": _CLOSED_AT_ONCE,

@@ -7,7 +7,7 @@ import weakref
 from typing import Any, TypeAlias
 
 from fiber._hub import heap
-from fiber._hub.handles import BlockHandle, handle_for, handle_for_block, ring
+from fiber._hub.handles import BlockHandle, handle_for_block, handle_for_remote_block, ring
 from fiber._hub.protocol import ObjectKind
 from fiber._hub.remote_semaphore import RemoteSemaphore
 from fiber._sync.semaphore import SIZE, SharedSemaphore
@@ -28,11 +28,11 @@ def create(kind: int, value: int, maximum: int) -> SharedSemaphore:
     return new
 
 
-def _rebuild(handle: BlockHandle, inode: int, kind: int, maximum: int) -> AnySemaphore:
+def _rebuild(handle: BlockHandle, kind: int, maximum: int) -> AnySemaphore:
     home = handle.elsewhere()
     if home is not None:
-        remote = RemoteSemaphore(home, handle.extent, inode, kind, maximum)
-        return _known.setdefault((home.home.key, inode, handle.extent.offset), remote)
+        remote = RemoteSemaphore(home, handle.extent, handle.inode, kind, maximum)
+        return _known.setdefault((home.home.key, handle.inode, handle.extent.offset), remote)
     block = handle.block()
     known = _known.get(block.identity)
     if known is None:
@@ -41,15 +41,14 @@ def _rebuild(handle: BlockHandle, inode: int, kind: int, maximum: int) -> AnySem
 
 
 def _reduce(semaphore: SharedSemaphore) -> tuple[Any, ...]:
-    block = semaphore.block
-    assert isinstance(block, heap.Block)
-    handle = handle_for_block(ObjectKind.SEMAPHORE, block)
-    return _rebuild, (handle, block.segment.inode, semaphore.kind, semaphore.maximum)
+    assert isinstance(semaphore.block, heap.Block)
+    handle = handle_for_block(ObjectKind.SEMAPHORE, semaphore.block)
+    return _rebuild, (handle, semaphore.kind, semaphore.maximum)
 
 
 def _reduce_remote(remote: RemoteSemaphore) -> tuple[Any, ...]:
-    handle = BlockHandle(handle_for(remote), remote.extent)
-    return _rebuild, (handle, remote.inode, remote.kind, remote.maximum)
+    handle = handle_for_remote_block(remote, remote.extent, remote.inode)
+    return _rebuild, (handle, remote.kind, remote.maximum)
 
 
 copyreg.pickle(SharedSemaphore, _reduce)

@@ -8,7 +8,13 @@ from typing import Any, TypeAlias
 
 from fiber._hub import heap
 from fiber._hub.client import HubStream, Unreachable
-from fiber._hub.handles import BlockHandle, HubHandle, handle_for, handle_for_block, ring
+from fiber._hub.handles import (
+    BlockHandle,
+    HubHandle,
+    handle_for_block,
+    handle_for_remote_block,
+    ring,
+)
 from fiber._hub.protocol import ONE, TWO, Extent, ObjectKind, Op, Status
 from fiber._hub.remote import RemoteObject
 from fiber._sync.wait_list import SIZE, WaitList
@@ -17,8 +23,9 @@ from fiber._sync.wait_list import SIZE, WaitList
 class RemoteWaitList(RemoteObject):
     """Of another host; as ``WaitList``.  A place is a stream, so it ends with this process."""
 
-    def __init__(self, handle: HubHandle, extent: Extent) -> None:
+    def __init__(self, handle: HubHandle, extent: Extent, inode: int) -> None:
         self.extent = extent
+        self.inode = inode
         super().__init__(*handle)
 
     def enter(self) -> HubStream:
@@ -84,7 +91,7 @@ def create() -> WaitList:
 def _rebuild(handle: BlockHandle) -> AnyWaitList:
     home = handle.elsewhere()
     if home is not None:
-        return RemoteWaitList(home, handle.extent)
+        return RemoteWaitList(home, handle.extent, handle.inode)
     return WaitList(handle.block(), ring)
 
 
@@ -94,7 +101,7 @@ def _reduce(waiters: WaitList) -> tuple[Any, ...]:
 
 
 def _reduce_remote(remote: RemoteWaitList) -> tuple[Any, ...]:
-    return _rebuild, (BlockHandle(handle_for(remote), remote.extent),)
+    return _rebuild, (handle_for_remote_block(remote, remote.extent, remote.inode),)
 
 
 copyreg.pickle(WaitList, _reduce)
