@@ -208,8 +208,7 @@ def test_who_may_not_have_it_is_told_why(
 
 def test_a_block_is_had_as_a_whole_or_not_at_all(replicas: Replicas, hosts: Hosts) -> None:
     block = memory_of(fiber.RawArray("i", 4))
-    home, extent = buffer_of_handle(block)
-    inode = block.segment.inode
+    (home, extent, inode) = buffer_of_handle(block)
     for wrong in ((0, 8), (extent.offset, 1 << 20)):
         asker = Asker()
         replicas.join(Origin("a", inode, *wrong, home.number, home.grant, home.home.key), 1, asker)

@@ -10,7 +10,7 @@ from typing import Any
 
 from fiber._hub import client, heap
 from fiber._hub.client import HubStream
-from fiber._hub.handles import BlockHandle, HubHandle, handle_for, handle_for_block
+from fiber._hub.handles import BlockHandle, HubHandle, handle_for_block, handle_for_remote_block
 from fiber._hub.heap import Block, block_of
 from fiber._hub.protocol import Extent, ObjectKind, Op, Origin
 from fiber._hub.remote import RemoteObject
@@ -31,8 +31,7 @@ class SharedBuffer:
         return self._block.view
 
     def __reduce__(self) -> tuple[Any, ...]:
-        handle = handle_for_block(ObjectKind.MEMORY, self._block)
-        return _rebuild, (handle, self._block.segment.inode)
+        return _rebuild, (handle_for_block(ObjectKind.MEMORY, self._block),)
 
 
 class ReplicaBuffer(SharedBuffer):
@@ -54,7 +53,7 @@ class ReplicaBuffer(SharedBuffer):
         super().__init__(block_of(own(fd), offset, extent.size))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (BlockHandle(handle_for(self._original), self._extent), self._inode)
+        return _rebuild, (handle_for_remote_block(self._original, self._extent, self._inode),)
 
     def __del__(self) -> None:
         if hasattr(self, "_stream"):
@@ -66,8 +65,8 @@ def allocate(size: int) -> SharedBuffer:
     return SharedBuffer(heap.allocate(size))
 
 
-def _rebuild(handle: BlockHandle, inode: int) -> SharedBuffer:
+def _rebuild(handle: BlockHandle) -> SharedBuffer:
     home = handle.elsewhere()
     if home is None:
         return SharedBuffer(handle.block())
-    return ReplicaBuffer(home, handle.extent, inode)
+    return ReplicaBuffer(home, handle.extent, handle.inode)
