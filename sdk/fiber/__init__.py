@@ -53,6 +53,7 @@ _SUBMODULES = frozenset(
         "dummy",
         "errors",
         "futures",
+        "joblib",
         "managers",
         "pool",
         "process",

@@ -56,3 +56,14 @@ EXECUTORS: dict[str, dict[str, str]] = {
     "loopback": {**_EXECUTORS, **_ELSEWHERE},
     "kubernetes": {**_EXECUTORS, **_ELSEWHERE, **_ONE_PORT},
 }
+
+_REGISTERED_HERE = "starts another interpreter, which does not import fiber.joblib"
+_NO_MEMORY_MAPS = "large arrays are sent to a worker, and not mapped from a file"
+
+# Of joblib's tests of a backend: name of the test -> reason
+JOBLIB: dict[str, str] = {
+    "test_parallel_with_interactively_defined_functions": _REGISTERED_HERE,
+    "test_parallel_with_unpicklable_functions_in_args": _REGISTERED_HERE,
+    "test_auto_memmap_on_arrays_from_generator": _NO_MEMORY_MAPS,
+    "test_memmapping_leaks": _NO_MEMORY_MAPS,
+}
