@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pickle
 import weakref
+from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client, Listener, answer_challenge, deliver_challenge, wait
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 __all__ = [
+    "AuthenticationError",
     "Client",
     "Connection",
     "Listener",
