@@ -1,5 +1,9 @@
 """``Connection``, ``Pipe`` and ``wait``: multiprocessing's, over message channels.
 
+``Listener``, ``Client`` and what belongs to them, ``families`` or ``CHALLENGE`` for instance, are
+multiprocessing's own: they meet other programs.  With an ``authkey`` both sides prove that they know
+it, or get an AuthenticationError.
+
 A message arrives whole.  Large contiguous buffers (NumPy arrays) are not copied into the pickle.
 """
 
@@ -8,6 +12,7 @@ from __future__ import annotations
 import pickle
 import weakref
 from multiprocessing import AuthenticationError
+from multiprocessing import connection as _mp
 from multiprocessing.connection import Client, Listener, answer_challenge, deliver_challenge, wait
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +37,13 @@ __all__ = [
     "deliver_challenge",
     "wait",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    try:
+        return vars(_mp)[name]
+    except KeyError:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
 
 
 _LAST_MOMENT = 0.05
