@@ -1,8 +1,8 @@
 """``Connection``, ``Pipe`` and ``wait``: multiprocessing's, over message channels.
 
 ``Listener``, ``Client`` and what belongs to them, ``families`` or ``CHALLENGE`` for instance, are
-multiprocessing's own: they meet other programs.  With an ``authkey`` both sides prove that they know
-it, or get an AuthenticationError.
+multiprocessing's own: they meet other programs.  With an ``authkey`` both sides prove that they
+know it, or get an AuthenticationError.
 
 A message arrives whole.  Large contiguous buffers (NumPy arrays) are not copied into the pickle.
 """

@@ -1,6 +1,6 @@
 """multiprocessing's utilities: finalizers, logging, exit functions.  Shared, not copied.
 
-Any other name, such as those with an underscore that libraries import, is multiprocessing's as well.
+Any other name, as those with an underscore that libraries import, is multiprocessing's as well.
 """
 
 from multiprocessing import util as _mp

@@ -17,6 +17,7 @@ import pytest
 
 import fiber
 from census import wait_until
+from fiber import connection
 from fiber._transport import unix
 from fiber._transport.unix import UnixChannel
 from fiber._wire.packet import Message
@@ -456,14 +457,14 @@ def test_listener_and_client_prove_to_each_other_that_they_know_the_key(
     keys: tuple[bytes, bytes],
 ) -> None:
     """Also the client gives nothing to a listener that does not."""
-    errors: list[BaseException] = []
-    with connection.Listener(authkey=keys[0]) as listener:
+    errors: list[str] = []
+    with connection.Listener(("127.0.0.1", 0), authkey=keys[0]) as listener:
 
         def accept() -> None:
             try:
                 listener.accept()
             except connection.AuthenticationError as error:
-                errors.append(error)
+                errors.append(str(error))
 
         accepting = threading.Thread(target=accept)
         accepting.start()
@@ -474,7 +475,7 @@ def test_listener_and_client_prove_to_each_other_that_they_know_the_key(
 
 
 def test_a_client_does_not_believe_a_listener_that_welcomes_everybody() -> None:
-    with connection.Listener() as listener:
+    with connection.Listener(("127.0.0.1", 0)) as listener:
 
         def welcome() -> None:
             with listener.accept() as accepted:
@@ -483,9 +484,10 @@ def test_a_client_does_not_believe_a_listener_that_welcomes_everybody() -> None:
                 accepted.send_bytes(connection.WELCOME)
                 accepted.recv_bytes()  # the client's own challenge
                 accepted.send_bytes(b"no idea")
+                accepted.recv_bytes()  # it says that it does not believe that
 
         welcoming = threading.Thread(target=welcome)
         welcoming.start()
-        with pytest.raises(connection.AuthenticationError, match="digest received was wrong"):
+        with pytest.raises(connection.AuthenticationError):
             connection.Client(listener.address, authkey=b"one")
         welcoming.join(5)
