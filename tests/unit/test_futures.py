@@ -50,6 +50,22 @@ def test_wait_and_as_completed(executor: fiber.Executor, tmp_path: Path) -> None
     assert [future.result() for future in futures.as_completed([waits], PATIENCE)] == ["gate"]
 
 
+def test_a_lock_of_a_future_that_is_not_given_back_holds_up_no_other(
+    executor: fiber.Executor, tmp_path: Path
+) -> None:
+    # A signal's handler that raises between the two leaves it so, in any of the lock's users.
+    taken = executor.submit(tasks.wait_for, tmp_path / "gate")
+    cancelled = [executor.submit(tasks.square, number) for number in range(100)][-1]
+    with taken._condition, cancelled._condition:
+        assert cancelled.cancel()
+        (tmp_path / "gate").touch()
+        assert executor.submit(tasks.square, 3).result(PATIENCE) == 9
+        with fiber.Pool(1) as pool:
+            assert pool.apply(tasks.square, (4,)) == 16
+    assert taken.result(PATIENCE) == "gate"
+    assert futures.wait([cancelled], PATIENCE).done == {cancelled}
+
+
 def test_callbacks_run_neither_on_the_loops_thread_nor_too_late(executor: fiber.Executor) -> None:
     names: list[str] = []
     called = threading.Event()

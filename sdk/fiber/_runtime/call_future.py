@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from concurrent.futures._base import CANCELLED, CANCELLED_AND_NOTIFIED, RUNNING
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from typing import Any
@@ -35,22 +37,43 @@ class CallFuture(Future[Any]):
         super().__init__()
         self._executor = executor
         self._queue = queue
+        self._undecided = deque((True,))
+        """Whoever takes it out decides: to give the call to a worker, or to cancel it."""
         self._claimed: bool | None = None
 
     def cancel(self) -> bool:
         """As in concurrent.futures; ``wait`` and ``as_completed`` hear of it in a moment."""
-        if not super().cancel():
+        if not (self._decide() or self.cancelled()):
             return False
+        super().cancel()
         self._executor.calls.drop_cancelled(self._queue)
         return True
+
+    def cancelled(self) -> bool:
+        """As in concurrent.futures, without its lock: the loop asks."""
+        return self._claimed is False or self._state in (CANCELLED, CANCELLED_AND_NOTIFIED)
+
+    def _decide(self) -> bool:
+        try:
+            return self._undecided.pop()
+        except IndexError:
+            return False
 
     # What the executor says, on the loop's thread
 
     def claim(self) -> bool:
         """It is about to run, unless it was cancelled."""
         if self._claimed is None:
-            self._claimed = self.set_running_or_notify_cancel()
+            self._claimed = self._decide()
+            if self._claimed:
+                self._state = RUNNING
+            else:
+                self._locked(self._end_cancelled)
         return self._claimed
+
+    def _end_cancelled(self) -> None:
+        super().cancel()  # whoever did may have been interrupted
+        self.set_running_or_notify_cancel()
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take the outcome."""
@@ -74,13 +97,14 @@ class CallFuture(Future[Any]):
     def set_exception(self, exception: BaseException | None) -> None:
         """There will be no outcome, or this is it."""
         if self.claim() and exception is not None:
-            super().set_exception(translated(exception, self._executor))
+            error = translated(exception, self._executor)
+            self._locked(partial(super().set_exception, error))
 
     def _settle(self, outcome: Any) -> None:
         if type(outcome) is Failure:
             self.set_exception(outcome.error)
         else:
-            self.set_result(outcome)
+            self._locked(partial(self.set_result, outcome))
 
     def _unpickle(self, outcome: Pickled) -> None:
         try:
@@ -89,6 +113,22 @@ class CallFuture(Future[Any]):
             value = Failure(error)
         self._settle(value)
 
+    def _locked(self, action: Callable[[], object]) -> None:
+        """Do what takes the lock that the program's threads take, too.
+
+        The loop does not wait for it: one who was interrupted between taking it and the ``with``
+        block has it for as long as it likes.
+        """
+        if not self._executor.on_loop():
+            action()
+        elif self._condition.acquire(blocking=False):
+            try:
+                action()
+            finally:
+                self._condition.release()
+        else:
+            self._elsewhere(action)
+
     def _invoke_callbacks(self) -> None:
         call = super()._invoke_callbacks  # type: ignore[misc]
         if self._done_callbacks and self._executor.on_loop():  # type: ignore[attr-defined]
@@ -96,7 +136,7 @@ class CallFuture(Future[Any]):
         else:
             call()
 
-    def _elsewhere(self, action: Callable[[], None]) -> None:
+    def _elsewhere(self, action: Callable[[], object]) -> None:
         with contextlib.suppress(RuntimeError):  # the system has no room for its thread
             if self._executor.callbacks.submit(action):
                 return
