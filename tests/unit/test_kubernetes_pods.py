@@ -306,6 +306,7 @@ def test_a_process_that_waits_for_one_more_pod_is_told_what_for(
     worker: bool, told: list[str], site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pool works with what it has; nothing else can do what a process is to do."""
+    monkeypatch.setattr(progress, "_is_terminal", lambda: False)
     monkeypatch.setattr(progress, "_FIRST_WRITTEN", 0.0)
     pods = site.pods(until_the_end)
     full = {"reason": "QuotaExceeded", "severity": "Error", "message": "it is full"}
