@@ -416,7 +416,8 @@ FORKS = """
 def test_a_program_that_forks_itself_has_pods_and_its_copy_runs_beside_it(
     launch: Callable[..., Program],
 ) -> None:
-    assert launch(FORKS, env={"FIBER_BACKEND": "kubernetes"}).finish() == "9 [0, 1, 4]\n"
+    program = launch(FORKS, env={"FIBER_BACKEND": "kubernetes"})
+    assert program.finish(2 * PATIENCE) == "9 [0, 1, 4]\n"
 
 
 def test_one_port_is_not_enough_for_two_pools(cluster: FakeCluster) -> None:
