@@ -27,7 +27,7 @@ demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
 ## make test          every test
-test: $(VENV)/.with-dev $(VENV)/.with-testsuite
+test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-testsuite
 	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
 	$(CLUSTER) prepare
 	$(FAST)
@@ -35,7 +35,7 @@ test: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation
-test-fast: $(VENV)/.with-dev
+test-fast: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3
 	$(FAST)
 
 ## make test-pythons  the essential tests on every other supported Python that is found here
@@ -109,6 +109,11 @@ $(VENV)/.with-dev: EXTRAS := dev,rl
 $(VENV)/.with-bench: EXTRAS := bench,rl
 $(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench: $(VENV)/.made pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
+	touch $@
+
+# Without torch, which it needs to learn and is larger than all else together.
+$(VENV)/.with-stable-baselines3: $(VENV)/.with-dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
 	touch $@
 
 $(VENV)/.with-testsuite: $(VENV)/.made

@@ -108,6 +108,9 @@ class Faulty(gymnasium.Env[Any, Any]):
     def pid(self) -> int:
         return os.getpid()
 
+    def getenv(self, name: str) -> str | None:
+        return os.environ.get(name)
+
     def exit(self, row: float) -> None:
         if self.steps == row:
             os._exit(4)

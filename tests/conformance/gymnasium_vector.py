@@ -31,6 +31,8 @@ TESTS = (
     "tests/vector/test_vector_wrapper.py",
     "tests/wrappers/vector",
     "tests/envs/registration/test_make_vec.py",
+    # Opens windows, and makes MuJoCo draw in them.
+    "--ignore=tests/wrappers/vector/test_human_rendering.py",
 )
 
 # A part of a test's id -> why it cannot pass.

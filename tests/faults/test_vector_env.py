@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fiber
-from faults.program import alive, wait_for
+from faults.program import PATIENCE, Program, alive, wait_for
 from fiber.vector import VectorEnv, dispatcher
 from vector_envs import Faulty
 
@@ -181,6 +181,7 @@ def test_a_worker_that_dies_in_a_call(vector_env: Make) -> None:
         pytest.raises(fiber.WorkerDied, match="a call"),
     ):
         env.call("exit", 0)
+    assert len(env.call("pid")) == 4  # of workers that are being started just now
     works(env)
 
 
@@ -206,3 +207,56 @@ def test_an_answer_that_cannot_be_pickled(vector_env: Make) -> None:
     ]
     works(env)
     assert np.isfinite(env.step([GOOD] * 4)[0]).all()
+
+
+PROGRAM = """
+    from contextlib import suppress
+    from functools import partial
+    from pathlib import Path
+    from fiber.vector import VectorEnv
+    from vector_envs import Faulty
+    if __name__ == "__main__":
+        gate = Path("gate")
+        env = VectorEnv([partial(Faulty, gate.absolute())] * 3, num_workers=2)
+        env.reset()
+        {prepare}
+        try:
+            print("ready", flush=True)
+            {call}
+        except KeyboardInterrupt:
+            print("interrupted", flush=True)
+        gate.touch()
+        with suppress(ValueError):  # there is nothing to receive: it was given up
+            env.recv()  # the interrupt came just before that would have waited
+        print(env.reset()[0].tolist(), env.step([0, 0, 0])[0].tolist(), flush=True)
+        env.send([0, 0, 0])
+        print(len(env.recv(3)[0]))
+        {close}
+"""
+
+
+@pytest.mark.parametrize(
+    ("prepare", "call", "close"),
+    [
+        ("pass", "env.step([Faulty.WAIT, 0, Faulty.WAIT])", "env.close()"),
+        ("env.send([Faulty.WAIT] * 3)", "env.recv(1)", "pass"),
+    ],
+)
+def test_an_interrupt(
+    launch_on: Callable[..., Program], prepare: str, call: str, close: str
+) -> None:
+    program = launch_on(PROGRAM.format(prepare=prepare, call=call, close=close))
+    assert program.line() == "ready"
+    program.signal(signal.SIGINT)
+    assert program.line() == "interrupted"
+    assert program.finish() == "[[0.0], [0.0], [0.0]] [[1.0], [1.0], [1.0]]\n3\n"
+    assert not program.stderr
+
+
+def test_a_learner_that_is_killed_leaves_nothing(launch_on: Callable[..., Program]) -> None:
+    program = launch_on(
+        PROGRAM.format(prepare="pass", call="env.step([Faulty.HANG] * 3)", close="pass")
+    )
+    assert program.line() == "ready"
+    program.kill()
+    assert program.left(PATIENCE) == []

@@ -1,4 +1,4 @@
-"""Vector environments on Fiber's processes, for Gymnasium.
+"""Vector environments on Fiber's processes: for Gymnasium and for stable-baselines3.
 
 Needs the extra ``rl``.
 """
@@ -11,19 +11,21 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fiber.vector.registration import make_vec as make_vec
     from fiber.vector.registration import register as register
+    from fiber.vector.vec_env import VecEnv as VecEnv
     from fiber.vector.vector_env import VectorEnv as VectorEnv
 
 _HOMES = {
+    "VecEnv": "vec_env",
     "VectorEnv": "vector_env",
     "make_vec": "registration",
     "register": "registration",
 }
 
-__all__ = ["VectorEnv", "make_vec", "register"]
+__all__ = ["VecEnv", "VectorEnv", "make_vec", "register"]
 
 
 def __getattr__(name: str) -> Any:
-    # Of Gymnasium and NumPy as little is imported as is asked for.
+    # stable-baselines3, and with it torch, is imported by those who ask for VecEnv.
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

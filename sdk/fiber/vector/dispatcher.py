@@ -50,7 +50,7 @@ class Dispatcher:
         """Start the workers and wait until each has its environments."""
         for worker in self._workers:
             self._workers.start(worker)
-        self._wait(lambda: all(worker.hello or worker.error for worker in self._workers), None)
+        self._wait(self._all_there, None)
 
     def begin(self, shape: Shape, arrays: StepArrays, memory: SharedMemory | None) -> None:
         """Give them the arrays: those of this host share them, if they lie in ``memory``."""
@@ -64,7 +64,7 @@ class Dispatcher:
         """End the workers; kill those that have not ended when ``timeout`` is over."""
         self._workers.close(timeout)
 
-    # Commands
+    # Commands: nobody is told anything before all of it is pickled.
 
     def step(self, numbers: Sequence[int] | None, actions: Any, *, together: bool) -> None:
         """Step some environments, or all.
@@ -72,17 +72,18 @@ class Dispatcher:
         ``actions``: a list with one for each, or None if they are in the arrays.  ``together``:
         nobody asks for the first of them that are done.
         """
+        commands = []
         for group in self._groups(numbers):
-            worker, rows = group.worker, group.rows
-            worker.pending.update(dict.fromkeys(group.each(), _STEP))
             if actions is not None:
                 payload: Any = [actions[position] for position in group.positions]
-            elif self._shares(worker):
+            elif self._shares(group.worker):
                 payload = None
             else:
-                where = slice(None) if rows is None else rows
-                payload = (worker.arrays.actions.pack(where, shared=False),)
-            self._tell(worker, "step", rows, payload, together)
+                where = slice(None) if group.rows is None else group.rows
+                payload = (group.worker.arrays.actions.pack(where, shared=False),)
+            told = dict.fromkeys(group.each(), _STEP)
+            commands.append((group, told, self._encoded("step", group.rows, payload, together)))
+        self._tell(commands)
 
     def reset(
         self,
@@ -91,21 +92,30 @@ class Dispatcher:
         options: Sequence[dict[str, Any] | None],
     ) -> None:
         """Reset some environments, or all, with a seed and options for each."""
+        commands = []
         for group in self._groups(numbers):
-            for row, position in zip(group.each(), group.positions, strict=True):
-                told = Pending("reset", seeds[position], options[position])
-                group.worker.pending[row] = told
-            self._tell_reset(group.worker, group.rows)
+            told = {
+                row: Pending("reset", seeds[position], options[position])
+                for row, position in zip(group.each(), group.positions, strict=True)
+            }
+            commands.append((group, told, self._reset_command(group.rows, told)))
+        self._tell(commands)
 
     def call(
         self, numbers: Sequence[int], method: str, arguments: Sequence[tuple[Any, ...]]
     ) -> None:
         """Have ``Slot.method(*arguments)`` called, with arguments for each environment."""
-        self._calls = self._groups(numbers)
-        for group in self._calls:
-            group.worker.results = None
+        self._wait(self._all_there, None)
+        groups = self._groups(numbers)
+        commands = []
+        for group in groups:
             mine = [arguments[position] for position in group.positions]
-            self._tell(group.worker, "call", group.rows, method, mine)
+            no_steps: dict[int, Pending] = {}
+            commands.append((group, no_steps, self._encoded("call", group.rows, method, mine)))
+        for group in groups:
+            group.worker.results = None
+        self._calls = groups
+        self._tell(commands)
 
     # Answers
 
@@ -161,34 +171,45 @@ class Dispatcher:
         """An environment, for a person."""
         return f"environment {number}, of worker {self._worker_of[number].name!r}"
 
+    def _all_there(self) -> bool:
+        return all(worker.hello or worker.error for worker in self._workers)
+
     # Telling
 
     def _groups(self, numbers: Sequence[int] | None) -> list[_Group]:
+        """A command's parts, by worker; raises what became of one that is there no more."""
         if numbers is None:
-            return [_Group(worker, None, worker.numbers) for worker in self._workers]
-        groups: dict[str, tuple[WorkerProcess, list[int], list[int]]] = {}
-        for position, number in enumerate(numbers):
-            worker = self._worker_of[number]
-            _, rows, positions = groups.setdefault(worker.name, (worker, [], []))
-            rows.append(number - worker.setup.first)
-            positions.append(position)
-        return [_Group(*group) for group in groups.values()]
+            groups = [_Group(worker, None, worker.numbers) for worker in self._workers]
+        else:
+            by_name: dict[str, tuple[WorkerProcess, list[int], list[int]]] = {}
+            for position, number in enumerate(numbers):
+                worker = self._worker_of[number]
+                _, rows, positions = by_name.setdefault(worker.name, (worker, [], []))
+                rows.append(number - worker.setup.first)
+                positions.append(position)
+            groups = [_Group(*group) for group in by_name.values()]
+        for group in groups:
+            if group.worker.error is not None:
+                raise group.worker.error
+        return groups
 
-    def _tell(
-        self, worker: WorkerProcess, operation: str, rows: Sequence[int] | None, *rest: Any
-    ) -> None:
-        if worker.error is not None:
-            raise worker.error
-        if worker.hello is None:
-            return  # it is told once it has begun
-        command = (operation, self._generation, rows, *rest)
-        self._workers.send(worker, reduction.dumps(command))
+    def _encoded(self, operation: str, rows: Sequence[int] | None, *rest: Any) -> bytes:
+        return reduction.dumps((operation, self._generation, rows, *rest))
+
+    def _reset_command(self, rows: Sequence[int] | None, told: dict[int, Pending]) -> bytes:
+        seeds = [each.seed for each in told.values()]
+        return self._encoded("reset", rows, seeds, [each.options for each in told.values()])
+
+    def _tell(self, commands: Iterable[tuple[_Group, dict[int, Pending], bytes]]) -> None:
+        for group, told, data in commands:
+            group.worker.pending.update(told)
+            # One that is being started anew is told once it has begun.
+            if group.worker.hello is not None:
+                self._send(group.worker, data)
+
+    def _send(self, worker: WorkerProcess, data: bytes) -> None:
+        self._workers.send(worker, data)
         self._set_deadline(worker)
-
-    def _tell_reset(self, worker: WorkerProcess, rows: Sequence[int] | None) -> None:
-        told = [worker.pending[row] for row in _each(worker, rows)]
-        seeds, options = [each.seed for each in told], [each.options for each in told]
-        self._tell(worker, "reset", rows, seeds, options)
 
     def _begin(self, worker: WorkerProcess) -> None:
         """Tell a worker that has its environments where the arrays are."""
@@ -285,7 +306,11 @@ class Dispatcher:
         self._warn(f"{worker.whose()} made anew: {error}")
         self._workers.drop(worker)
         worker.hello, worker.lost, worker.deadline = None, str(error), None
-        self._workers.start(worker)
+        try:
+            self._workers.start(worker)
+        except BaseException:
+            self._lose(worker, error)
+            raise
 
     def _lose(self, worker: WorkerProcess, error: Exception) -> None:
         """There is no worker for its environments any more."""
@@ -308,12 +333,12 @@ class Dispatcher:
         """A new process has its environments: tell it what the one before was told."""
         self._begin(worker)
         steps = [row for row, told in worker.pending.items() if told is _STEP]
-        resets = [row for row, told in worker.pending.items() if told is not _STEP]
+        resets = {row: told for row, told in worker.pending.items() if told is not _STEP}
         if steps:
             # Their episodes are lost, and no action goes on with them.
-            self._tell(worker, "step", steps, [None] * len(steps), False)
+            self._send(worker, self._encoded("step", steps, [None] * len(steps), False))
         if resets:
-            self._tell_reset(worker, resets)
+            self._send(worker, self._reset_command(list(resets), resets))
 
     def _warn(self, message: str) -> None:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
@@ -345,8 +370,4 @@ class _Group(NamedTuple):
 
     def each(self) -> Sequence[int]:
         """The rows, one by one."""
-        return _each(self.worker, self.rows)
-
-
-def _each(worker: WorkerProcess, rows: Sequence[int] | None) -> Sequence[int]:
-    return range(len(worker.numbers)) if rows is None else rows
+        return range(len(self.worker.numbers)) if self.rows is None else self.rows

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
-from gymnasium import Env
+from gymnasium import Env, Wrapper
 from gymnasium.vector import AutoresetMode
 
 from fiber.vector.arrays import StepArrays
@@ -71,9 +71,28 @@ class Slot:
         attribute = self.env.get_wrapper_attr(name)
         return attribute(*args, **kwargs) if callable(attribute) else attribute
 
-    def set_attr(self, name: str, value: Any) -> None:
+    def get_attr(self, name: str) -> Any:
+        """An attribute of a wrapper or of the environment."""
+        return self.env.get_wrapper_attr(name)
+
+    def has_attr(self, name: str) -> bool:
+        """Whether there is one."""
+        return self.env.has_wrapper_attr(name)
+
+    def set_wrapper_attr(self, name: str, value: Any) -> None:
         """Set an attribute where a wrapper or the environment has it."""
         self.env.set_wrapper_attr(name, value)
+
+    def set_attr(self, name: str, value: Any) -> None:
+        """Set an attribute of the outermost wrapper."""
+        setattr(self.env, name, value)
+
+    def is_wrapped(self, wrapper_class: type[Wrapper[Any, Any, Any, Any]]) -> bool:
+        """Whether such a wrapper is around the environment."""
+        env = self.env
+        while isinstance(env, Wrapper) and not isinstance(env, wrapper_class):
+            env = env.env
+        return isinstance(env, wrapper_class)
 
     def lose(self, why: str) -> None:
         """Its episode cannot go on."""

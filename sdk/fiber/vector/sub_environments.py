@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
@@ -75,6 +76,31 @@ class SubEnvironments:
         except BaseException:
             self.close(0)
             raise
+
+    def step(
+        self,
+        numbers: Sequence[int] | None,
+        actions: Any,
+        split: Callable[[Any], list[Any]],
+        *,
+        together: bool,
+    ) -> None:
+        """Begin to step some environments, or all, with a batch of actions for them.
+
+        ``split`` makes a list of the batch; ``together``: nobody asks for the first that are done.
+        """
+        count = len(self.arrays.rewards) if numbers is None else len(numbers)
+        columns = self.arrays.actions
+        if columns.fits(actions, count):
+            columns.fill(slice(None) if numbers is None else numbers, actions)
+            self.dispatcher.step(numbers, None, together=together)
+            return
+        chosen = split(actions)
+        if len(chosen) != count:
+            raise ValueError(
+                f"actions for {count} environments are needed, one for each, not {len(chosen)}"
+            )
+        self.dispatcher.step(numbers, chosen, together=together)
 
     def close(self, timeout: float | None) -> None:
         """End the workers; kill those that have not ended when ``timeout`` is over."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from typing import Any, TypeAlias, TypeVar
 
@@ -114,8 +115,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 
         A ``seed`` that is a number is the first environment's, and the next one's is one more.
         """
-        self.reset_async(seed, options)
-        return self.reset_wait()
+        with self._given_up_if_interrupted():
+            self.reset_async(seed, options)
+            return self.reset_wait()
 
     def reset_async(
         self,
@@ -129,8 +131,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         numbers = None if mask is None else np.flatnonzero(mask).tolist()
         if numbers is not None:
             seeds = [seeds[number] for number in numbers]
-        self._dispatcher.reset(numbers, seeds, [options] * len(seeds))
-        self._state = AsyncState.WAITING_RESET
+        with self._given_up_if_interrupted():
+            self._dispatcher.reset(numbers, seeds, [options] * len(seeds))
+            self._state = AsyncState.WAITING_RESET
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """What ``reset`` returns; TimeoutError after ``timeout`` seconds."""
@@ -140,20 +143,19 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def step(self, actions: Any) -> Step:
         """Step all environments: observations, rewards, terminations, truncations and infos.
 
-        Interrupted (Ctrl-C), it is as if nobody had asked: what the step gives is not returned.
+        Interrupted (Ctrl-C), it is given up, as everything that is waited for: what the
+        environments do of it is not returned.
         """
-        self.step_async(actions)
-        try:
+        with self._given_up_if_interrupted():
+            self.step_async(actions)
             return self.step_wait()
-        except KeyboardInterrupt:
-            self._give_up()
-            raise
 
     def step_async(self, actions: Any) -> None:
         """Begin to step: for ``step_wait``."""
         self._check_idle("step_async")
-        self._tell_step(None, actions, together=True)
-        self._state = AsyncState.WAITING_STEP
+        with self._given_up_if_interrupted():
+            self._sub_environments.step(None, actions, self._each_action, together=True)
+            self._state = AsyncState.WAITING_STEP
 
     def step_wait(self, timeout: float | None = None) -> Step:
         """What ``step`` returns; TimeoutError after ``timeout`` seconds."""
@@ -175,7 +177,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         By default those of the last ``recv``, or all after ``reset`` or ``step``.
         """
         self._check_running()
-        self._tell_step(self._chosen(env_ids), actions, together=False)
+        numbers = self._chosen(env_ids)
+        with self._given_up_if_interrupted():
+            self._sub_environments.step(numbers, actions, self._each_action, together=False)
 
     def recv(self, batch_size: int | None = None, timeout: float | None = None) -> Step:
         """What ``step`` returns, of the ``batch_size`` environments that are ready first.
@@ -193,7 +197,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
                 "reset or step and not received yet. Call reset_async() or send() first"
             )
         self._state = AsyncState.DEFAULT
-        numbers = self._dispatcher.wait_for(count, timeout)
+        with self._given_up_if_interrupted():
+            numbers = self._dispatcher.wait_for(count, timeout)
         self._received = numbers
         arrays = self._arrays
         infos = self._infos(self._dispatcher.notes(numbers), numbers)
@@ -213,8 +218,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """What a method of each environment returns, or the value of an attribute."""
-        self.call_async(name, *args, **kwargs)
-        return self.call_wait()
+        with self._given_up_if_interrupted():
+            self.call_async(name, *args, **kwargs)
+            return self.call_wait()
 
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Begin such a call: for ``call_wait``."""
@@ -242,8 +248,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
                 f"values for {self.num_envs} environments are needed, one for each, not "
                 f"{len(values)}"
             )
-        self._call("set_attr", [(name, value) for value in values])
-        self.call_wait()
+        with self._given_up_if_interrupted():
+            self._call("set_wrapper_attr", [(name, value) for value in values])
+            self.call_wait()
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
         """Close the environments and end their processes.
@@ -263,23 +270,13 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     # What they have in common
 
-    def _tell_step(self, numbers: Sequence[int] | None, actions: Any, *, together: bool) -> None:
-        count = self.num_envs if numbers is None else len(numbers)
-        columns = self._arrays.actions
-        if columns.fits(actions, count):
-            columns.fill(slice(None) if numbers is None else numbers, actions)
-            self._dispatcher.step(numbers, None, together=together)
-        else:
-            chosen = list(iterate(self.action_space, actions))
-            if len(chosen) != count:
-                raise ValueError(
-                    f"actions for {count} environments are needed, one for each, not {len(chosen)}"
-                )
-            self._dispatcher.step(numbers, chosen, together=together)
-
     def _call(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> None:
-        self._dispatcher.call(range(self.num_envs), method, arguments)
-        self._state = AsyncState.WAITING_CALL
+        with self._given_up_if_interrupted():
+            self._dispatcher.call(range(self.num_envs), method, arguments)
+            self._state = AsyncState.WAITING_CALL
+
+    def _each_action(self, actions: Any) -> list[Any]:
+        return list(iterate(self.action_space, actions))
 
     def _observations(self) -> Any:
         batch = self._arrays.observations.batch(slice(None))
@@ -369,14 +366,23 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         self._received = None
 
     def _awaited(self, wait: Callable[[], _Result]) -> _Result:
-        """What ``wait`` returns.  Interrupted, it can be called again; failed, that was all."""
+        """What ``wait`` returns; if it fails, nothing more is waited for."""
         try:
             result = wait()
-        except Exception:
+        except BaseException:
             self._give_up()
             raise
         self._state = AsyncState.DEFAULT
         return result
+
+    @contextlib.contextmanager
+    def _given_up_if_interrupted(self) -> Iterator[None]:
+        """Who is interrupted does not know what was told and heard."""
+        try:
+            yield
+        except (KeyboardInterrupt, SystemExit):
+            self._give_up()
+            raise
 
     def _give_up(self) -> None:
         self._dispatcher.abandon()

@@ -93,6 +93,7 @@ def serve(connection: Connection, setup: Setup) -> None:
         for row, make in enumerate(setup.makes):
             try:
                 slots.append(Slot(row, make, setup.autoreset))
+                _check_that_it_is_new(slots)
             except Exception as error:
                 connection.send(Failure.of(row, "the making", error))
                 return
@@ -307,6 +308,15 @@ class _Report:
         packed = arrays.pack(slice(None) if whole else self.rows, shared=shared)
         rows = None if whole else self.rows
         return Answer(self.generation, rows, packed, self.notes, self.failures)
+
+
+def _check_that_it_is_new(slots: Sequence[Slot]) -> None:
+    newest = slots[-1].env.unwrapped
+    if any(slot.env.unwrapped is newest for slot in slots[:-1]):
+        raise ValueError(
+            "it is the environment that the function has made before: have it make a new one at "
+            "every call (`lambda: gymnasium.make(...)` instead of `lambda: env`)"
+        )
 
 
 def _hello(slots: Sequence[Slot]) -> Hello:

@@ -1,0 +1,45 @@
+"""A vector environment whose workers are pods, on a cluster played in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fakes.cluster import FakeCluster, fake_cluster
+from faults.runtime import running
+from fiber.vector import VectorEnv
+from fiber_api import names
+from unit.kubernetes_rig import kubeconfig
+from vector_envs import Faulty
+
+pytestmark = pytest.mark.may_leak("the operator's connections, for as long as the cluster is there")
+
+PATIENCE = 30
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[FakeCluster]:
+    with fake_cluster() as cluster, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, cluster.url)))
+        with running(backend="kubernetes"):
+            yield cluster
+
+
+def test_a_pod_that_is_deleted_between_send_and_recv(cluster: FakeCluster, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    env = VectorEnv([lambda: Faulty(gate)] * 4, num_workers=2, on_error="restart")
+    try:
+        assert env.reset()[0].tolist() == [[0]] * 4
+        victim = env.call("getenv", names.ENV_NAME)[2]
+        env.send([Faulty.GOOD, Faulty.GOOD, Faulty.WAIT, Faulty.GOOD])
+        cluster.do(cluster.world.store.delete, "pods", "lab", victim)
+        with pytest.warns(RuntimeWarning, match="(?s)environments 2 to 3 made anew: .*pod"):
+            _, _, _, truncations, infos = env.recv(4, timeout=PATIENCE)
+        truncated = dict(zip(infos["env_id"].tolist(), truncations.tolist(), strict=True))
+        assert truncated == {0: False, 1: False, 2: True, 3: True}
+        assert env.reset()[0].tolist() == [[0]] * 4
+        assert env.step([Faulty.GOOD] * 4)[0].tolist() == [[1]] * 4
+    finally:
+        env.close(terminate=True)
