@@ -27,9 +27,12 @@ KEPT = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
 OPERATORS = {names.operator_lease_name("fiber-operator"), "fiberpools.fiber.dev"}
 """Leases that stay."""
 
-PATIENCE = 30
+PATIENCE = 60
 
-pytestmark = pytest.mark.may_leak("the operator's connections, for as long as the cluster is there")
+pytestmark = [
+    pytest.mark.may_leak("the operator's connections, for as long as the cluster is there"),
+    pytest.mark.timeout(180),  # each pod is several interpreters that start
+]
 
 
 @pytest.fixture(scope="module")
@@ -307,7 +310,7 @@ def test_a_map_whose_fiber_pool_somebody_deletes_goes_on_with_another(
         pool.wait_until_workers_up(PATIENCE)
         (first,) = (one["metadata"]["name"] for one in cluster.objects("fiberpools"))
         cluster.do(cluster.world.store.delete, "fiberpools", "lab", first)
-        assert result.get(2 * PATIENCE) == [n * n for n in range(100)]
+        assert result.get(PATIENCE) == [n * n for n in range(100)]
         assert [one["metadata"]["name"] for one in cluster.objects("fiberpools")] == [f"{first}-1"]
 
 
@@ -439,7 +442,7 @@ def test_a_program_that_forks_itself_has_pods_and_its_copy_runs_beside_it(
     launch: Callable[..., Program],
 ) -> None:
     program = launch(FORKS, env={"FIBER_BACKEND": "kubernetes"})
-    assert program.finish(2 * PATIENCE) == "9 [0, 1, 4]\n"
+    assert program.finish(PATIENCE) == "9 [0, 1, 4]\n"
 
 
 def test_one_port_is_not_enough_for_two_pools(cluster: FakeCluster) -> None:
