@@ -77,6 +77,15 @@ ALL = (
         environment={"FIBER_BACKEND": "local"},
     ),
     Contender(
+        "fiber-joblib",
+        "joblib on Fiber",
+        ("fiber", "joblib"),
+        frozenset({"map", "stream", "stream in chunks"}),
+        "#009E73",
+        "v",
+        environment={"FIBER_BACKEND": "local"},
+    ),
+    Contender(
         "multiprocessing",
         "multiprocessing, fork",
         (),
