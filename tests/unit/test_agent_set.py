@@ -18,10 +18,10 @@ ERROR = FiberError("no agent will come")
 
 
 class Nothing:
-    """A hub, an output and a link of which nothing is wanted here."""
+    """A hub, an output and a link of which nothing is wanted here, nor of what they return."""
 
     def __getattr__(self, name: str) -> Any:
-        return lambda *args, **kwargs: None
+        return lambda *args, **kwargs: self
 
 
 class Owner:

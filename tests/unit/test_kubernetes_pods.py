@@ -27,7 +27,7 @@ DAMAGED = "the loop is to fail in this test"
 
 
 class Said:
-    """An ``Output``, and whatever else of which nothing is wanted here."""
+    """An ``Output``, and whatever else of which nothing is wanted here, nor of what it returns."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -39,7 +39,7 @@ class Said:
         self.lines.append(line)
 
     def __getattr__(self, name: str) -> Any:
-        return lambda *args, **kwargs: None
+        return lambda *args, **kwargs: self
 
 
 class Owner:
