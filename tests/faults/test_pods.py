@@ -27,9 +27,12 @@ KEPT = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
 OPERATORS = {names.operator_lease_name("fiber-operator"), "fiberpools.fiber.dev"}
 """Leases that stay."""
 
-PATIENCE = 30
+PATIENCE = 60
 
-pytestmark = pytest.mark.may_leak("the operator's connections, for as long as the cluster is there")
+pytestmark = [
+    pytest.mark.may_leak("the operator's connections, for as long as the cluster is there"),
+    pytest.mark.timeout(180),  # each pod is several interpreters that start
+]
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +58,11 @@ def _nothing_is_left(cluster: FakeCluster) -> Iterator[None]:
 
 def pods_of(cluster: FakeCluster) -> list[str]:
     return [pod["metadata"]["name"] for pod in cluster.objects("pods")]
+
+
+def free_port() -> int:
+    with socket.create_server(("", 0)) as taken:
+        return int(taken.getsockname()[1])
 
 
 def square(number: int) -> int:
@@ -258,7 +266,8 @@ def test_a_child_that_is_killed_before_it_has_a_pod_is_gone_and_its_pod_not_want
 
 
 def test_a_killed_pod_costs_its_tasks_another_run(cluster: FakeCluster) -> None:
-    with running(backend="kubernetes"), fiber.Pool(2) as pool:
+    # The next one listens at the same port.
+    with running(backend="kubernetes", listen_port=free_port()), fiber.Pool(2) as pool:
         result = pool.map_async(slow_square, range(200), chunksize=1)
         pool.wait_until_workers_up(PATIENCE)
         victim = pool.workers()[0].host
@@ -280,7 +289,8 @@ def test_a_task_that_dies_with_its_pod_says_so(cluster: FakeCluster) -> None:
 
 
 def test_a_deleted_pod_costs_its_tasks_another_run(cluster: FakeCluster) -> None:
-    with running(backend="kubernetes"), fiber.Pool(2) as pool:
+    # The next one listens at the same port.
+    with running(backend="kubernetes", listen_port=free_port()), fiber.Pool(2) as pool:
         result = pool.map_async(slow_square, range(200), chunksize=1)
         pool.wait_until_workers_up(PATIENCE)
         victim = pool.workers()[0].host
@@ -329,6 +339,19 @@ def test_a_fiber_pool_that_somebody_deletes_is_said_and_the_next_pool_has_anothe
         with fiber.Pool(1) as pool:
             assert pool.apply(square, (3,)) == 9
     assert capfd.readouterr().err.count("was deleted, and its processes with it") == 1
+
+
+def test_a_map_whose_fiber_pool_somebody_deletes_goes_on_with_another(
+    cluster: FakeCluster,
+) -> None:
+    # The next one listens at the same port.
+    with running(backend="kubernetes", listen_port=free_port()), fiber.Pool(1) as pool:
+        result = pool.map_async(slow_square, range(100), chunksize=1)
+        pool.wait_until_workers_up(PATIENCE)
+        (first,) = (one["metadata"]["name"] for one in cluster.objects("fiberpools"))
+        cluster.do(cluster.world.store.delete, "fiberpools", "lab", first)
+        assert result.get(PATIENCE) == [n * n for n in range(100)]
+        assert [one["metadata"]["name"] for one in cluster.objects("fiberpools")] == [f"{first}-1"]
 
 
 def test_processes_for_which_there_will_be_no_room_are_spoken_of(
@@ -458,13 +481,12 @@ FORKS = """
 def test_a_program_that_forks_itself_has_pods_and_its_copy_runs_beside_it(
     launch: Callable[..., Program],
 ) -> None:
-    assert launch(FORKS, env={"FIBER_BACKEND": "kubernetes"}).finish() == "9 [0, 1, 4]\n"
+    program = launch(FORKS, env={"FIBER_BACKEND": "kubernetes"})
+    assert program.finish(PATIENCE) == "9 [0, 1, 4]\n"
 
 
 def test_one_port_is_not_enough_for_two_pools(cluster: FakeCluster) -> None:
-    with socket.create_server(("", 0)) as taken:
-        port = taken.getsockname()[1]
-    with running(backend="kubernetes", listen_port=port):
+    with running(backend="kubernetes", listen_port=free_port()):
         with fiber.Pool(1) as pool:
             assert pool.apply(square, (2,)) == 4
         with fiber.Pool(1) as pool, pytest.raises(ConfigError, match="needs one of its own"):

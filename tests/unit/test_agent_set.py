@@ -18,10 +18,10 @@ ERROR = FiberError("no agent will come")
 
 
 class Nothing:
-    """A hub, an output and a link of which nothing is wanted here."""
+    """A hub, an output and a link of which nothing is wanted here, nor of what they return."""
 
     def __getattr__(self, name: str) -> Any:
-        return lambda *args, **kwargs: None
+        return lambda *args, **kwargs: self
 
 
 class Owner:
@@ -47,12 +47,16 @@ class Site:
         link: Any = Nothing()
         return self.agents.join(name, link)
 
-    def start(self) -> tuple[RemoteChild, Owner]:
+    def child(self) -> tuple[RemoteChild, Owner]:
+        """One that is not started yet."""
         owner: Any = Owner()
         spec = ChildSpec(
             name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=False
         )
-        child = self.agents.child(spec, owner)
+        return self.agents.child(spec, owner), owner
+
+    def start(self) -> tuple[RemoteChild, Owner]:
+        child, owner = self.child()
         child.start()
         return child, owner
 
@@ -106,3 +110,29 @@ def test_a_signal_that_ends_a_process_ends_one_that_waits_for_an_agent(
     assert owner.report.exitcode == -signum
     assert f"killed by {signum.name} before it had a host" in owner.report.reason
     assert not site.placement.waiting
+
+
+def test_others_get_who_waits_and_who_comes_later(site: Site) -> None:
+    other = Site()
+    agent = site.join("a")
+    (first, _), (_, owner) = site.start(), site.start()
+    waits, late = site.start()[0], site.child()[0]
+    site.agents.hand_over(lambda: other.agents)
+    assert list(other.placement.waiting) == [waits]
+    late.start()
+    other.join("b")
+    assert (waits.host, late.host, first.host) == ("b", "b", "a")
+    assert not site.placement.waiting
+    agent.lose("its pod is gone")  # with those that ran on it
+    assert owner.report is not None
+    assert owner.report.cause == Cause.AGENT_LOST
+
+
+def test_who_was_handed_over_is_taken_back_where_it_waits_now(site: Site) -> None:
+    other = Site()
+    child, owner = site.start()
+    site.agents.hand_over(lambda: other.agents)
+    child.signal(signal.SIGTERM)
+    site.loop.run_for(0.0)
+    assert owner.report is not None
+    assert not other.placement.waiting

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
+from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes import program, progress
 from fiber._backends.kubernetes.pods import Pods
 from fiber._backends.kubernetes.program import PreparedPool
@@ -26,7 +27,7 @@ DAMAGED = "the loop is to fail in this test"
 
 
 class Said:
-    """An ``Output``, and whatever else of which nothing is wanted here."""
+    """An ``Output``, and whatever else of which nothing is wanted here, nor of what it returns."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -38,7 +39,7 @@ class Said:
         self.lines.append(line)
 
     def __getattr__(self, name: str) -> Any:
-        return lambda *args, **kwargs: None
+        return lambda *args, **kwargs: self
 
 
 class Owner:
@@ -88,7 +89,10 @@ class Site:
         self.api = SimpleNamespace(server="kube", trouble=None)
 
     def pods(
-        self, prepare: Callable[[threading.Event], PreparedPool], config: Config | None = None
+        self,
+        prepare: Callable[[threading.Event], PreparedPool],
+        config: Config | None = None,
+        successor: Callable[[], AgentSet] | None = None,
     ) -> Pods:
         """``prepare`` is called with the event that ends its calls."""
         nothing: Any = self.said
@@ -100,6 +104,7 @@ class Site:
             config or Config(),
             api,
             lambda observer, cancel: prepare(cancel),
+            successor,
         )
         return self.made
 
@@ -306,6 +311,7 @@ def test_a_process_that_waits_for_one_more_pod_is_told_what_for(
     worker: bool, told: list[str], site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pool works with what it has; nothing else can do what a process is to do."""
+    monkeypatch.setattr(progress, "_is_terminal", lambda: False)
     monkeypatch.setattr(progress, "_FIRST_WRITTEN", 0.0)
     pods = site.pods(until_the_end)
     full = {"reason": "QuotaExceeded", "severity": "Error", "message": "it is full"}
@@ -321,6 +327,61 @@ def test_a_process_that_waits_for_one_more_pod_is_told_what_for(
         site.start(worker=worker)
     settled(site)
     assert site.said.lines[1:] == told  # after the problem itself
+    pods.close()
+
+
+def lost(reason: str) -> FiberPoolError:
+    return FiberPoolError("it is gone", pool="es-1", namespace="lab", reason=reason)
+
+
+def lose_pool(site: Site, pods: Pods, error: FiberPoolError, *, used: bool) -> tuple[Any, Owner]:
+    """A child waits for a pool whose agent has gone, if it was ``used``, and which is lost now."""
+    owner: Any = Owner(site.said)
+    spec = ChildSpec(name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=True)
+    child = pods.agents.child(spec, owner)
+    over = threading.Event()
+
+    def lose() -> None:
+        if used:
+            pods.on_agent(Dialled("es-1-a"))  # type: ignore[arg-type]
+            pods.agents.agents["es-1-a"].lose("its pod is gone")
+        child.start()
+        pods.on_error(error)
+        pods.on_end()
+        over.set()
+
+    site.loop.call_soon(lose)
+    assert over.wait(PATIENCE)
+    return child, owner
+
+
+def test_who_waits_for_a_pool_of_ours_that_is_lost_gets_the_next_one(site: Site) -> None:
+    """Also where its agents had gone before anybody heard of that."""
+    follows = site.pods(until_the_end)
+    pods = site.pods(until_the_end, successor=lambda: follows.agents)
+    child, owner = lose_pool(site, pods, lost("Deleted"), used=True)
+    assert pods.over
+    assert list(follows.agents.placement.waiting) == [child]
+    assert owner.report is None
+    assert site.said.lines == ["fiber: it is gone"]
+    pods.close()
+    follows.close()
+
+
+@pytest.mark.parametrize(
+    ("ours", "reason", "used"),
+    [(False, "Deleted", True), (True, "NoOperator", True), (True, "Deleted", False)],
+    ids=["somebody-elses", "not-lost", "never-of-use"],
+)
+def test_who_waits_for_what_another_pool_would_not_change_is_refused(
+    ours: bool, reason: str, used: bool, site: Site
+) -> None:
+    successor = (lambda: pytest.fail("no other is to be made")) if ours else None
+    pods = site.pods(until_the_end, successor=successor)
+    error = lost(reason)
+    child, owner = lose_pool(site, pods, error, used=used)
+    assert owner.gone.is_set()
+    assert child.start_error is error
     pods.close()
 
 

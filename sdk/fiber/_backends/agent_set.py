@@ -36,8 +36,11 @@ class AgentSet:
         """Which of them runs which child."""
         self.agents: dict[str, RemoteAgent] = {}
         """Those that have joined and are not lost, by name."""
+        self.joined = 0
+        """How many ever have."""
         self.error: Exception | None = None
         """Why no agent will come."""
+        self._successor: Callable[[], AgentSet] | None = None
         self._hub = hub
         self._output = output
         self._on_change = on_change
@@ -59,6 +62,9 @@ class AgentSet:
     def start(self, child: RemoteChild) -> None:
         """Give it an agent, now or as soon as there is room."""
         self._not_started.discard(child)
+        if self._successor is not None:
+            child.move(self._successor())
+            return
         if self.error is not None and not self.placement.loads:
             _refuse(child, self.error)
             return
@@ -76,6 +82,7 @@ class AgentSet:
         """An agent has dialled in."""
         agent = RemoteAgent(host, link, self.loop, self._hub, self._output, self)
         self.agents[host] = agent
+        self.joined += 1
         self.error = None
         self.placement.add(agent, self.loop.now())
         link.attach(agent)
@@ -88,13 +95,23 @@ class AgentSet:
         if not self.placement.loads:
             self.refuse_waiting(error)
 
+    def hand_over(self, successor: Callable[[], AgentSet]) -> None:
+        """Whoever waits, or is to be started from now on, is for others: no agent comes here."""
+        self._successor = successor
+        for child in self._take_waiting():
+            self.start(child)
+        self._on_change()
+
     def refuse_waiting(self, error: Exception) -> None:
         """Nobody is to wait any longer."""
-        waiting = list(self.placement.waiting)
-        self.placement.waiting.clear()
-        for child in waiting:
+        for child in self._take_waiting():
             _refuse(child, error)
         self._on_change()
+
+    def _take_waiting(self) -> list[RemoteChild]:
+        waiting = list(self.placement.waiting)
+        self.placement.waiting.clear()
+        return waiting
 
     def _place(self) -> None:
         while (placed := self.placement.place()) is not None:

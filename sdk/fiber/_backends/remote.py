@@ -219,6 +219,11 @@ class RemoteChild:
         """Have it started."""
         self._starter.start(self)
 
+    def move(self, starter: Starter) -> None:
+        """Have it started by somebody else, while it has no agent."""
+        self._starter = starter
+        starter.start(self)
+
     def begin(self, agent: RemoteAgent, number: int) -> None:
         """It has an agent."""
         self._agent, self._number, self.host = agent, number, agent.host

@@ -14,6 +14,9 @@ from fiber._backends.kubernetes.resources import LEASES, POOLS
 from fiber.errors import FiberPoolError
 from fiber_api import names
 
+LOST = ("Deleted", "Replaced")
+"""Reasons of a FiberPoolError by which the pool is this program's no more."""
+
 
 @dataclass(frozen=True)
 class Master:
@@ -133,9 +136,9 @@ class AttachedPool:
             raise loss
 
     def _loss(self, reason: str, what: str, advice: str) -> FiberPoolError:
-        """``advice`` is for a pool that somebody else keeps; another is made as one is needed."""
+        """``advice`` is for a pool that somebody else keeps; its own is followed by another."""
         if not self._kept_by_others:
-            advice = "Make a new Pool, or Process, to go on: it begins anew"
+            advice = "What is to run from now on gets another FiberPool, and lost tasks run again"
         return FiberPoolError(
             f"the FiberPool {self.name!r} in namespace {self.namespace!r} {what}. {advice}",
             pool=self.name,

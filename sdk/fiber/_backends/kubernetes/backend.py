@@ -33,6 +33,7 @@ class KubernetesBackend:
         self._program = Program(config)
         self._pods: dict[tuple[Shape | str, int], Pods] = {}
         """By what they are like, and how many of these there were before them."""
+        self._closing = False
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """A child in a pod that has what it wishes."""
@@ -47,21 +48,22 @@ class KubernetesBackend:
             pods = self._pods.get((key, before))
             if pods is None:  # one that another thread makes meanwhile has had no effect yet
                 pods = self._pods.setdefault((key, before), self._make(key))
+                if self._closing:  # which may have looked before
+                    pods.begin_close()
             if not pods.over:
                 return pods
             before += 1
 
     def _make(self, key: Shape | str) -> Pods:
-        program, loop = self._program, self._loop
-        prepare = (
-            partial(program.prepare_warm, key, loop)
-            if isinstance(key, str)
-            else partial(program.prepare_own, key, loop)
-        )
-        return Pods(loop, self._hub, self._output, self._config, program.api, prepare)
+        make = partial(Pods, self._loop, self._hub, self._output, self._config, self._program.api)
+        if isinstance(key, str):
+            return make(partial(self._program.prepare_warm, key, self._loop))
+        prepare = partial(self._program.prepare_own, key, self._loop)
+        return make(prepare, successor=lambda: self._find(key).agents)
 
     def close(self) -> None:
         """End the pods, and the pools or their use."""
+        self._closing = True
         with contextlib.ExitStack() as rest:  # of which nothing is left out if it is interrupted
             rest.callback(self._output.close)
             rest.callback(self._program.api.close)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.attached_pool import LOST
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._backends.kubernetes.pod_reasons import node_of, pod_end
+from fiber._backends.kubernetes.preparation import Preparation
 from fiber._backends.kubernetes.problems import PoolName
 from fiber._backends.kubernetes.program import ListenerObserver, PreparedPool
 from fiber._backends.kubernetes.waiting import Waiting
@@ -29,6 +32,8 @@ _END_TIMEOUT = 10.0
 
 _ENDED = ("Failed", "Succeeded")
 
+_NOT_OURS = "its FiberPool is not this program's any more"
+
 Document = Mapping[str, Any]
 
 
@@ -36,7 +41,8 @@ class Pods:
     """Begins with the first child, and asks for pods as children come and go.
 
     ``prepare`` says which pool that is and begins to listen for its agents; it blocks, until the
-    event that it is given is set, and raises FiberError.  Everything but ``agents.child`` and
+    event that it is given is set, and raises FiberError.  ``successor`` has the agents of the next
+    such pool, where this one can be followed by another.  Everything but ``agents.child`` and
     ``close`` happens on the loop's thread.
     """
 
@@ -48,11 +54,13 @@ class Pods:
         config: Config,
         api: Api,
         prepare: Callable[[ListenerObserver, threading.Event], PreparedPool],
+        successor: Callable[[], AgentSet] | None = None,
     ) -> None:
         self._loop = loop
         self._output = output
         self._api = api
         self._prepare = prepare
+        self._successor = successor
         self._placement: Placement[RemoteAgent, RemoteChild] = Placement(
             config.processes_per_pod, spread=False
         )
@@ -67,7 +75,9 @@ class Pods:
         )
         self.over = False
         """Nothing comes of its pool any more, and it was given back."""
-        self._preparing: threading.Thread | None = None
+        self._goes_on = False
+        """Who waits then is for the successor."""
+        self._preparation: Preparation | None = None
         self._prepared: PreparedPool | None = None
         self._client: FiberPoolClient | None = None
         self._closing = threading.Event()
@@ -91,9 +101,8 @@ class Pods:
         """End the children, and the pool or its use.  Not on the loop's thread."""
         self._closing.set()
         self._wait_for(lambda then: self._loop.call_soon(self._shut_down, then))
-        preparing = self._preparing  # from here on there will be no other
-        if preparing is not None:
-            preparing.join(_END_TIMEOUT)
+        if (preparation := self._preparation) is not None:  # from here on there is no other
+            preparation.join(_END_TIMEOUT)
             self._wait_for(self._loop.call_soon)  # until what it prepared is known
         if self._client is not None:
             self._client.close(_END_TIMEOUT)
@@ -119,27 +128,16 @@ class Pods:
     # -- The pool begins
 
     def _begin(self) -> None:
-        """Calls of the API server take their time: a thread makes them."""
-        thread = threading.Thread(target=self._run_prepare, name="fiber-prepare", daemon=True)
-        try:
-            thread.start()
-        except RuntimeError as error:  # the system has no room for it
-            self._waiting.refuse(_unexpected(error))
-        else:
-            self._preparing = thread
-
-    def _run_prepare(self) -> None:
-        try:
-            prepared = self._prepare(self, self._closing)
-        except FiberError as error:
-            self._loop.call_soon(self._failed_to_prepare, error)
-        except Exception as error:  # a fault of ours must not leave anybody waiting
-            self._loop.call_soon(self._failed_to_prepare, _unexpected(error))
-        else:
-            self._loop.call_soon(self._begin_with, prepared)
+        self._preparation = Preparation(
+            self._loop,
+            partial(self._prepare, self, self._closing),
+            on_prepared=self._begin_with,
+            on_failed=self._failed_to_prepare,
+        )
+        self._preparation.start()
 
     def _failed_to_prepare(self, error: FiberError) -> None:
-        self._preparing = None  # the next child may have more luck
+        self._preparation = None  # the next child may have more luck
         self._waiting.refuse(error)
 
     def _begin_with(self, prepared: PreparedPool) -> None:
@@ -170,7 +168,7 @@ class Pods:
         if self._closing.is_set():
             return
         desired = self._demand.decide(self._loop.now())
-        if self._placement.waiting and self._preparing is None:
+        if self._placement.waiting and self._preparation is None:
             self._begin()
         released = [agent.host for agent in desired.release]
         self._given_up.update(released)
@@ -276,22 +274,27 @@ class Pods:
 
     def on_error(self, error: FiberPoolError) -> None:
         """Nothing comes of the pool any more."""
-        if not self._placement.waiting:
+        # What works with one of our own goes on with another.  One that was lost before it was of
+        # any use would be made and lost again and again.
+        self._goes_on = bool(self._successor and error.reason in LOST and self.agents.joined)
+        if self._goes_on or not self._placement.waiting:
             self._output.write("fiber", str(error))  # nobody else says it
-        self._waiting.refuse(error)
-        self.agents.fail(error)
+        if not self._goes_on:
+            self._waiting.refuse(error)
+            self.agents.fail(error)
 
     def on_end(self) -> None:
         """The pool is given back: whoever starts something now gets another."""
+        for agent in self.agents.agents.values():
+            agent.close()
+        if self._prepared is None:
+            self._end()
+        else:  # first: the next one may have to listen at the same port
+            self._prepared.listener.close(_NOT_OURS, then=self._end)
+
+    def _end(self) -> None:
         self.over = True
         for agent in list(self.agents.agents.values()):
-            agent.close()
-            agent.lose("its FiberPool is not this program's any more")
-        if self._prepared is not None:
-            self._prepared.listener.close("its FiberPool is not this program's any more")
-
-
-def _unexpected(error: Exception) -> FiberError:
-    failure = FiberError(f"no pods can be asked for, after an unexpected {error!r}")
-    failure.__cause__ = error
-    return failure
+            agent.lose(_NOT_OURS)
+        if self._successor is not None and self._goes_on:
+            self.agents.hand_over(self._successor)

@@ -23,7 +23,7 @@ from fiber.errors import FiberPoolError
 class Reporter:
     """Any thread may call; ``on_warning`` and ``on_error`` are told on the loop's.
 
-    There is one error at most, before which ``on_failure`` is called on the caller's thread.
+    There is one error at most.  ``on_failure`` is called after it, on the thread that found it.
     """
 
     def __init__(
@@ -85,8 +85,8 @@ class Reporter:
     def fail(self, error: FiberPoolError) -> None:
         """Nothing comes of the pool any more."""
         if not self._muted and self._failing.acquire(blocking=False):
-            self._on_failure()
             self._loop.call_soon(self._on_error, error)
+            self._on_failure()  # whatever that leads to is told later
 
     def error(self, reason: str, what: str) -> FiberPoolError:
         """``what``: what is the matter, in words that follow the pool."""
