@@ -14,6 +14,8 @@ import fiber
 from census import wait_until
 from fiber import synchronize
 from fiber._hub import hosted_wait_list
+from fiber._hub.client import HubStream
+from fiber._hub.protocol import Op
 from hosts import PATIENCE, Far, Hosts, background
 
 # From Python 3.12 on os.fork() warns of any thread, and the runtime's loop may be one.
@@ -108,6 +110,36 @@ def test_who_waits_has_let_go_of_the_lock_and_gets_it_back(brought: Callable[[An
         assert there.wait(0.01) is False
         assert not on_thread(lambda: here.acquire(False))
     assert here.acquire(timeout=PATIENCE)
+
+
+def test_waiting_again_and_again_takes_no_more_streams(hosts: Hosts) -> None:
+    there = Far(hosts)(fiber.Condition())
+    with there:
+        for _ in range(10):
+            there.wait(0)
+    assert len(there._waiters._streams) == 1
+
+
+def test_ctrl_c_as_a_wait_begins_leaves_no_waiter(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = fiber.Condition()
+    there = Far(hosts)(here)
+    ask = HubStream.ask
+
+    def strike(stream: HubStream, operation: Op, *args: Any, **options: Any) -> Any:
+        reply = ask(stream, operation, *args, **options)
+        if operation is Op.ENTER:
+            raise KeyboardInterrupt
+        return reply
+
+    monkeypatch.setattr(HubStream, "ask", strike)
+    with there, pytest.raises(KeyboardInterrupt):
+        there.wait()
+    monkeypatch.undo()
+    assert there._waiters.waiters() == 0
+    with there:
+        assert not there.wait(0)
 
 
 def test_wait_for_says_what_the_predicate_says(brought: Callable[[Any], Any]) -> None:

@@ -219,6 +219,13 @@ def test_more_tokens_than_can_be_told_apart() -> None:
     assert semaphore._get_value() == 1000
 
 
+def test_signals_are_consumed_without_end() -> None:
+    semaphore = shared_semaphores.create(COUNTING, 0, SEM_VALUE_MAX)
+    in_fork(lambda: [semaphore.release() for _ in range(2000)])
+    assert all(semaphore.acquire(False) for _ in range(2000))
+    assert len(semaphore._held) < 1000
+
+
 def test_the_slots_of_the_dead_are_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
     semaphore = shared_semaphores.create(COUNTING, 1, 1)
     for _ in range(len(module._SLOTS) // 64):

@@ -112,6 +112,15 @@ def test_a_semaphore_carries_signals_between_hosts(far: Far) -> None:
     assert there.get_value() == 0
 
 
+def test_signals_that_are_consumed_elsewhere_keep_no_stream(far: Far) -> None:
+    here = fiber.Semaphore(0)
+    there = far(here)
+    for _ in range(50):
+        here.release()
+        assert there.acquire(timeout=PATIENCE)
+    assert len(there._semlock._streams) == 1
+
+
 def test_it_goes_on_to_other_processes(here: Any, far: Far, hosts: Hosts) -> None:
     there = far(here)
     data, home = pickle.dumps(there), pickle.dumps(there)

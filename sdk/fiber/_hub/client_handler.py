@@ -391,8 +391,8 @@ class ClientHandler:
 
     def leave(self, message: Message) -> None:
         """Give the place up."""
-        notified = self._wait_list().places.leave(self._own_place())
-        self._place = None
+        place, self._place = self._place, None
+        notified = place is not None and self._wait_list().places.leave(place)
         self._request(message).answer(Status.OK if notified else Status.NO)
 
     def notify(self, message: Message) -> None:

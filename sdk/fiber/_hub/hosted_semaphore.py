@@ -35,7 +35,7 @@ class HostedSemaphore:
         self._revival = threading.Thread()  # none yet
 
     def acquire(self, waiter: Waiter, granted: Callable[[], None]) -> None:
-        """Answer once there is a token for it, having called ``granted``."""
+        """Answer once there is a token for it, having called ``granted`` if it is to keep it."""
         self._waiters.append((waiter, granted))
         self._serve()
         if self._waiters and not self._is_listening:
@@ -78,9 +78,11 @@ class HostedSemaphore:
     def _serve(self) -> None:
         while self._waiters and (result := self._semaphore.try_acquire()):
             waiter, granted = self._waiters.popleft()
-            granted()
+            tracked = not self._semaphore.is_untracked()
+            if tracked:
+                granted()
             holder = [memoryview(result.holder.encode())] if isinstance(result, Abandoned) else []
-            waiter.answer(Status.OK, len(holder), holder)
+            waiter.answer(Status.OK, tracked, holder)
 
     def _look(self) -> None:
         """Now and then: who would ring may die before it does, or while it has a token."""

@@ -93,7 +93,7 @@ class Op(IntEnum):
     WAIT = 24
     CHANGED = 25  # since
     # For an attached semaphore
-    ACQUIRE = 40  # the process's name beside it -> whether it was abandoned; by whom beside it
+    ACQUIRE = 40  # the process's name beside it -> whether the stream keeps it; who died beside it
     POST = 41  # NO if there are as many tokens as there can be
     TOKENS = 42  # -> how many there are
     # For an attached wait list

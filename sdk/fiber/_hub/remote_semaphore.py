@@ -1,7 +1,7 @@
 """A lock or semaphore of another host: the hub there has its tokens for this process.
 
 A stream keeps each token.  The hub gives it back when the stream ends, which the kernel sees to
-when this process dies.
+when this process dies.  Of a semaphore that carries signals nobody keeps the tokens.
 """
 
 from __future__ import annotations
@@ -58,8 +58,10 @@ class RemoteSemaphore(RemoteObject):
         if reply.status is not Status.OK:
             self._idle.append(stream)
             return False
-        self._owner, self._depth = threading.get_ident(), 1
-        self._holding.append(stream)
+        self._owner = threading.get_ident()
+        self._depth = 1 if self.kind == RECURSIVE else self._depth + 1
+        (is_kept,) = reply.values
+        (self._holding if is_kept else self._idle).append(stream)
         return Abandoned(str(reply.parts[0], "utf-8", "replace")) if reply.parts else True
 
     def release(self) -> None:
@@ -70,8 +72,8 @@ class RemoteSemaphore(RemoteObject):
         if self.kind == RECURSIVE:
             if not self._is_mine():
                 raise AssertionError("attempt to release recursive lock not owned by thread")
-            self._depth -= 1
-            if self._depth:
+            if self._depth > 1:
+                self._depth -= 1
                 return
         self._check()
         if not self._holding:
@@ -86,11 +88,11 @@ class RemoteSemaphore(RemoteObject):
 
     def _is_mine(self) -> bool:
         """Whether this thread has it, having been the last in this process to acquire it."""
-        return bool(self._holding) and self._owner == threading.get_ident()
+        return self._depth > 0 and self._owner == threading.get_ident()
 
     def _count(self) -> int:
         """How often this process has acquired it and not released it."""
-        return self._depth if self.kind == RECURSIVE else len(self._holding)
+        return self._depth
 
     def _get_value(self) -> int:
         """How often it can be acquired now."""
@@ -108,7 +110,9 @@ class RemoteSemaphore(RemoteObject):
         self._holding.clear()
 
     def _give(self, stream: HubStream) -> None:
+        self._depth -= 1  # before another thread can have it
         if stream.ask(Op.POST).status is Status.NO:
+            self._depth += 1
             raise ValueError("semaphore or lock released too many times")
 
     def _forked(self) -> None:

@@ -31,8 +31,18 @@ class RemoteWaitList(RemoteObject):
     def enter(self) -> HubStream:
         """A place for this thread."""
         self._check()
-        stream = self._open()
-        stream.ask(Op.ENTER)
+        try:
+            stream = self._idle.pop()
+        except IndexError:
+            stream = self._open()
+        try:
+            stream.settle()
+            stream.ask(Op.ENTER)
+        except BaseException:
+            with suppress(OSError, Unreachable):
+                stream.say(Op.LEAVE)
+            self._idle.append(stream)
+            raise
         return stream
 
     def sleep(self, place: HubStream, timeout: float | None) -> None:

@@ -230,6 +230,10 @@ class SharedSemaphore:
             self._ring()
         return True
 
+    def is_untracked(self) -> bool:
+        """Whether nothing is given back for who dies."""
+        return bool(self._words[_IS_UNTRACKED])
+
     def listen(self, listens: bool) -> None:
         """Whether the hub is to be rung for."""
         self._bytes[_LISTENS] = listens
@@ -292,7 +296,10 @@ class SharedSemaphore:
             self._idle += (slot,)
             return False
         words[slot] = _HELD
-        self._held += (slot,)
+        if slot == _NO_SLOT:  # nobody notes what signals there were
+            self._idle += (slot,)
+        else:
+            self._held += (slot,)
         return True
 
     def _give_untracked(self) -> None:
