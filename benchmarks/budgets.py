@@ -15,6 +15,7 @@ from benchmarks import (
     pipes,
     startup,
     throughput,
+    vector,
     workers,
 )
 from benchmarks.model import BASELINE, Metric, Run
@@ -168,6 +169,20 @@ def _pipes() -> Iterator[Budget]:
         yield Budget(f"vector step, {case}", "pipes", case, pipes.STEP.name, 0.8)
 
 
+def _vector() -> Iterator[Budget]:
+    def budget(what: str, case: str, bound: float, **more: Any) -> Budget:
+        rate = vector.RATE.name
+        return Budget(f"vector: {what}", "vector", case, rate, bound, at_least=True, **more)
+
+    case = vector.cart_poles(64)
+    yield budget(case, case, 3)
+    yield budget(f"{case}, to PufferLib", case, 1, against="pufferlib")
+    what = "uneven steps, first ready to waiting for all"
+    yield budget(what, vector.FIRST_READY, 1.5, to_case=vector.UNEVEN)
+    what = f"loopback to local, {vector.PIXELS}"
+    yield budget(what, vector.PIXELS, 0.5, contender="fiber-loopback", against="fiber")
+
+
 def _start() -> Iterator[Budget]:
     for count, metric, what in (
         (1, coldstart.READY, "first worker ready"),
@@ -261,5 +276,5 @@ def _on_pods() -> Iterator[Budget]:
     )
 
 
-BUDGETS = (*_pool(), *_pipes(), *_start(), *_remote(), *_many())
+BUDGETS = (*_pool(), *_pipes(), *_vector(), *_start(), *_remote(), *_many())
 ON_PODS = tuple(_on_pods())

@@ -10,7 +10,17 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-from benchmarks import agents, coldstart, latency, overhead, pipes, startup, throughput, workers
+from benchmarks import (
+    agents,
+    coldstart,
+    latency,
+    overhead,
+    pipes,
+    startup,
+    throughput,
+    vector,
+    workers,
+)
 from benchmarks.contenders import BY_NAME
 from benchmarks.model import Metric, Run
 from benchmarks.samples import Summary, in_words, summary
@@ -109,6 +119,14 @@ def _pipe_panel(
     )
 
 
+def _vector(run: Run, path: Path) -> None:
+    figure, panel = plt.subplots(figsize=(10, 5))
+    names = [case.name for case in vector.cases(run.about["size"])]
+    _rows(panel, run, names, vector.RATE)
+    panel.set(title="Further right is better", xlabel="environment steps a second")
+    _finish(figure, path)
+
+
 def _startup(run: Run, path: Path) -> None:
     figure, panels = plt.subplots(1, 3, figsize=(14, 5))
     points = [(float(count), startup.workers(count)) for count in startup.WORKERS]
@@ -167,6 +185,7 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "throughput": _throughput,
     "latency": _latency,
     "pipes": _pipes,
+    "vector": _vector,
     "startup": _startup,
     "coldstart": _coldstart,
     "workers": _workers,

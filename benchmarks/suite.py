@@ -12,6 +12,7 @@ from benchmarks import (
     pipes,
     startup,
     throughput,
+    vector,
     workers,
 )
 
@@ -20,6 +21,7 @@ MEASURES: dict[str, ModuleType] = {
     "throughput": throughput,
     "latency": latency,
     "pipes": pipes,
+    "vector": vector,
     "startup": startup,
     "coldstart": coldstart,
     "workers": workers,
