@@ -11,9 +11,10 @@ from typing import Any
 
 from fiber._hub import client, handles
 from fiber._hub.hub import Hub
-from fiber._hub.tunnel import Frame, Tunnels
+from fiber._hub.hub_link import HubLink
 from fiber._transport.loop import Loop
 from fiber._wire import messages
+from fiber._wire.messages import OfHubs
 
 
 class Wire:
@@ -21,11 +22,11 @@ class Wire:
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop
-        self.to: Tunnels | None = None
+        self.to: HubLink | None = None
         self.held: deque[bytes] | None = None
         self.frames = 0
 
-    def send(self, frame: Frame) -> None:
+    def send(self, frame: OfHubs) -> None:
         """On the loop's thread, as links are used."""
         self.frames += 1
         encoded = frame.encode()
@@ -46,7 +47,9 @@ class Wire:
 
     def _deliver(self, encoded: bytes) -> None:
         if self.to is not None:
-            self.to.on_frame(messages.decode(bytearray(encoded)))
+            frame = messages.decode(bytearray(encoded))
+            assert isinstance(frame, OfHubs)
+            self.to.on_frame(frame)
 
 
 class Hosts:

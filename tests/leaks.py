@@ -31,9 +31,10 @@ _NNG_OPENS = Counter(["anon_inode:[eventpoll]", "anon_inode:[eventfd]"])
 # Memory for large messages is kept for the next ones; each block holds two descriptors.
 _MESSAGE_MEMORY = "/memfd:fiber-message (deleted)"
 _MESSAGE_MEMORY_LIMIT = 2 * RETAINED_BLOCKS
-# So is memory for small shared objects: a segment for each size of them.
+# So is memory for small shared objects: a segment for each size of them, and a full one of which
+# places are free again; each may hold two descriptors.
 _HEAP = "/memfd:fiber-heap (deleted)"
-_HEAP_LIMIT = 2 * len(SIZES)
+_HEAP_LIMIT = 4 * len(SIZES)
 
 
 class Lasting(NamedTuple):

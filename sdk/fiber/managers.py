@@ -9,6 +9,7 @@ RuntimeWarning that names it.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import weakref
 from collections.abc import Callable, Iterable
@@ -26,8 +27,9 @@ from multiprocessing.managers import (
 from multiprocessing.util import Finalize
 from typing import Any
 
-from fiber._hub.unsupported import refuse
+from fiber._hub import client as hub_client
 from fiber._managers import SERIALIZER, client
+from fiber._managers.asynchronous import AsyncBaseProxy, AsyncProxyResult
 from fiber._managers.door import ManagerAddress
 from fiber._managers.rlock import RLock, condition
 from fiber._managers.server import Server
@@ -35,10 +37,14 @@ from fiber._runtime.state import runtime
 from fiber.connection import Connection, Pipe
 from fiber.process import Process
 from fiber.resources import Resources, largest, merged, resources_of, with_resources
+from fiber.shared_memory import ShareableList, SharedMemory
 
 __all__ = [
     "AcquirerProxy",
     "ArrayProxy",
+    "AsyncBaseProxy",
+    "AsyncManager",
+    "AsyncProxyResult",
     "AutoProxy",
     "BarrierProxy",
     "BaseManager",
@@ -220,10 +226,72 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
 
 
 class SharedMemoryManager(BaseManager):
-    """The name to subclass; making one raises an error that says what to use."""
+    """Makes named shared memory, which goes when the manager is shut down.
 
-    def __init__(self, *_args: Any, **_options: Any) -> None:
-        refuse("SharedMemoryManager")
+    On one host: RuntimeError if the manager's process is on another one than who asks it.
+    """
+
+    def SharedMemory(self, size: int) -> SharedMemory:
+        """A new block of ``size`` bytes; ValueError if the manager does not run."""
+        names = self._names()
+        memory = SharedMemory(create=True, size=size)
+        names.append(memory.name)
+        return memory
+
+    def ShareableList(self, sequence: Iterable[Any]) -> ShareableList:
+        """A new list; ValueError if the manager does not run."""
+        names = self._names()
+        made = ShareableList(sequence)
+        names.append(made.shm.name)
+        return made
+
+    def _names(self) -> Any:
+        if self._state.value != State.STARTED:
+            raise ValueError("the manager does not run: start it, or use it in a with statement")
+        names: Any = self._memory_names()
+        host = names.host()
+        if host != hub_client.host():
+            raise RuntimeError(
+                f"the manager runs on host {host!r} and this process on {hub_client.host()!r}: "
+                "named shared memory is for the processes of one host. Use fiber.Array or "
+                "fiber.RawArray, whose memory goes when nobody uses it"
+            )
+        return names
+
+
+class _MemoryNames:
+    """In the server of a SharedMemoryManager: what it removes when it ends."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+
+    def host(self) -> str:
+        """Where it is."""
+        return hub_client.host()
+
+    def append(self, name: str) -> None:
+        """Remove this, too."""
+        if not self._names:
+            Finalize(None, _unlink_all, (self._names,), exitpriority=10)
+        self._names.append(name)
+
+
+def _unlink_all(names: list[str]) -> None:
+    for name in names:
+        with contextlib.suppress(FileNotFoundError):
+            memory = SharedMemory(name)
+            memory.close()
+            memory.unlink()
+
+
+_names = _MemoryNames()
+
+
+def _memory_names() -> _MemoryNames:
+    return _names
+
+
+SharedMemoryManager.register("_memory_names", _memory_names, exposed=("append", "host"))
 
 
 class SyncManager(BaseManager):
@@ -234,6 +302,28 @@ def _pool(*args: Any, **options: Any) -> Any:
     from fiber.pool import Pool
 
     return Pool(*args, **options)
+
+
+class AsyncManager(BaseManager):
+    """A manager of whose objects every method returns an ``AsyncProxyResult`` at once.
+
+    Objects of different managers work side by side, those of one in threads of its process.  An
+    object is made before the manager's method for that returns.  It registers no types of its own,
+    and has no address that other programs could connect to.
+    """
+
+    def __init__(self, address: ManagerAddress | None = None, **options: Any) -> None:
+        super().__init__(address, **options)
+        if self._serializer != SERIALIZER:
+            raise ValueError(
+                f"an AsyncManager cannot serve at {address!r} or by serializer "
+                f"{self._serializer!r}: leave them out, or use BaseManager"
+            )
+
+    @classmethod
+    def register(cls, typeid: str, callable: Any = None, proxytype: Any = None, **how: Any) -> None:
+        """As ``BaseManager.register``; ``proxytype`` is ``AsyncBaseProxy`` or a subclass."""
+        super().register(typeid, callable, proxytype or AsyncBaseProxy, **how)
 
 
 _OURS = {"Condition": condition, "Pool": _pool, "RLock": RLock}

@@ -6,35 +6,25 @@ list says what is so.
 
 from __future__ import annotations
 
-_MEMORY_MANAGERS = {
-    f"WithProcessesTestSharedMemory.test_shared_memory_{name}": "SharedMemoryManager: not yet"
-    for name in ("SharedMemoryManager_basics", "SharedMemoryServer_ignores_sigint")
-}
 _CLOSED_AT_ONCE = {
     "WithProcessesTestQueue.test_closed_queue_empty_exceptions": (
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
     )
 }
-_ONE_HOST = {
-    f"WithProcesses{test}": (
-        "memory is shared by the processes of one host: to start one elsewhere with a shared value "
-        "is an error that says what to use"
-    )
+_LOCKED = {
+    f"WithProcesses{test}": "the lock of a Value or Array is for the processes of one host"
     for test in (
         "TestArray.test_array",
-        "TestArray.test_rawarray",
-        "TestSharedCTypes.test_sharedctypes",
         "TestSharedCTypes.test_synchronize",
-        "TestValue.test_rawvalue",
         "TestValue.test_value",
     )
 }
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
-    "local": {**_MEMORY_MANAGERS, **_CLOSED_AT_ONCE},
-    "loopback": {**_CLOSED_AT_ONCE, **_ONE_HOST},
-    "kubernetes": {**_CLOSED_AT_ONCE, **_ONE_HOST},
+    "local": _CLOSED_AT_ONCE,
+    "loopback": {**_CLOSED_AT_ONCE, **_LOCKED},
+    "kubernetes": {**_CLOSED_AT_ONCE, **_LOCKED},
 }
 
 _CONCERNS_ONE_TASK = "concerns one task, which gets the error itself: the executor is not broken"

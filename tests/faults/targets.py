@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import select
@@ -136,6 +137,33 @@ def make_and_send_a_pipe(connection: Any) -> NoReturn:
     connection.send(theirs)
     theirs.close()
     ours.send("through the inner pipe")
+    block()
+
+
+def square_each(array: Any, connection: Any) -> None:
+    with contextlib.suppress(EOFError):
+        while True:
+            number = connection.recv()
+            array[number] *= number
+            connection.send(number)
+
+
+def write_half_and_die(array: Any) -> NoReturn:
+    for index in range(len(array) // 2):
+        array[index] = index + 1
+    os.kill(os.getpid(), signal.SIGKILL)
+    raise AssertionError
+
+
+def make_and_send_an_array(connection: Any) -> NoReturn:
+    array = fiber.RawArray("i", [1, 2, 3])
+    connection.send(array)
+    block()
+
+
+def write_and_block(array: Any, connection: Any) -> NoReturn:
+    array[0] = 1
+    connection.send(None)
     block()
 
 

@@ -84,6 +84,25 @@ def test_a_short_cut_loses_nothing(wire: Wire, way: str) -> None:
     assert child.exitcode == 0
 
 
+@pytest.mark.parametrize("way", ["silence", "sever"])
+def test_shared_memory_is_in_step_after_a_short_cut(wire: Wire, way: str) -> None:
+    ours, theirs = fiber.Pipe()
+    array = fiber.RawArray("i", 50)
+    child = wire.start(targets.square_each, array, theirs)
+    theirs.close()
+    for number in range(50):
+        array[number] = number
+        ours.send(number)
+        if number == 25:
+            getattr(wire.proxy, way)()
+            wire.backend._loop.call_later(SHORT, wire.proxy.heal)
+        assert ours.recv() == number
+        assert array[number] == number * number
+    ours.close()
+    child.join(PATIENCE)
+    assert child.exitcode == 0
+
+
 @pytest.mark.lost_after(2.0)
 @pytest.mark.parametrize("way", ["silence", "sever"])
 def test_a_long_cut_is_told_ends_its_processes_and_brings_a_new_agent(wire: Wire, way: str) -> None:

@@ -65,6 +65,18 @@ def own_pod(_: object = None) -> str:
     return os.environ[names.ENV_NAME]
 
 
+shared: list[Any] = []
+
+
+def share(*memory: Any) -> None:
+    shared[:] = memory
+
+
+def add_turn(index: int) -> None:
+    sums, turn = shared
+    sums[index] += turn.value
+
+
 def slow_square(number: int) -> int:
     time.sleep(0.02)
     return number * number
@@ -101,6 +113,16 @@ def test_a_pool_is_pods_that_come_with_the_work_and_go_with_the_program(
         assert sorted(info.host for info in pool.workers()) == pods_of(cluster)
         assert {info.node for info in pool.workers()} == {"node-1"}
         assert sum(info.tasks for info in pool.workers()) == 100
+
+
+def test_pods_share_memory_with_the_program_and_each_other(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"):
+        sums, turn = fiber.RawArray("i", 20), fiber.RawValue("i", 0)
+        with fiber.Pool(2, share, (sums, turn)) as pool:
+            for number in range(1, 4):
+                turn.value = number
+                pool.map(add_turn, range(20), chunksize=1)
+        assert list(sums) == [6] * 20
 
 
 def test_the_next_pool_begins_on_pods_that_are_there(cluster: FakeCluster) -> None:

@@ -354,6 +354,9 @@ class Silent:
     def unlink(self, *_: Any) -> None:
         pass
 
+    def flush(self) -> None:
+        pass
+
     def attach(self, _observer: Any) -> None:
         pass
 

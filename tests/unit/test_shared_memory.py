@@ -15,6 +15,7 @@ import pytest
 
 import fiber
 from census import wait_until
+from fiber.managers import SharedMemoryManager
 from fiber.shared_memory import ShareableList, SharedMemory
 from hosts import Hosts
 
@@ -106,6 +107,24 @@ def test_a_list_is_shared() -> None:
     assert isinstance(numbers, multiprocessing.shared_memory.ShareableList)
     numbers.shm.close()
     numbers.shm.unlink()
+
+
+def test_a_manager_removes_what_it_made() -> None:
+    manager = SharedMemoryManager()
+    with pytest.raises(ValueError, match="does not run"):
+        manager.SharedMemory(size=10)
+    with manager:
+        memory, numbers = manager.SharedMemory(size=10), manager.ShareableList([1, 2])
+        run(write, memory)
+        assert bytes(memory.buf[:3]) == b"abc"
+        assert list(numbers) == [1, 2]
+        names = memory.name, numbers.shm.name
+        assert all(map(there_is, names))
+    assert not any(map(there_is, names))
+    memory.close()
+    numbers.shm.close()
+    with pytest.raises(ValueError, match="does not run"):
+        manager.ShareableList([])
 
 
 @pytest.mark.parametrize("end", ["pass", "os.kill(os.getpid(), signal.SIGKILL)"])

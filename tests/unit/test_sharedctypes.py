@@ -16,7 +16,6 @@ import pytest
 
 import fiber
 from fiber import sharedctypes
-from hosts import Hosts
 
 PATIENCE = 15.0
 
@@ -192,18 +191,3 @@ def test_part_of_a_shared_array_pickles_by_value() -> None:
     part = pickle.loads(pickle.dumps(points[1]))
     part.x = 9
     assert points[1].x == 3
-
-
-def test_another_host_is_told_what_came_and_what_to_do() -> None:
-    hosts = Hosts()
-    try:
-        hosts.link("there", "here")
-        with hosts.at("here"):
-            data = pickle.dumps(fiber.RawArray("d", 3))
-        with (
-            hosts.at("there"),
-            pytest.raises(pickle.UnpicklingError, match=r"24 bytes .*'here'.* Pipe or Queue"),
-        ):
-            pickle.loads(data)
-    finally:
-        hosts.close()

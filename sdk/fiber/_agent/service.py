@@ -40,8 +40,8 @@ class AgentService:
     ) -> None:
         self._loop = loop
         self._hub = hub
-        self._tunnels = hub.link(None, self.send, dialer=True)
         self._link = link
+        self._hub_link = hub.link(None, self._transmit, dialer=True)
         self._agent = agent
         self._on_end = on_end
         self._blobs = BlobStore(config.current().runtime_directory)
@@ -52,6 +52,10 @@ class AgentService:
 
     def send(self, message: messages.Message) -> None:
         """Tell the master."""
+        self._hub_link.flush()
+        self._transmit(message)
+
+    def _transmit(self, message: messages.Message) -> None:
         self._link.send(message.encode())
 
     def busy(self) -> bool:
@@ -71,8 +75,8 @@ class AgentService:
             self._blobs.forget(message.digest)
         elif isinstance(message, messages.Shutdown):
             self.stop("the master ended", message.grace)
-        elif isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
-            self._tunnels.on_frame(message)
+        elif isinstance(message, messages.OfHubs):
+            self._hub_link.on_frame(message)
         elif isinstance(message, messages.Deliver | messages.Signal | messages.Recall):
             child = self._children.get(message.child)
             if child is not None:  # otherwise its end and this crossed

@@ -84,7 +84,7 @@ class RemoteAgent:
         self._hub = hub
         self._output = output
         self._observer = observer
-        self._tunnels = hub.link(host, self.send, dialer=False)
+        self._hub_link = hub.link(host, self._put, dialer=False)
         self._numbers = itertools.count(1)
         self._children: dict[int, RemoteChild] = {}
 
@@ -104,10 +104,14 @@ class RemoteAgent:
 
     def send(self, message: messages.Message) -> None:
         """Send a message.  From anywhere."""
-        self.loop.call_soon(self._link.send, message.encode())
+        self.loop.call_soon(self.transmit, message)
 
     def transmit(self, message: messages.Message) -> None:
         """Send a message now."""
+        self._hub_link.flush()
+        self._put(message)
+
+    def _put(self, message: messages.Message) -> None:
         self._link.send(message.encode())
 
     def close(self) -> None:
@@ -136,8 +140,8 @@ class RemoteAgent:
     def on_frame(self, frame: Frame) -> None:
         """What the agent tells of its children."""
         message = messages.decode(frame)
-        if isinstance(message, messages.TunnelOpen | messages.TunnelData | messages.TunnelClose):
-            self._tunnels.on_frame(message)
+        if isinstance(message, messages.OfHubs):
+            self._hub_link.on_frame(message)
             return
         if isinstance(message, messages.Lacking):
             self._blobs.lost(message.digest)

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import hmac
+import os
 import struct
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from fiber._hub import protocol
 from fiber._hub.doorbell import Doorbell
+from fiber._hub.heap import Block
 from fiber._hub.hosted import HostedChannel, HostedCounter
-from fiber._hub.protocol import FOUR, HEAD, ONE, TWO, Extent, GrantFlags, ObjectKind, Op, Status
+from fiber._hub.protocol import (
+    FOUR,
+    HEAD,
+    ONE,
+    TWO,
+    Extent,
+    GrantFlags,
+    ObjectKind,
+    Op,
+    Origin,
+    Status,
+)
 from fiber._hub.registry import Entry, NoSuchObject, Registry
+from fiber._hub.replicas import Replicas
 from fiber._hub.streams import NullHandler, Stream
 from fiber._wire.packet import Message
 
@@ -22,6 +36,7 @@ class HandlerHub(Protocol):
     key: bytes
     registry: Registry
     doorbell: Doorbell
+    replicas: Replicas
 
     def connect(self, host: str, stream: Stream) -> None:
         """Go on with ``stream`` at the hub of ``host``."""
@@ -64,6 +79,7 @@ class ClientHandler:
         self._home = home
         self._admitted = False
         self._entry: Entry | None = None
+        self._joined: tuple[str, int, int] | None = None
         self._bound: set[int] = set()
         stream.handler = self
 
@@ -105,6 +121,9 @@ class ClientHandler:
             if isinstance(entry.hosted, HostedChannel):
                 entry.hosted.forget(self)
             self._home.registry.detach(entry)
+        joined, self._joined = self._joined, None
+        if joined is not None:
+            self._home.replicas.leave(joined, self)
         self._home.registry.take_back(self._bound)
         self._bound.clear()
         self._home.ended(self)
@@ -192,6 +211,17 @@ class ClientHandler:
     def ring(self, message: Message) -> None:
         """Look again at shared memory that somebody here waits for."""
         self._home.doorbell.rung()
+
+    def replicate(self, message: Message) -> None:
+        """Hand over memory that is in step with another host's, as long as this stream lasts."""
+        number = HEAD.unpack_from(message.payload)[1]
+        if not self.stream.passes_descriptors:
+            raise RequestRefused("a descriptor cannot be handed to another host")
+        if self._joined is not None:
+            raise RequestRefused("a stream is for one object")
+        origin = Origin.decode(message.buffers[0])
+        self._joined = origin.identity
+        self._home.replicas.join(origin, self, _Joining(self, number))
 
     def cancel(self, message: Message) -> None:
         """End the request that waits, with the answer NO."""
@@ -284,6 +314,23 @@ class ClientHandler:
     def changed(self, message: Message) -> None:
         """Wait until it is another."""
         self._counter().changed(self._request(message), ONE.unpack(message.payload)[2])
+
+
+class _Joining:
+    """A client's request for memory of another host; a ``Joiner``."""
+
+    def __init__(self, handler: ClientHandler, number: int) -> None:
+        self._handler = handler
+        self._number = number
+
+    def joined(self, block: Block) -> None:
+        """Hand it over."""
+        reply = ONE.pack(Status.OK, self._number, block.offset)
+        self._handler.stream.send(reply, (), [os.dup(block.segment.fileno())])
+
+    def refused(self, reason: str) -> None:
+        """There is nothing to hand over."""
+        self._handler.close(reason)
 
 
 _OPERATIONS: dict[Op, Callable[[ClientHandler, Message], None]] = {

@@ -90,6 +90,8 @@ class BlockHandle(NamedTuple):
 
     segment: Handle
     extent: Extent
+    inode: int
+    """Of the segment, on its own host."""
 
     def elsewhere(self) -> HubHandle | None:
         """How to reach the hub of its host, if that is not this one."""
@@ -144,14 +146,21 @@ def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
     block.give()
     extent = Extent(block.offset, block.size)
     spawning = _spawning_here()
+    inode = block.segment.inode
     if spawning is None:
-        return BlockHandle(_grants().for_local(kind, block.segment.fileno(), extent), extent)
+        segment = _grants().for_local(kind, block.segment.fileno(), extent)
+        return BlockHandle(segment, extent, inode)
     # multiprocessing's own Process duplicates the descriptor for each of the blocks.
     inherit = getattr(spawning, "inherit_segment", None)
     if inherit is None:
         number = spawning.duplicate_for_child(block.segment.fileno())
-        return BlockHandle(spawning.DupFd(number), extent)
-    return BlockHandle(inherit(block.segment), extent)
+        return BlockHandle(spawning.DupFd(number), extent, inode)
+    return BlockHandle(inherit(block.segment), extent, inode)
+
+
+def handle_for_remote_block(end: RemoteObject, extent: Extent, inode: int) -> BlockHandle:
+    """What to pickle in place of a block of another host."""
+    return BlockHandle(_grants().for_remote(end), extent, inode)
 
 
 def _spawning_here() -> Any:

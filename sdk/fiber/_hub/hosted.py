@@ -235,4 +235,15 @@ class HostedCounter:
         self._watch()
 
 
-Hosted: TypeAlias = HostedChannel | HostedCounter
+class HostedMemory:
+    """Shared memory, which is kept there: what changes does not travel on these streams."""
+
+    def withdraw(self, waiter: Waiter) -> bool:
+        """Nobody waits for it."""
+        return False
+
+    def close(self) -> None:
+        """The registry lets go of it."""
+
+
+Hosted: TypeAlias = HostedChannel | HostedCounter | HostedMemory

@@ -23,13 +23,15 @@ from fiber._hub.client import NoHub, Unreachable
 from fiber._hub.client_handler import ClientHandler
 from fiber._hub.directory import remove_directory
 from fiber._hub.doorbell import Doorbell
-from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter
+from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter, HostedMemory
+from fiber._hub.hub_link import HubLink, Send
 from fiber._hub.local import QuietSocket, without_timeout
 from fiber._hub.poller import Poller
 from fiber._hub.protocol import HubAddress, ObjectKind
 from fiber._hub.registry import Registry, SharedObject
+from fiber._hub.replicas import Replicas
 from fiber._hub.streams import SocketStream, Stream
-from fiber._hub.tunnel import Router, Send, Tunnels
+from fiber._hub.tunnel import Router
 from fiber._transport.loop import DOZE, Loop
 from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire.descriptor import Descriptor, own
@@ -52,6 +54,7 @@ class Hub:
         self._poller = Poller(loop)
         self.registry = Registry(self._host_object, loop.call_soon)
         self.doorbell = Doorbell(loop.call_soon)
+        self.replicas = Replicas(host, self.key, self.registry)
         self._router = Router(host, self._accept)
         self._handlers: set[ClientHandler] = set()
         self._streams: weakref.WeakSet[SocketStream] = weakref.WeakSet()
@@ -126,16 +129,20 @@ class Hub:
         except Exception as error:
             answers.put(error)
 
-    def link(self, host: str | None, send: Send, *, dialer: bool) -> Tunnels:
-        """The hub of ``host`` can be reached by tunnels whose frames go out by ``send``.
+    def link(self, host: str | None, send: Send, *, dialer: bool) -> HubLink:
+        """The hub of ``host`` can be reached by frames that go out by ``send``.
 
         None stands for every host that has no link of its own, as an agent's link to the master.
         """
-        return self._router.link(host, send, dialer=dialer)
+        link = HubLink(self._loop.call_soon, send)
+        link.memory = self.replicas.link(host, send, dialer=dialer)
+        link.tunnels = self._router.link(host, link.send, dialer=dialer)
+        return link
 
     def unlink(self, host: str | None, reason: str) -> None:
         """That link is over; whoever used it is told ``reason``."""
         self._router.unlink(host, reason)
+        self.replicas.unlink(host, reason)
 
     def connect(self, host: str, stream: Stream) -> None:
         """Lead ``stream`` to the hub of ``host``."""
@@ -217,6 +224,8 @@ class Hub:
     # The objects
 
     def _host_object(self, shared: SharedObject) -> Hosted:
+        if shared.kind is ObjectKind.MEMORY:
+            return HostedMemory()
         fd = os.dup(shared.descriptor.fileno())
         if shared.kind is ObjectKind.CHANNEL:
             return HostedChannel(self._poller, fd)

@@ -76,6 +76,7 @@ class Op(IntEnum):
     CANCEL = 8  # answers the request of this number NO, if it is still waiting; otherwise silent
     SYNC = 9  # withdraws what is waiting -> nothing
     RING = 30  # something in shared memory of this host has changed; silent
+    REPLICATE = 31  # an Origin beside it -> where in the segment whose descriptor is beside it
     # For an attached channel
     SEND = 10  # payload and buffers beside it
     RECV = 11  # -> more; payload and buffers beside it
@@ -102,6 +103,39 @@ class Status(IntEnum):
     READY = 4  # of a watching stream; answers nothing
     GONE = 5  # why the stream ends
 
+
+class Origin(NamedTuple):
+    """A block of shared memory, and which object of its home's hub it is."""
+
+    home: str
+    """The host where it was made."""
+    inode: int
+    offset: int
+    size: int
+    entry: int
+    grant: int
+    key: bytes
+    """Of the home's hub."""
+
+    @property
+    def identity(self) -> tuple[str, int, int]:
+        """What tells it from all other blocks."""
+        return self.home, self.inode, self.offset
+
+    def __repr__(self) -> str:
+        return f"Origin(home={self.home!r}, inode={self.inode}, offset={self.offset})"
+
+    def encode(self) -> bytes:
+        """As it travels between hubs."""
+        return _ORIGIN.pack(*self[1:]) + self.home.encode()
+
+    @classmethod
+    def decode(cls, data: memoryview) -> Origin:
+        """The same back; struct.error or ValueError for what is none."""
+        return cls(str(data[_ORIGIN.size :], "utf-8"), *_ORIGIN.unpack_from(data))
+
+
+_ORIGIN = struct.Struct(f"<5Q{KEY_BYTES}s")
 
 HEAD = struct.Struct("<BI")
 HELLO = struct.Struct(f"<BIB{KEY_BYTES}s")

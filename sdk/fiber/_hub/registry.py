@@ -143,6 +143,12 @@ class Registry:
         self._use(grant)
         return entry
 
+    def look_up(self, number: int, grant: int) -> SharedObject:
+        """What somebody is attached to, or is about to be by this grant."""
+        self._settle()
+        entry = self._entries.get(number)
+        return self._find(number, grant if entry and grant in entry.grants else 0).shared
+
     def detach(self, entry: Entry) -> None:
         """One user less."""
         entry.attached -= 1

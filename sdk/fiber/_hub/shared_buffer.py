@@ -1,23 +1,20 @@
 """Memory for a user's object, which goes wherever that is pickled to.
 
-On the host where it was made, every process has the memory itself.
+On the host where it was made, every process has the memory itself.  On another host they have a
+replica, which their hub keeps in step with it (``fiber._hub.replicas``).
 """
 
 from __future__ import annotations
 
-import pickle
-from multiprocessing import context as mp_context
 from typing import Any
 
 from fiber._hub import client, heap
-from fiber._hub.handles import BlockHandle, handle_for_block
-from fiber._hub.heap import Block
-from fiber._hub.protocol import ObjectKind
-
-_ONE_HOST = (
-    "memory is shared by the processes of one host. Send the data through a Pipe or Queue, or keep "
-    "it in a manager"
-)
+from fiber._hub.client import HubStream
+from fiber._hub.handles import BlockHandle, HubHandle, handle_for_block, handle_for_remote_block
+from fiber._hub.heap import Block, block_of
+from fiber._hub.protocol import Extent, ObjectKind, Op, Origin
+from fiber._hub.remote import RemoteObject
+from fiber._wire.descriptor import own
 
 
 class SharedBuffer:
@@ -34,10 +31,33 @@ class SharedBuffer:
         return self._block.view
 
     def __reduce__(self) -> tuple[Any, ...]:
-        spawning: Any = mp_context.get_spawning_popen()
-        if getattr(spawning, "other_host", False):
-            raise pickle.PicklingError(f"the process runs on another host, and {_ONE_HOST}")
         return _rebuild, (handle_for_block(ObjectKind.MEMORY, self._block),)
+
+
+class ReplicaBuffer(SharedBuffer):
+    """The same on another host than where it was made."""
+
+    __slots__ = ("_extent", "_inode", "_original", "_stream")
+
+    def __init__(self, home: HubHandle, extent: Extent, inode: int) -> None:
+        self._extent = extent
+        self._inode = inode
+        # Keeps the original at its home.
+        self._original = RemoteObject(*home)
+        # Keeps the replica at this host's hub.
+        self._stream = HubStream(client.hub_address())
+        address, entry, grant = home
+        origin = Origin(address.host, inode, *extent, entry, grant, address.key)
+        reply = self._stream.ask(Op.REPLICATE, buffers=[memoryview(origin.encode())])
+        (fd,), (offset,) = reply.fds, reply.values
+        super().__init__(block_of(own(fd), offset, extent.size))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (handle_for_remote_block(self._original, self._extent, self._inode),)
+
+    def __del__(self) -> None:
+        if hasattr(self, "_stream"):
+            self._stream.close()
 
 
 def allocate(size: int) -> SharedBuffer:
@@ -46,10 +66,7 @@ def allocate(size: int) -> SharedBuffer:
 
 
 def _rebuild(handle: BlockHandle) -> SharedBuffer:
-    elsewhere = handle.elsewhere()
-    if elsewhere is not None:
-        raise pickle.UnpicklingError(
-            f"a Value or Array of {handle.extent.size} bytes was made on host "
-            f"{elsewhere.home.host!r} and came to {client.host()!r}: {_ONE_HOST}"
-        )
-    return SharedBuffer(handle.block())
+    home = handle.elsewhere()
+    if home is None:
+        return SharedBuffer(handle.block())
+    return ReplicaBuffer(home, handle.extent, handle.inode)

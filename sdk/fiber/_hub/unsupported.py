@@ -10,7 +10,6 @@ from fiber.errors import NotInFiber
 _INSTEAD = {
     "Condition": "use an Event, or a Queue that carries what is waited for",
     "Barrier": "use a Semaphore for arrivals and an Event for the release",
-    "SharedMemoryManager": "make a SharedMemory and unlink it",
 }
 
 

@@ -28,7 +28,7 @@ from fiber._hub import handles
 from fiber._hub.client import Unreachable, host
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel
-from fiber._managers.door import TAKE_BACK, ManagerAddress, knock
+from fiber._managers.door import NUMBER, TAKE_BACK, ManagerAddress, knock
 from fiber._transport.base import Channel
 from fiber.connection import how_it_ended
 from fiber.errors import ConnectionClosed
@@ -53,7 +53,7 @@ class Line:
         """Send a request."""
         payload, buffers = reduction.encode(request)
         self._asked += 1
-        self._channel.send(payload, buffers)
+        self._channel.send(NUMBER.pack(self._asked) + payload, buffers)
 
     def answer(self) -> tuple[str, Any]:
         """The answer to the last request."""

@@ -20,10 +20,11 @@ from typing import Any
 
 from fiber import reduction
 from fiber._managers.client import TravellingToken
-from fiber._managers.door import TAKE_BACK, received
+from fiber._managers.door import NUMBER, TAKE_BACK, received
 from fiber._managers.holdings import CONTENDED, Client, ClientThread, Holdings
 from fiber._transport.base import Channel
 from fiber._wire import packet
+from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
 
 _mp: Any = mp_managers  # typeshed has part of it
@@ -101,9 +102,8 @@ class Server(_mp.Server):  # type: ignore[misc]
         thread = ClientThread(self._holdings, client)
         try:
             line.send(b"")
-            for number in itertools.count(1):
-                message = line.recv()
-                thread.kept = self._serve_call(client, thread, line, number, message)
+            while True:
+                thread.kept = self._serve_call(client, thread, line, line.recv())
         except (OSError, ConnectionClosed):
             pass
         finally:
@@ -111,8 +111,10 @@ class Server(_mp.Server):  # type: ignore[misc]
             thread.end()
 
     def _serve_call(
-        self, client: Client, thread: ClientThread, line: Channel, number: int, message: Any
+        self, client: Client, thread: ClientThread, line: Channel, message: Message
     ) -> Any:
+        (number,) = NUMBER.unpack_from(message.payload)
+        message.payload = message.payload[NUMBER.size :]
         ident, method = None, ""
         got_before, thread.got = thread.got, None
         answer: _Answer
@@ -129,9 +131,9 @@ class Server(_mp.Server):  # type: ignore[misc]
             answer = "#TRACEBACK", format_exc()
         try:
             return _reply(line, number, answer)
-        except OSError:
+        except BrokenPipeError:  # it is not there any more, or waits for no answer
             thread.take_back(thread.got)
-            raise
+            return None
         finally:
             if ident is None and method == "shutdown":
                 self.stop_event.set()
@@ -252,7 +254,10 @@ def _reply(line: Channel, number: int, answer: _Answer) -> Any:
     """Send an answer; the result, if it has proxies in it."""
     try:
         payload, buffers = reduction.encode((number, *answer))
-    except Exception:
+        line.send(payload, buffers)
+    except BrokenPipeError:
+        raise
+    except Exception:  # it does not pickle, or there is no memory for it
         payload, buffers = reduction.encode((number, "#UNSERIALIZABLE", format_exc()))
-    line.send(payload, buffers)
+        line.send(payload, buffers)
     return answer[1] if _PROXY in payload else None

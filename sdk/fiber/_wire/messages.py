@@ -229,6 +229,20 @@ class TunnelClose(NamedTuple):
         return _NUMBER.pack(PROTOCOL, _TUNNEL_CLOSE, self.tunnel) + _utf8(self.reason)
 
 
+class Memory(NamedTuple):
+    """Either way: about a block of shared memory that both hosts have."""
+
+    block: int
+    payload: BytesLike
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _NUMBER.pack(PROTOCOL, _MEMORY, self.block) + self.payload
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
 class Shutdown(NamedTuple):
     """Master to agent: end every child, within ``grace`` seconds by force, and then yourself."""
 
@@ -255,8 +269,13 @@ Message: TypeAlias = (
     | TunnelOpen
     | TunnelData
     | TunnelClose
+    | Memory
     | Shutdown
 )
+
+
+OfHubs: TypeAlias = TunnelOpen | TunnelData | TunnelClose | Memory
+"""What the hubs of both sides say to each other."""
 
 
 def decode(frame: bytes | bytearray) -> Message:
@@ -286,7 +305,7 @@ def decode(frame: bytes | bytearray) -> Message:
 
 _START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
-_BLOB, _FORGET, _LACKING = 15, 16, 17
+_BLOB, _FORGET, _LACKING, _MEMORY = 15, 16, 17, 18
 
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
@@ -421,6 +440,10 @@ def _read_tunnel_close(view: memoryview) -> TunnelClose:
     return TunnelClose(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
 
 
+def _read_memory(view: memoryview) -> Memory:
+    return Memory(_NUMBER.unpack_from(view)[2], view[_NUMBER.size :])
+
+
 def _read_shutdown(view: memoryview) -> Shutdown:
     return Shutdown(_GRACE.unpack(view)[2])
 
@@ -453,6 +476,7 @@ _READERS: dict[int, Callable[[memoryview], Message]] = {
     _TUNNEL_OPEN: _read_tunnel_open,
     _TUNNEL_DATA: _read_tunnel_data,
     _TUNNEL_CLOSE: _read_tunnel_close,
+    _MEMORY: _read_memory,
     _SHUTDOWN: _read_shutdown,
 }
 

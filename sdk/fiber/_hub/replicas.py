@@ -1,0 +1,302 @@
+"""Blocks of shared memory that several hosts have, as the hub of one of them sees them.
+
+A block has a home, where it was made.  Another host of which a process wants it *joins*: its hub
+makes a block of its own, a *replica*, and asks the next hub on the way to the home for the
+contents, which joins first if it is not the home itself.  So the hosts that have a block form a
+tree along the links, and what changes travels only there (``fiber._hub.coherence``).
+
+On a link each block has a number, given by the side that joins.  What is said of it::
+
+    JOIN      an Origin; the other side sends what is not zero, as patches, and READY
+    READY     empty, or why it cannot be had
+    PATCH     what changed
+    ACK       a patch of the side that joined has arrived
+    LEAVE     the side that joined has no use for it any more
+
+All of this is on the loop's thread.
+"""
+
+from __future__ import annotations
+
+import hmac
+import itertools
+import os
+import struct
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Protocol
+
+from fiber._hub import heap
+from fiber._hub.coherence import Twin
+from fiber._hub.heap import Block, block_of
+from fiber._hub.protocol import ObjectKind, Origin
+from fiber._hub.registry import NoSuchObject, Registry
+from fiber._wire.descriptor import opened
+from fiber._wire.messages import Memory, ProtocolError
+
+Identity = tuple[str, int, int]
+Send = Callable[[Memory], None]
+
+
+class _Kind(IntEnum):
+    JOIN = 1
+    READY = 2
+    PATCH = 3
+    ACK = 4
+    LEAVE = 5
+
+
+_KINDS = {kind: bytes([kind]) for kind in _Kind}
+
+
+class Joiner(Protocol):
+    """Waits for a block to be here."""
+
+    def joined(self, block: Block) -> None:
+        """It is here, as its home knew it a moment ago."""
+
+    def refused(self, reason: str) -> None:
+        """It cannot be had."""
+
+
+class Replica:
+    """A block that this host shares with others: its own, or a copy of another's."""
+
+    def __init__(self, identity: Identity, block: Block) -> None:
+        self.identity = identity
+        self.block = block
+        self.memory = block.view
+        self.joiners: list[Joiner] = []
+        """Who waits for the contents."""
+        self.users: set[object] = set()
+        """Processes of this host, and links whose other side has joined here."""
+        self.upstream: _Share | None = None
+        """Towards the home; None at the home, and once that cannot be reached any more."""
+        self.ready = True
+
+
+class _Share:
+    """A block on one link."""
+
+    def __init__(self, link: MemoryLink, number: int, replica: Replica, *, follows: bool) -> None:
+        self.link = link
+        self.number = number
+        self.replica = replica
+        self.follows = follows
+        self.twin = Twin(replica.memory, follows=follows)
+
+
+class Replicas:
+    """Of one hub."""
+
+    def __init__(self, host: str, key: bytes, registry: Registry) -> None:
+        self._host = host
+        self._key = key
+        self._registry = registry
+        self._replicas: dict[Identity, Replica] = {}
+        self._links: dict[str | None, MemoryLink] = {}
+
+    def link(self, host: str | None, send: Send, *, dialer: bool) -> MemoryLink:
+        """A new link, as the router's."""
+        link = self._links[host] = MemoryLink(self, send, dialer=dialer)
+        return link
+
+    def unlink(self, host: str | None, reason: str) -> None:
+        """The link is over."""
+        link = self._links.pop(host, None)
+        if link is not None:
+            link.lost(reason)
+
+    def join(self, origin: Origin, user: object, joiner: Joiner) -> None:
+        """Have the block here for ``user``, until that leaves; tell ``joiner``."""
+        try:
+            replica = self._replicas.get(origin.identity) or self._new(origin)
+        except (LookupError, OSError) as error:
+            joiner.refused(str(error))
+            return
+        replica.users.add(user)
+        if replica.ready:
+            joiner.joined(replica.block)
+        else:
+            replica.joiners.append(joiner)
+
+    def leave(self, identity: Identity, user: object) -> None:
+        """It is of no use to ``user`` any more."""
+        replica = self._replicas.get(identity)
+        if replica is None or user not in replica.users:
+            return
+        replica.users.discard(user)
+        if not replica.users:
+            del self._replicas[identity]
+            if replica.upstream is not None:
+                replica.upstream.link.leave(replica.upstream)
+
+    def at(self, identity: Identity) -> Replica:
+        """A block that is here."""
+        return self._replicas[identity]
+
+    def arrived(self, replica: Replica, problem: str) -> None:
+        """The contents are there, or there is a ``problem``."""
+        replica.ready = not problem
+        joiners, replica.joiners = replica.joiners, []
+        if problem:
+            self._replicas.pop(replica.identity, None)
+        for joiner in joiners:
+            if problem:
+                joiner.refused(problem)
+            else:
+                joiner.joined(replica.block)
+
+    def _new(self, origin: Origin) -> Replica:
+        if origin.home == self._host:
+            replica = Replica(origin.identity, self._own_block(origin))
+        else:
+            link = self._towards(origin.home)
+            replica = Replica(origin.identity, heap.allocate(origin.size))
+            replica.block.give()
+            replica.ready = False
+            replica.upstream = link.join(replica, origin)
+        self._replicas[origin.identity] = replica
+        return replica
+
+    def _own_block(self, origin: Origin) -> Block:
+        if not hmac.compare_digest(origin.key, self._key):
+            raise NoSuchObject("the key is not this hub's: it belongs to another program")
+        shared = self._registry.look_up(origin.entry, origin.grant)
+        extent = origin.offset, origin.size
+        if shared.kind is not ObjectKind.MEMORY or extent != shared.extent:
+            raise NoSuchObject("there is no such block of shared memory")
+        return block_of(opened(os.dup, shared.descriptor.fileno()), *extent)
+
+    def _towards(self, host: str) -> MemoryLink:
+        link = self._links.get(host, self._links.get(None))
+        if link is None:
+            raise NoSuchObject(f"host {host!r} cannot be reached: no agent of that name is there")
+        return link
+
+
+class MemoryLink:
+    """The blocks that both sides of one link have."""
+
+    def __init__(self, home: Replicas, send: Send, *, dialer: bool) -> None:
+        self._home = home
+        self._send = send
+        self._numbers = itertools.count(1 if dialer else 2, 2)
+        self._shares: dict[int, _Share] = {}
+        self._joining: dict[int, _Downstream] = {}
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self._shares)
+
+    def flush(self) -> None:
+        """Send what has changed here, ahead of what is about to be sent."""
+        for share in self._shares.values():
+            self._flush(share)
+
+    def _flush(self, share: _Share) -> None:
+        if share.replica.ready:
+            for patch in share.twin.collect():
+                self._say(share.number, _Kind.PATCH, patch)
+
+    def _say(self, number: int, kind: _Kind, data: bytes = b"") -> None:
+        self._send(Memory(number, _KINDS[kind] + data))
+
+    def on_frame(self, frame: Memory) -> None:
+        """What the other side says; ProtocolError for what it never should."""
+        payload = memoryview(frame.payload)
+        try:
+            kind = _Kind(payload[0])
+            if kind is _Kind.JOIN:
+                self._accept(frame.block, Origin.decode(payload[1:]))
+            else:
+                self._heard(frame.block, kind, payload[1:])
+        except (struct.error, ValueError, IndexError) as error:
+            raise ProtocolError(f"malformed data about shared memory: {error}") from error
+
+    # The side that joins
+
+    def join(self, replica: Replica, origin: Origin) -> _Share:
+        """Ask the other side for a block."""
+        share = _Share(self, next(self._numbers), replica, follows=True)
+        self._shares[share.number] = share
+        self._say(share.number, _Kind.JOIN, origin.encode())
+        return share
+
+    def leave(self, share: _Share) -> None:
+        """Nobody here has a use for it any more."""
+        if self._shares.pop(share.number, None) is not None:
+            self._flush(share)
+            self._say(share.number, _Kind.LEAVE)
+
+    # The other side
+
+    def _accept(self, number: int, origin: Origin) -> None:
+        downstream = self._joining[number] = _Downstream(self, number, origin.identity)
+        self._home.join(origin, downstream, downstream)
+
+    def accepted(self, downstream: _Downstream) -> None:
+        """The contents for the other side are here."""
+        number = downstream.number
+        if number not in self._joining:
+            return  # it left while it waited
+        replica = self._home.at(downstream.identity)
+        share = self._shares[number] = _Share(self, number, replica, follows=False)
+        self._flush(share)
+        self._say(number, _Kind.READY)
+
+    def refused(self, downstream: _Downstream, reason: str) -> None:
+        """They cannot be had."""
+        if self._joining.pop(downstream.number, None) is not None:
+            self._say(downstream.number, _Kind.READY, reason.encode(errors="replace"))
+
+    def _heard(self, number: int, kind: _Kind, data: memoryview) -> None:
+        if kind is _Kind.LEAVE:
+            self._shares.pop(number, None)
+            downstream = self._joining.pop(number, None)
+            if downstream is not None:
+                self._home.leave(downstream.identity, downstream)
+            return
+        share = self._shares.get(number)
+        if share is None:
+            return  # it was left while this was under way
+        if kind is _Kind.PATCH:
+            share.twin.merge(data)
+            if not share.follows:
+                self._say(number, _Kind.ACK)
+        elif kind is _Kind.ACK:
+            share.twin.acknowledged()
+        else:
+            problem = str(data, "utf-8", "replace")
+            if problem:
+                del self._shares[number]
+            self._home.arrived(share.replica, problem)
+
+    def lost(self, reason: str) -> None:
+        """The link is over: what is here stays as it is."""
+        shares, self._shares = self._shares, {}
+        joining, self._joining = self._joining, {}
+        for share in shares.values():
+            if share.follows:
+                share.replica.upstream = None
+                if not share.replica.ready:
+                    self._home.arrived(share.replica, reason)
+        for downstream in joining.values():
+            self._home.leave(downstream.identity, downstream)
+
+
+class _Downstream:
+    """The other side of a link, which has joined here or waits for that; a ``Joiner``."""
+
+    def __init__(self, link: MemoryLink, number: int, identity: Identity) -> None:
+        self.number = number
+        self.identity = identity
+        self._link = link
+
+    def joined(self, block: Block) -> None:
+        """Send it on."""
+        self._link.accepted(self)
+
+    def refused(self, reason: str) -> None:
+        """Say why not."""
+        self._link.refused(self, reason)

@@ -1,0 +1,233 @@
+"""Proxies whose methods return at once, with a handle for the result.
+
+::
+
+    proxy ── Pipeline ── calls, one after the other ──► a thread of the server, for this proxy alone
+                 ◄────── answers, in the same order
+
+An answer is taken in by whoever waits for any of them, and kept for who asks for it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import select
+import threading
+import time
+import weakref
+from multiprocessing import managers as mp_managers
+from typing import Any
+
+from fiber import reduction
+from fiber._hub.client import Unreachable
+from fiber._managers.client import Session, proxy_of, session, thread_name
+from fiber._managers.door import NUMBER
+from fiber._runtime.latch import Waiters, acquire
+from fiber.errors import ConnectionClosed, TimeoutError
+
+_mp: Any = mp_managers  # typeshed has part of it
+
+_A_MOMENT = 1000
+"""Milliseconds after which who waits for room looks again who reads."""
+
+
+class AsyncProxyResult:
+    """A call under way, with the methods of ``multiprocessing.pool.AsyncResult``."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline = pipeline
+        self._outcome: tuple[str, Any] | None = None
+
+    def get(self, timeout: float | None = None) -> Any:
+        """What the method returned, each time the same; raises what it raised.
+
+        TimeoutError if it has not ended within ``timeout`` seconds; the call goes on.
+        ConnectionClosed if the manager is gone.
+        """
+        if not self._pipeline.wait(self, timeout):
+            raise TimeoutError(f"the call has not returned within {timeout:g} s")
+        kind, result = self._pipeline.understood(self)
+        if kind == "#RETURN":
+            return result
+        raise _mp.convert_to_error(kind, result)
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Wait until the call has ended, at most ``timeout`` seconds."""
+        self._pipeline.wait(self, timeout)
+
+    def ready(self) -> bool:
+        """Whether the call has ended."""
+        return self._pipeline.wait(self, 0)
+
+    def successful(self) -> bool:
+        """Whether it has returned without an error; ValueError if it has not ended."""
+        if not self.ready():
+            raise ValueError(f"{self!r} not ready")
+        assert self._outcome is not None
+        return self._outcome[0] in ("#RETURN", "#PROXY")
+
+
+class Pipeline:
+    """The calls of one proxy, each of which may begin before those before it have ended."""
+
+    def __init__(self, server: Session) -> None:
+        self.pid = os.getpid()
+        self._session = server
+        self._channel = server.hand_over("line", thread_name())
+        self._numbers = itertools.count(1)
+        self._answered = 0
+        self._sending = threading.RLock()
+        """Calls are sent in the order of their numbers; a signal's handler may call, too."""
+        self._pending: dict[int, weakref.ref[AsyncProxyResult]] = {}
+        self._reading = threading.Lock()
+        self._waiters = Waiters()
+
+    def call(self, ident: str, method: str, args: Any, kwds: Any) -> AsyncProxyResult:
+        """Begin a call."""
+        try:
+            payload, buffers = reduction.encode((ident, method, args, kwds))
+        except reduction.REFUSALS as error:
+            raise reduction.blame({f"the arguments of {method}()": (args, kwds)}, error) from error
+        result = AsyncProxyResult(self)
+        with self._sending:
+            number = next(self._numbers)
+            self._pending[number] = weakref.ref(result)
+            try:
+                while not self._channel.try_send(NUMBER.pack(number) + payload, buffers):
+                    self._make_room()
+            except OSError:
+                self._end()
+        return result
+
+    def _make_room(self) -> None:
+        """The server reads no calls, perhaps since nobody reads its answers."""
+        poller = select.poll()
+        poller.register(self._channel.fileno(), select.POLLIN | select.POLLOUT)
+        readable = any(events & select.POLLIN for _, events in poller.poll(_A_MOMENT))
+        if readable and self._reading.acquire(blocking=False):
+            self._read(0)
+
+    def wait(self, result: AsyncProxyResult, timeout: float | None) -> bool:
+        """Wait for a call's end; False if ``timeout`` seconds are over first."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while result._outcome is None:
+            left = None if deadline is None else max(0.0, deadline - time.monotonic())
+            if self._reading.acquire(blocking=False):
+                came = self._read(left)
+            else:
+                came = self._let_another_read(result, left)
+            if not came and deadline is not None and time.monotonic() >= deadline:
+                break
+        return result._outcome is not None
+
+    def _let_another_read(self, result: AsyncProxyResult, timeout: float | None) -> bool:
+        lock = self._waiters.join()
+        try:
+            return not self._reading.locked() or acquire(lock, timeout)
+        finally:
+            self._waiters.leave(lock)
+
+    def _read(self, timeout: float | None) -> bool:
+        """Take in one answer, if it comes; the lock for that is held, and released."""
+        try:
+            if not self._channel.poll(timeout):
+                return False
+            self._take_in(*self._next())
+            return True
+        except _Ended:
+            self._end()
+            return True
+        finally:
+            self._reading.release()
+            self._waiters.wake()
+
+    def _next(self) -> tuple[int, str, Any]:
+        try:
+            answer: tuple[int, str, Any] = self._channel.recv_object()
+            return answer
+        except ConnectionClosed as error:
+            if isinstance(error, Unreachable):  # something in the answer
+                return self._answered + 1, "#ERROR", error
+            raise _Ended from error
+        except Exception as error:  # it does not unpickle
+            return self._answered + 1, "#ERROR", error
+
+    def _take_in(self, number: int, kind: str, value: Any) -> None:
+        for lost in range(self._answered + 1, number):  # its reader was interrupted
+            self._settle(lost, "#ERROR", InterruptedError("the answer was lost to a signal"))
+        self._answered = number
+        if not self._settle(number, kind, value) and kind == "#PROXY":
+            self._session.got_reference()
+            self._session.let_go(str(value[1].id))
+
+    def _settle(self, number: int, kind: str, value: Any) -> bool:
+        """Whether anybody wants to know."""
+        reference = self._pending.pop(number, None)
+        result = None if reference is None else reference()
+        if result is None:
+            return False
+        result._outcome = kind, value
+        return True
+
+    def _end(self) -> None:
+        error = self._session.gone()
+        for number in list(self._pending):
+            self._settle(number, "#ERROR", error)
+        self._waiters.wake()
+
+    def understood(self, result: AsyncProxyResult) -> tuple[str, Any]:
+        """The outcome of a call that has ended, on its caller's thread."""
+        assert result._outcome is not None
+        kind, value = result._outcome
+        if kind == "#PROXY":
+            result._outcome = "#RETURN", proxy_of(self._session, *value)
+        return result._outcome
+
+
+class _Ended(Exception):
+    """There will be no more answers."""
+
+
+class AsyncBaseProxy(_mp.BaseProxy):  # type: ignore[misc]
+    """A proxy of which every method returns an ``AsyncProxyResult`` at once.
+
+    Calls by one proxy are made one after the other, in their order, and those by different proxies
+    side by side.
+    """
+
+    def __init__(self, *args: Any, exposed: Any = None, **options: Any) -> None:
+        super().__init__(*args, exposed=exposed, **options)
+        self._exposed = tuple(exposed or ())
+        self._calls: Pipeline | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name not in self._exposed:
+            raise AttributeError(f"{self!r} has no method {name!r}")
+
+        def method(*args: Any, **kwds: Any) -> AsyncProxyResult:
+            return self._callmethod(name, args, kwds)
+
+        method.__name__ = name
+        return method
+
+    def _callmethod(self, methodname: str, args: Any = (), kwds: Any = None) -> AsyncProxyResult:
+        """Begin a call of any exposed method, ``__getitem__`` for instance."""
+        calls, token = self._calls, self._token
+        if calls is None or calls.pid != os.getpid():  # else forked
+            calls = self._calls = Pipeline(session(token.address))
+        return calls.call(token.id, methodname, args, kwds or {})
+
+    def _getvalue(self) -> AsyncProxyResult:
+        """A copy of the object."""
+        return self._callmethod("#GETVALUE")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        token, serializer = self._token, self._serializer
+        return _mp.RebuildProxy, (type(self), token, serializer, {"exposed": self._exposed})
+
+    def __repr__(self) -> str:
+        token = self._token
+        return f"<{type(self).__name__} object, typeid {token.typeid!r}, of {token.address.server}>"
+
+    __str__ = __repr__
