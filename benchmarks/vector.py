@@ -61,7 +61,6 @@ def cases(size: float) -> list[Case]:
             params={**params, "seconds": 2.0 * size},
             metrics=(RATE,),
             limit=30.0,
-            fresh=True,
         )
         for group, name, needs, params in found
         if not (tiny and params["count"] > 64)
