@@ -69,10 +69,11 @@ bench-operator: $(VENV)/.with-dev
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
 
-## make conformance   CPython's tests of multiprocessing and executors (BACKEND=local, loopback or kubernetes)
+## make conformance   CPython's tests of multiprocessing and executors, joblib's (BACKEND=local, loopback or kubernetes)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(BIN)/python tests/conformance/run.py --backend $(BACKEND)
 	$(BIN)/python tests/conformance/executors.py --backend $(BACKEND)
+	$(BIN)/python -m pytest tests/conformance/test_joblib.py
 
 ## make crds          crds/fiberpools.yaml and the chart's copy, from the model
 crds: $(VENV)/.with-dev

@@ -13,6 +13,7 @@ from benchmarks import (
     latency,
     overhead,
     pipes,
+    sharing,
     startup,
     throughput,
     vector,
@@ -123,19 +124,31 @@ def _pool() -> Iterator[Budget]:
     yield from _overhead()
     for case in throughput.ARRAY_KINDS:
         yield Budget(case, "throughput", case, throughput.TIME.name, 0.25)
-    for case, what in (("map, chunksize 1", "map"), ("apply_async", "submit")):
-        yield Budget(
-            f"fiber.Executor: no-op tasks, {what}",
-            "throughput",
-            case,
-            rate,
-            5,
-            at_least=True,
-            contender="fiber-executor",
-            against="concurrent.futures",
-        )
     case, what = throughput.LONG_NAME, "one 1 s task among 10,000 no-ops"
     yield Budget(what, "throughput", case, throughput.TIME.name, 1.03, unit="s")
+
+
+def _executors() -> Iterator[Budget]:
+    def budget(what: str, case: str, contender: str, against: str, bound: float) -> Budget:
+        return Budget(
+            what,
+            "throughput",
+            case,
+            throughput.RATE.name,
+            bound,
+            at_least=True,
+            contender=contender,
+            against=against,
+        )
+
+    for what, case, against in (
+        ("map, to concurrent.futures'", "map, chunksize 1", "concurrent.futures"),
+        ("submit, to concurrent.futures'", "apply_async", "concurrent.futures"),
+        ("submit, to loky's", "apply_async", "joblib"),
+    ):
+        yield budget(f"fiber.Executor: no-op tasks by {what}", case, "fiber-executor", against, 5)
+    name = "joblib: no-op tasks, batch_size=1, on Fiber to loky"
+    yield budget(name, "map, chunksize 1", "fiber-joblib", "joblib", 2)
 
 
 def _overhead() -> Iterator[Budget]:
@@ -181,6 +194,20 @@ def _vector() -> Iterator[Budget]:
     yield budget(what, vector.FIRST_READY, 1.5, to_case=vector.UNEVEN)
     what = f"loopback to local, {vector.PIXELS}"
     yield budget(what, vector.PIXELS, 0.5, contender="fiber-loopback", against="fiber")
+
+
+def _sharing() -> Iterator[Budget]:
+    bounds = {
+        sharing.ROUND_TRIP: 1.0,
+        sharing.MANAGER: 1.0,
+        sharing.LOCK: 3.0,
+        sharing.VALUE: 3.0,
+        **{sharing.array(megabytes): 1.05 for megabytes in sharing.MEGABYTES},
+    }
+    for case, bound in bounds.items():
+        yield Budget(case, "sharing", case, sharing.CALL.name, bound)
+    case = sharing.STREAM
+    yield Budget(case, "sharing", case, sharing.RATE.name, 1.0, at_least=True)
 
 
 def _start() -> Iterator[Budget]:
@@ -276,5 +303,14 @@ def _on_pods() -> Iterator[Budget]:
     )
 
 
-BUDGETS = (*_pool(), *_pipes(), *_vector(), *_start(), *_remote(), *_many())
+BUDGETS = (
+    *_pool(),
+    *_executors(),
+    *_pipes(),
+    *_sharing(),
+    *_vector(),
+    *_start(),
+    *_remote(),
+    *_many(),
+)
 ON_PODS = tuple(_on_pods())

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
 _EXECUTOR = frozenset({"map", "stream", "submit", "apply"})
-_PROCESSES = frozenset({"pipes", "start", "cold start"})
+_PROCESSES = frozenset({"pipes", "sharing", "start", "cold start"})
 _VECTOR = frozenset({"vector steps", "many vector steps"})
 _SLOW_VECTOR = frozenset({"slow vector steps"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
@@ -80,6 +80,15 @@ ALL = (
         ("fiber",),
         _EXECUTOR,
         "#0072B2",
+        "v",
+        environment={"FIBER_BACKEND": "local"},
+    ),
+    Contender(
+        "fiber-joblib",
+        "joblib on Fiber",
+        ("fiber", "joblib"),
+        frozenset({"map", "stream", "stream in chunks"}),
+        "#009E73",
         "v",
         environment={"FIBER_BACKEND": "local"},
     ),

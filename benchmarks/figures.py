@@ -16,6 +16,7 @@ from benchmarks import (
     latency,
     overhead,
     pipes,
+    sharing,
     startup,
     throughput,
     vector,
@@ -105,6 +106,18 @@ def _pipes(run: Run, path: Path) -> None:
     _finish(figure, path)
 
 
+def _sharing(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 2, figsize=(13, 5), width_ratios=(2, 1))
+    arrays = [sharing.array(megabytes) for megabytes in sharing.MEGABYTES]
+    cases = sharing.cases(run.about["size"])
+    calls = [case.name for case in cases if sharing.CALL in case.metrics]
+    _rows(panels[0], run, [name for name in calls if name not in arrays], sharing.CALL)
+    panels[0].set(title="Calls: further left is better", xlabel="time of one")
+    _rows(panels[1], run, arrays, sharing.CALL)
+    panels[1].set(title="Arrays, written there and read here", xlabel="time of one")
+    _finish(figure, path)
+
+
 def _pipe_panel(
     panel: Any, run: Run, messages: Sequence[str], cases: Sequence[str], where: str
 ) -> None:
@@ -186,6 +199,7 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "latency": _latency,
     "pipes": _pipes,
     "vector": _vector,
+    "sharing": _sharing,
     "startup": _startup,
     "coldstart": _coldstart,
     "workers": _workers,

@@ -112,13 +112,13 @@ class Futures(Adapter):
 
 
 class Joblib(Adapter):
-    """joblib.Parallel on its loky executor: the default chunk is joblib's batch_size="auto"."""
+    """joblib.Parallel on loky's executor or another: its default chunk is batch_size="auto"."""
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int, executor: Any, backend: Any) -> None:
         self.workers = workers
         self.joblib = import_module("joblib")
-        # The one that joblib.Parallel gets too.
-        self.executor = import_module("joblib.executor").get_memmapping_executor(workers)
+        self.executor = executor
+        self.backend = backend
 
     def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
         return list(self._parallel(function, items, chunksize or "auto", "list"))
@@ -138,10 +138,24 @@ class Joblib(Adapter):
     def _parallel(
         self, function: Function, items: Sequence[Any], batch: int | str, kind: str
     ) -> Iterable[Any]:
-        parallel = self.joblib.Parallel(self.workers, batch_size=batch, return_as=kind)
+        parallel = self.joblib.Parallel(
+            self.workers, backend=self.backend, batch_size=batch, return_as=kind
+        )
         call = self.joblib.delayed(function)
         results: Iterable[Any] = parallel(call(item) for item in items)
         return results
+
+
+def joblib_on_loky(workers: int) -> Joblib:
+    """With the executor that joblib.Parallel gets too."""
+    executor = import_module("joblib.executor").get_memmapping_executor(workers)
+    return Joblib(workers, executor, "loky")
+
+
+def joblib_on_fiber(workers: int) -> Joblib:
+    """With an executor of Fiber's."""
+    executor = import_module("fiber").Executor(workers)
+    return Joblib(workers, executor, import_module("fiber.joblib").FiberBackend(executor=executor))
 
 
 class Dask(Adapter):
@@ -262,7 +276,8 @@ def processes_of(contender: str) -> Any:
 _ADAPTERS: dict[str, Callable[[int], Adapter]] = {
     "concurrent.futures": lambda workers: Futures(futures.ProcessPoolExecutor(workers)),
     "fiber-executor": lambda workers: Futures(import_module("fiber").Executor(workers)),
-    "joblib": Joblib,
+    "fiber-joblib": joblib_on_fiber,
+    "joblib": joblib_on_loky,
     "dask": Dask,
     "ipyparallel": IPyParallel,
     "ray": Ray,

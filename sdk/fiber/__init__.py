@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from fiber.errors import FiberPoolError as FiberPoolError
     from fiber.errors import FileTooLarge as FileTooLarge
     from fiber.errors import LinkError as LinkError
-    from fiber.errors import NotInFiber as NotInFiber
     from fiber.errors import ProcessError as ProcessError
     from fiber.errors import ProgramTooLarge as ProgramTooLarge
     from fiber.errors import StartError as StartError
@@ -54,6 +53,7 @@ _SUBMODULES = frozenset(
         "dummy",
         "errors",
         "futures",
+        "joblib",
         "managers",
         "pool",
         "process",
@@ -119,7 +119,6 @@ _HOMES = {
     "FiberPoolError": "errors",
     "FileTooLarge": "errors",
     "LinkError": "errors",
-    "NotInFiber": "errors",
     "Process": "process",
     "ProcessError": "errors",
     "ProgramTooLarge": "errors",

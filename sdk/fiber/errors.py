@@ -13,7 +13,6 @@
     │       ├── FiberPoolError    a FiberPool on Kubernetes that cannot serve
     │       ├── FileTooLarge      a message, or shared memory, above the limit (also OSError)
     │       ├── LinkError         no way between program and agent, a port in use for instance
-    │       ├── NotInFiber        a part of multiprocessing that Fiber has not (yet)
     │       ├── ProgramTooLarge   the program's folder is more than is sent to other machines
     │       ├── StartError        a process that does not start, an initializer that fails
     │       ├── TooManyOpenFiles  the limit of file descriptors is reached (also OSError)
@@ -49,7 +48,6 @@ __all__ = [
     "FileTooLarge",
     "LinkError",
     "MaybeEncodingError",
-    "NotInFiber",
     "ProcessError",
     "ProgramTooLarge",
     "StartError",
@@ -160,10 +158,6 @@ class FileTooLarge(FiberError, OSError):
 
 class LinkError(FiberError):
     """A link between a master and an agent cannot be made, or the other side refused it."""
-
-
-class NotInFiber(FiberError, NotImplementedError):
-    """A part of multiprocessing that this version of Fiber does not have; says what to use."""
 
 
 class ProgramTooLarge(FiberError):

@@ -11,20 +11,12 @@ _CLOSED_AT_ONCE = {
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
     )
 }
-_LOCKED = {
-    f"WithProcesses{test}": "the lock of a Value or Array is for the processes of one host"
-    for test in (
-        "TestArray.test_array",
-        "TestSharedCTypes.test_synchronize",
-        "TestValue.test_value",
-    )
-}
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
     "local": _CLOSED_AT_ONCE,
-    "loopback": {**_CLOSED_AT_ONCE, **_LOCKED},
-    "kubernetes": {**_CLOSED_AT_ONCE, **_LOCKED},
+    "loopback": _CLOSED_AT_ONCE,
+    "kubernetes": _CLOSED_AT_ONCE,
 }
 
 _CONCERNS_ONE_TASK = "concerns one task, which gets the error itself: the executor is not broken"
@@ -63,4 +55,15 @@ EXECUTORS: dict[str, dict[str, str]] = {
     "local": _EXECUTORS,
     "loopback": {**_EXECUTORS, **_ELSEWHERE},
     "kubernetes": {**_EXECUTORS, **_ELSEWHERE, **_ONE_PORT},
+}
+
+_REGISTERED_HERE = "starts another interpreter, which does not import fiber.joblib"
+_NO_MEMORY_MAPS = "large arrays are sent to a worker, and not mapped from a file"
+
+# Of joblib's tests of a backend: name of the test -> reason
+JOBLIB: dict[str, str] = {
+    "test_parallel_with_interactively_defined_functions": _REGISTERED_HERE,
+    "test_parallel_with_unpicklable_functions_in_args": _REGISTERED_HERE,
+    "test_auto_memmap_on_arrays_from_generator": _NO_MEMORY_MAPS,
+    "test_memmapping_leaks": _NO_MEMORY_MAPS,
 }

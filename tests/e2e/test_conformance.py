@@ -13,7 +13,7 @@ from e2e.kube import environment
 from e2e.scene import Scene
 
 RUN = Path(__file__).resolve().parents[1] / "conformance" / "run.py"
-SECONDS = 900
+SECONDS = 1800
 
 
 @pytest.mark.long

@@ -21,7 +21,7 @@ from typing import Any
 
 from fiber import reduction
 from fiber._hub.client import Unreachable
-from fiber._managers.client import Session, proxy_of, session, thread_name
+from fiber._managers.client import Session, new_owner, proxy_of, session
 from fiber._managers.door import NUMBER
 from fiber._runtime.latch import Waiters, acquire
 from fiber.errors import ConnectionClosed, TimeoutError
@@ -74,7 +74,7 @@ class Pipeline:
     def __init__(self, server: Session) -> None:
         self.pid = os.getpid()
         self._session = server
-        self._channel = server.hand_over("line", thread_name())
+        self._channel = server.hand_over(new_owner())
         self._numbers = itertools.count(1)
         self._answered = 0
         self._sending = threading.RLock()

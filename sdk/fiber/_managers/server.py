@@ -97,9 +97,9 @@ class Server(_mp.Server):  # type: ignore[misc]
 
     # A thread of a client
 
-    def _serve_line(self, client: Client, name: str, line: Channel) -> None:
+    def _serve_line(self, client: Client, name: str, owner: str, line: Channel) -> None:
         threading.current_thread().name = name
-        thread = ClientThread(self._holdings, client)
+        thread = ClientThread(self._holdings, client, owner)
         try:
             line.send(b"")
             while True:

@@ -1,0 +1,161 @@
+"""joblib's parallel loops on Fiber: importing this registers the backend ``"fiber"``.
+
+::
+
+    import fiber.joblib
+    import joblib
+
+    with joblib.parallel_config(backend="fiber", n_jobs=-1):
+        search.fit(X, y)  # of scikit-learn, for instance
+
+The backend makes a ``fiber.Executor`` of ``n_jobs`` workers, with the options that are given beside
+``backend=``: ``retries=0``, ``initializer=``.  ``executor=`` is one of yours in its place, perhaps
+with options: ``parallel_config(backend="fiber", executor=executor.options(memory="4Gi"))``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from inspect import signature
+from typing import Any
+
+from joblib import register_parallel_backend
+from joblib.parallel import (
+    AutoBatchingMixin,
+    FallbackToBackend,
+    ParallelBackendBase,
+    SequentialBackend,
+)
+
+from fiber import cpu
+from fiber.futures import Executor
+
+__all__ = ["FiberBackend"]
+
+_OPTIONS = frozenset(signature(Executor).parameters) - {"max_workers"}
+
+
+class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc]
+    """Runs the tasks of ``joblib.Parallel`` on a ``fiber.Executor``.
+
+    ``n_jobs=-1`` is the number of processors, or that of the executor's workers.  Loops within a
+    task run in threads, as with loky.
+    """
+
+    supports_retrieve_callback = True
+    supports_inner_max_num_threads = True
+
+    def __init__(
+        self,
+        *,
+        executor: Executor | None = None,
+        nesting_level: int | None = None,
+        inner_max_num_threads: int | None = None,
+        **options: Any,
+    ) -> None:
+        if executor is not None and not isinstance(executor, Executor):
+            raise TypeError(f"executor must be a fiber.Executor, not {executor!r}")
+        if executor is not None and (options or inner_max_num_threads is not None):
+            given = [*options, *(["inner_max_num_threads"] if inner_max_num_threads else [])]
+            raise ValueError(f"executor= has workers already: give {', '.join(given)} to that one")
+        if unknown := options.keys() - _OPTIONS:
+            raise TypeError(
+                f"the backend fiber has no {', '.join(sorted(unknown))}: expected executor, or "
+                f"options of fiber.Executor, {', '.join(sorted(_OPTIONS))}"
+            )
+        super().__init__(
+            nesting_level=nesting_level, inner_max_num_threads=inner_max_num_threads, **options
+        )
+        self._given = executor
+        self._own: Executor | None = None
+        self._own_options: dict[str, Any] = {}
+        self._workers: Executor | None = None
+        """That of the loop that runs."""
+        self._unfinished: set[Future[Any]] = set()
+
+    def effective_n_jobs(self, n_jobs: int | None) -> int:
+        """How many tasks run at a time."""
+        if n_jobs == 0:
+            raise ValueError("n_jobs == 0 in Parallel has no meaning")
+        if n_jobs is None:
+            return 1
+        if n_jobs > 0:
+            return n_jobs
+        workers = cpu.cpu_count() if self._given is None else self._given._max_workers
+        return max(workers + 1 + n_jobs, 1)
+
+    def configure(self, n_jobs: int = 1, parallel: Any = None, **options: Any) -> int:
+        """Be ready for one more loop; options that joblib has for loky mean nothing here."""
+        n_jobs = self.effective_n_jobs(n_jobs)
+        if n_jobs == 1 and self._given is None:
+            raise FallbackToBackend(SequentialBackend(nesting_level=self.nesting_level))
+        self.parallel = parallel
+        own = {key: value for key, value in options.items() if key in _OPTIONS}
+        self._workers = self._given or self._start({**self.backend_kwargs, **own}, n_jobs)
+        return n_jobs
+
+    def submit(self, func: Callable[[], Any], callback: Any = None) -> Future[Any]:
+        """Have a batch of tasks run, and ``callback`` called with its future then."""
+        assert self._workers is not None
+        future = self._workers.submit(func)
+        self._unfinished.add(future)
+        future.add_done_callback(self._unfinished.discard)
+        if callback is not None:
+            future.add_done_callback(callback)
+        return future
+
+    apply_async = submit
+    """Its name before joblib 1.5."""
+
+    def retrieve_result_callback(self, out: Future[Any]) -> Any:
+        """What became of a batch."""
+        return out.result()
+
+    def abort_everything(self, ensure_ready: bool = True) -> None:
+        """The loop has failed: cancel what has not begun, and end workers of our own."""
+        for future in tuple(self._unfinished):
+            future.cancel()
+        if self._own is not None:
+            self._own.terminate_workers()
+            self._own = None
+            if ensure_ready:
+                self._workers = self._start(self._own_options, self.parallel.n_jobs)
+
+    def terminate(self) -> None:
+        """The loop is over.  Workers stay for the next one, until they are idle for too long."""
+        self._workers = None
+        self.reset_batch_stats()
+
+    def _start(self, options: dict[str, Any], n_jobs: int) -> Executor:
+        """An executor with these options: the last one, if it has them."""
+        options = {**options, "max_workers": self.effective_n_jobs(n_jobs)}
+        if self._own is None or self._own_options != options:
+            if self._own is not None:
+                self._own.shutdown(wait=False)
+            threads = self._prepare_worker_env(options["max_workers"])
+            then = options.get("initializer"), options.get("initargs", ())
+            self._own = Executor(
+                **{**options, "initializer": _prepare, "initargs": (threads, *then)}
+            )
+            self._own_options = options
+        return self._own
+
+
+def _prepare(
+    threads: dict[str, str], initializer: Callable[..., object] | None, initargs: Iterable[Any]
+) -> None:
+    """In a worker: leave its neighbours their processors; ``threads`` are joblib's variables."""
+    os.environ.update(threads)
+    try:
+        from threadpoolctl import threadpool_limits
+    except ImportError:
+        pass  # what is imported from now on reads the variables
+    else:
+        threadpool_limits(int(threads["OMP_NUM_THREADS"]))
+    if initializer is not None:
+        initializer(*initargs)
+
+
+register_parallel_backend("fiber", FiberBackend)
