@@ -16,6 +16,7 @@ from benchmarks import (
     sharing,
     startup,
     throughput,
+    vector,
     workers,
 )
 from benchmarks.model import BASELINE, Metric, Run
@@ -181,6 +182,20 @@ def _pipes() -> Iterator[Budget]:
         yield Budget(f"vector step, {case}", "pipes", case, pipes.STEP.name, 0.8)
 
 
+def _vector() -> Iterator[Budget]:
+    def budget(what: str, case: str, bound: float, **more: Any) -> Budget:
+        rate = vector.RATE.name
+        return Budget(f"vector: {what}", "vector", case, rate, bound, at_least=True, **more)
+
+    case = vector.cart_poles(64)
+    yield budget(case, case, 3)
+    yield budget(f"{case}, to PufferLib", case, 1, against="pufferlib")
+    what = "uneven steps, first ready to waiting for all"
+    yield budget(what, vector.FIRST_READY, 1.5, to_case=vector.UNEVEN)
+    what = f"loopback to local, {vector.PIXELS}"
+    yield budget(what, vector.PIXELS, 0.5, contender="fiber-loopback", against="fiber")
+
+
 def _sharing() -> Iterator[Budget]:
     bounds = {
         sharing.ROUND_TRIP: 1.0,
@@ -293,6 +308,7 @@ BUDGETS = (
     *_executors(),
     *_pipes(),
     *_sharing(),
+    *_vector(),
     *_start(),
     *_remote(),
     *_many(),

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
 _EXECUTOR = frozenset({"map", "stream", "submit", "apply"})
 _PROCESSES = frozenset({"pipes", "sharing", "start", "cold start"})
+_VECTOR = frozenset({"vector steps", "many vector steps"})
+_SLOW_VECTOR = frozenset({"slow vector steps"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 
@@ -53,7 +55,12 @@ ALL = (
         "fiber",
         "Fiber",
         ("fiber",),
-        _POOL | _PROCESSES | _AGAINST_BASELINE | {"fake workers"},
+        _POOL
+        | _PROCESSES
+        | _AGAINST_BASELINE
+        | _VECTOR
+        | _SLOW_VECTOR
+        | {"fake workers", "first ready"},
         "#0072B2",
         "o",
         environment={"FIBER_BACKEND": "local"},
@@ -62,7 +69,7 @@ ALL = (
         "fiber-loopback",
         "Fiber, loopback agents",
         ("fiber",),
-        _POOL | _PROCESSES,
+        _POOL | _PROCESSES | _VECTOR,
         "#56B4E9",
         "s",
         environment={"FIBER_BACKEND": "loopback"},
@@ -89,7 +96,7 @@ ALL = (
         "multiprocessing",
         "multiprocessing, fork",
         (),
-        _POOL | _PROCESSES | _AGAINST_BASELINE,
+        _POOL | _PROCESSES | _AGAINST_BASELINE | _SLOW_VECTOR | {"vector steps"},
         "#000000",
         "D",
     ),
@@ -130,6 +137,30 @@ ALL = (
         "X",
         program="java",
         servers=True,
+    ),
+    Contender(
+        "sync-vector-env",
+        "SyncVectorEnv",
+        ("gymnasium",),
+        _VECTOR | _SLOW_VECTOR,
+        "#999999",
+        "p",
+    ),
+    Contender(
+        "pufferlib",
+        "PufferLib",
+        ("pufferlib", "torch"),
+        _VECTOR | _SLOW_VECTOR,
+        "#CC79A7",
+        "h",
+    ),
+    Contender(
+        "stable-baselines3",
+        "SubprocVecEnv",
+        ("stable_baselines3", "torch"),
+        _SLOW_VECTOR | {"vector steps"},
+        "#E69F00",
+        "H",
     ),
 )
 

@@ -19,6 +19,7 @@ from benchmarks import (
     sharing,
     startup,
     throughput,
+    vector,
     workers,
 )
 from benchmarks.contenders import BY_NAME
@@ -131,6 +132,14 @@ def _pipe_panel(
     )
 
 
+def _vector(run: Run, path: Path) -> None:
+    figure, panel = plt.subplots(figsize=(10, 5))
+    names = [case.name for case in vector.cases(run.about["size"])]
+    _rows(panel, run, names, vector.RATE)
+    panel.set(title="Further right is better", xlabel="environment steps a second")
+    _finish(figure, path)
+
+
 def _startup(run: Run, path: Path) -> None:
     figure, panels = plt.subplots(1, 3, figsize=(14, 5))
     points = [(float(count), startup.workers(count)) for count in startup.WORKERS]
@@ -189,6 +198,7 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "throughput": _throughput,
     "latency": _latency,
     "pipes": _pipes,
+    "vector": _vector,
     "sharing": _sharing,
     "startup": _startup,
     "coldstart": _coldstart,

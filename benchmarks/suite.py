@@ -13,6 +13,7 @@ from benchmarks import (
     sharing,
     startup,
     throughput,
+    vector,
     workers,
 )
 
@@ -21,6 +22,7 @@ MEASURES: dict[str, ModuleType] = {
     "throughput": throughput,
     "latency": latency,
     "pipes": pipes,
+    "vector": vector,
     "sharing": sharing,
     "startup": startup,
     "coldstart": coldstart,

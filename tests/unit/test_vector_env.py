@@ -38,6 +38,8 @@ SPACES = {
 
 Make = Callable[..., VectorEnv]
 
+pytestmark = pytest.mark.timeout(60)  # processes that import Gymnasium; the machine may be busy
+
 
 @pytest.fixture
 def vector_env() -> Iterator[Make]:
