@@ -13,6 +13,7 @@
     │       ├── FiberPoolError    a FiberPool on Kubernetes that cannot serve
     │       ├── FileTooLarge      a message, or shared memory, above the limit (also OSError)
     │       ├── LinkError         no way between program and agent, a port in use for instance
+    │       ├── MemberLost        a process of a ring that has ended
     │       ├── NotInFiber        a part of multiprocessing that Fiber has not (yet)
     │       ├── ProgramTooLarge   the program's folder is more than is sent to other machines
     │       ├── StartError        a process that does not start, an initializer that fails
@@ -49,6 +50,7 @@ __all__ = [
     "FileTooLarge",
     "LinkError",
     "MaybeEncodingError",
+    "MemberLost",
     "NotInFiber",
     "ProcessError",
     "ProgramTooLarge",
@@ -160,6 +162,18 @@ class FileTooLarge(FiberError, OSError):
 
 class LinkError(FiberError):
     """A link between a master and an agent cannot be made, or the other side refused it."""
+
+
+class MemberLost(FiberError):
+    """A member of a ring has ended; `rank` is its own, `how` says how it ended."""
+
+    def __init__(self, rank: int, how: str) -> None:
+        super().__init__(
+            f"member {rank} of the ring is lost: {how}. Nothing comes of it any more, and what is "
+            "sent to it goes nowhere: run the ring again, from what was saved."
+        )
+        self.rank = rank
+        self.how = how
 
 
 class NotInFiber(FiberError, NotImplementedError):

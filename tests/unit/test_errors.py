@@ -45,6 +45,7 @@ EXAMPLES = [
     errors.ConnectionClosed("Worker-1", "killed by SIGSEGV"),
     errors.FiberPoolError("no quota", pool="es-1", namespace="team", reason="QuotaExceeded"),
     errors.FileTooLarge("sending a message"),
+    errors.MemberLost(3, "killed by SIGKILL"),
     errors.NotInFiber("no Lock yet"),
     errors.StartError("worker 'Worker-1'", "its initializer raised", "ValueError: no", 3),
     errors.TooManyOpenFiles("starting process 'Worker-1'"),
