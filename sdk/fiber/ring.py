@@ -81,7 +81,7 @@ class Member:
         while not self._previous.poll():
             for rank, how in self.lost.items():
                 raise MemberLost(rank, how)
-            wait([self._previous, self._news])
+            _wait([self._previous, self._news])
         try:
             return self._previous.recv()
         except ConnectionClosed:
@@ -114,7 +114,8 @@ class Ring:
     """So many ``processes``, each of which calls ``func(rank, size)``.
 
     Before, each calls ``initializer(member, *initargs)`` with its ``Member``, which ``current()``
-    returns from then on.  On Kubernetes members are pods, with what ``fiber.meta`` says of ``func``.
+    returns from then on.  On Kubernetes members are in pods, which have what ``fiber.meta`` says
+    that ``func`` needs.
     """
 
     def __init__(
@@ -171,7 +172,7 @@ def _attend(channels: list[Connection]) -> list[Any]:
     results: list[Any] = [None] * len(channels)
     failure: BaseException | None = None
     while running:
-        ready = wait(running.values())
+        ready = _wait(running.values())
         for rank, channel in list(running.items()):
             if channel in ready:
                 del running[rank]
@@ -201,6 +202,10 @@ def _tell(end: _End, running: dict[int, Connection], size: int) -> None:
     for rank in running if end.lost else neighbours & running.keys():
         with contextlib.suppress(BrokenPipeError, ConnectionClosed):
             running[rank].send(end)
+
+
+def _wait(connections: Iterable[Any]) -> list[Any]:
+    return wait(connections)  # multiprocessing's, whose types know no other connections
 
 
 def _close(connections: list[Connection]) -> None:

@@ -103,7 +103,7 @@ class Losing:
 
 def test_all_hear_of_a_member_that_is_killed(tmp_path: Path) -> None:
     losing = Losing("kill", tmp_path)
-    with pytest.raises(MemberLost, match="member 1 of the ring is lost: .*SIGKILL") as caught:
+    with pytest.raises(MemberLost, match=r"member 1 of the ring is lost: .*SIGKILL") as caught:
         fiber.Ring(4, losing).run()
     assert caught.value.rank == 1
     heard = losing.heard()
@@ -113,7 +113,7 @@ def test_all_hear_of_a_member_that_is_killed(tmp_path: Path) -> None:
 
 def test_an_exit_is_a_loss(tmp_path: Path) -> None:
     losing = Losing("exit", tmp_path)
-    with pytest.raises(MemberLost, match="exit(ed)? .*3"):
+    with pytest.raises(MemberLost, match=r"exit(ed)? .*3"):
         fiber.Ring(3, losing).run()
     assert set(losing.heard()) == {0, 2}
 
@@ -124,6 +124,10 @@ def test_what_a_member_raises_is_raised(tmp_path: Path) -> None:
         fiber.Ring(3, losing).run()
     assert "in lose_one" in str(caught.value.__cause__)
     assert set(losing.heard().values()) == {"1 it raised ValueError: no such device"}
+
+
+def keep_folder(member: fiber.ring.Member, folder: str) -> None:
+    os.environ["HEARD"] = folder
 
 
 def work_on(rank: int, size: int) -> dict[int, str]:
