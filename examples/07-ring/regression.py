@@ -1,4 +1,4 @@
-"""Gradient descent on several machines: each has a part of the data, and a ring adds gradients up."""
+"""Gradient descent by several processes: each has a part of the data, a ring sums the gradients."""
 
 from __future__ import annotations
 
