@@ -29,6 +29,8 @@ MEASURES: dict[str, ModuleType] = {
     "kubernetes_start": kubernetes_start,
 }
 PAGE, PICTURE, RESULTS = "kubernetes.md", "kubernetes.png", "kubernetes.json"
+NOTES = "kubernetes-notes.md"
+"""By hand."""
 _OF_ONE_HOST = {
     "throughput": ("map, chunksize 1", "map, default chunks", *throughput.ARRAY_KINDS),
     "pipes": (pipes.environments(8),),
@@ -57,10 +59,11 @@ def write(folder: Path, runs: Mapping[str, Run]) -> None:
     data = {name: run.as_json() for name, run in runs.items()}
     (folder / RESULTS).write_text(json.dumps(data, separators=(",", ":")) + "\n", encoding="utf-8")
     figures.DRAW["overhead"](runs["overhead"], folder / PICTURE)
-    (folder / PAGE).write_text(page(runs), encoding="utf-8")
+    text = page(runs, notes=(folder / NOTES).exists())
+    (folder / PAGE).write_text(text, encoding="utf-8")
 
 
-def page(runs: Mapping[str, Run]) -> str:
+def page(runs: Mapping[str, Run], *, notes: bool = False) -> str:
     """Every measure with a table for each of its groups."""
     first = runs["overhead"]
     parts = [
@@ -70,6 +73,7 @@ def page(runs: Mapping[str, Run]) -> str:
         "`make bench-kubernetes` writes this page.",
         "## Budgets",
         budget_table(budgets.verdicts(runs, budgets.ON_PODS)),
+        *([f"Why one is missed, and what was tried: [notes]({NOTES})."] if notes else []),
         reading(first),
         f"![Overhead]({PICTURE})",
     ]

@@ -49,7 +49,7 @@ def run(bench: Bench, warm: bool) -> dict[str, float]:
 
 def _time_of_one(contender: str) -> float:
     begin = time.perf_counter()
-    pool = peers.start(contender, WORKERS)
+    pool = peers.start(contender, WORKERS, lazily=True)
     try:
         pool.map(no_op, range(WORKERS), 1)
         return time.perf_counter() - begin

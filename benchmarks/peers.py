@@ -285,7 +285,12 @@ _ADAPTERS: dict[str, Callable[[int], Adapter]] = {
 }
 
 
-def start(contender: str, workers: int = WORKERS) -> Adapter:
-    """The contender's pool, its workers started."""
-    make = _ADAPTERS.get(contender)
-    return make(workers) if make else PoolAdapter(processes_of(contender).Pool(workers))
+def start(contender: str, workers: int = WORKERS, *, lazily: bool = False) -> Adapter:
+    """The contender's pool, its workers started, or `lazily`: Fiber's in pods by the first task."""
+    if make := _ADAPTERS.get(contender):
+        return make(workers)
+    pool = processes_of(contender).Pool(workers)
+    if contender.startswith("fiber") and not lazily:
+        pool.start_workers()
+        pool.wait_until_workers_up()
+    return PoolAdapter(pool)

@@ -15,7 +15,12 @@ from benchmarks.samples import Summary, in_words, is_idle, ratio, summary, times
 from benchmarks.suite import MEASURES
 
 RESULTS = "results.json"
-_NOTES = "notes.md"
+_OTHER_PAGES = {
+    "kubernetes.md": "[Pods](kubernetes.md): the same with processes in pods",
+    "operator.md": "[Operator](operator.md): thousands of pods",
+    "notes.md": "[Notes](notes.md): why a budget is missed and what was tried",
+}
+"""Made by other commands, and by hand: what the index says of each."""
 _GENERATED = (
     "<!-- Written by benchmarks/run.py from results.json; changes made by hand are lost. -->"
 )
@@ -40,9 +45,8 @@ def write(folder: Path, runs: Mapping[str, Run], new: Iterable[str]) -> None:
     for name in new:
         figures.DRAW[name](runs[name], folder / f"{name}.png")
         (folder / f"{name}.md").write_text(page(name, runs[name]), encoding="utf-8")
-    (folder / "README.md").write_text(
-        index(runs, notes=(folder / _NOTES).exists()), encoding="utf-8"
-    )
+    there = [line for name, line in _OTHER_PAGES.items() if (folder / name).exists()]
+    (folder / "README.md").write_text(index(runs, there), encoding="utf-8")
 
 
 def page(name: str, run: Run) -> str:
@@ -67,11 +71,9 @@ def page(name: str, run: Run) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def index(runs: Mapping[str, Run], *, notes: bool) -> str:
-    """The index: where the pages are, and every budget with its verdict."""
-    pages = [f"* [{MEASURES[name].TITLE}]({name}.md)" for name in MEASURES if name in runs]
-    if notes:
-        pages.append(f"* [Notes]({_NOTES}): why a budget is missed and what was tried")
+def index(runs: Mapping[str, Run], others: Iterable[str] = ()) -> str:
+    """The index: where the pages are, these others too, and every budget with its verdict."""
+    pages = [f"[{MEASURES[name].TITLE}]({name}.md)" for name in MEASURES if name in runs]
     found = budgets.verdicts(runs)
     met = sum(v.kept is True for v in found)
     parts = [
@@ -79,7 +81,7 @@ def index(runs: Mapping[str, Run], *, notes: bool) -> str:
         "# Benchmarks",
         "`make bench` writes these pages. A ratio is taken within each round; then the median over "
         "the rounds is given.",
-        "\n".join(pages),
+        "\n".join(f"* {page}" for page in (*pages, *others)),
         "## Budgets",
         f"{met} of {len(found)} met. Contender: Fiber with local processes, if not said otherwise.",
         budget_table(found),

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from fiber.errors import FileTooLarge as FileTooLarge
     from fiber.errors import LinkError as LinkError
     from fiber.errors import MemberLost as MemberLost
-    from fiber.errors import NotInFiber as NotInFiber
     from fiber.errors import ProcessError as ProcessError
     from fiber.errors import ProgramTooLarge as ProgramTooLarge
     from fiber.errors import StartError as StartError
@@ -123,7 +122,6 @@ _HOMES = {
     "FileTooLarge": "errors",
     "LinkError": "errors",
     "MemberLost": "errors",
-    "NotInFiber": "errors",
     "Process": "process",
     "ProcessError": "errors",
     "ProgramTooLarge": "errors",

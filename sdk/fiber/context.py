@@ -21,7 +21,6 @@ from multiprocessing.context import (
 from typing import TYPE_CHECKING, Any
 
 from fiber import config, cpu
-from fiber._hub.unsupported import unsupported
 from fiber._runtime import early, methods
 from fiber.process import ForkProcess, ForkServerProcess, Process, SpawnProcess
 
@@ -32,7 +31,16 @@ if TYPE_CHECKING:
     from fiber.managers import SyncManager
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
-    from fiber.synchronize import BoundedSemaphore, Event, Lock, RLock, Semaphore
+    from fiber.synchronize import (
+        Barrier,
+        BoundedSemaphore,
+        Condition,
+        Event,
+        Lock,
+        RLock,
+        Semaphore,
+        SemLock,
+    )
 
 __all__ = [
     "BaseContext",
@@ -57,10 +65,6 @@ class BaseContext:
     TimeoutError = TimeoutError
     AuthenticationError = AuthenticationError
     Process: type[Process] = Process
-
-    # What multiprocessing has and Fiber has not yet: each says what to use instead.
-    Condition = staticmethod(unsupported("Condition"))
-    Barrier = staticmethod(unsupported("Barrier"))
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)
@@ -125,6 +129,25 @@ class BaseContext:
 
         config.use()
         return Event()
+
+    def Condition(self, lock: SemLock | None = None) -> Condition:
+        """A lock, and those who wait until others notify them."""
+        from fiber.synchronize import Condition
+
+        config.use()
+        return Condition(lock)
+
+    def Barrier(
+        self,
+        parties: int,
+        action: Callable[[], object] | None = None,
+        timeout: float | None = None,
+    ) -> Barrier:
+        """A point at which some threads or processes wait for each other."""
+        from fiber.synchronize import Barrier
+
+        config.use()
+        return Barrier(parties, action, timeout)
 
     def Semaphore(self, value: int = 1) -> Semaphore:
         """A semaphore."""

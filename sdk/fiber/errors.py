@@ -14,7 +14,6 @@
     │       ├── FileTooLarge      a message, or shared memory, above the limit (also OSError)
     │       ├── LinkError         no way between program and agent, a port in use for instance
     │       ├── MemberLost        a process of a ring that has ended
-    │       ├── NotInFiber        a part of multiprocessing that Fiber has not (yet)
     │       ├── ProgramTooLarge   the program's folder is more than is sent to other machines
     │       ├── StartError        a process that does not start, an initializer that fails
     │       ├── TooManyOpenFiles  the limit of file descriptors is reached (also OSError)
@@ -51,7 +50,6 @@ __all__ = [
     "LinkError",
     "MaybeEncodingError",
     "MemberLost",
-    "NotInFiber",
     "ProcessError",
     "ProgramTooLarge",
     "StartError",
@@ -174,10 +172,6 @@ class MemberLost(FiberError):
         )
         self.rank = rank
         self.how = how
-
-
-class NotInFiber(FiberError, NotImplementedError):
-    """A part of multiprocessing that this version of Fiber does not have; says what to use."""
 
 
 class ProgramTooLarge(FiberError):

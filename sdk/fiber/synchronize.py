@@ -9,21 +9,24 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+import weakref
+from collections.abc import Callable
 from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any
 
-from fiber._hub import shared_semaphores
+from fiber._hub import shared_semaphores, wait_lists
 from fiber._hub.local import LocalCounter
-from fiber._hub.unsupported import Unsupported
 from fiber._sync.abandonment import Abandoned
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX
 
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from fiber._sync.semaphore import SharedSemaphore
+    from fiber._hub.shared_semaphores import AnySemaphore
+    from fiber._hub.wait_lists import AnyWaitList
     from fiber._transport.base import SharedCounter
 
 __all__ = [
@@ -42,14 +45,6 @@ RECHECK = 1.0
 """Seconds after which whoever waits for a bell looks for itself: its ringer may have died."""
 
 
-class Condition(Unsupported):
-    pass
-
-
-class Barrier(Unsupported):
-    pass
-
-
 class SemLock:
     """What all locks and semaphores are: tokens that are acquired and released.
 
@@ -59,7 +54,7 @@ class SemLock:
     """
 
     def __init__(self, kind: int, value: int, maximum: int) -> None:
-        self._semlock = shared_semaphores.create(kind, value, maximum)
+        self._semlock: AnySemaphore = shared_semaphores.create(kind, value, maximum)
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
         """Take a token; False if there is none, nor within ``timeout`` seconds."""
@@ -94,48 +89,31 @@ class SemLock:
         return "SomeOtherThread" if semlock._count() > 0 else "SomeOtherProcess"
 
 
-def _rebuild(cls: type[SemLock], semlock: SharedSemaphore) -> SemLock:
+def _rebuild(cls: type[SemLock], semlock: AnySemaphore) -> SemLock:
     new = cls.__new__(cls)
     new._semlock = semlock
     return new
 
 
-class Semaphore:
-    """A count that ``acquire`` lowers, waiting while it is zero, and ``release`` raises."""
+class Semaphore(SemLock):
+    """A count that ``acquire`` lowers, waiting while it is zero, and ``release`` raises.
+
+    If some process releases it more often than it acquired it, it carries signals from one process
+    to another, and nothing is released for a process that dies.
+    """
 
     def __init__(self, value: int = 1, *, ctx: Any = None) -> None:
-        if not 0 <= value <= SEM_VALUE_MAX:
-            raise ValueError(f"a semaphore's value is from 0 to {SEM_VALUE_MAX}, not {value}")
-        self._counter: SharedCounter = LocalCounter.create(value)
-
-    def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
-        """Lower the count; False if it is zero and stays so for ``timeout`` seconds."""
-        taken: list[Any] = []
-        try:
-            return self._counter.take(timeout if block else 0, taken)
-        except BaseException:
-            if taken:  # interrupted on the way back
-                self._counter.add(1)
-            raise
-
-    def release(self) -> None:
-        """Raise the count, and wake one who waits."""
-        self._counter.add(1)
+        self._check(value)
+        super().__init__(COUNTING, value, SEM_VALUE_MAX)
 
     def get_value(self) -> int:
         """The count now."""
-        return self._counter.value()
+        return self._semlock._get_value()
 
-    def __enter__(self) -> bool:
-        return self.acquire()
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.release()
+    @staticmethod
+    def _check(value: int) -> None:
+        if not 0 <= value <= SEM_VALUE_MAX:
+            raise ValueError(f"a semaphore's value is from 0 to {SEM_VALUE_MAX}, not {value}")
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}(value={self.get_value()})>"
@@ -145,17 +123,12 @@ class BoundedSemaphore(Semaphore):
     """A semaphore whose count never rises above where it started."""
 
     def __init__(self, value: int = 1, *, ctx: Any = None) -> None:
-        super().__init__(value, ctx=ctx)
-        self._maximum = value
-
-    def release(self) -> None:
-        """Raise the count; ValueError if it was not acquired that often."""
-        if self._counter.value() >= self._maximum:
-            raise ValueError("semaphore or lock released too many times")
-        self._counter.add(1)
+        self._check(value)
+        SemLock.__init__(self, COUNTING, value, value)
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__}(value={self.get_value()}, maxvalue={self._maximum})>"
+        maximum = self._semlock.maximum
+        return f"<{type(self).__name__}(value={self.get_value()}, maxvalue={maximum})>"
 
 
 class Lock(SemLock):
@@ -183,6 +156,206 @@ class RLock(SemLock):
         if owner.startswith("Some"):
             return f"<{type(self).__name__}({owner}, nonzero)>"
         return f"<{type(self).__name__}({owner}, {count})>"
+
+
+class Condition:
+    """A lock, and threads of any process that wait until others, who have it, notify them.
+
+    Who is killed while it waits is passed over; in multiprocessing ``notify`` waits for it.
+    """
+
+    def __init__(self, lock: SemLock | None = None, *, ctx: Any = None) -> None:
+        self._lock = RLock() if lock is None else lock
+        self._waiters: AnyWaitList = wait_lists.create()
+
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
+        """Acquire its lock."""
+        return self._lock.acquire(block, timeout)
+
+    def release(self) -> None:
+        """Release its lock."""
+        self._lock.release()
+
+    def __enter__(self) -> bool | Abandoned:
+        return self._lock.__enter__()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._lock.__exit__(kind, error, trace)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Release the lock until notified; False when ``timeout`` seconds are over before."""
+        self._check("wait")
+        waiters: Any = self._waiters  # a place is its own affair
+        depth = self._lock._semlock._count()
+        place = waiters.enter()
+        for _ in range(depth):
+            self._lock.release()
+        try:
+            waiters.sleep(place, timeout)
+        finally:
+            try:
+                for _ in range(depth):
+                    self._lock.acquire()
+            finally:
+                notified = waiters.leave(place)
+        return bool(notified)
+
+    def wait_for(self, predicate: Callable[[], Any], timeout: float | None = None) -> Any:
+        """Wait until ``predicate`` is true; what it says when ``timeout`` seconds are over."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not (result := predicate()):
+            left = None if deadline is None else deadline - time.monotonic()
+            if left is not None and left <= 0:
+                break
+            self.wait(left)
+        return result
+
+    def notify(self, n: int = 1) -> None:
+        """Wake ``n`` of those who wait, the first to come first."""
+        self._check("notify")
+        self._waiters.notify(n)
+
+    def notify_all(self) -> None:
+        """Wake all who wait."""
+        self._check("notify")
+        self._waiters.notify(SEM_VALUE_MAX)
+
+    def _check(self, what: str) -> None:
+        assert self._lock._semlock._is_mine(), f"must acquire() condition before using {what}()"
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}({self._lock!r}, {self._waiters.waiters()})>"
+
+
+class Barrier(threading.Barrier):
+    """A point at which ``parties`` threads of any process wait for each other.
+
+    When a process that has taken part is killed, the barrier is broken for those who wait, or will,
+    within a second or two; in multiprocessing they wait for ever.
+    """
+
+    def __init__(
+        self,
+        parties: int,
+        action: Callable[[], object] | None = None,
+        timeout: float | None = None,
+        *,
+        ctx: Any = None,
+    ) -> None:
+        if parties < 1:
+            raise ValueError(f"a barrier is for at least one party, not {parties}")
+        self._set_up(parties, action, timeout, Condition(), wait_lists.create())
+
+    def _set_up(
+        self,
+        parties: int,
+        action: Callable[[], object] | None,
+        timeout: float | None,
+        condition: Condition,
+        members: AnyWaitList,
+    ) -> None:
+        self._parties, self._action, self._timeout = parties, action, timeout
+        self._cond = condition
+        self._members: Any = members  # processes that took part; with the lock
+        self._is_member = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        parts = self._parties, self._action, self._timeout, self._cond, self._members
+        return _rebuild_barrier, (type(self), parts)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the others; a number from 0 to ``parties`` - 1, another for each."""
+        with self._cond as acquired:
+            if isinstance(acquired, Abandoned):  # in the middle of this very method
+                self._bury()
+                self._break()
+            self._join()
+            self._enter()
+            index = self._count
+            self._count += 1
+            try:
+                if index + 1 == self._parties:
+                    self._release()
+                else:
+                    self._wait(self._timeout if timeout is None else timeout)
+            finally:
+                self._count -= 1
+                self._exit()
+        return index
+
+    def _join(self) -> None:
+        if not self._is_member:
+            self._is_member = True
+            # Who ends in good order is not missed.
+            weakref.finalize(self, self._members.dismiss, self._members.enter())
+
+    def _enter(self) -> None:
+        while self._state in (_RESETTING, _DRAINING):
+            if not self._cond.wait(RECHECK) and self._bury():
+                self._break()
+        if self._state < 0:
+            raise threading.BrokenBarrierError
+
+    def _wait(self, timeout: float | None) -> None:
+        deadline = math.inf if timeout is None else time.monotonic() + timeout
+        while self._state == _FILLING:
+            left = max(0.0, deadline - time.monotonic())
+            if self._cond.wait(min(left, RECHECK)):
+                continue
+            lost = self._bury()
+            if self._state == _FILLING and (lost or left <= RECHECK):
+                self._break()
+                raise threading.BrokenBarrierError(
+                    f"{lost} of the processes that took part have died"
+                    if lost
+                    else f"the others did not come in {timeout} s"
+                )
+        if self._state < 0:
+            raise threading.BrokenBarrierError
+
+    def _bury(self) -> int:
+        """How many members died; they wait no more."""
+        waited = self._cond._waiters.bury()
+        self._count = max(0, self._count - waited)
+        return int(waited + self._members.bury())
+
+    # What threading's class keeps, in shared memory
+
+    @property
+    def _state(self) -> int:
+        return self._cond._waiters.get(0)
+
+    @_state.setter
+    def _state(self, value: int) -> None:
+        self._cond._waiters.set(0, value)
+
+    @property
+    def _count(self) -> int:
+        return self._cond._waiters.get(1)
+
+    @_count.setter
+    def _count(self, value: int) -> None:
+        self._cond._waiters.set(1, value)
+
+    if TYPE_CHECKING:  # threading's own, of which its stub does not tell
+
+        def _break(self) -> None: ...
+        def _release(self) -> None: ...
+        def _exit(self) -> None: ...
+
+
+_FILLING, _DRAINING, _RESETTING = 0, 1, -1  # states of threading's barrier
+
+
+def _rebuild_barrier(cls: type[Barrier], parts: tuple[Any, ...]) -> Barrier:
+    new = cls.__new__(cls)
+    new._set_up(*parts)
+    return new
 
 
 class Event:

@@ -11,20 +11,12 @@ _CLOSED_AT_ONCE = {
         "from Python 3.13 on: close() gives the descriptors back also if nothing was ever put"
     )
 }
-_LOCKED = {
-    f"WithProcesses{test}": "the lock of a Value or Array is for the processes of one host"
-    for test in (
-        "TestArray.test_array",
-        "TestSharedCTypes.test_synchronize",
-        "TestValue.test_value",
-    )
-}
 
 # backend -> id of the test -> reason
 EXCLUSIONS: dict[str, dict[str, str]] = {
     "local": _CLOSED_AT_ONCE,
-    "loopback": {**_CLOSED_AT_ONCE, **_LOCKED},
-    "kubernetes": {**_CLOSED_AT_ONCE, **_LOCKED},
+    "loopback": _CLOSED_AT_ONCE,
+    "kubernetes": _CLOSED_AT_ONCE,
 }
 
 _CONCERNS_ONE_TASK = "concerns one task, which gets the error itself: the executor is not broken"

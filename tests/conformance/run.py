@@ -48,6 +48,8 @@ CLASSES = (
     "TestLock",
     "TestSemaphore",
     "TestEvent",
+    "TestCondition",
+    "TestBarrier",
     "TestValue",
     "TestArray",
     "TestSharedCTypes",
@@ -59,11 +61,16 @@ CLASSES = (
     "TestManagerRestart",
 )
 # An agent on another host cannot share a pid or a file with the master.
-TIERS = {"local": ("core", "local"), "loopback": ("core",), "kubernetes": ("core",)}
+TIERS = {
+    "local": ("core", "prompt", "local"),
+    "loopback": ("core", "prompt"),
+    "kubernetes": ("core",),
+}
 # Agents start children by the same code behind a link: there one method is enough.
 METHODS = {"local": ("spawn", "forkserver"), "loopback": ("spawn",), "kubernetes": ("spawn",)}
 _TIER_SAYS = {
     "core": "part of every run",
+    "prompt": "needs processes that start at once",
     "local": "needs one host",
     "ext": "promised to nobody",
     "na": "not applicable",

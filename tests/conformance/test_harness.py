@@ -86,10 +86,14 @@ def test_the_report_gives_each_exclusion_its_reason() -> None:
     assert "=== fail: C.b\nits traceback" in text
 
 
-@pytest.mark.parametrize("tiers", [{"core"}, {"core", "local"}])
+@pytest.mark.parametrize("tiers", [{"core"}, {"core", "prompt", "local"}])
 def test_what_is_left_out_of_the_classes_that_run_has_a_reason(tiers: set[str]) -> None:
     groups, left_out = select(Target("multiprocessing", "spawn", frozenset(tiers), 60))
     assert not {id_ for group in groups for id_ in group} & left_out.keys()
     assert all(not line.endswith(": ") for line in left_out.values())
     assert left_out["TestSimpleQueue.test_closed"].startswith("promised to nobody")
-    assert ("WithProcessesTestProcess.test_set_executable" in left_out) == (tiers == {"core"})
+    for id_ in (
+        "WithProcessesTestProcess.test_set_executable",
+        "TestInitializers.test_pool_initializer",
+    ):
+        assert (id_ in left_out) == (tiers == {"core"})

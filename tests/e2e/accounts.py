@@ -42,17 +42,22 @@ def make_account(scene: Scene, name: str) -> None:
 
 def kubeconfig_of(scene: Scene, folder: Path, account: str = ACCOUNT) -> Path:
     """A kubeconfig whose user is an account of the scene's namespace."""
-    token = scene.kube.kubectl("--namespace", scene.namespace, "create", "token", account)
-    return write_kubeconfig(scene, folder / f"{account}.kubeconfig", token.strip())
+    return write_kubeconfig(scene, folder / account, {"token": make_token(scene, account)})
 
 
-def write_kubeconfig(scene: Scene, path: Path, token: str) -> Path:
-    """The same cluster, and a user who has this token."""
+def make_token(scene: Scene, account: str, *options: str) -> str:
+    """A new login as the account; the options are those of ``kubectl create token``."""
+    create = ("--namespace", scene.namespace, "create", "token", account, *options)
+    return scene.kube.kubectl(*create).strip()
+
+
+def write_kubeconfig(scene: Scene, path: Path, user: Body) -> Path:
+    """The same cluster, and a user who logs in so."""
     view = ("config", "view", "--raw", "--minify", "--flatten", "--output", "json")
     config: Body = json.loads(scene.kube.kubectl(*view))
     (context,) = config["contexts"]
     context["context"] = {"cluster": context["context"]["cluster"], "user": "user"}
-    config["users"] = [{"name": "user", "user": {"token": token}}]
+    config["users"] = [{"name": "user", "user": user}]
     path.touch(mode=0o600)
     path.write_text(json.dumps(config), encoding="utf-8")
     return path

@@ -82,6 +82,8 @@ def release(
     release = Release(kube, RELEASE, RELEASE, cluster.images, tmp_path_factory.mktemp("helm"))
     _remove_namespaces(kube)
     release.uninstall()  # of a session that was killed, perhaps while Helm was at work
+    # Where the last session ended just now it is about to go, and takes nothing in.
+    kube.kubectl("delete", "namespace", RELEASE, "--ignore-not-found", "--timeout=120s")
     release.install()
     pytestconfig.stash[_RELEASE] = release
     yield release

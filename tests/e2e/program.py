@@ -163,6 +163,7 @@ class Inside(Program):
         environment: dict[str, str],
         image: str,
         cluster: Cluster,
+        node: str | None,
     ) -> None:
         super().__init__(scene)
         self._cluster = cluster
@@ -174,6 +175,7 @@ class Inside(Program):
         config = scene.kube.create(scene.path("configmaps"), body)["metadata"]["name"]
         command = ["python", f"{_MOUNT}/{script.name}", *arguments]
         pod = _pod(command, environment, image, config)
+        pod["spec"]["nodeName"] = node
         self._name = str(scene.kube.create(scene.path("pods"), pod)["metadata"]["name"])
         self._log = Stream(scene.kube, self._begin, self._repeat)
 
@@ -250,6 +252,8 @@ class Programs:
         self._cluster = cluster
         self.kubeconfig = kubeconfig_of(scene, home)
         """Of what is started beside the tests from now on."""
+        self.node: str | None = None
+        """Where what is started inside from now on runs; None: anywhere."""
         self._started: list[Program] = []
 
     def start(self, place: str, script: str, *arguments: object, **settings: object) -> Program:
@@ -292,7 +296,8 @@ class Programs:
         self, script: Path, words: list[str], image: str, settings: dict[str, object]
     ) -> Inside:
         # No setting is needed: in a pod whose account may make FiberPools, pods are the default.
-        return Inside(self.scene, script, words, _variables(settings), image, self._cluster)
+        variables = _variables(settings)
+        return Inside(self.scene, script, words, variables, image, self._cluster, self.node)
 
 
 def local(script: str, *arguments: object) -> list[str]:

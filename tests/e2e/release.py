@@ -97,11 +97,12 @@ class Release:
 
     def may(self, verb: str, resource: str, namespace: str) -> bool:
         """Whether the operator's account has this right there."""
+        return self._may(verb, resource, "--namespace", namespace)
+
+    def _may(self, *what: str) -> bool:
         account = f"system:serviceaccount:{self.namespace}:{self.deployment}"
         try:
-            self._kube.kubectl(
-                "auth", "can-i", verb, resource, "--namespace", namespace, "--as", account
-            )
+            self._kube.kubectl("auth", "can-i", *what, "--as", account)
         except Failed:
             return False
         return True
@@ -144,14 +145,23 @@ class Release:
             yield sample[1], dict(_LABEL.findall(sample[2] or "")), float(sample[3])
 
     def note_refusals(self) -> None:
-        """Ask the operator, before it ends, what it was not allowed to do.
+        """Ask the operator, before it ends, what it was not allowed to do, and is not now.
 
-        Creation is left out: a quota, a policy, or a namespace that goes may have refused it.
+        An API server that starts refuses all until it has read the roles. Creation is left out: a
+        quota, a policy, or a namespace that goes may have refused it.
         """
         if any(is_ready(pod) for pod in self.pods()):
             calls = [labels for name, labels, _ in self.metrics() if name == _CALLS]
             found = {(call["verb"], call["resource"]) for call in calls if call["code"] == "403"}
-            self.refused |= {call for call in found if call[0] != "create"}
+            self.refused |= {
+                call for call in found if call[0] != "create" and not self._may_everywhere(*call)
+            }
+
+    def _may_everywhere(self, verb: str, resource: str) -> bool:
+        resource, _, part = resource.partition("/")
+        if resource == "leases":  # of which it may change this one alone
+            resource = f"{resource}/{names.CRD_NAME}"
+        return self._may(verb, resource, "--subresource", part, "--all-namespaces")
 
     def page(self, name: str, pod: Body) -> str:
         """What an operator's pod serves."""

@@ -5,15 +5,13 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
 
 import pytest
 
-from e2e.accounts import ACCOUNT, may_read_credentials, write_kubeconfig
 from e2e.clusters import Cluster
 from e2e.kube import Body
 from e2e.leftovers import leaves_nothing
-from e2e.pools import Pool, is_ready
+from e2e.pools import is_ready
 from e2e.program import PLACES, Program, Programs
 from e2e.release import Release
 from e2e.scene import Scene
@@ -26,6 +24,10 @@ RUNNING = ("--seconds", 0.1)
 """1,000 tasks on three workers: half a minute, in which a fault can strike."""
 LOST = 30 + 60
 """Seconds after which a program that is gone without a word is lost: its Lease and the grace."""
+SILENCE = 15
+"""Seconds after which a worker that cannot be heard is lost."""
+BRIEF = 8
+"""Seconds of silence that cost nobody anything."""
 OUTAGE = 60
 """Seconds."""
 
@@ -45,6 +47,16 @@ class Site:
             "a worker is Ready", lambda: list(filter(is_ready, workers(self.scene)))
         )
         return ready[0]
+
+    def a_node(self) -> str:
+        """A node with workers, and neither the program nor the operator."""
+        spared = {self.release.pod()["spec"]["nodeName"]}
+        if self.program.pod:
+            spared.add(self.scene.now["pods"][self.program.pod]["spec"]["nodeName"])
+        nodes = {pod["spec"]["nodeName"] for pod in workers(self.scene)} - spared
+        if not nodes:
+            pytest.skip("every node with workers has the program or the operator, too")
+        return str(nodes.pop())
 
     def gone(self, pod: Body) -> None:
         """Wait until the pod is no more."""
@@ -86,17 +98,28 @@ def api_server_stopped(site: Site) -> Iterator[None]:
 
 @contextmanager
 def node_cut_off(site: Site) -> Iterator[None]:
-    """A node with workers, and neither the program nor the operator, for as long as agents wait."""
-    pods = site.scene.now["pods"]
-    spared = {site.release.pod()["spec"]["nodeName"]}
-    if site.program.pod:
-        spared.add(pods[site.program.pod]["spec"]["nodeName"])
-    nodes = {pod["spec"]["nodeName"] for pod in workers(site.scene)} - spared
-    if not nodes:
-        pytest.skip("every node with workers has the program or the operator, too")
-    with site.cluster.cut_off(nodes.pop()):
+    """Until the work is done elsewhere."""
+    with site.cluster.cut_off(site.a_node()):
         site.program.says("done", seconds=90)
         yield
+
+
+@contextmanager
+def node_back_in_time(site: Site) -> Iterator[None]:
+    """Before its workers count as lost."""
+    with site.cluster.cut_off(site.a_node()):
+        site.scene.never("it ends", lambda: site.program.status is not None, BRIEF)
+    site.program.says("done", seconds=90)
+    assert len(list(filter(is_worker, ever(site.scene, "pods").values()))) <= 3
+    yield
+
+
+@contextmanager
+def node_back_too_late(site: Site) -> Iterator[None]:
+    """After its workers were lost: what they say then is not counted a second time."""
+    with site.cluster.cut_off(site.a_node()):
+        site.scene.never("it ends", lambda: site.program.status is not None, SILENCE + 10)
+    yield
 
 
 @pytest.mark.parametrize("place", ["outside", pytest.param("inside", marks=pytest.mark.long)])
@@ -108,6 +131,8 @@ def node_cut_off(site: Site) -> Iterator[None]:
         (operator_killed, 0.1),
         pytest.param(api_server_stopped, 0.25, marks=pytest.mark.long),
         pytest.param(node_cut_off, 0.1, marks=pytest.mark.long),
+        pytest.param(node_back_in_time, 0.1, marks=pytest.mark.long),
+        pytest.param(node_back_too_late, 0.25, marks=pytest.mark.long),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -120,6 +145,7 @@ def test_a_map_ends_as_if_nothing_had_been(
     release: Release,
     scene: Scene,
 ) -> None:
+    programs.node = release.pod()["spec"]["nodeName"]  # the other ones are there for faults
     program = programs.start(place, "mapping.py", "--seconds", seconds)
     program.says("first")
     with fault(Site(cluster, release, scene, program)):
@@ -163,6 +189,38 @@ def test_a_vector_environment_whose_pod_is_deleted(programs: Programs, scene: Sc
     assert None not in program.says("left")["exitcodes"]
     program.ends()
     leaves_nothing(program)
+
+
+@pytest.mark.long
+def test_a_vector_environment_stands_still_while_a_node_is_cut_off(
+    programs: Programs, cluster: Cluster, scene: Scene
+) -> None:
+    program = programs.start("outside", "stepping.py", "--steps", 2000)
+    host = program.says("stepping")["hosts"][0]
+    with cluster.cut_off(node_of(scene, host)):
+        scene.never("it ends", lambda: program.status is not None, BRIEF)
+    assert program.says("done")["total"] == 4 * sum(range(2000))
+    program.ends()
+    leaves_nothing(program)
+
+
+@pytest.mark.long
+def test_a_vector_environment_whose_node_is_cut_off_for_long(
+    programs: Programs, cluster: Cluster, scene: Scene
+) -> None:
+    program = programs.start("outside", "stepping.py", "--steps", 3000)
+    hosts = program.says("stepping")["hosts"]
+    node = node_of(scene, hosts[0])
+    with cluster.cut_off(node):
+        lost = program.says("lost", seconds=SILENCE + 10)
+        assert any(host in lost["text"] and node_of(scene, host) == node for host in hosts)
+        assert None not in program.says("left")["exitcodes"]
+    program.ends()
+    leaves_nothing(program, seconds=90)
+
+
+def node_of(scene: Scene, pod: str) -> str:
+    return str(scene.now["pods"][pod]["spec"]["nodeName"])
 
 
 # -- The program itself
@@ -218,88 +276,3 @@ def test_a_program_that_is_stopped_and_continued_goes_on(programs: Programs, sce
     assert program.says("done", seconds=120)["total"] == SQUARES
     program.ends()
     leaves_nothing(program)
-
-
-# -- What cannot be
-
-
-def nothing_done(_: Scene) -> None: ...
-
-
-def no_pods_allowed(scene: Scene) -> None:
-    hard = {"metadata": {"name": "none"}, "spec": {"hard": {"pods": "0"}}}
-    scene.kube.create(scene.path("resourcequotas"), hard)
-
-
-def role_taken_away(scene: Scene) -> None:
-    scene.kube.delete(scene.path("rolebindings", ACCOUNT))
-
-
-REFUSED = {
-    "an image that is not there": (
-        nothing_done,
-        {"image": "registry.invalid/none:1"},
-        ("ErrImagePull", "registry.invalid/none:1"),
-        45,
-    ),
-    "no name of an image": (nothing_done, {"image": "No:Name:1"}, ("InvalidImageName",), 15),
-    "a quota": (no_pods_allowed, {}, ("exceeded quota", "none"), 15),
-    "no right": (role_taken_away, {}, ("fiberpools", "fiber-user"), 10),
-    "a namespace that is not there": (nothing_done, {"namespace": "nowhere"}, ("nowhere",), 10),
-}
-"""What is so before the program starts, what it is told, what it says, and within how long."""
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_come_is_an_error_at_once(case: str, programs: Programs, scene: Scene) -> None:
-    prepare, settings, words, seconds = REFUSED[case]
-    prepare(scene)
-    program = programs.start("outside", "mapping.py", **settings)
-    output = program.ends(status=1, seconds=seconds)
-    assert "FiberPoolError" in output
-    assert all(word in output for word in words), output
-    leaves_nothing(program)
-
-
-def test_a_token_that_is_not_taken(programs: Programs, scene: Scene, tmp_path: Path) -> None:
-    programs.kubeconfig = write_kubeconfig(scene, tmp_path / "expired", "expired")
-    output = programs.start("outside", "mapping.py").ends(status=1, seconds=15)
-    assert "FiberPoolError" in output
-    assert "Unauthorized" in output
-
-
-def test_without_an_operator_nobody_waits(programs: Programs, release: Release) -> None:
-    release.stop()
-    try:
-        program = programs.start("outside", "mapping.py")
-        program.prints("operator", seconds=15)  # a warning, before it is an error
-        output = program.ends(status=1, seconds=45)
-        assert "FiberPoolError" in output
-        assert "helm install" in output
-    finally:
-        release.start()
-    leaves_nothing(program)
-
-
-@pytest.mark.usefixtures("bare_cluster")
-def test_a_cluster_without_fiber(programs: Programs, cluster: Cluster) -> None:
-    programs.kubeconfig = cluster.kubeconfig  # an administrator's: the role went with the rest
-    output = programs.start("outside", "mapping.py").ends(status=1, seconds=15)
-    assert "FiberPoolError" in output
-    assert "helm install" in output
-
-
-def test_a_second_program_is_told_who_holds_a_pool(
-    programs: Programs, scene: Scene, agent: Body
-) -> None:
-    warm = Pool(scene, "warm").apply(agent, minReplicas=2)
-    may_read_credentials(scene, "warm")
-    there = warm.ready(2)
-    first = programs.start("outside", "mapping.py", "--workers", 2, *RUNNING, pool="warm")
-    first.says("first")
-    identity = warm.body["spec"]["master"]["identity"]
-    output = programs.start("outside", "mapping.py", pool="warm").ends(status=1, seconds=15)
-    assert "FiberPoolError" in output
-    assert identity in output
-    assert first.says("done", seconds=90)["hosts"] == there
-    first.ends()

@@ -92,7 +92,7 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
         (lambda: fiber.set_start_method("typo", force=True), ValueError, "typo"),
         (lambda: fiber.init(bakend="local"), fiber.ConfigError, "'bakend'.*'backend'"),
         (lambda: fiber.init(backend="typo"), fiber.ConfigError, "'typo'.*'local'"),
-        (fiber.Condition, NotImplementedError, "Condition.*Event"),
+        (lambda: fiber.Barrier(0), ValueError, "one party.*0"),
     ],
 )
 def test_bad_arguments_are_named(make: Callable[[], Any], error: Any, words: str) -> None:

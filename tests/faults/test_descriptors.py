@@ -98,7 +98,7 @@ QUEUES = (
 )
 
 
-@pytest.mark.parametrize("what", ["Queue", "SimpleQueue", "JoinableQueue", "Event", "Semaphore"])
+@pytest.mark.parametrize("what", ["Queue", "SimpleQueue", "JoinableQueue", "Event"])
 def test_too_many_of_anything_leak_nothing(launch: Callable[..., Program], what: str) -> None:
     output = launch(QUEUES.format(what=what)).finish()
     assert output == "TooManyOpenFiles 100 24\nTrue\nTrue\n"

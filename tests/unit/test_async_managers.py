@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -81,6 +82,34 @@ def test_each_result_is_that_of_its_call(manager: Any) -> None:
     assert results[150].get(PATIENCE) == 151
     assert [result.get() for result in reversed(results)] == list(range(200, 0, -1))
     assert results[0].get() == 1, "as often as one likes"
+
+
+def test_each_thread_has_the_results_of_its_own_calls(manager: Any) -> None:
+    desk = manager.Desk()
+
+    def ask(size: int) -> set[int]:
+        results = [desk.fill(size) for _ in range(200)]
+        return {len(result.get(PATIENCE)) for result in results}
+
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(ask, range(1, 5))) == [{1}, {2}, {3}, {4}]
+
+
+def test_a_call_that_is_interrupted_as_it_is_sent_shifts_no_other(
+    manager: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = manager.Desk()
+    assert desk.add(1).get(PATIENCE) == 1
+
+    def interrupted(*_: Any) -> bool:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(desk._calls._channel), "try_send", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            desk.add(100)
+    results = [desk.add(1) for _ in range(3)]
+    assert [result.get(PATIENCE) for result in results] == [2, 3, 4]
 
 
 def test_calls_of_one_proxy_wait_for_each_other_and_others_do_not(manager: Any) -> None:

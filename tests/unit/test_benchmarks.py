@@ -196,6 +196,14 @@ def test_measuring_one_thing_again_keeps_the_other_pages(tmp_path: Path) -> None
     assert "≤ 0.95x | 0.50x | met" in index
 
 
+def test_the_index_names_pages_of_other_commands_that_are_there(tmp_path: Path) -> None:
+    (tmp_path / "operator.md").touch()
+    report.write(tmp_path, {"overhead": overhead_run(0.5, 1.0)}, new=[])
+    index = (tmp_path / "README.md").read_text(encoding="utf-8")
+    assert "(operator.md)" in index
+    assert "(kubernetes.md)" not in index
+
+
 def test_an_absent_peer_names_what_is_missing() -> None:
     peer = contenders.Contender("x", "X", ("no_such_module_at_all",), frozenset(), "#000000", "o")
     assert peer.missing() == "no_such_module_at_all"

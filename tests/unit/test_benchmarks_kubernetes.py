@@ -67,11 +67,17 @@ def test_the_page_has_all_measures_and_their_budgets() -> None:
     )
 
 
+def test_the_page_leads_to_the_notes_where_there_are_some() -> None:
+    runs = runs_of(0.1, 1.0)
+    assert f"[notes]({kubernetes_report.NOTES})" in kubernetes_report.page(runs, notes=True)
+    assert kubernetes_report.NOTES not in kubernetes_report.page(runs)
+
+
 def test_pods_are_no_part_of_what_needs_no_cluster() -> None:
     assert ON_PODS not in ALL
     assert BY_NAME[PODS] is ON_PODS
     assert not {each.contender for each in budgets.BUDGETS} & {PODS}
-    assert "pods" not in report.index({}, notes=False)
+    assert "pods" not in report.index({})
 
 
 @pytest.mark.parametrize("measure", ["kubernetes_start", "kubernetes_es"])

@@ -130,9 +130,7 @@ def test_preloaded_modules_are_there_in_a_forked_child() -> None:
 
 def test_every_name_of_multiprocessings_context_is_there() -> None:
     theirs = {name for name in dir(multiprocessing.get_context()) if not name.startswith("_")}
-    absent = {"Array", "Barrier", "Condition", "Lock", "Manager", "RLock", "RawArray", "RawValue"}
-    absent |= {"Value"}  # shared memory, locks and managers are not there yet
-    assert theirs - absent <= set(dir(fiber.get_context()))
+    assert theirs <= set(dir(fiber.get_context()))
 
 
 def test_cpu_count_and_loggers_are_reached_through_a_context() -> None:

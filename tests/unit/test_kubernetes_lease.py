@@ -11,6 +11,7 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes import lease
+from fiber._backends.kubernetes.api_errors import ApiError
 from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber._backends.kubernetes.lease import LeaseRenewer
 from fiber.errors import FiberPoolError
@@ -210,6 +211,30 @@ def test_a_login_or_right_that_stays_away_ends_the_thread(
     case.now += 1
     assert "this is a test" in str(case.refusals.get(timeout=10))
     case.renewer.join(10)
+
+
+def test_an_api_server_that_was_away_may_refuse_as_it_comes_back(case: Case) -> None:
+    """It has not read who may do what."""
+    case.now += 60
+    case.rig.server.api.faults.append(Fault("patch", "leases", status=403, times=2))
+    for _ in range(2):
+        case.renewer._attempt()
+        assert "this is a test" in str(case.troubles.get_nowait())
+        case.now += 2
+    case.renewer._attempt()
+    assert case.troubles.empty()
+
+
+def test_refusals_count_from_the_first_after_something_else(case: Case) -> None:
+    statuses = (403, 422, 403, 403)
+    case.rig.server.api.faults += [Fault("patch", "leases", status=each) for each in statuses]
+    for _ in statuses[:-1]:
+        case.renewer._attempt()
+        assert "this is a test" in str(case.troubles.get_nowait())
+        case.now += 25
+    case.now += 10
+    with pytest.raises(ApiError, match="this is a test"):
+        case.renewer._attempt()
 
 
 def test_a_fault_of_ours_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,9 +16,8 @@ import fiber
 from fiber._hub import shared_semaphores
 from fiber._sync import semaphore as module
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, SharedSemaphore
-from fiber.errors import NotInFiber
 from fiber.synchronize import Abandoned
-from hosts import PATIENCE, Hosts
+from hosts import PATIENCE
 from unit.interrupting import LINES, is_interrupted
 
 KINDS = {"mutex": (COUNTING, 1), "recursive": (RECURSIVE, 1), "counting": (COUNTING, SEM_VALUE_MAX)}
@@ -133,18 +132,6 @@ def test_pickled_anywhere_it_is_the_same() -> None:
         assert again
     with fiber.Pool(1) as pool:
         assert pool.apply(repr, (lock,)) == "<RLock(None, 0)>"
-
-
-def test_on_another_host_it_says_what_to_use() -> None:
-    hosts = Hosts()
-    try:
-        hosts.link("b", "a")
-        with hosts.at("a"):
-            data = pickle.dumps(fiber.Lock())
-        with hosts.at("b"), pytest.raises(NotInFiber, match=r"another host.*Queue"):
-            pickle.loads(data)
-    finally:
-        hosts.close()
 
 
 # Holders that die

@@ -5,11 +5,13 @@ from __future__ import annotations
 import gc
 import multiprocessing.managers
 import re
+import signal
 import subprocess
 import sys
 import threading
 import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing import AuthenticationError
 from pathlib import Path
 from typing import Any
@@ -290,6 +292,93 @@ def test_an_interruption_takes_nothing_of_an_earlier_call_back(
         with pytest.raises(KeyboardInterrupt):
             queue.qsize()
     assert queue.empty()
+
+
+class Slow:
+    def wait_for(self, event: Any) -> None:
+        event.wait(PATIENCE)
+
+
+class SlowManager(SyncManager):
+    pass
+
+
+SlowManager.register("Slow", Slow)
+
+
+class TooLong(Exception):
+    pass
+
+
+@contextmanager
+def struck(error: type[BaseException]) -> Iterator[None]:
+    """A signal's handler raises it, once this thread waits for an answer."""
+
+    def strike(*_: object) -> None:
+        raise error
+
+    before = signal.signal(signal.SIGALRM, strike)
+    signal.setitimer(signal.ITIMER_REAL, 0.2)
+    try:
+        with pytest.raises(error):
+            yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("kind", ["RLock", "Condition"])
+def test_who_has_a_lock_has_it_still_after_another_call_was_interrupted(kind: str) -> None:
+    with SlowManager() as manager:
+        lock, slow, go_on = getattr(manager, kind)(), manager.Slow(), fiber.Event()
+        with struck(KeyboardInterrupt), lock:
+            try:
+                slow.wait_for(go_on)
+            finally:
+                assert acquired_elsewhere(lock) == [False]
+        assert acquired_elsewhere(lock) == [True]
+        go_on.set()
+    manager._process.close()
+
+
+def acquired_elsewhere(lock: Any) -> list[bool]:
+    got: list[bool] = []
+
+    def acquire_and_release() -> None:
+        got.append(lock.acquire(False))
+        if got[0]:
+            lock.release()
+
+    background(acquire_and_release).join(PATIENCE)
+    return got
+
+
+def test_a_wait_that_was_interrupted_takes_nothing_of_its_thread(manager: Any) -> None:
+    condition = manager.Condition()
+    with struck(TooLong):
+        condition.acquire()
+        condition.wait()
+    with condition:
+        condition.notify()
+        assert acquired_elsewhere(condition) == [False]
+    wait_until(lambda: acquired_elsewhere(condition) == [True], PATIENCE)
+    with condition, condition:
+        pass
+    assert acquired_elsewhere(condition) == [True]
+
+
+def test_any_exception_of_a_signals_handler_ends_a_call_alone(manager: Any) -> None:
+    queue, other, lock = manager.Queue(), manager.dict(), manager.Lock()
+    with struck(TooLong):
+        queue.get()
+    other["a"] = 1
+    queue.put("kept")
+    assert queue.get(True, PATIENCE) == "kept"
+    lock.acquire()
+    with struck(TooLong):
+        lock.acquire()
+    lock.release()
+    assert lock.acquire(True, PATIENCE)
 
 
 # From elsewhere

@@ -96,15 +96,6 @@ def test_classes_serve_in_annotations_and_isinstance(name: str) -> None:
     assert not isinstance(3, cls)
 
 
-def test_whoever_makes_an_object_that_is_not_there_is_told_what_to_use() -> None:
-    class Own(fiber.synchronize.Barrier):
-        pass
-
-    for make in (Own, fiber.synchronize.Barrier, fiber.Barrier, fiber.get_context("spawn").Barrier):
-        with pytest.raises(fiber.NotInFiber, match=r"no Barrier yet.*Semaphore"):
-            make()
-
-
 @pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
 def test_contexts_are_of_a_class_by_the_name_that_multiprocessing_has(method: str) -> None:
     ours, theirs = fiber.get_context(method), multiprocessing.get_context(method)

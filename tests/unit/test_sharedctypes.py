@@ -9,6 +9,7 @@ import multiprocessing.sharedctypes
 import pickle
 import threading
 from collections.abc import Callable
+from multiprocessing import resource_tracker
 from typing import Any
 
 import numpy as np
@@ -129,6 +130,23 @@ def test_processes_share_what_they_are_given() -> None:
         process.join(PATIENCE)
     assert value.value == 300
     assert sum(array) == 100_000
+
+
+def test_processes_of_multiprocessings_own_share_them() -> None:
+    context = multiprocessing.get_context("spawn")
+    values = fiber.Value("i", 0), fiber.Value("i", 0)  # whose locks are in one segment
+    process = context.Process(target=count_both, args=values)
+    process.start()
+    process.join(PATIENCE)
+    assert process.exitcode == 0
+    process.close()
+    resource_tracker._resource_tracker._stop()  # type: ignore[attr-defined]
+    assert [value.value for value in values] == [1, 1]
+
+
+def count_both(*values: Any) -> None:
+    for value in values:
+        count_up(value, 1)
 
 
 def test_they_travel_through_queues_and_keep_their_lock() -> None:

@@ -12,7 +12,6 @@ import pytest
 
 import fiber
 from fiber import synchronize
-from fiber.errors import NotInFiber
 
 PATIENCE = 15.0
 
@@ -143,9 +142,3 @@ def test_who_waits_is_woken_even_if_the_event_is_cleared_at_once() -> None:
             event.set()
             event.clear()
     assert woken == [True] * 100
-
-
-@pytest.mark.parametrize("name", ["Condition", "Barrier"])
-def test_what_is_not_there_says_what_to_use(name: str) -> None:
-    with pytest.raises(NotInFiber, match=f"no {name} yet.*Semaphore|Event"):
-        getattr(synchronize, name)()

@@ -204,12 +204,20 @@ class HubStream:
         except Unreachable:
             raise
         except BaseException:
-            # Ctrl-C, or what another signal's handler raised.  What nobody waits for any more
-            # should not be taken for us; what was, ``settle`` finds.
-            self._send(HEAD.pack(Op.SYNC, self._next()))
+            # Ctrl-C, or what another signal's handler raised.
+            self.give_up(operation)
             raise
         self._unsettled = None
         return reply
+
+    def give_up(self, operation: Op) -> None:
+        """Nobody wants the answer to the last request, which is such an operation.
+
+        What it waits for should not be taken for us; what was, ``settle`` finds, and the hub takes
+        back a token.
+        """
+        self._unsettled = operation
+        self._send(HEAD.pack(Op.SYNC, self._next()))
 
     def settle(self) -> tuple[Op, Reply] | None:
         """The answer to a request that was given up, if it was answered all the same."""

@@ -6,12 +6,15 @@ import hmac
 import os
 import struct
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Protocol
 
 from fiber._hub import protocol
 from fiber._hub.doorbell import Doorbell
 from fiber._hub.heap import Block
 from fiber._hub.hosted import HostedChannel, HostedCounter
+from fiber._hub.hosted_semaphore import HostedSemaphore
+from fiber._hub.hosted_wait_list import HostedWaitList
 from fiber._hub.protocol import (
     FOUR,
     HEAD,
@@ -28,6 +31,9 @@ from fiber._hub.registry import Entry, NoSuchObject, Registry
 from fiber._hub.replicas import Replicas
 from fiber._hub.streams import NullHandler, Stream
 from fiber._wire.packet import Message
+
+_NAME_BYTES = 80
+"""Of who holds a lock, as it is shown."""
 
 
 class HandlerHub(Protocol):
@@ -81,6 +87,8 @@ class ClientHandler:
         self._entry: Entry | None = None
         self._joined: tuple[str, int, int] | None = None
         self._bound: set[int] = set()
+        self._holder: str | None = None
+        self._place: int | None = None
         stream.handler = self
 
     def on_message(self, message: Message) -> None:
@@ -104,6 +112,11 @@ class ClientHandler:
 
     def on_closed(self, reason: str) -> None:
         """Whoever used it has ended."""
+        if self._holder is not None:
+            self._semaphore().abandon(self._holder)
+            self._holder = None
+        if self._place is not None:
+            self._wait_list().places.lose(self._place)
         self._leave()
 
     def close(self, reason: str) -> None:
@@ -116,6 +129,7 @@ class ClientHandler:
 
     def _leave(self) -> None:
         self._cancel()
+        self._give_back()
         entry, self._entry = self._entry, None
         if entry is not None:
             if isinstance(entry.hosted, HostedChannel):
@@ -232,7 +246,11 @@ class ClientHandler:
             request.answer(Status.NO)
 
     def sync(self, message: Message) -> None:
-        """Answer, so that the requester knows that nothing else is to come."""
+        """Answer, so that the requester knows that nothing else is to come.
+
+        A token that it was given meanwhile it does not know of.
+        """
+        self._give_back()
         self._request(message).answer(Status.OK)
 
     # A channel
@@ -314,6 +332,95 @@ class ClientHandler:
     def changed(self, message: Message) -> None:
         """Wait until it is another."""
         self._counter().changed(self._request(message), ONE.unpack(message.payload)[2])
+
+    # A semaphore
+
+    def _semaphore(self) -> HostedSemaphore:
+        if self._entry is None or not isinstance(self._entry.hosted, HostedSemaphore):
+            raise RequestRefused("the stream is not attached to a lock or semaphore")
+        return self._entry.hosted
+
+    def acquire(self, message: Message) -> None:
+        """Take a token, which is the stream's."""
+        holder = bytes(message.buffers[0][:_NAME_BYTES]).decode(errors="replace")
+        self._semaphore().acquire(self._request(message), partial(self._granted_to, holder))
+
+    def _granted_to(self, holder: str) -> None:
+        self._holder = holder
+
+    def _give_back(self) -> None:
+        if self._holder is not None:
+            self._semaphore().release()
+            self._holder = None
+
+    def post(self, message: Message) -> None:
+        """Give back the stream's, or another's."""
+        request = self._request(message)
+        try:
+            self._semaphore().release()
+        except ValueError:
+            request.answer(Status.NO)
+        else:
+            self._holder = None
+            request.answer(Status.OK)
+
+    def tokens(self, message: Message) -> None:
+        """Tell how many there are."""
+        self._request(message).answer(Status.OK, self._semaphore().value())
+
+    # A wait list
+
+    def _wait_list(self) -> HostedWaitList:
+        if self._entry is None or not isinstance(self._entry.hosted, HostedWaitList):
+            raise RequestRefused("the stream is not attached to a condition")
+        return self._entry.hosted
+
+    def enter(self, message: Message) -> None:
+        """Take a place, which is the stream's."""
+        self._place = self._wait_list().places.enter(afar=True)
+        self._request(message).answer(Status.OK)
+
+    def _own_place(self) -> int:
+        if self._place is None:
+            raise RequestRefused("the stream has no place at the condition")
+        return self._place
+
+    def sleep(self, message: Message) -> None:
+        """Answer once it is notified."""
+        self._wait_list().sleep(self._request(message), self._own_place())
+
+    def leave(self, message: Message) -> None:
+        """Give the place up."""
+        notified = self._wait_list().places.leave(self._own_place())
+        self._place = None
+        self._request(message).answer(Status.OK if notified else Status.NO)
+
+    def notify(self, message: Message) -> None:
+        """Wake some."""
+        self._wait_list().places.notify(ONE.unpack(message.payload)[2])
+        self._request(message).answer(Status.OK)
+
+    def waiters(self, message: Message) -> None:
+        """Tell how many wait."""
+        self._request(message).answer(Status.OK, self._wait_list().places.waiters())
+
+    def bury(self, message: Message) -> None:
+        """Tell how many died waiting."""
+        self._request(message).answer(Status.OK, self._wait_list().places.bury())
+
+    def get(self, message: Message) -> None:
+        """Tell a word."""
+        value = self._wait_list().places.get(ONE.unpack(message.payload)[2] & 1)
+        self._request(message).answer(Status.OK, value & _WORD)
+
+    def set(self, message: Message) -> None:
+        """Set a word."""
+        _, _, number, value = TWO.unpack(message.payload)
+        self._wait_list().places.set(number & 1, value - (1 << 64) if value >> 63 else value)
+        self._request(message).answer(Status.OK)
+
+
+_WORD = (1 << 64) - 1
 
 
 class _Joining:

@@ -41,7 +41,7 @@ from fiber._hub.registry import NoSuchObject, Registry
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
 from fiber._transport.base import SharedChannel, SharedCounter
 from fiber._transport.unix import UnixChannel, UnixCounter
-from fiber._wire.descriptor import Descriptor, own
+from fiber._wire.descriptor import Descriptor, opened, own
 
 
 class InheritedDescriptor(Protocol):
@@ -150,10 +150,12 @@ def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
     if spawning is None:
         segment = _grants().for_local(kind, block.segment.fileno(), extent)
         return BlockHandle(segment, extent, inode)
-    # multiprocessing's own Process duplicates the descriptor for each of the blocks.
     inherit = getattr(spawning, "inherit_segment", None)
     if inherit is None:
-        number = spawning.duplicate_for_child(block.segment.fileno())
+        # multiprocessing's own Process takes each descriptor once, and closes it in the child.
+        duplicate = opened(os.dup, block.segment.fileno())
+        vars(spawning).setdefault("_fiber_duplicates", []).append(duplicate)  # until it started
+        number = spawning.duplicate_for_child(duplicate.fileno())
         return BlockHandle(spawning.DupFd(number), extent, inode)
     return BlockHandle(inherit(block.segment), extent, inode)
 

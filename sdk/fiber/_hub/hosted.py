@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.poller import EDGE, IN, OUT, Poller
@@ -244,6 +244,3 @@ class HostedMemory:
 
     def close(self) -> None:
         """The registry lets go of it."""
-
-
-Hosted: TypeAlias = HostedChannel | HostedCounter | HostedMemory

@@ -23,12 +23,15 @@ from fiber._hub.client import NoHub, Unreachable
 from fiber._hub.client_handler import ClientHandler
 from fiber._hub.directory import remove_directory
 from fiber._hub.doorbell import Doorbell
-from fiber._hub.hosted import Hosted, HostedChannel, HostedCounter, HostedMemory
+from fiber._hub.heap import block_of
+from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory
+from fiber._hub.hosted_semaphore import HostedSemaphore
+from fiber._hub.hosted_wait_list import HostedWaitList
 from fiber._hub.hub_link import HubLink, Send
 from fiber._hub.local import QuietSocket, without_timeout
 from fiber._hub.poller import Poller
 from fiber._hub.protocol import HubAddress, ObjectKind
-from fiber._hub.registry import Registry, SharedObject
+from fiber._hub.registry import Hosted, Registry, SharedObject
 from fiber._hub.replicas import Replicas
 from fiber._hub.streams import SocketStream, Stream
 from fiber._hub.tunnel import Router
@@ -229,6 +232,10 @@ class Hub:
         fd = os.dup(shared.descriptor.fileno())
         if shared.kind is ObjectKind.CHANNEL:
             return HostedChannel(self._poller, fd)
+        if shared.kind is ObjectKind.SEMAPHORE:
+            return HostedSemaphore(self._loop, self.doorbell, block_of(own(fd), *shared.extent))
+        if shared.kind is ObjectKind.WAIT_LIST:
+            return HostedWaitList(self._loop, self.doorbell, block_of(own(fd), *shared.extent))
         return HostedCounter(self._poller, fd)
 
 

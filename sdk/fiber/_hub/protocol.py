@@ -43,6 +43,7 @@ class ObjectKind(IntEnum):
     # What is a block of shared memory
     MEMORY = 3
     SEMAPHORE = 4
+    WAIT_LIST = 5
 
 
 class Extent(NamedTuple):
@@ -91,6 +92,19 @@ class Op(IntEnum):
     VALUE = 23  # -> count
     WAIT = 24
     CHANGED = 25  # since
+    # For an attached semaphore
+    ACQUIRE = 40  # the process's name beside it -> whether it was abandoned; by whom beside it
+    POST = 41  # NO if there are as many tokens as there can be
+    TOKENS = 42  # -> how many there are
+    # For an attached wait list
+    ENTER = 50
+    SLEEP = 51
+    LEAVE = 52  # NO if the stream's place was not notified
+    NOTIFY = 53  # how many
+    WAITERS = 54  # -> how many
+    BURY = 55  # -> how many
+    GET = 56  # which -> the word
+    SET = 57  # which, the word
 
 
 class Status(IntEnum):

@@ -13,11 +13,16 @@ import stat
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable
+from typing import TypeAlias
 
-from fiber._hub.hosted import Hosted
+from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory
+from fiber._hub.hosted_semaphore import HostedSemaphore
+from fiber._hub.hosted_wait_list import HostedWaitList
 from fiber._hub.protocol import WHOLE, Extent, ObjectKind
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.descriptor import Descriptor, opened
+
+Hosted: TypeAlias = HostedChannel | HostedCounter | HostedMemory | HostedSemaphore | HostedWaitList
 
 
 class NoSuchObject(LookupError):

@@ -1,20 +1,22 @@
-"""Locks and semaphores of this host, and how they get into other processes."""
+"""Locks and semaphores, and how they get into other processes: of this host and of others."""
 
 from __future__ import annotations
 
 import copyreg
 import weakref
-from typing import Any
+from typing import Any, TypeAlias
 
 from fiber._hub import heap
-from fiber._hub.handles import BlockHandle, handle_for_block
+from fiber._hub.handles import BlockHandle, handle_for_block, handle_for_remote_block, ring
 from fiber._hub.protocol import ObjectKind
+from fiber._hub.remote_semaphore import RemoteSemaphore
 from fiber._sync.semaphore import SIZE, SharedSemaphore
-from fiber.errors import NotInFiber
 
-# One object for each in a process, by the identity of its block: only so a recursive one knows
-# its thread again, however often it was unpickled.
-_known: weakref.WeakValueDictionary[tuple[int, int], SharedSemaphore] = (
+AnySemaphore: TypeAlias = SharedSemaphore | RemoteSemaphore
+
+# One object for each in a process: only so a recursive one knows its thread again, however often it
+# was unpickled.  By the identity of its block, and the key of its hub if that is elsewhere.
+_known: weakref.WeakValueDictionary[tuple[object, ...], AnySemaphore] = (
     weakref.WeakValueDictionary()
 )
 
@@ -22,20 +24,19 @@ _known: weakref.WeakValueDictionary[tuple[int, int], SharedSemaphore] = (
 def create(kind: int, value: int, maximum: int) -> SharedSemaphore:
     """A new one, with ``value`` of at most ``maximum`` tokens."""
     block = heap.allocate(SIZE)
-    new = _known[block.identity] = SharedSemaphore.create(block, kind, value, maximum)
+    new = _known[block.identity] = SharedSemaphore.create(block, kind, value, maximum, ring)
     return new
 
 
-def _rebuild(handle: BlockHandle, kind: int, maximum: int) -> SharedSemaphore:
-    if handle.elsewhere() is not None:
-        raise NotInFiber(
-            "a lock or semaphore cannot be used on another host than the one that it was made on "
-            "yet. Please coordinate hosts by a Queue or an Event."
-        )
+def _rebuild(handle: BlockHandle, kind: int, maximum: int) -> AnySemaphore:
+    home = handle.elsewhere()
+    if home is not None:
+        remote = RemoteSemaphore(home, handle.extent, handle.inode, kind, maximum)
+        return _known.setdefault((home.home.key, handle.inode, handle.extent.offset), remote)
     block = handle.block()
     known = _known.get(block.identity)
     if known is None:
-        known = _known.setdefault(block.identity, SharedSemaphore(block, kind, maximum))
+        known = _known.setdefault(block.identity, SharedSemaphore(block, kind, ring))
     return known
 
 
@@ -45,4 +46,10 @@ def _reduce(semaphore: SharedSemaphore) -> tuple[Any, ...]:
     return _rebuild, (handle, semaphore.kind, semaphore.maximum)
 
 
+def _reduce_remote(remote: RemoteSemaphore) -> tuple[Any, ...]:
+    handle = handle_for_remote_block(remote, remote.extent, remote.inode)
+    return _rebuild, (handle, remote.kind, remote.maximum)
+
+
 copyreg.pickle(SharedSemaphore, _reduce)
+copyreg.pickle(RemoteSemaphore, _reduce_remote)

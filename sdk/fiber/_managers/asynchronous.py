@@ -21,7 +21,8 @@ from typing import Any
 
 from fiber import reduction
 from fiber._hub.client import Unreachable
-from fiber._managers.client import Session, proxy_of, session, thread_name
+from fiber._managers.client import Session, new_owner, proxy_of, session
+from fiber._managers.door import NUMBER
 from fiber._runtime.latch import Waiters, acquire
 from fiber.errors import ConnectionClosed, TimeoutError
 
@@ -73,9 +74,11 @@ class Pipeline:
     def __init__(self, server: Session) -> None:
         self.pid = os.getpid()
         self._session = server
-        self._channel = server.hand_over("line", thread_name())
+        self._channel = server.hand_over(new_owner())
         self._numbers = itertools.count(1)
         self._answered = 0
+        self._sending = threading.RLock()
+        """Calls are sent in the order of their numbers; a signal's handler may call, too."""
         self._pending: dict[int, weakref.ref[AsyncProxyResult]] = {}
         self._reading = threading.Lock()
         self._waiters = Waiters()
@@ -87,12 +90,14 @@ class Pipeline:
         except reduction.REFUSALS as error:
             raise reduction.blame({f"the arguments of {method}()": (args, kwds)}, error) from error
         result = AsyncProxyResult(self)
-        self._pending[next(self._numbers)] = weakref.ref(result)
-        try:
-            while not self._channel.try_send(payload, buffers):
-                self._make_room()
-        except OSError:
-            self._end()
+        with self._sending:
+            number = next(self._numbers)
+            self._pending[number] = weakref.ref(result)
+            try:
+                while not self._channel.try_send(NUMBER.pack(number) + payload, buffers):
+                    self._make_room()
+            except OSError:
+                self._end()
         return result
 
     def _make_room(self) -> None:

@@ -12,6 +12,8 @@ a finalizer may say it wherever the garbage collector runs.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import pickle
 import warnings
@@ -28,13 +30,17 @@ from fiber._hub import handles
 from fiber._hub.client import Unreachable, host
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel
-from fiber._managers.door import TAKE_BACK, ManagerAddress, knock
+from fiber._managers.door import NUMBER, TAKE_BACK, ManagerAddress, knock
 from fiber._transport.base import Channel
+from fiber._wire import packet
 from fiber.connection import how_it_ended
 from fiber.errors import ConnectionClosed
 
 _LOOK_AGAIN = 0.5
 """Seconds after which whoever waits to be let in looks whether anybody is there."""
+
+_ACQUIRING = ("acquire", "wait")
+"""Methods whose results are no objects of the user's."""
 
 _BEFORE_EXIT = -50
 """Exit priority: after the managers of this process have been shut down."""
@@ -48,19 +54,25 @@ class Line:
         self._asked = 0
         self._draining = False
         self.busy = False
+        self.came = False
+        """Whether the server has answered the last request."""
 
     def ask(self, request: tuple[Any, ...]) -> None:
         """Send a request."""
         payload, buffers = reduction.encode(request)
         self._asked += 1
-        self._channel.send(payload, buffers)
+        self._channel.send(NUMBER.pack(self._asked) + payload, buffers)
 
     def answer(self) -> tuple[str, Any]:
         """The answer to the last request."""
+        self.came = False
         while True:
-            number, kind, result = self._channel.recv_object()
+            message = self._channel.recv_answer()
+            self.came = True
+            number, kind, result = packet.loads(message)
             if number == self._asked:  # else an earlier call was interrupted
                 return kind, result
+            self.came = False
 
     def take_back(self) -> None:
         """Nobody waits for the last answer any more."""
@@ -105,10 +117,13 @@ class Session:
         except (ConnectionClosed, BrokenPipeError) as error:
             raise self.gone() from error
 
-    def hand_over(self, kind: str, name: str) -> LocalChannel:
-        """A new channel to a new thread of the server, which is to be called ``name``."""
+    def hand_over(self, owner: str) -> LocalChannel:
+        """A new channel to a new thread of the server.
+
+        What that acquires, all have that are handed over for the same ``owner``.
+        """
         try:
-            return _hand_over(self._control, kind, name)
+            return _hand_over(self._control, "line", thread_name(), owner)
         except (ConnectionClosed, BrokenPipeError) as error:
             raise self.gone() from error
 
@@ -118,13 +133,23 @@ class Session:
             raise self.gone()
         lines: list[Line] | None = getattr(self._of_thread, "lines", None)
         if lines is None:
+            self._of_thread.owner = new_owner()
             lines = self._of_thread.lines = []
         for line in lines:
             if line.is_free():
                 return line
-        line = Line(self.hand_over("line", thread_name()))
-        lines.append(line)
+        return self._new_line()
+
+    def _new_line(self) -> Line:
+        line = Line(self.hand_over(self._of_thread.owner))
+        self._of_thread.lines.append(line)
         return line
+
+    def replace(self, line: Line) -> None:
+        """Nobody waits for what it brings; what this thread has acquired stays its own."""
+        with contextlib.suppress(ConnectionClosed):
+            self._new_line()
+        self.give_up(line)
 
     def give_up(self, line: Line) -> None:
         """Nobody waits for what it brings."""
@@ -262,7 +287,7 @@ class Request:
             line.busy = False
             raise reduction.blame({f"the arguments of {method}()": request}, error) from error
         except BaseException:
-            self._session.give_up(line)  # it may have been sent or not
+            self._session.replace(line)  # it may have been sent or not
             raise
         self._under_way.append((line, method, ident))
 
@@ -278,10 +303,10 @@ class Request:
                 raise  # something in the answer
             self._session.give_up(line)
             raise self._session.gone() from error
-        except Exception:
-            raise  # it came, and does not unpickle
-        except BaseException:
-            line.take_back()
+        except BaseException as error:
+            # What came and does not unpickle stays with who asked.  All else is a signal's handler.
+            if method in _ACQUIRING or not (line.came and isinstance(error, Exception)):
+                line.take_back()
             raise
         finally:
             line.busy = False
@@ -355,6 +380,14 @@ def forget(address: ManagerAddress) -> None:
     _held.pop(address, None)
     if session is not None:
         session.end()
+
+
+_owners = itertools.count()
+
+
+def new_owner() -> str:
+    """The name of one who has acquired nothing yet, for this process's servers."""
+    return str(next(_owners))
 
 
 def introduction() -> str:

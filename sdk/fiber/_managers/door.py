@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import pickle
+import struct
 import time
 from multiprocessing.process import current_process
 from typing import Any, NamedTuple
@@ -14,6 +15,11 @@ from fiber._hub.handles import GrantSet, HubHandle
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
 from fiber._transport.base import Channel
+
+NUMBER = struct.Struct("<Q")
+"""Before each call on a line: its number, which its answer has, too.  Numbers that a line skips are
+of calls that were interrupted as they were sent.
+"""
 
 TAKE_BACK = "take_back"
 """Asked of the server by whoever was interrupted: that others get what the last call got."""

@@ -7,6 +7,7 @@ one may be meant to release them.
 
 from __future__ import annotations
 
+import itertools
 import threading
 import weakref
 from collections import Counter
@@ -14,7 +15,7 @@ from collections.abc import Callable
 from queue import Queue
 from typing import Any, TypeAlias
 
-from fiber._managers.rlock import RLock
+from fiber._managers.rlock import RLock, act_as
 
 _LOCK = type(threading.Lock())
 _ANYBODYS = (_LOCK, threading.Semaphore)
@@ -40,6 +41,26 @@ class Client:
         self.barriers: list[threading.Barrier] = []
         """At which its threads wait."""
         self.threads: list[ClientThread] = []
+        self.owners: dict[str, Owner] = {}
+        """Its own threads."""
+
+
+class Owner:
+    """A thread of a client.
+
+    It has several threads here, one after the other: the one before may still be in a call that
+    was interrupted.
+    """
+
+    def __init__(self) -> None:
+        self.ident = next(_idents)
+        self.owned: set[RLock] = set()
+        self.threads = 0
+        """Those here that act for it."""
+
+
+_idents = itertools.count(-1, -1)
+"""Which no thread has."""
 
 
 class Holdings:
@@ -112,13 +133,18 @@ class Holdings:
 
 
 class ClientThread:
-    """What one thread of the server has on behalf of one thread of a client."""
+    """What one thread of the server has on behalf of one thread of a client, of a given name."""
 
-    def __init__(self, holdings: Holdings, client: Client) -> None:
+    def __init__(self, holdings: Holdings, client: Client, name: str) -> None:
         self._holdings = holdings
         self._client = client
-        self._ident = threading.get_ident()
-        self._owned: set[RLock] = set()
+        self._name = name
+        with client.mutex:
+            self._owner = client.owners.setdefault(name, Owner())
+            self._owner.threads += 1
+        self._ident = self._owner.ident
+        self._owned = self._owner.owned
+        act_as(self._ident)
         self.got: Got | None = None
         """What the last call brought, if others wait for such."""
         self.kept: Any = None
@@ -169,13 +195,15 @@ class ClientThread:
             if kind == "#WARNING":
                 self._holdings.warn(lock, result[0])
             if isinstance(lock, RLock):
-                lock.revoke(self._ident)
-            elif self._holdings.withdraw(lock, self._client):
+                mine = lock.owned_by(self._ident)  # else its client is gone, and it was revoked
+            else:
+                mine = self._holdings.withdraw(lock, self._client)
+            if mine:
                 lock.release()
         elif method == "wait" and result and isinstance(lock, RLock):
             with lock:
                 obj.notify()
-            lock.revoke(self._ident)  # without a warning: it only waited
+            lock.undo_restore()  # without a warning: it only waited
         elif method == "get" and type(obj) is Queue:
             with obj.mutex:
                 obj.queue.appendleft(result)
@@ -189,7 +217,13 @@ class ClientThread:
 
     def end(self) -> None:
         """The client's thread has ended."""
-        self._client.threads.remove(self)
+        client, owner = self._client, self._owner
+        client.threads.remove(self)
+        with client.mutex:
+            owner.threads -= 1
+            if owner.threads:
+                return
+            del client.owners[self._name]
         self.abandon()
 
 

@@ -8,6 +8,18 @@ from __future__ import annotations
 import threading
 from types import TracebackType
 
+_acting = threading.local()
+
+
+def act_as(owner: int) -> None:
+    """What this thread acquires from here on is that owner's, as it is of all that act as that."""
+    _acting.owner = owner
+
+
+def _me() -> int:
+    owner: int = getattr(_acting, "owner", 0)
+    return owner or threading.get_ident()
+
 
 class RLock:
     """As ``threading.RLock``."""
@@ -21,7 +33,7 @@ class RLock:
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
         """As in ``threading``."""
-        me = threading.get_ident()
+        me = _me()
         with self._mutex:
             if self._owner == me:
                 self._count += 1
@@ -35,7 +47,7 @@ class RLock:
     def release(self) -> None:
         """As in ``threading``."""
         with self._mutex:
-            if self._owner != threading.get_ident():
+            if self._owner != _me():
                 raise RuntimeError("cannot release un-acquired lock")
             self._count -= 1
             if not self._count:
@@ -53,9 +65,9 @@ class RLock:
             self._block.release()
             return True
 
-    def owned_by(self, thread: int) -> bool:
+    def owned_by(self, owner: int) -> bool:
         """Whether that thread has it."""
-        return self._owner == thread
+        return self._owner == owner
 
     def __enter__(self) -> bool:
         return self.acquire()
@@ -71,17 +83,30 @@ class RLock:
     # What threading.Condition asks of an RLock
 
     def _is_owned(self) -> bool:
-        return self.owned_by(threading.get_ident())
+        return self.owned_by(_me())
 
     def _release_save(self) -> int:
         count = self._count
-        if not self.revoke(threading.get_ident()):
+        if not self.revoke(_me()):
             raise RuntimeError("cannot release un-acquired lock")
         return count
 
     def _acquire_restore(self, count: int) -> None:
-        self.acquire()
-        self._count = count
+        # Whoever acts for the same owner may have it meanwhile, if this wait was interrupted.
+        self._block.acquire()
+        with self._mutex:
+            self._owner, self._count = _me(), count
+        _acting.restored = count
+
+    def undo_restore(self) -> None:
+        """What this thread's last ``wait`` of a condition acquired is not to be had."""
+        with self._mutex:
+            if self._owner != _me():
+                return  # its client is gone, and it was revoked
+            self._count -= _acting.restored
+            if not self._count:
+                self._owner = None
+                self._block.release()
 
 
 def condition(lock: object = None) -> threading.Condition:

@@ -20,10 +20,11 @@ from typing import Any
 
 from fiber import reduction
 from fiber._managers.client import TravellingToken
-from fiber._managers.door import TAKE_BACK, received
+from fiber._managers.door import NUMBER, TAKE_BACK, received
 from fiber._managers.holdings import CONTENDED, Client, ClientThread, Holdings
 from fiber._transport.base import Channel
 from fiber._wire import packet
+from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
 
 _mp: Any = mp_managers  # typeshed has part of it
@@ -96,14 +97,13 @@ class Server(_mp.Server):  # type: ignore[misc]
 
     # A thread of a client
 
-    def _serve_line(self, client: Client, name: str, line: Channel) -> None:
+    def _serve_line(self, client: Client, name: str, owner: str, line: Channel) -> None:
         threading.current_thread().name = name
-        thread = ClientThread(self._holdings, client)
+        thread = ClientThread(self._holdings, client, owner)
         try:
             line.send(b"")
-            for number in itertools.count(1):
-                message = line.recv()
-                thread.kept = self._serve_call(client, thread, line, number, message)
+            while True:
+                thread.kept = self._serve_call(client, thread, line, line.recv())
         except (OSError, ConnectionClosed):
             pass
         finally:
@@ -111,8 +111,10 @@ class Server(_mp.Server):  # type: ignore[misc]
             thread.end()
 
     def _serve_call(
-        self, client: Client, thread: ClientThread, line: Channel, number: int, message: Any
+        self, client: Client, thread: ClientThread, line: Channel, message: Message
     ) -> Any:
+        (number,) = NUMBER.unpack_from(message.payload)
+        message.payload = message.payload[NUMBER.size :]
         ident, method = None, ""
         got_before, thread.got = thread.got, None
         answer: _Answer

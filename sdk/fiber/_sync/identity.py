@@ -12,8 +12,15 @@ _PID = (1 << 31) - 1
 _START = (1 << 32) - 1
 
 
-def own() -> int:
+def me() -> int:
     """The word for this process."""
+    global _me
+    if _me is None:
+        _me = _own()
+    return _me
+
+
+def _own() -> int:
     pid = os.getpid()
     start = _start_time(pid)
     assert start is not None
@@ -28,6 +35,15 @@ def pid(who: int) -> int:
 def is_alive(who: int) -> bool:
     """Whether that process still runs; one that has ended and that nobody reaped does not."""
     return _start_time(who & _PID) == who >> 31
+
+
+def _after_fork() -> None:
+    global _me
+    _me = None
+
+
+_me: int | None = None
+os.register_at_fork(after_in_child=_after_fork)
 
 
 def _start_time(pid: int) -> int | None:

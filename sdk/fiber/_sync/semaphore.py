@@ -46,7 +46,7 @@ import time
 import warnings
 import weakref
 from _multiprocessing import SemLock  # type: ignore[import-not-found]  # it has no stub
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import compress, starmap
 from multiprocessing import current_process
 from typing import Protocol
@@ -75,7 +75,8 @@ _MUTEX = 8
 _ATTENTION = 16
 _IS_UNTRACKED = 17
 _TOTAL = 18
-_DEAD = 22  # whose token was given back, as in a slot
+_MAXIMUM = 19
+_DEAD = range(20, 31)  # whose token was given back, in words
 _SLOTS = range(32, SIZE // 8, 8)
 _NO_SLOT = 31
 """In place of one, when there are no more: nobody reads it."""
@@ -89,7 +90,10 @@ _IDLE, _BUSY, _HELD, _LEFT = range(4)  # states
 # Bytes of the word ``attention``.  Who reads it reads them all at once.
 _STOP = 8 * _ATTENTION
 _ABANDONED = 8 * _ATTENTION + 1
+_LISTENS = 8 * _ATTENTION + 2
 _IS_STOPPED = 0xFF
+_IS_SPECIAL = 0xFFFF  # stopped or abandoned
+_IS_LISTENED_TO = 0xFF0000
 
 _NO_WAIT = (False,)
 
@@ -114,24 +118,25 @@ class SharedSemaphore:
     __slots__ = (
         "__weakref__", "_bytes", "_candidates", "_count", "_get_value", "_give", "_held", "_idle",
         "_is_mine", "_is_mutex", "_is_recursive", "_is_zero", "_me", "_mutex", "_next_look",
-        "_revivals", "_sem", "_take", "_words", "block", "kind", "maximum",
+        "_revivals", "_ring", "_sem", "_take", "_words", "block", "kind", "maximum",
     )  # fmt: skip
 
-    def __init__(self, block: Block, kind: int, maximum: int) -> None:
+    def __init__(self, block: Block, kind: int, ring: Callable[[], None] = lambda: None) -> None:
         self.block = block
         self.kind = kind
-        self.maximum = maximum
-        self._is_mutex = maximum == 1
-        self._is_recursive = kind == RECURSIVE
+        self._ring = ring
         self._bytes = block.view
         self._words = block.view.cast("q")
+        self.maximum = self._words[_MAXIMUM]
+        self._is_mutex = self.maximum == 1
+        self._is_recursive = kind == RECURSIVE
         self._mutex = RobustMutex(block.address + 8 * _MUTEX)
         self._sem = self._semlock(kind)
         self._take = self._sem.acquire
         self._give = self._sem.release
         self._is_mine = self._sem._is_mine
         self._count = self._sem._count
-        self._get_value = self._sem._get_value
+        self._get_value: Callable[[], int] = self._sem._get_value
         self._is_zero = self._sem._is_zero
         self._revivals = 0
         self._next_look = 0.0
@@ -139,19 +144,23 @@ class SharedSemaphore:
         _all.add(self)
 
     @classmethod
-    def create(cls, block: Block, kind: int, value: int, maximum: int) -> SharedSemaphore:
-        """Begin the life of one in zeroed memory."""
-        if _libc.sem_init(ctypes.c_void_p(block.address), 1, value):
-            code = ctypes.get_errno()
-            raise OSError(code, os.strerror(code))
-        new = cls(block, kind, maximum)
+    def create(
+        cls, block: Block, kind: int, value: int, maximum: int, ring: Callable[[], None]
+    ) -> SharedSemaphore:
+        """Begin the life of one in zeroed memory.
+
+        ``ring`` is called when a token is given back while the hub listens.
+        """
+        make_semaphore(block.address, value)
+        words = block.view.cast("q")
+        words[_TOTAL], words[_MAXIMUM] = value, maximum
+        new = cls(block, kind, ring)
         new._mutex.create()
-        new._words[_TOTAL] = value
         return new
 
     def _begin(self) -> None:
         """In a new process, which may be a fork: what its parent has is not its own."""
-        self._me = identity.own()
+        self._me = identity.me()
         self._idle: list[int] = []
         self._held: list[int] = []
         self._candidates: Iterator[int] = iter(_SLOTS)
@@ -173,7 +182,7 @@ class SharedSemaphore:
                 return self._acquire(block, timeout)
             try:
                 words[slot] = _BUSY
-                if not words[_ATTENTION] and self._take(False):
+                if not words[_ATTENTION] & _IS_SPECIAL and self._take(False):
                     # CPython looks for signals after a call, and there is none from here on.
                     words[slot] = _HELD
                     self._held += (slot,)
@@ -185,24 +194,30 @@ class SharedSemaphore:
                 raise
         return self._acquire(block, timeout)
 
-    def release(self) -> None:
+    def release(self, *, wait: bool = True) -> bool:
         """Give a token back; ValueError if there are as many as there can be.
 
-        AssertionError if it is recursive and this thread has not acquired it.
+        AssertionError if it is recursive and this thread has not acquired it.  Unless it is to
+        ``wait`` it is False, and nothing is done, while dead processes' tokens are given back.
         """
         if self._is_recursive and (not self._is_mine() or self._count() > 1):
             self._give()
-            return
+            return True
         words = self._words
         try:
             slot = self._held.pop()
         except IndexError:
+            slot = 0
+        if not slot:
             self._mutex.run(self._give_untracked)
-            return
+            return True
         try:
             words[slot] = _BUSY
             while words[_ATTENTION] & _IS_STOPPED:
                 words[slot] = _HELD
+                if not wait:
+                    self._held += (slot,)
+                    return False
                 self._park()
                 words[slot] = _BUSY
             self._give()
@@ -211,6 +226,24 @@ class SharedSemaphore:
         except BaseException:
             self._leave(slot)
             raise
+        if words[_ATTENTION] & _IS_LISTENED_TO:
+            self._ring()
+        return True
+
+    def listen(self, listens: bool) -> None:
+        """Whether the hub is to be rung for."""
+        self._bytes[_LISTENS] = listens
+
+    def try_acquire(self) -> bool | Abandoned:
+        """Take a token if there is one, and look for none that are lost: it takes no time."""
+        taken: list[int] = []
+        return self._try_acquire(_NO_WAIT, taken) and self._told()
+
+    def abandon(self, holder: str) -> None:
+        """Have the next one to acquire it know who had it."""
+        start, size = 8 * _DEAD.start, 8 * len(_DEAD)
+        self._bytes[start : start + size] = holder.encode()[:size].ljust(size, b"\0")
+        self._bytes[_ABANDONED] = 1
 
     # Steps
 
@@ -218,7 +251,7 @@ class SharedSemaphore:
         taken: list[int] = []
         try:
             if self._try_acquire(_NO_WAIT, taken) or self._wait(block, timeout, taken):
-                return self._abandoned() if self._words[_ATTENTION] else True
+                return self._told()
             return False
         except BaseException:
             if taken:
@@ -266,6 +299,8 @@ class SharedSemaphore:
         """Give back what this process has not acquired.  With the mutex."""
         self._give()
         self._words[_IS_UNTRACKED] = True
+        if self._words[_ATTENTION] & _IS_LISTENED_TO:
+            self._ring()
 
     def _leave(self, slot: int) -> None:
         """What was done last was interrupted: a revival will see whether a token is lost."""
@@ -273,12 +308,12 @@ class SharedSemaphore:
             self._sem._after_fork()  # it is not: the count is zero
         self._words[slot] = _LEFT
 
-    def _abandoned(self) -> Abandoned | bool:
-        """What the one who acquires it after a revival is told, and nobody else."""
+    def _told(self) -> bool | Abandoned:
+        """What who has acquired it is told: the first one after a death, of that."""
         if not self._bytes[_ABANDONED]:
             return True
         self._bytes[_ABANDONED] = 0
-        return Abandoned(self._named(_DEAD))
+        return Abandoned(_text(self._bytes[8 * _DEAD.start : 8 * _DEAD.stop]))
 
     # Waiting
 
@@ -309,14 +344,18 @@ class SharedSemaphore:
         if now < self._next_look:
             return False
         self._next_look = now + SLICE
-        if not self._is_suspicious():
+        if not self.is_suspicious():
             return False
-        self._warn(self._mutex.run(self._revive))
+        self.revive()
         return True
 
     # Reviving
 
-    def _is_suspicious(self) -> bool:
+    def revive(self) -> None:
+        """Give back the tokens of those who are gone, and say whose they were."""
+        self._warn(self._mutex.run(self._revive))
+
+    def is_suspicious(self) -> bool:
         """Whether somebody who is gone has a token, or may have."""
         words = self._words
         if words[_IS_UNTRACKED] or self._get_value():
@@ -341,7 +380,9 @@ class SharedSemaphore:
             lost = words[_TOTAL] - self._get_value()
             lost -= sum(words[slot] == _HELD for slot in self._used() if slot not in gone)
             if gone and lost > 0 and not words[_IS_UNTRACKED]:
-                released = self._abandon(gone)
+                released = self._names(gone)
+                if released:
+                    self.abandon(released[-1])
                 # By another view of it: ours counts what this process has.
                 give = self._semlock(COUNTING).release
                 for _ in range(lost):
@@ -371,24 +412,17 @@ class SharedSemaphore:
                 return {}
             time.sleep(_NAP)
 
-    def _abandon(self, gone: dict[int, int]) -> list[str]:
-        """Have the next one who acquires it know whose it was; the names of all who are dead."""
-        words, bytes_ = self._words, self._bytes
-        dead = [slot for slot in gone if words[slot] in (_BUSY, _HELD)]
-        dead = [slot for slot in dead if words[slot] == _HELD] or dead
-        for slot in dead[-1:]:
-            bytes_[8 * _DEAD : 8 * _DEAD + 64] = bytes_[8 * slot : 8 * slot + 64]
-            bytes_[_ABANDONED] = 1
-        return list(map(self._named, dead))
+    def _names(self, gone: Iterable[int]) -> list[str]:
+        """The dead who had a token; if none has a note of one, who may have had it."""
+        states = {slot: self._words[slot] for slot in gone}
+        for state in (_HELD, _BUSY):
+            if state in states.values():
+                return [self._name(slot) for slot in states if states[slot] == state]
+        return []
 
     def _warn(self, released: list[str]) -> None:
         for process in dict.fromkeys(released):
-            warnings.warn(
-                f"{process} ended while it held a lock or semaphore, which is released: what it "
-                "guards may be half changed",
-                RuntimeWarning,
-                stacklevel=7,  # who called acquire()
-            )
+            warn_of(process, stacklevel=8)  # who called acquire()
 
     # Slots
 
@@ -400,11 +434,10 @@ class SharedSemaphore:
         who = self._words[slot + _WHO]
         return self._words[slot] == _LEFT or not (who == self._me or identity.is_alive(who))
 
-    def _named(self, slot: int) -> str:
+    def _name(self, slot: int) -> str:
         start = 8 * (slot + _NAME)
-        name = bytes(self._bytes[start : start + _NAME_BYTES]).rstrip(b"\0")
-        pid = identity.pid(self._words[slot + _WHO])
-        return f"{name.decode(errors='replace')} (pid {pid})"
+        name = _text(self._bytes[start : start + _NAME_BYTES])
+        return f"{name} (pid {identity.pid(self._words[slot + _WHO])})"
 
     def _claim(self) -> int:
         """One more slot for this process.  With the mutex."""
@@ -428,9 +461,35 @@ class SharedSemaphore:
         return slot
 
     def _semlock(self, kind: int) -> SemLock:
-        # Without a name it takes the handle, an address here, as it is.  What it does at its end,
-        # ``sem_close``, is refused for an address that ``sem_open`` never gave.
-        return SemLock._rebuild(self.block.address, kind, self.maximum, None)
+        return semaphore_at(self.block.address, kind, self.maximum)
+
+
+def make_semaphore(address: int, value: int) -> None:
+    """Begin the life of a POSIX semaphore that processes share."""
+    if _libc.sem_init(ctypes.c_void_p(address), 1, value):
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+
+
+def semaphore_at(address: int, kind: int = COUNTING, maximum: int = SEM_VALUE_MAX) -> SemLock:
+    """A view of one."""
+    # Without a name it takes the handle, an address here, as it is.  What it does at its end,
+    # ``sem_close``, is refused for an address that ``sem_open`` never gave.
+    return SemLock._rebuild(address, kind, maximum, None)
+
+
+def warn_of(holder: str, *, stacklevel: int = 2) -> None:
+    """Say that it died with a token."""
+    warnings.warn(
+        f"{holder} ended while it held a lock or semaphore, which is released: what it guards may "
+        "be half changed",
+        RuntimeWarning,
+        stacklevel=stacklevel,
+    )
+
+
+def _text(field: memoryview) -> str:
+    return bytes(field).rstrip(b"\0").decode(errors="replace")
 
 
 _all: weakref.WeakSet[SharedSemaphore] = weakref.WeakSet()

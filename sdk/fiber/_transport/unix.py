@@ -129,12 +129,20 @@ class UnixChannel:
 
     def recv_object(self) -> Any:
         """The next message, unpickled; ConnectionClosed at the end."""
+        message = self._looked_for()
+        return packet.receive_object(self._sock) if message is None else packet.loads(message)
+
+    def recv_answer(self) -> Message:
+        """As ``recv``, for what is probably there soon."""
+        message = self._looked_for()
+        return packet.receive(self._sock) if message is None else message
+
+    def _looked_for(self) -> Message | None:
         if _last_asked == id(self):
-            if self._sleeps:
-                self._sleeps -= 1
-            elif (message := self._look()) is not None:
-                return packet.loads(message)
-        return packet.receive_object(self._sock)
+            if not self._sleeps:
+                return self._look()
+            self._sleeps -= 1
+        return None
 
     def _look(self) -> Message | None:
         """The answer, if it comes soon."""

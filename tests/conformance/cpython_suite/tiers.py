@@ -10,7 +10,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-Tier = Literal["core", "local", "ext", "na"]
+Tier = Literal["core", "prompt", "local", "ext", "na"]
+
+# Looks at once at what pods do only once somebody uses it.  It may be fast enough now and then.
+PROMPT = {
+    "TestInitializers.test_manager_initializer": "a manager's server may wait for its pod",
+    "TestInitializers.test_pool_initializer": "a pool's workers start with its first task",
+}
 
 # Needs one host: pids, signals, shared files, raw sockets.
 LOCAL = {
@@ -139,6 +145,7 @@ KNOWN_CLASSES = frozenset(
 _TABLES: tuple[tuple[Tier, dict[str, str]], ...] = (
     ("na", NOT_APPLICABLE),
     ("local", LOCAL),
+    ("prompt", PROMPT),
     ("ext", EXT),
 )
 

@@ -57,6 +57,8 @@ class LeaseRenewer:
         self._on_fault = on_fault
         self._now = now
         self._renewed = now()
+        self._refused: float | None = None
+        """Since when.  An API server that was away refuses everybody as it starts."""
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fiber-lease", daemon=True)
 
@@ -116,13 +118,21 @@ class LeaseRenewer:
         try:
             self.renew()
         except ApiError as error:
-            refused = isinstance(error, Forbidden | Unauthorized)
-            if refused and self._late() > self._pool.master.lease_duration:
+            if self._stays_refused(error):
                 raise
             self._on_trouble(error)
             asked = error.retry_after if isinstance(error, Transient) else 0.0
             return max(_RETRY, min(asked, pause))  # who lives must be heard in time all the same
+        self._refused = None
         return pause
+
+    def _stays_refused(self, error: ApiError) -> bool:
+        if not isinstance(error, Forbidden | Unauthorized):
+            self._refused = None
+            return False
+        now = self._now()
+        self._refused = now if self._refused is None else self._refused
+        return now - self._refused > self._pool.master.lease_duration
 
     def _late(self) -> float:
         return self._now() - self._renewed

@@ -1,0 +1,120 @@
+"""A lock or semaphore of another host: the hub there has its tokens for this process.
+
+A stream keeps each token.  The hub gives it back when the stream ends, which the kernel sees to
+when this process dies.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from multiprocessing import current_process
+
+from fiber._hub import client
+from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.handles import HubHandle
+from fiber._hub.protocol import Extent, Op, Status
+from fiber._hub.remote import RemoteObject
+from fiber._sync.abandonment import Abandoned
+from fiber._sync.semaphore import RECURSIVE
+
+
+class RemoteSemaphore(RemoteObject):
+    """With the methods of multiprocessing's ``SemLock``, as ``SharedSemaphore``."""
+
+    def __init__(
+        self, handle: HubHandle, extent: Extent, inode: int, kind: int, maximum: int
+    ) -> None:
+        self.extent = extent
+        self.inode = inode
+        self.kind = kind
+        self.maximum = maximum
+        self._holding: list[HubStream] = []
+        self._owner: int | None = None
+        self._depth = 0
+        super().__init__(*handle)
+
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
+        """Take a token; False if there is none, nor within ``timeout`` seconds."""
+        if self.kind == RECURSIVE and self._is_mine():
+            self._depth += 1
+            return True
+        self._check()
+        try:
+            stream = self._idle.pop()
+        except IndexError:
+            stream = self._open()
+        try:
+            stream.settle()
+            name = memoryview(self._name().encode())
+            reply = stream.ask(Op.ACQUIRE, timeout=timeout if block else 0, buffers=[name])
+        except Unreachable:
+            self._idle.append(stream)
+            raise
+        except BaseException:
+            stream.give_up(Op.ACQUIRE)
+            self._idle.append(stream)
+            raise
+        if reply.status is not Status.OK:
+            self._idle.append(stream)
+            return False
+        self._owner, self._depth = threading.get_ident(), 1
+        self._holding.append(stream)
+        return Abandoned(str(reply.parts[0], "utf-8", "replace")) if reply.parts else True
+
+    def release(self) -> None:
+        """Give a token back; ValueError if there are as many as there can be.
+
+        AssertionError if it is recursive and this thread has not acquired it.
+        """
+        if self.kind == RECURSIVE:
+            if not self._is_mine():
+                raise AssertionError("attempt to release recursive lock not owned by thread")
+            self._depth -= 1
+            if self._depth:
+                return
+        self._check()
+        if not self._holding:
+            with self.stream() as stream:
+                self._give(stream)
+            return
+        stream = self._holding.pop()
+        try:
+            self._give(stream)
+        finally:
+            self._idle.append(stream)
+
+    def _is_mine(self) -> bool:
+        """Whether this thread has it, having been the last in this process to acquire it."""
+        return bool(self._holding) and self._owner == threading.get_ident()
+
+    def _count(self) -> int:
+        """How often this process has acquired it and not released it."""
+        return self._depth if self.kind == RECURSIVE else len(self._holding)
+
+    def _get_value(self) -> int:
+        """How often it can be acquired now."""
+        with self.stream() as stream:
+            (value,) = stream.ask(Op.TOKENS).values
+        return value
+
+    def _is_zero(self) -> bool:
+        """Whether nobody can acquire it now."""
+        return not self._get_value()
+
+    def close(self) -> None:
+        """Let go of it, and of what this process has of it."""
+        super().close()
+        self._holding.clear()
+
+    def _give(self, stream: HubStream) -> None:
+        if stream.ask(Op.POST).status is Status.NO:
+            raise ValueError("semaphore or lock released too many times")
+
+    def _forked(self) -> None:
+        super()._forked()
+        self._holding.clear()
+        self._owner, self._depth = None, 0
+
+    def _name(self) -> str:
+        return f"{current_process().name} (pid {os.getpid()} on {client.host()})"

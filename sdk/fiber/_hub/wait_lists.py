@@ -1,0 +1,108 @@
+"""Who waits at a condition, in whichever process of whichever host."""
+
+from __future__ import annotations
+
+import copyreg
+from contextlib import suppress
+from typing import Any, TypeAlias
+
+from fiber._hub import heap
+from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.handles import (
+    BlockHandle,
+    HubHandle,
+    handle_for_block,
+    handle_for_remote_block,
+    ring,
+)
+from fiber._hub.protocol import ONE, TWO, Extent, ObjectKind, Op, Status
+from fiber._hub.remote import RemoteObject
+from fiber._sync.wait_list import SIZE, WaitList
+
+
+class RemoteWaitList(RemoteObject):
+    """Of another host; as ``WaitList``.  A place is a stream, so it ends with this process."""
+
+    def __init__(self, handle: HubHandle, extent: Extent, inode: int) -> None:
+        self.extent = extent
+        self.inode = inode
+        super().__init__(*handle)
+
+    def enter(self) -> HubStream:
+        """A place for this thread."""
+        self._check()
+        stream = self._open()
+        stream.ask(Op.ENTER)
+        return stream
+
+    def sleep(self, place: HubStream, timeout: float | None) -> None:
+        """Wait until that place is notified, for ``timeout`` seconds at most.  Without the lock."""
+        place.ask(Op.SLEEP, timeout=timeout)
+
+    def leave(self, place: HubStream) -> bool:
+        """Whether it was notified; it is free then."""
+        place.settle()
+        notified = place.ask(Op.LEAVE).status is Status.OK
+        self._idle.append(place)
+        return notified
+
+    def dismiss(self, place: HubStream) -> None:
+        """Free a place that was taken for longer.  Waits for nothing, and needs no hub."""
+        with suppress(OSError, Unreachable):
+            place.say(Op.LEAVE)
+        place.close()
+
+    def notify(self, n: int) -> None:
+        """Wake the ``n`` that have waited for longest; who died meanwhile is passed over."""
+        self._ask(Op.NOTIFY, n)
+
+    def waiters(self) -> int:
+        """How many wait."""
+        return self._ask(Op.WAITERS, 0)
+
+    def bury(self) -> int:
+        """How many died while they waited, since this was asked last."""
+        return self._ask(Op.BURY, 0)
+
+    def get(self, number: int) -> int:
+        """One of the user's two words."""
+        value = self._ask(Op.GET, number)
+        return value - (1 << 64) if value >> 63 else value
+
+    def set(self, number: int, value: int) -> None:
+        """Set it."""
+        with self.stream() as stream:
+            stream.ask(Op.SET, number, value & ((1 << 64) - 1), form=TWO)
+
+    def _ask(self, operation: Op, number: int) -> int:
+        with self.stream() as stream:
+            (value,) = stream.ask(operation, number, form=ONE).values
+        return value
+
+
+AnyWaitList: TypeAlias = WaitList | RemoteWaitList
+
+
+def create() -> WaitList:
+    """A new one, with nobody in it."""
+    return WaitList(heap.allocate(SIZE), ring)
+
+
+def _rebuild(handle: BlockHandle) -> AnyWaitList:
+    home = handle.elsewhere()
+    if home is not None:
+        return RemoteWaitList(home, handle.extent, handle.inode)
+    return WaitList(handle.block(), ring)
+
+
+def _reduce(waiters: WaitList) -> tuple[Any, ...]:
+    assert isinstance(waiters.block, heap.Block)
+    return _rebuild, (handle_for_block(ObjectKind.WAIT_LIST, waiters.block),)
+
+
+def _reduce_remote(remote: RemoteWaitList) -> tuple[Any, ...]:
+    return _rebuild, (handle_for_remote_block(remote, remote.extent, remote.inode),)
+
+
+copyreg.pickle(WaitList, _reduce)
+copyreg.pickle(RemoteWaitList, _reduce_remote)

@@ -1,0 +1,136 @@
+"""Who waits at a condition: a table in shared memory, which only the condition's lock's holder
+changes.
+
+::
+
+    next ticket │ two words of the user's │ end │ place │ place │ …
+
+A *place* is for one thread that waits: what became of it, whose it is, when it came, and a
+semaphore on which it sleeps.  Each change is one store, so a holder that dies between two leaves
+the table in order.  To leave a place is one store, too, for which nobody needs the lock.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from itertools import filterfalse, islice
+
+from fiber._sync import identity
+from fiber._sync.semaphore import SLICE, Block, make_semaphore, semaphore_at
+
+SIZE = 1 << 15
+
+# Words of 8 bytes
+_TICKET = 0
+_USERS = 1
+_END = 3  # of the places that anybody ever had
+_PLACES = range(8, SIZE // 8, 8)
+# Of a place
+_STATE = 0
+_WHO = 1  # the process, or 0: it is free
+_CAME = 2
+_BELL = 4
+_WAITS, _WAITS_AFAR, _LOST, _NOTIFIED = range(4)
+
+
+class WaitList:
+    """One table, as this process sees it."""
+
+    __slots__ = ("__weakref__", "_ring", "_words", "block")
+
+    def __init__(self, block: Block, ring: Callable[[], None] = lambda: None) -> None:
+        self.block = block
+        self._ring = ring
+        self._words = block.view.cast("q")
+
+    def enter(self, *, afar: bool = False) -> int:
+        """A place for this thread.  ``afar``: the hub's, for one of another host."""
+        words = self._words
+        place = self._free_place()
+        words[_END] = max(words[_END], place + _PLACES.step)
+        make_semaphore(self._bell(place), 0)
+        words[place] = _WAITS_AFAR if afar else _WAITS
+        words[_TICKET] = words[place + _CAME] = words[_TICKET] + 1
+        words[place + _WHO] = identity.me()  # last: from here on it is taken
+        return place
+
+    def sleep(self, place: int, timeout: float | None) -> None:
+        """Wait until that place is notified, for ``timeout`` seconds at most.  Without the lock."""
+        bell = semaphore_at(self._bell(place))
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not self.is_notified(place):
+            left = SLICE if deadline is None else min(SLICE, deadline - time.monotonic())
+            if bell.acquire(True, left) or left <= 0:
+                return
+
+    def is_notified(self, place: int) -> bool:
+        """Whether whoever waits there is to go on."""
+        return self._words[place] == _NOTIFIED
+
+    def leave(self, place: int) -> bool:
+        """Whether it was notified; it is free then."""
+        notified = self.is_notified(place)
+        self._words[place + _WHO] = 0
+        return notified
+
+    def dismiss(self, place: int) -> None:
+        """Free a place that was taken for longer."""
+        self._words[place + _WHO] = 0
+
+    def lose(self, place: int) -> None:
+        """Whoever waits there, elsewhere, has died."""
+        self._words[place] = _LOST
+
+    def notify(self, n: int) -> None:
+        """Wake the ``n`` that have waited for longest; who died meanwhile is passed over."""
+        words = self._words
+        waiting = [place for place in self._used() if words[place] in (_WAITS, _WAITS_AFAR)]
+        if n < len(waiting):
+            waiting.sort(key=lambda place: words[place + _CAME])
+            waiting = list(islice(filterfalse(self._is_dead, waiting), n))
+        rings = _WAITS_AFAR in [words[place] for place in waiting]
+        for place in waiting:
+            words[place] = _NOTIFIED
+            semaphore_at(self._bell(place)).release()
+        if rings:
+            self._ring()
+
+    def waiters(self) -> int:
+        """How many wait."""
+        return sum(self._words[place] in (_WAITS, _WAITS_AFAR) for place in self._used())
+
+    def bury(self) -> int:
+        """How many died while they waited, since this was asked last."""
+        dead = [place for place in self._used() if self._is_dead(place)]
+        for place in dead:
+            self._words[place + _WHO] = 0
+        return len(dead)
+
+    def get(self, number: int) -> int:
+        """One of the user's two words."""
+        return self._words[_USERS + number]
+
+    def set(self, number: int, value: int) -> None:
+        """Set it."""
+        self._words[_USERS + number] = value
+
+    def _free_place(self) -> int:
+        for is_free in (self._is_unused, self._is_dead):
+            for place in filter(is_free, _PLACES):
+                return place
+        raise OSError(f"more than {len(_PLACES)} threads wait at one condition")
+
+    def _bell(self, place: int) -> int:
+        return self.block.address + 8 * (place + _BELL)
+
+    def _is_unused(self, place: int) -> bool:
+        return not self._words[place + _WHO]
+
+    def _used(self) -> Iterator[int]:
+        places = range(_PLACES.start, self._words[_END], _PLACES.step)
+        return (place for place in places if self._words[place + _WHO])
+
+    def _is_dead(self, place: int) -> bool:
+        words = self._words
+        return words[place] == _LOST or not identity.is_alive(words[place + _WHO])

@@ -1,0 +1,128 @@
+"""What a program cannot have: an error at once that says what to do, and never a silent wait."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+
+import pytest
+
+from e2e.accounts import ACCOUNT, may_read_credentials
+from e2e.clusters import Cluster
+from e2e.kube import Body, Refused, path_of
+from e2e.leftovers import leaves_nothing
+from e2e.pools import Pool
+from e2e.program import Programs
+from e2e.release import Release
+from e2e.scene import Scene
+from e2e.test_program_faults import RUNNING
+from fiber_api import names
+
+
+def nothing_done(_: Scene) -> None: ...
+
+
+def no_pods_allowed(scene: Scene) -> None:
+    hard = {"metadata": {"name": "none"}, "spec": {"hard": {"pods": "0"}}}
+    scene.kube.create(scene.path("resourcequotas"), hard)
+
+
+def role_taken_away(scene: Scene) -> None:
+    scene.kube.delete(scene.path("rolebindings", ACCOUNT))
+
+
+REFUSED = {
+    "an image that is not there": (
+        nothing_done,
+        {"image": "registry.invalid/none:1"},
+        ("ErrImagePull", "registry.invalid/none:1"),
+        45,
+    ),
+    "no name of an image": (nothing_done, {"image": "No:Name:1"}, ("InvalidImageName",), 15),
+    "a quota": (no_pods_allowed, {}, ("exceeded quota", "none"), 15),
+    "no right": (role_taken_away, {}, ("fiberpools", "fiber-user"), 10),
+    "a namespace that is not there": (nothing_done, {"namespace": "nowhere"}, ("nowhere",), 10),
+}
+"""What is so before the program starts, what it is told, what it says, and within how long."""
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_come_is_an_error_at_once(case: str, programs: Programs, scene: Scene) -> None:
+    prepare, settings, words, seconds = REFUSED[case]
+    prepare(scene)
+    program = programs.start("outside", "mapping.py", **settings)
+    output = program.ends(status=1, seconds=seconds)
+    assert "FiberPoolError" in output
+    assert all(word in output for word in words), output
+    leaves_nothing(program)
+
+
+def test_without_an_operator_nobody_waits(programs: Programs, release: Release) -> None:
+    release.stop()
+    try:
+        program = programs.start("outside", "mapping.py")
+        program.prints("operator", seconds=15)  # a warning, before it is an error
+        output = program.ends(status=1, seconds=45)
+        assert "FiberPoolError" in output
+        assert "helm install" in output
+    finally:
+        release.start()
+    leaves_nothing(program)
+
+
+@pytest.mark.usefixtures("bare_cluster")
+def test_a_cluster_without_fiber(programs: Programs, cluster: Cluster) -> None:
+    programs.kubeconfig = cluster.kubeconfig  # an administrator's: the role went with the rest
+    output = programs.start("outside", "mapping.py").ends(status=1, seconds=15)
+    assert "FiberPoolError" in output
+    assert "helm install" in output
+
+
+@pytest.fixture
+def older_definition(scene: Scene, agent: Body) -> Iterator[None]:
+    """FiberPools as they were before one of the fields that every program sets."""
+    path = path_of("customresourcedefinitions", name=names.CRD_NAME)
+    definition = scene.kube.get(path)
+    assert definition is not None
+    versions = definition["spec"]["versions"]
+    older = copy.deepcopy(versions)
+    del older[0]["schema"]["openAPIV3Schema"]["properties"]["spec"]["properties"]["onLost"]
+    pool = Pool(scene, "probe").manifest(agent, onLost="Delete")
+    scene.kube.patch(path, {"spec": {"versions": older}})
+    scene.wait("the older one is served", lambda: not is_valid(scene, pool), poll=0.2)
+    yield
+    scene.kube.patch(path, {"spec": {"versions": versions}})
+    scene.wait("the newer one is served", lambda: is_valid(scene, pool), poll=0.2)
+
+
+def is_valid(scene: Scene, pool: Body) -> bool:
+    strictly = {"dryRun": "All", "fieldValidation": "Strict"}
+    try:
+        scene.kube.create(scene.path("fiberpools"), pool, **strictly)
+    except Refused:
+        return False
+    return True
+
+
+@pytest.mark.usefixtures("older_definition")
+def test_fiberpools_of_an_older_version(programs: Programs) -> None:
+    program = programs.start("outside", "mapping.py")
+    output = program.ends(status=1, seconds=15)
+    assert all(word in output for word in ("FiberPoolError", "spec.onLost", "chart")), output
+    leaves_nothing(program)
+
+
+def test_a_second_program_is_told_who_holds_a_pool(
+    programs: Programs, scene: Scene, agent: Body
+) -> None:
+    warm = Pool(scene, "warm").apply(agent, minReplicas=2)
+    may_read_credentials(scene, "warm")
+    there = warm.ready(2)
+    first = programs.start("outside", "mapping.py", "--workers", 2, *RUNNING, pool="warm")
+    first.says("first")
+    identity = warm.body["spec"]["master"]["identity"]
+    output = programs.start("outside", "mapping.py", pool="warm").ends(status=1, seconds=15)
+    assert "FiberPoolError" in output
+    assert identity in output
+    assert first.says("done", seconds=90)["hosts"] == there
+    first.ends()

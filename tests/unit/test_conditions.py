@@ -1,0 +1,267 @@
+"""Conditions and barriers, on one host and between hosts."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import fiber
+from census import wait_until
+from fiber import synchronize
+from fiber._hub import hosted_wait_list
+from hosts import PATIENCE, Far, Hosts, background
+
+
+@pytest.fixture
+def hosts() -> Iterator[Hosts]:
+    hosts = Hosts()
+    hosts.link("b", "a")
+    with hosts.at("b"):
+        yield hosts
+    hosts.close()
+
+
+@pytest.fixture(params=["one host", "two hosts"])
+def brought(request: pytest.FixtureRequest, hosts: Hosts) -> Callable[[Any], Any]:
+    """Brings a thing where another process could be."""
+    return Far(hosts) if request.param == "two hosts" else lambda thing: thing
+
+
+def on_thread(action: Callable[[], Any]) -> Any:
+    results: list[Any] = []
+    background(lambda: results.append(action())).join(PATIENCE)
+    return results[0]
+
+
+def waiter(condition: Any, woken: list[Any], name: str) -> threading.Thread:
+    """A thread that waits, once it does."""
+    before = condition._waiters.waiters()
+
+    def wait() -> None:
+        with condition:
+            if condition.wait(PATIENCE):
+                woken.append(name)
+
+    thread = background(wait)
+    wait_until(lambda: condition._waiters.waiters() == before + 1, PATIENCE)
+    return thread
+
+
+def fork_that(action: Callable[[], object]) -> int:
+    """The pid of a process that does it."""
+    pid = os.fork()
+    if not pid:
+        try:
+            action()
+        finally:
+            os._exit(0)
+    return pid
+
+
+def kill(pid: int) -> None:
+    os.kill(pid, 9)
+    os.waitpid(pid, 0)
+
+
+# Conditions
+
+
+def test_the_first_to_come_is_the_first_to_be_notified(brought: Callable[[Any], Any]) -> None:
+    here, woken = fiber.Condition(), []
+    there = brought(here)
+    threads = [waiter(condition, woken, name) for condition, name in ((there, "1"), (here, "2"))]
+    for count in (1, 2):
+        with here:
+            here.notify()
+        wait_until(lambda: len(woken) == count, PATIENCE)  # noqa: B023 - it is called at once
+    assert woken == ["1", "2"]
+    for thread in threads:
+        thread.join(PATIENCE)
+
+
+def test_all_are_notified_from_elsewhere(brought: Callable[[Any], Any]) -> None:
+    here, woken = fiber.Condition(fiber.Lock()), []
+    there = brought(here)
+    threads = [waiter(condition, woken, "") for condition in (here, there, here, there)]
+    assert repr(here) == "<Condition(<Lock(owner=None)>, 4)>"
+    with there:
+        there.notify(1)
+        there.notify_all()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert len(woken) == 4
+    assert not here._waiters.waiters()
+
+
+def test_who_waits_has_let_go_of_the_lock_and_gets_it_back(brought: Callable[[Any], Any]) -> None:
+    here = fiber.Condition()
+    there = brought(here)
+    with there, there:
+        assert there.wait(0.01) is False
+        assert not on_thread(lambda: here.acquire(False))
+    assert here.acquire(timeout=PATIENCE)
+
+
+def test_wait_for_says_what_the_predicate_says(brought: Callable[[Any], Any]) -> None:
+    there = brought(fiber.Condition())
+    with there:
+        assert there.wait_for(lambda: 0, timeout=0.01) == 0
+        assert there.wait_for(lambda: "yes") == "yes"
+
+
+def test_without_the_lock_it_is_refused(brought: Callable[[Any], Any]) -> None:
+    there = brought(fiber.Condition())
+    for call in (there.wait, there.notify, there.notify_all):
+        with pytest.raises(AssertionError, match="must acquire"):
+            call()
+
+
+def test_who_was_killed_while_it_waited_is_passed_over() -> None:
+    condition, woken = fiber.Condition(), []
+    pid = fork_that(lambda: condition.acquire() and condition.wait())
+    wait_until(lambda: condition._waiters.waiters() == 1, PATIENCE)
+    kill(pid)
+    thread = waiter(condition, woken, "living")
+    with condition:
+        condition.notify()
+    thread.join(PATIENCE)
+    assert woken == ["living"]
+
+
+def test_who_died_elsewhere_while_it_waited_is_passed_over(hosts: Hosts) -> None:
+    condition, woken = fiber.Condition(), []
+    there = Far(hosts)(condition)
+    place = there._waiters.enter()
+    assert condition._waiters.waiters() == 1
+    place.close()
+    wait_until(lambda: condition._waiters.waiters() == 0, PATIENCE)
+    thread = waiter(condition, woken, "living")
+    with condition:
+        condition.notify()
+    thread.join(PATIENCE)
+    assert woken == ["living"]
+
+
+def test_one_elsewhere_wakes_though_the_doorbell_was_never_rung(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hosted_wait_list, "_LOOK", 0.01)
+    condition, woken = fiber.Condition(), []
+    thread = waiter(Far(hosts)(condition), woken, "far")
+    condition._waiters._ring = lambda: None  # the notifier dies just before
+    with condition:
+        condition.notify()
+    thread.join(PATIENCE)
+    assert woken == ["far"]
+
+
+def test_ctrl_c_in_a_wait_leaves_no_waiter(
+    brought: Callable[[Any], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def strike(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    there = brought(fiber.Condition())
+    monkeypatch.setattr(type(there._waiters), "sleep", strike)
+    with there, pytest.raises(KeyboardInterrupt):
+        there.wait()
+    assert not there._waiters.waiters()
+
+
+# Barriers
+
+
+def test_a_barrier_lets_all_go_at_once(brought: Callable[[Any], Any]) -> None:
+    acted: list[Any] = []
+    there = brought(fiber.Barrier(3))
+    there._action = lambda: acted.append(there.n_waiting)
+    numbers: list[int] = []
+    threads = [background(lambda: numbers.append(there.wait(PATIENCE))) for _ in range(3)]
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert sorted(numbers) == [0, 1, 2]
+    assert acted == [3]
+
+
+def test_a_barrier_is_used_again_from_several_hosts(hosts: Hosts) -> None:
+    here = fiber.Barrier(2)
+    there = Far(hosts)(here)
+    thread = background(lambda: [there.wait(PATIENCE) for _ in range(20)])
+    for _ in range(20):
+        assert here.wait(PATIENCE) in (0, 1)
+    thread.join(PATIENCE)
+    assert not here.broken
+    assert here.parties == there.parties == 2
+
+
+def test_a_timeout_breaks_it_until_it_is_reset(brought: Callable[[Any], Any]) -> None:
+    there = brought(fiber.Barrier(2))
+    with pytest.raises(threading.BrokenBarrierError, match="did not come"):
+        there.wait(0.01)
+    assert there.broken
+    with pytest.raises(threading.BrokenBarrierError):
+        there.wait()
+    there.reset()
+    assert not there.broken
+    assert there.n_waiting == 0
+
+
+def test_a_barrier_for_nobody_is_refused() -> None:
+    with pytest.raises(ValueError, match="0"):
+        fiber.Barrier(0)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(synchronize, "RECHECK", 0.05)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_member_killed_while_it_waits_breaks_the_barrier() -> None:
+    barrier = fiber.Barrier(3)
+    pid = fork_that(barrier.wait)
+    wait_until(lambda: barrier.n_waiting == 1, PATIENCE)
+    kill(pid)
+    with pytest.raises(threading.BrokenBarrierError, match="have died"):
+        barrier.wait(PATIENCE)
+    assert barrier.n_waiting == 0
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_member_killed_between_two_waits_breaks_the_barrier() -> None:
+    barrier = fiber.Barrier(2)
+    pid = fork_that(lambda: (barrier.wait(PATIENCE), os.kill(os.getpid(), 19)))
+    barrier.wait(PATIENCE)
+    kill(pid)
+    with pytest.raises(threading.BrokenBarrierError, match="have died"):
+        barrier.wait(PATIENCE)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_member_that_dies_elsewhere_breaks_the_barrier(hosts: Hosts) -> None:
+    barrier = fiber.Barrier(2)
+    there = Far(hosts)(barrier)
+    there._members.enter().close()
+    with pytest.raises(threading.BrokenBarrierError, match="have died"):
+        barrier.wait(PATIENCE)
+
+
+def take_part(barrier: Any) -> None:
+    barrier.wait(PATIENCE)
+
+
+def test_members_that_end_in_good_order_are_not_missed() -> None:
+    barrier = fiber.Barrier(2)
+    for _ in range(2):
+        process = fiber.Process(target=take_part, args=(barrier,))
+        process.start()
+        barrier.wait(PATIENCE)
+        process.join(PATIENCE)
+    with barrier._cond:
+        assert not barrier._bury()
+    assert pickle.loads(pickle.dumps(barrier)).parties == 2

@@ -1,0 +1,240 @@
+"""Locks and semaphores of another host."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+from weakref import WeakValueDictionary
+
+import pytest
+
+import fiber
+from fiber._hub import shared_semaphores
+from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.protocol import Op, Status
+from fiber._hub.remote_semaphore import RemoteSemaphore
+from fiber.synchronize import Abandoned
+from hosts import PATIENCE, Far, Hosts, Wire, background, objects_kept
+
+MAKERS = {
+    "Lock": fiber.Lock,
+    "RLock": fiber.RLock,
+    "Semaphore": fiber.Semaphore,
+    "BoundedSemaphore": fiber.BoundedSemaphore,
+}
+
+
+@pytest.fixture
+def hosts() -> Iterator[Hosts]:
+    """Locks are made on host a; this process is on host b."""
+    hosts = Hosts()
+    hosts.link("b", "a")
+    with hosts.at("b"):
+        yield hosts
+    hosts.close()
+
+
+@pytest.fixture
+def far(hosts: Hosts) -> Far:
+    return Far(hosts)
+
+
+@pytest.fixture(params=MAKERS.values(), ids=MAKERS.keys())
+def here(request: pytest.FixtureRequest, hosts: Hosts) -> Any:
+    with hosts.at("a"):
+        return request.param()
+
+
+def on_thread(action: Callable[[], Any]) -> Any:
+    results: list[Any] = []
+    background(lambda: results.append(action())).join(PATIENCE)
+    return results[0]
+
+
+def test_one_host_at_a_time(here: Any, far: Far) -> None:
+    there = far(here)
+    assert isinstance(there._semlock, RemoteSemaphore)
+    with there as acquired:
+        assert acquired is True
+        assert not here.acquire(False)
+        assert not on_thread(lambda: there.acquire(timeout=0.01))
+        assert not on_thread(lambda: there.acquire(False))
+    with here:
+        assert not there.acquire(False)
+        assert not there.acquire(timeout=-1)
+    assert there.acquire(False)
+
+
+def test_who_waits_elsewhere_gets_it(here: Any, far: Far) -> None:
+    there = far(here)
+    got: list[Any] = []
+    with here:
+        waiters = [background(lambda: (got.append(there.acquire()), there.release())) for _ in "ab"]
+    for waiter in waiters:
+        waiter.join(PATIENCE)
+    assert got == [True, True]
+    assert here.acquire(timeout=PATIENCE)
+
+
+def test_an_rlock_of_another_host_is_its_threads(far: Far) -> None:
+    lock = fiber.RLock()
+    there, again = far(lock), far(lock)
+    assert there._semlock is again._semlock
+    with there, again:
+        assert repr(there) == "<RLock(MainProcess, 2)>"
+        assert on_thread(lambda: repr(there)) == "<RLock(SomeOtherThread, nonzero)>"
+        assert not on_thread(lambda: there.acquire(False))
+        assert "SomeOther" in repr(lock)
+    assert repr(there) == "<RLock(None, 0)>"
+    with pytest.raises(AssertionError, match="not owned by thread"):
+        there.release()
+
+
+@pytest.mark.parametrize("name", ["Lock", "BoundedSemaphore"])
+def test_a_release_too_many_is_refused(name: str, far: Far) -> None:
+    there = far(MAKERS[name]())
+    with pytest.raises(ValueError, match="too many times"):
+        there.release()
+    assert there.acquire(timeout=PATIENCE)
+
+
+def test_a_semaphore_carries_signals_between_hosts(far: Far) -> None:
+    here = fiber.Semaphore(0)
+    there = far(here)
+    there.release()
+    assert here.acquire(timeout=PATIENCE)
+    here.release()
+    assert there.acquire(timeout=PATIENCE)
+    assert there.get_value() == 0
+
+
+def test_it_goes_on_to_other_processes(here: Any, far: Far, hosts: Hosts) -> None:
+    there = far(here)
+    data, home = pickle.dumps(there), pickle.dumps(there)
+    again = pickle.loads(data)
+    with hosts.at("a"):
+        assert pickle.loads(home)._semlock is here._semlock
+    with again:
+        assert not here.acquire(False)
+
+
+def test_nothing_is_kept_for_nobody(far: Far, hosts: Hosts) -> None:
+    lock = fiber.Lock()
+    there = far(lock)
+    assert objects_kept(hosts["a"]) == 1
+    del there
+    gc.collect()
+    assert objects_kept(hosts["a"]) == 0
+
+
+# What goes wrong
+
+
+def die_holding(there: Any) -> None:
+    """What the kernel does when its process dies."""
+    there._semlock._holding[0].close()
+
+
+@pytest.mark.filterwarnings("ignore:MainProcess:RuntimeWarning")
+def test_who_dies_elsewhere_gives_it_back(here: Any, far: Far) -> None:
+    there = far(here)
+    assert there.acquire()
+    die_holding(there)
+    acquired = here.acquire(timeout=PATIENCE)
+    assert isinstance(acquired, Abandoned)
+    assert acquired.holder.startswith("MainProcess (pid ")
+    assert acquired.holder.endswith(" on b)")
+    here.release()
+    assert here.acquire() is True
+
+
+def test_the_warning_names_who_died_elsewhere(far: Far, hosts: Hosts) -> None:
+    here = fiber.Lock()
+    there = far(here)
+    assert there.acquire()
+    with pytest.warns(RuntimeWarning, match=r"MainProcess \(pid \d+ on b\) ended while it held"):
+        die_holding(there), here.acquire(timeout=PATIENCE)
+
+
+@pytest.mark.filterwarnings("ignore:MainProcess:RuntimeWarning")
+def test_who_waits_elsewhere_is_told_of_a_death(
+    here: Any, far: Far, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = far(here)
+    monkeypatch.setattr(shared_semaphores, "_known", WeakValueDictionary())
+    other = far(here)  # in another process
+    assert one.acquire()
+    die_holding(one)
+    acquired = on_thread(lambda: other.acquire(timeout=PATIENCE))
+    assert isinstance(acquired, Abandoned)
+    assert "on b" in acquired.holder
+
+
+def test_ctrl_c_within_acquire_leaves_it_to_others(
+    here: Any, far: Far, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = far(here)
+    ask = HubStream.ask
+
+    def strike(stream: HubStream, *args: Any, **options: Any) -> Any:
+        monkeypatch.undo()
+        assert ask(stream, *args, **options).status is Status.OK
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(HubStream, "ask", strike)
+    with pytest.raises(KeyboardInterrupt):
+        there.acquire()
+    assert here.acquire(timeout=PATIENCE) is True
+    here.release()
+    assert there.acquire(timeout=PATIENCE)
+
+
+def test_a_link_that_ends_is_an_error_and_gives_it_back(here: Any, far: Far, hosts: Hosts) -> None:
+    there = far(here)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        assert there.acquire()
+        hosts.on_loop(hosts["a"].unlink, "b", "it was cut")
+        hosts.on_loop(hosts["b"].unlink, "a", "it was cut")
+        assert here.acquire(timeout=PATIENCE)
+    with pytest.raises(Unreachable, match="it was cut"):
+        there.release()
+
+
+def test_while_a_link_is_cut_it_waits(here: Any) -> None:
+    hosts = Hosts()
+    wires: tuple[Wire, Wire] = hosts.link("b", "a")
+    try:
+        with hosts.at("b"):
+            there = Far(hosts)(here)
+            assert there.acquire()
+            there.release()
+            for wire in wires:
+                hosts.on_loop(wire.hold)
+            acquired = threading.Event()
+            waiting = background(lambda: (there.acquire(), acquired.set()))
+            assert not acquired.wait(0.05)
+            for wire in wires:
+                hosts.on_loop(wire.let_go)
+            assert acquired.wait(PATIENCE)
+            waiting.join(PATIENCE)
+            assert not here.acquire(False)
+    finally:
+        hosts.close()
+
+
+@pytest.mark.parametrize("operation", [Op.ACQUIRE, Op.POST, Op.TOKENS])
+def test_a_stream_for_something_else_is_refused(operation: Op, far: Far) -> None:
+    reader, writer = fiber.Pipe(duplex=False)
+    there = far(reader)
+    with (
+        there._channel.stream() as stream,
+        pytest.raises(Unreachable, match="not attached to a lock"),
+    ):
+        stream.ask(operation, buffers=[memoryview(b"me")])
+    for end in (there, reader, writer):
+        end.close()
