@@ -50,7 +50,9 @@ def test_wait_and_as_completed(executor: fiber.Executor, tmp_path: Path) -> None
     assert [future.result() for future in futures.as_completed([waits], PATIENCE)] == ["gate"]
 
 
-def test_callbacks_run_neither_on_the_loops_thread_nor_too_late(executor: fiber.Executor) -> None:
+def test_callbacks_run_neither_on_the_loops_thread_nor_too_late(
+    executor: fiber.Executor, tmp_path: Path
+) -> None:
     names: list[str] = []
     called = threading.Event()
 
@@ -59,7 +61,8 @@ def test_callbacks_run_neither_on_the_loops_thread_nor_too_late(executor: fiber.
         assert future.done()
         called.set()
 
-    executor.submit(tasks.sleep, 0.01).add_done_callback(note)
+    executor.submit(tasks.wait_for, tmp_path / "gate").add_done_callback(note)
+    (tmp_path / "gate").touch()
     assert called.wait(PATIENCE)
     done = executor.submit(tasks.square, 1)
     done.result(PATIENCE)
@@ -165,13 +168,13 @@ def test_map_ends_with_the_first_error(executor: fiber.Executor) -> None:
 
 
 def test_map_has_a_deadline(executor: fiber.Executor, tmp_path: Path) -> None:
-    results = executor.map(
-        tasks.wait_if_first, [(1, tmp_path / "x"), (0, tmp_path / "g")], timeout=0.3
-    )
-    assert next(results) == 1
+    gates = [tmp_path / "open", tmp_path / "shut"]
+    gates[0].touch()
+    assert list(executor.map(tasks.wait_for, gates[:1], timeout=PATIENCE)) == ["open"]
+    results = executor.map(tasks.wait_for, gates[1:], timeout=0.1)
     with pytest.raises(TimeoutError, match="not there in time"):
         next(results)
-    (tmp_path / "g").touch()
+    gates[1].touch()
 
 
 def test_map_reads_no_more_than_its_buffer(executor: fiber.Executor) -> None:
