@@ -45,13 +45,17 @@ class Order:
 
 
 class _NoHub:
-    """No object is shared here, so no tunnel is ever opened: all that a service asks of a hub."""
+    """No object is shared here: all that a service asks of a hub, and of its link to another."""
 
-    def link(self, *_: object, **__: object) -> None:
+    def link(self, *_: object, **__: object) -> _NoHub:
         """There will be no frames for it."""
+        return self
+
+    def flush(self) -> None:
+        """No memory is shared, either."""
 
     def unlink(self, *_: object) -> None:
-        """Nor an end of them."""
+        """Nor is there anything to end."""
 
 
 class AgentHost:

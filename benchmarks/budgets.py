@@ -13,6 +13,7 @@ from benchmarks import (
     latency,
     overhead,
     pipes,
+    sharing,
     startup,
     throughput,
     workers,
@@ -180,6 +181,20 @@ def _pipes() -> Iterator[Budget]:
         yield Budget(f"vector step, {case}", "pipes", case, pipes.STEP.name, 0.8)
 
 
+def _sharing() -> Iterator[Budget]:
+    bounds = {
+        sharing.ROUND_TRIP: 1.0,
+        sharing.MANAGER: 1.0,
+        sharing.LOCK: 3.0,
+        sharing.VALUE: 3.0,
+        **{sharing.array(megabytes): 1.05 for megabytes in sharing.MEGABYTES},
+    }
+    for case, bound in bounds.items():
+        yield Budget(case, "sharing", case, sharing.CALL.name, bound)
+    case = sharing.STREAM
+    yield Budget(case, "sharing", case, sharing.RATE.name, 1.0, at_least=True)
+
+
 def _start() -> Iterator[Budget]:
     for count, metric, what in (
         (1, coldstart.READY, "first worker ready"),
@@ -273,5 +288,13 @@ def _on_pods() -> Iterator[Budget]:
     )
 
 
-BUDGETS = (*_pool(), *_executors(), *_pipes(), *_start(), *_remote(), *_many())
+BUDGETS = (
+    *_pool(),
+    *_executors(),
+    *_pipes(),
+    *_sharing(),
+    *_start(),
+    *_remote(),
+    *_many(),
+)
 ON_PODS = tuple(_on_pods())

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
 _EXECUTOR = frozenset({"map", "stream", "submit", "apply"})
-_PROCESSES = frozenset({"pipes", "start", "cold start"})
+_PROCESSES = frozenset({"pipes", "sharing", "start", "cold start"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 

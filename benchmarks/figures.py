@@ -10,7 +10,17 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-from benchmarks import agents, coldstart, latency, overhead, pipes, startup, throughput, workers
+from benchmarks import (
+    agents,
+    coldstart,
+    latency,
+    overhead,
+    pipes,
+    sharing,
+    startup,
+    throughput,
+    workers,
+)
 from benchmarks.contenders import BY_NAME
 from benchmarks.model import Metric, Run
 from benchmarks.samples import Summary, in_words, summary
@@ -95,6 +105,18 @@ def _pipes(run: Run, path: Path) -> None:
     _finish(figure, path)
 
 
+def _sharing(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 2, figsize=(13, 5), width_ratios=(2, 1))
+    arrays = [sharing.array(megabytes) for megabytes in sharing.MEGABYTES]
+    cases = sharing.cases(run.about["size"])
+    calls = [case.name for case in cases if sharing.CALL in case.metrics]
+    _rows(panels[0], run, [name for name in calls if name not in arrays], sharing.CALL)
+    panels[0].set(title="Calls: further left is better", xlabel="time of one")
+    _rows(panels[1], run, arrays, sharing.CALL)
+    panels[1].set(title="Arrays, written there and read here", xlabel="time of one")
+    _finish(figure, path)
+
+
 def _pipe_panel(
     panel: Any, run: Run, messages: Sequence[str], cases: Sequence[str], where: str
 ) -> None:
@@ -167,6 +189,7 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "throughput": _throughput,
     "latency": _latency,
     "pipes": _pipes,
+    "sharing": _sharing,
     "startup": _startup,
     "coldstart": _coldstart,
     "workers": _workers,

@@ -22,8 +22,7 @@ def main() -> None:
     for milliseconds in dict.fromkeys([0.0, options.ms]):
         makes = makers(options, milliseconds)
         alone, expected = run(SyncVectorEnv(makes), options)
-        # shared_memory=False: the observations come through the pipes.
-        spread, seen = run(AsyncVectorEnv(makes, shared_memory=False), options)
+        spread, seen = run(AsyncVectorEnv(makes), options)
         if not np.array_equal(expected, seen):
             raise SystemExit("the two saw different observations")
         took = f"{milliseconds:g} ms" if milliseconds else "what it takes"

@@ -1,5 +1,9 @@
 """``Connection``, ``Pipe`` and ``wait``: multiprocessing's, over message channels.
 
+``Listener``, ``Client`` and what belongs to them, ``families`` or ``CHALLENGE`` for instance, are
+multiprocessing's own: they meet other programs.  With an ``authkey`` both sides prove that they
+know it, or get an AuthenticationError.
+
 A message arrives whole.  Large contiguous buffers (NumPy arrays) are not copied into the pickle.
 """
 
@@ -7,6 +11,8 @@ from __future__ import annotations
 
 import pickle
 import weakref
+from multiprocessing import AuthenticationError
+from multiprocessing import connection as _mp
 from multiprocessing.connection import Client, Listener, answer_challenge, deliver_challenge, wait
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +28,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 __all__ = [
+    "AuthenticationError",
     "Client",
     "Connection",
     "Listener",
@@ -30,6 +37,13 @@ __all__ = [
     "deliver_challenge",
     "wait",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    try:
+        return vars(_mp)[name]
+    except KeyError:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
 
 
 _LAST_MOMENT = 0.05

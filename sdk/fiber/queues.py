@@ -16,6 +16,7 @@ Differs from multiprocessing in that an item is pickled when it is put, not some
 
 from __future__ import annotations
 
+import threading
 import time
 import types
 from multiprocessing import util
@@ -23,6 +24,7 @@ from queue import Empty, Full
 from typing import Any
 
 from fiber import reduction
+from fiber._hub.dealer import Dealer, arrive
 from fiber._hub.feeder import Feeder, ItemCount, Slots
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._transport.base import SharedCounter
@@ -31,7 +33,7 @@ from fiber._wire.packet import Message
 from fiber.connection import Connection
 from fiber.synchronize import RECHECK
 
-__all__ = ["Empty", "Full", "JoinableQueue", "Queue", "SimpleQueue"]
+__all__ = ["Empty", "Full", "JoinableQueue", "Queue", "SimpleQueue", "SimpleQueuePush"]
 
 
 class Queue:
@@ -228,7 +230,11 @@ class SimpleQueue:
 
     def empty(self) -> bool:
         """Whether ``get`` would wait."""
-        return not self._reader.poll()
+        return not self._poll()
+
+    def _poll(self, timeout: float | None = 0.0) -> bool:
+        """What some libraries call to wait with a timeout."""
+        return self._reader.poll(timeout)
 
     def close(self) -> None:
         """This process puts and gets no more."""
@@ -243,3 +249,62 @@ class SimpleQueue:
 
     def __class_getitem__(cls, item: Any) -> types.GenericAlias:
         return types.GenericAlias(cls, item)
+
+
+class SimpleQueuePush:
+    """A queue that deals its items round robin: each to the next reader in turn, before it asks.
+
+    A process is a reader from its first ``get`` on, until it closes the queue or ends; an item for
+    which a reader has no room goes to the next one.  It suits items that take equally long.  What
+    was dealt to a reader that ends is lost with it, so where that must not be, or where items
+    differ, use ``SimpleQueue``, of which each reader takes an item when it has time for one.
+
+    A thread of the process that makes the queue deals the items.
+    """
+
+    _writer: Connection
+    _reader: Connection | None
+
+    def __init__(self, *, ctx: Any = None) -> None:
+        inbox, outbox = LocalChannel.pair()
+        arrivals, door = LocalChannel.pair()
+        Dealer(inbox, arrivals).start()
+        self.__setstate__((Connection(outbox, readable=False), door))
+
+    def put(self, obj: Any) -> None:
+        """Put an item; waits for room while every reader has more than it can hold."""
+        self._writer.send(obj)
+
+    def get(self) -> Any:
+        """The next of the items dealt to this process."""
+        return self._joined().recv()
+
+    def empty(self) -> bool:
+        """Whether ``get`` would wait."""
+        return not self._joined().poll()
+
+    def close(self) -> None:
+        """This process puts and gets no more."""
+        self._writer.close()
+        self._door.close()
+        if self._reader is not None:
+            self._reader.close()
+
+    def _joined(self) -> Connection:
+        with self._joining:  # two would be two readers, of which one is never asked
+            if self._reader is None:
+                self._reader = Connection(arrive(self._door), writable=False)
+        return self._reader
+
+    def __getstate__(self) -> tuple[Any, ...]:
+        return self._writer, self._door
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self._writer, self._door = state
+        self._reader = None
+        self._joining = threading.Lock()
+        util.register_after_fork(self, SimpleQueuePush._after_fork)
+
+    def _after_fork(self) -> None:
+        self._reader = None  # the parent reads that one
+        self._joining = threading.Lock()

@@ -20,6 +20,7 @@ from multiprocessing import context as mp_context
 from multiprocessing import process as mp_process
 from multiprocessing import reduction as mp_reduction
 from multiprocessing.reduction import (
+    HAVE_SEND_HANDLE,
     DupFd,
     ForkingPickler,
     recv_handle,
@@ -39,6 +40,7 @@ from fiber._wire.descriptor import Descriptor, opened
 from fiber.errors import UnpicklableError
 
 __all__ = [
+    "HAVE_SEND_HANDLE",
     "AbstractReducer",
     "DupFd",
     "ForkingPickler",

@@ -1,5 +1,9 @@
-"""multiprocessing's utilities: finalizers, logging, exit functions.  Shared, not copied."""
+"""multiprocessing's utilities: finalizers, logging, exit functions.  Shared, not copied.
 
+Any other name, as those with an underscore that libraries import, is multiprocessing's as well.
+"""
+
+from multiprocessing import util as _mp
 from multiprocessing.util import (
     DEBUG,
     INFO,
@@ -41,3 +45,10 @@ __all__ = [
     "sub_debug",
     "sub_warning",
 ]
+
+
+def __getattr__(name: str) -> object:
+    try:
+        return vars(_mp)[name]
+    except KeyError:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None

@@ -263,3 +263,25 @@ def touch_until_it_fails(shared: Any, connection: Any) -> None:
             len(shared)
     except Exception as error:
         connection.send(f"{type(error).__name__}: {error}")
+
+
+def read_as_told(queue: Any, orders: Any) -> None:
+    """Call methods of a queue by name, and send what they return."""
+    while True:
+        orders.send(getattr(queue, orders.recv())())
+
+
+def read_one(queue: Any, sent: Any) -> None:
+    sent.put(queue.get())
+
+
+def make_a_push_queue(connection: Any) -> None:
+    """Send a queue with an item in it, and the same again when asked."""
+    from fiber.queues import SimpleQueuePush
+
+    queue = SimpleQueuePush()
+    queue.put(1)
+    connection.send(queue)
+    connection.recv()
+    connection.send(queue)
+    block()

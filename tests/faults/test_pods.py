@@ -79,6 +79,22 @@ def add_turn(index: int) -> None:
     sums[index] += turn.value
 
 
+def acquire_and_die(lock: Any) -> None:
+    lock.acquire()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def acquired_after(process: fiber.Process, lock: Any) -> Any:
+    process.start()
+    process.join(PATIENCE)
+    return lock.acquire(timeout=PATIENCE)
+
+
+def wait_twice(barrier: Any) -> None:
+    barrier.wait(PATIENCE)
+    signal.pause()
+
+
 def slow_square(number: int) -> int:
     time.sleep(0.02)
     return number * number
@@ -125,6 +141,30 @@ def test_pods_share_memory_with_the_program_and_each_other(cluster: FakeCluster)
                 turn.value = number
                 pool.map(add_turn, range(20), chunksize=1)
         assert list(sums) == [6] * 20
+
+
+def test_what_a_killed_process_of_a_pod_held_is_released(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"):
+        lock = fiber.Lock()
+        process = fiber.Process(target=acquire_and_die, args=(lock,))
+        died = rf"{process.name} \(pid \d+ on .*ended while it held"
+        with pytest.warns(RuntimeWarning, match=died):
+            acquired = acquired_after(process, lock)
+        assert isinstance(acquired, fiber.synchronize.Abandoned)
+        assert process.name in acquired.holder
+
+
+def test_a_barrier_of_which_a_pod_is_deleted_is_broken(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"):
+        barrier = fiber.Barrier(2)
+        process = fiber.Process(target=wait_twice, args=(barrier,))
+        process.start()
+        assert barrier.wait(PATIENCE) in (0, 1)
+        (pod,) = pods_of(cluster)
+        cluster.do(cluster.world.store.delete, "pods", "lab", pod)
+        with pytest.raises(threading.BrokenBarrierError, match="have died"):
+            barrier.wait(PATIENCE)
+        process.join(PATIENCE)
 
 
 def test_the_next_pool_begins_on_pods_that_are_there(cluster: FakeCluster) -> None:

@@ -16,6 +16,9 @@ from fiber import synchronize
 from fiber._hub import hosted_wait_list
 from hosts import PATIENCE, Far, Hosts, background
 
+# From Python 3.12 on os.fork() warns of any thread, and the runtime's loop may be one.
+pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+
 
 @pytest.fixture
 def hosts() -> Iterator[Hosts]:

@@ -17,6 +17,7 @@ import pytest
 
 import fiber
 from census import wait_until
+from fiber import connection
 from fiber._transport import unix
 from fiber._transport.unix import UnixChannel
 from fiber._wire.packet import Message
@@ -449,3 +450,44 @@ def test_who_waits_for_an_answer_looks_and_then_sleeps(
     here.send("question")
     assert here.recv() == "answer"
     assert len(looks) == 1
+
+
+@pytest.mark.parametrize("keys", [(b"one", b"another"), (b"one", b"")])
+def test_listener_and_client_prove_to_each_other_that_they_know_the_key(
+    keys: tuple[bytes, bytes],
+) -> None:
+    """Also the client gives nothing to a listener that does not."""
+    errors: list[str] = []
+    with connection.Listener(("127.0.0.1", 0), authkey=keys[0]) as listener:
+
+        def accept() -> None:
+            try:
+                listener.accept()
+            except connection.AuthenticationError as error:
+                errors.append(str(error))
+
+        accepting = threading.Thread(target=accept)
+        accepting.start()
+        with pytest.raises(connection.AuthenticationError):
+            connection.Client(listener.address, authkey=keys[1])
+        accepting.join(5)
+    assert len(errors) == 1
+
+
+def test_a_client_does_not_believe_a_listener_that_welcomes_everybody() -> None:
+    with connection.Listener(("127.0.0.1", 0)) as listener:
+
+        def welcome() -> None:
+            with listener.accept() as accepted:
+                accepted.send_bytes(connection.CHALLENGE + b"x" * 20)
+                accepted.recv_bytes()
+                accepted.send_bytes(connection.WELCOME)
+                accepted.recv_bytes()  # the client's own challenge
+                accepted.send_bytes(b"no idea")
+                accepted.recv_bytes()  # it says that it does not believe that
+
+        welcoming = threading.Thread(target=welcome)
+        welcoming.start()
+        with pytest.raises(connection.AuthenticationError):
+            connection.Client(listener.address, authkey=b"one")
+        welcoming.join(5)

@@ -20,6 +20,9 @@ from fiber.synchronize import Abandoned
 from hosts import PATIENCE
 from unit.interrupting import LINES, is_interrupted
 
+# From Python 3.12 on os.fork() warns of any thread, and the runtime's loop may be one.
+pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+
 KINDS = {"mutex": (COUNTING, 1), "recursive": (RECURSIVE, 1), "counting": (COUNTING, SEM_VALUE_MAX)}
 
 

@@ -63,6 +63,19 @@ def test_submodules_have_multiprocessings_names(name: str) -> None:
     assert {other for other in public_names(theirs) if not hasattr(ours, other)} == set()
 
 
+def test_what_libraries_import_beside_the_public_names_is_multiprocessings() -> None:
+    from multiprocessing import connection, reduction, util
+
+    assert fiber.util._exit_function is vars(util)["_exit_function"]
+    assert fiber.util.spawnv_passfds is vars(util)["spawnv_passfds"]
+    assert fiber.connection.CHALLENGE is vars(connection)["CHALLENGE"]
+    assert fiber.connection.AuthenticationError is fiber.AuthenticationError
+    assert fiber.reduction.HAVE_SEND_HANDLE is vars(reduction)["HAVE_SEND_HANDLE"]
+    for module in (fiber.util, fiber.connection):
+        with pytest.raises(AttributeError, match=f"{module.__name__}.*'no_such_name'"):
+            getattr(module, "no_such_name")  # noqa: B009  # mypy
+
+
 @pytest.mark.parametrize("name", errors.__all__)
 def test_every_error_but_the_pools_is_at_the_top(name: str) -> None:
     if name != "MaybeEncodingError":  # multiprocessing has that one in its pool alone

@@ -139,6 +139,11 @@ def die_holding(there: Any) -> None:
     there._semlock._holding[0].close()
 
 
+def acquired_after_death(there: Any, here: Any) -> Any:
+    die_holding(there)
+    return here.acquire(timeout=PATIENCE)
+
+
 @pytest.mark.filterwarnings("ignore:MainProcess:RuntimeWarning")
 def test_who_dies_elsewhere_gives_it_back(here: Any, far: Far) -> None:
     there = far(here)
@@ -157,7 +162,7 @@ def test_the_warning_names_who_died_elsewhere(far: Far, hosts: Hosts) -> None:
     there = far(here)
     assert there.acquire()
     with pytest.warns(RuntimeWarning, match=r"MainProcess \(pid \d+ on b\) ended while it held"):
-        die_holding(there), here.acquire(timeout=PATIENCE)
+        assert acquired_after_death(there, here)
 
 
 @pytest.mark.filterwarnings("ignore:MainProcess:RuntimeWarning")

@@ -191,7 +191,7 @@ def replicas(hosts: Hosts) -> Iterator[Replicas]:
 @pytest.mark.parametrize(
     ("home", "key", "reason"),
     [
-        ("a", bytes(KEY_BYTES), "key is not this hub's"),
+        ("a", bytes(KEY_BYTES), "key is not the hub's"),
         ("a", None, "not there any more"),
         ("c", None, "'c' cannot be reached"),
     ],
@@ -204,6 +204,19 @@ def test_who_may_not_have_it_is_told_why(
     replicas.join(origin, asker, asker)
     assert reason in asker.reason
     assert not replicas._replicas
+
+
+def test_what_others_have_is_not_had_without_the_key(far: Far, hosts: Hosts) -> None:
+    with hosts.at("a"):
+        array = fiber.RawArray("i", 3)
+    other = far(array)
+    for name in ("a", "b"):
+        replicas, asker = hosts[name].replicas, Asker()
+        (replica,) = replicas._replicas.values()
+        wrong = Origin(*replica.identity, replica.block.size, 0, 0, bytes(KEY_BYTES))
+        replicas.join(wrong, asker, asker)
+        assert "key is not the hub's" in asker.reason
+    assert list(other) == [0, 0, 0]
 
 
 def test_a_block_is_had_as_a_whole_or_not_at_all(replicas: Replicas, hosts: Hosts) -> None:

@@ -32,6 +32,7 @@ class HostedSemaphore:
         self._semaphore = SharedSemaphore(block, COUNTING)
         self._waiters: deque[tuple[Waiter, Callable[[], None]]] = deque()
         self._is_listening = False
+        self._revival = threading.Thread()  # none yet
 
     def acquire(self, waiter: Waiter, granted: Callable[[], None]) -> None:
         """Answer once there is a token for it, having called ``granted``."""
@@ -53,9 +54,9 @@ class HostedSemaphore:
     def abandon(self, holder: str) -> None:
         """Give back a token of a process that has ended."""
         self._semaphore.abandon(holder)
-        self.release()
         with contextlib.suppress(RuntimeWarning):  # as an error it would end the hub
             warn_of(holder)
+        self.release()
 
     def value(self) -> int:
         """How often it can be acquired now."""
@@ -87,8 +88,9 @@ class HostedSemaphore:
         if not self._waiters:
             self._stop_listening()
             return
-        if self._semaphore.is_suspicious():
-            threading.Thread(target=self._semaphore.revive, name="fiber-revival").start()
+        if not self._revival.is_alive() and self._semaphore.is_suspicious():
+            self._revival = threading.Thread(target=self._semaphore.revive, name="fiber-revival")
+            self._revival.start()
         self._loop.call_later(SLICE, self._look)
 
     def _stop_listening(self) -> None:

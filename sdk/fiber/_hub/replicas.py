@@ -62,8 +62,10 @@ class Joiner(Protocol):
 class Replica:
     """A block that this host shares with others: its own, or a copy of another's."""
 
-    def __init__(self, identity: Identity, block: Block) -> None:
-        self.identity = identity
+    def __init__(self, origin: Origin, block: Block) -> None:
+        self.identity = origin.identity
+        self.key = origin.key
+        """Of the home's hub: whoever wants the block has to know it."""
         self.block = block
         self.memory = block.view
         self.joiners: list[Joiner] = []
@@ -111,6 +113,7 @@ class Replicas:
         """Have the block here for ``user``, until that leaves; tell ``joiner``."""
         try:
             replica = self._replicas.get(origin.identity) or self._new(origin)
+            _check_key(origin, replica.key)
         except (LookupError, OSError) as error:
             joiner.refused(str(error))
             return
@@ -149,10 +152,10 @@ class Replicas:
 
     def _new(self, origin: Origin) -> Replica:
         if origin.home == self._host:
-            replica = Replica(origin.identity, self._own_block(origin))
+            replica = Replica(origin, self._own_block(origin))
         else:
             link = self._towards(origin.home)
-            replica = Replica(origin.identity, heap.allocate(origin.size))
+            replica = Replica(origin, heap.allocate(origin.size))
             replica.block.give()
             replica.ready = False
             replica.upstream = link.join(replica, origin)
@@ -160,8 +163,7 @@ class Replicas:
         return replica
 
     def _own_block(self, origin: Origin) -> Block:
-        if not hmac.compare_digest(origin.key, self._key):
-            raise NoSuchObject("the key is not this hub's: it belongs to another program")
+        _check_key(origin, self._key)
         shared = self._registry.look_up(origin.entry, origin.grant)
         extent = origin.offset, origin.size
         if shared.kind is not ObjectKind.MEMORY or extent != shared.extent:
@@ -173,6 +175,11 @@ class Replicas:
         if link is None:
             raise NoSuchObject(f"host {host!r} cannot be reached: no agent of that name is there")
         return link
+
+
+def _check_key(origin: Origin, key: bytes) -> None:
+    if not hmac.compare_digest(origin.key, key):
+        raise NoSuchObject("the key is not the hub's: the handle belongs to another program")
 
 
 class MemoryLink:

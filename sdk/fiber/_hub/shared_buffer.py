@@ -44,7 +44,7 @@ class ReplicaBuffer(SharedBuffer):
         self._inode = inode
         # Keeps the original at its home.
         self._original = RemoteObject(*home)
-        # Keeps the replica at this host's hub.
+        # Keeps the replica at this host's hub, until this object is forgotten.
         self._stream = HubStream(client.hub_address())
         address, entry, grant = home
         origin = Origin(address.host, inode, *extent, entry, grant, address.key)
@@ -54,10 +54,6 @@ class ReplicaBuffer(SharedBuffer):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (handle_for_remote_block(self._original, self._extent, self._inode),)
-
-    def __del__(self) -> None:
-        if hasattr(self, "_stream"):
-            self._stream.close()
 
 
 def allocate(size: int) -> SharedBuffer:

@@ -47,7 +47,6 @@ EXT = {
     "TestPool.test_resource_warning": "Pool._state",
     "TestPoolWorkerLifetime.test_pool_worker_lifetime": "_pool, _repopulate_pool",
     "TestInvalidFamily.test_invalid_family": "address families",
-    "TestSimpleQueue.test_closed": "_reader, _writer",
     "TestStartMethod.test_context": "child reports the parent's method",
     "TestStartMethod.test_context_check_module_types": "types of forkserver preload",
     "TestStartMethod.test_get_all": "exact list of methods",

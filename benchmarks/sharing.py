@@ -1,0 +1,237 @@
+"""Sharing: queues, managers, locks, values, arrays and barriers between processes."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.model import Case, Metric
+
+if TYPE_CHECKING:
+    from benchmarks.contender import Bench
+
+TITLE = "Sharing"
+ABOUT = """\
+Queue: an int goes to another process by one `Queue` and comes back by a second; and 20,000 ints
+come from another process as fast as they can be read. Manager call: one `get` of a dict of
+`Manager()`. Lock, Value: `with lock`, and `with value.get_lock(): value.value += 1`, by this
+process alone, and by four processes at a time (the time divided by all that they did). Array: a
+process elsewhere writes all of an `Array` by NumPy and says so, and this process reads all of it.
+Barrier: eight processes, of which one is this, wait at one barrier. Loopback agents stand for
+other hosts: with them every one of these is a request to this process, and arrays are sent."""
+
+CALL = Metric("call", "time of one", "s")
+RATE = Metric("rate", "items", "1/s")
+QUEUES, CALLS, ARRAYS, BARRIERS = "queue", "lock, value, manager", "array", "barrier"
+ROUND_TRIP, STREAM = "queue, round trip of an int", "queue, stream of ints"
+MANAGER, LOCK, VALUE = "manager call", "with lock", "Value += 1"
+CONTENDED = "Value += 1, four processes"
+BARRIER = "barrier of 8"
+MEGABYTES = (1, 10, 100)
+_PARTIES = 8
+_WRITERS = 4
+
+
+def array(megabytes: int) -> str:
+    """The name of the case with an array of so many megabytes."""
+    return f"array of {megabytes} MB"
+
+
+def cases(size: float) -> list[Case]:
+    """The full measure at size 1; below, fewer of each."""
+    kinds: list[tuple[str, str, Metric, dict[str, Any], int]] = [
+        (QUEUES, ROUND_TRIP, CALL, {"what": "round_trip"}, 3000),
+        (QUEUES, STREAM, RATE, {"what": "stream"}, 20_000),
+        (CALLS, MANAGER, CALL, {"what": "manager"}, 2000),
+        (CALLS, LOCK, CALL, {"what": "lock"}, 20_000),
+        (CALLS, VALUE, CALL, {"what": "value"}, 20_000),
+        (CALLS, CONTENDED, CALL, {"what": "contended"}, 2000),
+        *(
+            (ARRAYS, array(n), CALL, {"what": "array", "megabytes": n}, max(3, 100 // n))
+            for n in MEGABYTES
+        ),
+        (BARRIERS, BARRIER, CALL, {"what": "barrier"}, 300),
+    ]
+    return [
+        Case(
+            measure="sharing",
+            name=name,
+            group=group,
+            needs="sharing",
+            params={**params, "count": max(5, round(count * size))},
+            metrics=(metric,),
+            limit=60,
+            fresh=True,
+        )
+        for group, name, metric, params, count in kinds
+    ]
+
+
+def run(bench: Bench, what: str, count: int, **params: int) -> dict[str, float]:
+    """One value of one case."""
+    with ExitStack() as stack:
+        return _MEASURES[what](bench.processes, stack, count, **params)
+
+
+def _start(processes: Any, stack: ExitStack, target: Callable[..., None], *args: Any) -> None:
+    process = processes.Process(target=target, args=args, daemon=True)
+    process.start()
+    stack.callback(process.join)
+    stack.callback(process.terminate)
+
+
+def _median_time(action: Callable[[], object], count: int) -> dict[str, float]:
+    times = []
+    for _ in range(count):
+        begin = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - begin)
+    return {CALL.name: median(times)}
+
+
+def _mean_time(action: Callable[[], object], count: int) -> dict[str, float]:
+    """For what takes less than the clock itself can tell."""
+    action()
+    begin = time.perf_counter()
+    for _ in range(count):
+        action()
+    return {CALL.name: (time.perf_counter() - begin) / count}
+
+
+def _pass_on(source: Any, target: Any) -> None:
+    while True:
+        target.put(source.get())
+
+
+def _round_trip(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
+    there, back = processes.Queue(), processes.Queue()
+    _start(processes, stack, _pass_on, there, back)
+
+    def trip() -> None:
+        there.put(1)
+        back.get()
+
+    trip()
+    return _median_time(trip, count)
+
+
+def _pour(queue: Any, go: Any, count: int) -> None:
+    go.recv()
+    for item in range(count):
+        queue.put(item)
+    go.recv()
+
+
+def _stream(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
+    queue = processes.Queue()
+    go, there = processes.Pipe()
+    _start(processes, stack, _pour, queue, there, count)
+    go.send(None)
+    queue.get()
+    begin = time.perf_counter()
+    for _ in range(count - 1):
+        queue.get()
+    return {RATE.name: (count - 1) / (time.perf_counter() - begin)}
+
+
+def _manager(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
+    shared = stack.enter_context(processes.Manager()).dict({1: 1})
+    shared.get(1)
+    return _median_time(lambda: shared.get(1), count)
+
+
+def _lock(processes: Any, _stack: ExitStack, count: int) -> dict[str, float]:
+    lock = processes.Lock()
+
+    def hold() -> None:
+        with lock:
+            pass
+
+    return _mean_time(hold, count)
+
+
+def _add(value: Any) -> None:
+    with value.get_lock():
+        value.value += 1
+
+
+def _value(processes: Any, _stack: ExitStack, count: int) -> dict[str, float]:
+    value = processes.Value("i", 0)
+    return _mean_time(lambda: _add(value), count)
+
+
+def _add_often(value: Any, barrier: Any, count: int) -> None:
+    barrier.wait()
+    for _ in range(count):
+        _add(value)
+    barrier.wait()
+
+
+def _contended(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
+    value, barrier = processes.Value("i", 0), processes.Barrier(_WRITERS + 1)
+    for _ in range(_WRITERS):
+        _start(processes, stack, _add_often, value, barrier, count)
+    barrier.wait()
+    begin = time.perf_counter()
+    barrier.wait()
+    seconds = time.perf_counter() - begin
+    if value.value != _WRITERS * count:
+        raise AssertionError(f"{_WRITERS * count} additions came to {value.value}")
+    return {CALL.name: seconds / (_WRITERS * count)}
+
+
+def _fill(shared: Any, connection: Any) -> None:
+    numpy = importlib.import_module("numpy")
+    view = numpy.frombuffer(shared, numpy.uint8)
+    while True:
+        view.fill(connection.recv())
+        connection.send(None)
+
+
+def _array(processes: Any, stack: ExitStack, count: int, megabytes: int) -> dict[str, float]:
+    numpy = importlib.import_module("numpy")
+    shared = processes.RawArray("B", megabytes << 20)
+    view = numpy.frombuffer(shared, numpy.uint8)
+    here, there = processes.Pipe()
+    _start(processes, stack, _fill, shared, there)
+    number = 0
+
+    def write_and_read() -> None:
+        nonlocal number
+        number = (number + 1) % 100
+        here.send(number)
+        here.recv()
+        if view.max() != number or view.min() != number:
+            raise AssertionError("what was written is not what is read")
+
+    write_and_read()
+    return _median_time(write_and_read, count)
+
+
+def _meet(barrier: Any, count: int) -> None:
+    for _ in range(count):
+        barrier.wait()
+
+
+def _barrier(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
+    barrier = processes.Barrier(_PARTIES)
+    for _ in range(_PARTIES - 1):
+        _start(processes, stack, _meet, barrier, count + 1)
+    barrier.wait()
+    return _median_time(barrier.wait, count)
+
+
+_MEASURES: dict[str, Callable[..., dict[str, float]]] = {
+    "round_trip": _round_trip,
+    "stream": _stream,
+    "manager": _manager,
+    "lock": _lock,
+    "value": _value,
+    "contended": _contended,
+    "array": _array,
+    "barrier": _barrier,
+}

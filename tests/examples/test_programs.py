@@ -1,0 +1,34 @@
+"""Programs as others write them: with Fiber they print what they do with multiprocessing."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+
+import pytest
+
+from examples.run_example import BACKENDS, run
+
+PROGRAMS = Path(__file__).parent / "programs"
+STAND_INS = Path(__file__).parents[1] / "stand_ins"
+"""For torch, where that is not installed."""
+
+
+def printed(program: str, module: str, backend: str = "local") -> str:
+    done = run(str(PROGRAMS / program), module, backend=backend)
+    assert not done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("program", ["poet.py", "subproc_vec_env.py", "stable_baselines3_envs.py"])
+def test_they_print_the_same(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if program.startswith("stable") and importlib.util.find_spec("stable_baselines3") is None:
+        pytest.skip("make installs stable-baselines3")
+    if importlib.util.find_spec("torch") is None:
+        path = os.environ.get("PYTHONPATH")
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (path, str(STAND_INS)))))
+    expected = printed(program, "multiprocessing")
+    assert len(expected.splitlines()) >= 3
+    for backend in BACKENDS:
+        assert printed(program, "fiber", backend) == expected
