@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from fiber.errors import FiberPoolError as FiberPoolError
     from fiber.errors import FileTooLarge as FileTooLarge
     from fiber.errors import LinkError as LinkError
+    from fiber.errors import MemberLost as MemberLost
     from fiber.errors import ProcessError as ProcessError
     from fiber.errors import ProgramTooLarge as ProgramTooLarge
     from fiber.errors import StartError as StartError
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from fiber.process import current_process as current_process
     from fiber.process import parent_process as parent_process
     from fiber.resources import meta as meta
+    from fiber.ring import Ring as Ring
     from fiber.util import SUBDEBUG as SUBDEBUG
     from fiber.util import SUBWARNING as SUBWARNING
 
@@ -53,7 +55,6 @@ _SUBMODULES = frozenset(
         "dummy",
         "errors",
         "futures",
-        "joblib",
         "managers",
         "pool",
         "process",
@@ -62,6 +63,7 @@ _SUBMODULES = frozenset(
         "resource_tracker",
         "resources",
         "results",
+        "ring",
         "shared_memory",
         "sharedctypes",
         "spawn",
@@ -119,9 +121,11 @@ _HOMES = {
     "FiberPoolError": "errors",
     "FileTooLarge": "errors",
     "LinkError": "errors",
+    "MemberLost": "errors",
     "Process": "process",
     "ProcessError": "errors",
     "ProgramTooLarge": "errors",
+    "Ring": "ring",
     "SUBDEBUG": "util",
     "SUBWARNING": "util",
     "StartError": "errors",

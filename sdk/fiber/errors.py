@@ -13,6 +13,7 @@
     │       ├── FiberPoolError    a FiberPool on Kubernetes that cannot serve
     │       ├── FileTooLarge      a message, or shared memory, above the limit (also OSError)
     │       ├── LinkError         no way between program and agent, a port in use for instance
+    │       ├── MemberLost        a process of a ring that has ended
     │       ├── ProgramTooLarge   the program's folder is more than is sent to other machines
     │       ├── StartError        a process that does not start, an initializer that fails
     │       ├── TooManyOpenFiles  the limit of file descriptors is reached (also OSError)
@@ -48,6 +49,7 @@ __all__ = [
     "FileTooLarge",
     "LinkError",
     "MaybeEncodingError",
+    "MemberLost",
     "ProcessError",
     "ProgramTooLarge",
     "StartError",
@@ -158,6 +160,18 @@ class FileTooLarge(FiberError, OSError):
 
 class LinkError(FiberError):
     """A link between a master and an agent cannot be made, or the other side refused it."""
+
+
+class MemberLost(FiberError):
+    """A member of a ring has ended; `rank` is its own, `how` says how it ended."""
+
+    def __init__(self, rank: int, how: str) -> None:
+        super().__init__(
+            f"member {rank} of the ring is lost: {how}. Nothing comes of it any more, and what is "
+            "sent to it goes nowhere: run the ring again, from what was saved."
+        )
+        self.rank = rank
+        self.how = how
 
 
 class ProgramTooLarge(FiberError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import socket
@@ -22,7 +23,7 @@ from faults.program import Program
 from faults.runtime import running
 from fiber._backends.kubernetes.api import Api
 from fiber._runtime import state
-from fiber.errors import ConfigError, FiberPoolError, WorkerDied
+from fiber.errors import ConfigError, FiberPoolError, MemberLost, WorkerDied
 from fiber_api import names
 from unit.kubernetes_rig import kubeconfig
 
@@ -255,6 +256,28 @@ def test_an_executors_task_that_dies_with_its_pod_says_so(cluster: FakeCluster) 
         with pytest.raises(BrokenProcessPool, match="OOMKilled") as caught:
             future.result(PATIENCE)
         assert isinstance(caught.value, WorkerDied)
+
+
+def stay_in_ring(channel: Any, rank: int, size: int) -> None:
+    member = fiber.ring.current()
+    for step in itertools.count():
+        pod = member.exchange(own_pod())
+        if rank == 0 and step == 0:
+            channel.send(pod)
+
+
+def test_a_rings_members_are_in_pods_and_hear_of_one_that_is_lost(cluster: FakeCluster) -> None:
+    with running(backend="kubernetes"):
+        ring = fiber.Ring(2, lambda rank, size: fiber.ring.current().exchange(own_pod()))
+        assert sorted(ring.run()) == pods_of(cluster)
+        ours, theirs = fiber.Pipe()
+        killing = threading.Thread(target=lambda: cluster.do(cluster.nodes.kill, ours.recv()))
+        killing.start()
+        with pytest.raises(MemberLost, match="member 1 of the ring is lost"):
+            fiber.Ring(2, partial(stay_in_ring, theirs)).run()
+        killing.join()
+        ours.close()
+        theirs.close()
 
 
 def test_processes_and_pipes(cluster: FakeCluster) -> None:

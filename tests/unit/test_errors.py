@@ -45,6 +45,7 @@ EXAMPLES = [
     errors.ConnectionClosed("Worker-1", "killed by SIGSEGV"),
     errors.FiberPoolError("no quota", pool="es-1", namespace="team", reason="QuotaExceeded"),
     errors.FileTooLarge("sending a message"),
+    errors.MemberLost(3, "killed by SIGKILL"),
     errors.StartError("worker 'Worker-1'", "its initializer raised", "ValueError: no", 3),
     errors.TooManyOpenFiles("starting process 'Worker-1'"),
     errors.UnpicklableError("argument 0 of f", "cannot pickle '_thread.lock' object", ".lock"),

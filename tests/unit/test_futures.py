@@ -50,23 +50,24 @@ def test_wait_and_as_completed(executor: fiber.Executor, tmp_path: Path) -> None
     assert [future.result() for future in futures.as_completed([waits], PATIENCE)] == ["gate"]
 
 
-def test_a_lock_of_a_future_that_is_not_given_back_holds_up_no_other(
+def test_a_lock_of_a_future_that_is_not_given_back_holds_up_no_other(tmp_path: Path) -> None:
+    # A signal's handler that raises between the two leaves it so, in any of the lock's users.
+    with fiber.Executor(1) as executor:
+        taken = executor.submit(tasks.wait_for, tmp_path / "gate")
+        cancelled = [executor.submit(tasks.square, number) for number in range(100)][-1]
+        with taken._condition, cancelled._condition:
+            assert cancelled.cancel()
+            (tmp_path / "gate").touch()
+            assert executor.submit(tasks.square, 3).result(PATIENCE) == 9
+            with fiber.Pool(1) as pool:
+                assert pool.apply(tasks.square, (4,)) == 16
+        assert taken.result(PATIENCE) == "gate"
+        assert futures.wait([cancelled], PATIENCE).done == {cancelled}
+
+
+def test_callbacks_run_neither_on_the_loops_thread_nor_too_late(
     executor: fiber.Executor, tmp_path: Path
 ) -> None:
-    # A signal's handler that raises between the two leaves it so, in any of the lock's users.
-    taken = executor.submit(tasks.wait_for, tmp_path / "gate")
-    cancelled = [executor.submit(tasks.square, number) for number in range(100)][-1]
-    with taken._condition, cancelled._condition:
-        assert cancelled.cancel()
-        (tmp_path / "gate").touch()
-        assert executor.submit(tasks.square, 3).result(PATIENCE) == 9
-        with fiber.Pool(1) as pool:
-            assert pool.apply(tasks.square, (4,)) == 16
-    assert taken.result(PATIENCE) == "gate"
-    assert futures.wait([cancelled], PATIENCE).done == {cancelled}
-
-
-def test_callbacks_run_neither_on_the_loops_thread_nor_too_late(executor: fiber.Executor) -> None:
     names: list[str] = []
     called = threading.Event()
 
@@ -75,7 +76,8 @@ def test_callbacks_run_neither_on_the_loops_thread_nor_too_late(executor: fiber.
         assert future.done()
         called.set()
 
-    executor.submit(tasks.sleep, 0.01).add_done_callback(note)
+    executor.submit(tasks.wait_for, tmp_path / "gate").add_done_callback(note)
+    (tmp_path / "gate").touch()
     assert called.wait(PATIENCE)
     done = executor.submit(tasks.square, 1)
     done.result(PATIENCE)
@@ -181,13 +183,13 @@ def test_map_ends_with_the_first_error(executor: fiber.Executor) -> None:
 
 
 def test_map_has_a_deadline(executor: fiber.Executor, tmp_path: Path) -> None:
-    results = executor.map(
-        tasks.wait_if_first, [(1, tmp_path / "x"), (0, tmp_path / "g")], timeout=0.3
-    )
-    assert next(results) == 1
+    gates = [tmp_path / "open", tmp_path / "shut"]
+    gates[0].touch()
+    assert list(executor.map(tasks.wait_for, gates[:1], timeout=PATIENCE)) == ["open"]
+    results = executor.map(tasks.wait_for, gates[1:], timeout=0.1)
     with pytest.raises(TimeoutError, match="not there in time"):
         next(results)
-    (tmp_path / "g").touch()
+    gates[1].touch()
 
 
 def test_map_reads_no_more_than_its_buffer(executor: fiber.Executor) -> None:

@@ -93,7 +93,9 @@ NOT_APPLICABLE = {
 
 # The same for tests of process pool executors: some would hang, or pass now and then.
 EXECUTORS_NOT_APPLICABLE = {
-    "ProcessPoolExecutorTest.test_ressources_gced_in_workers": "its set-up makes a manager",
+    "ProcessPoolExecutorTest.test_ressources_gced_in_workers": (
+        "waits one second for a manager, which is little on a busy machine"
+    ),
     "ProcessPoolExecutorTest.test_saturation": "counts processes at once: they start meanwhile",
     "ProcessPoolShutdownTest.test_processes_terminate": (
         "counts processes at once: they start meanwhile"

@@ -1,0 +1,230 @@
+"""``Ring``: processes that know their rank, each connected to the next, as in all-reduce.
+
+::
+
+    def train(rank, size):
+        ring = fiber.ring.current()
+        theirs = ring.exchange(mine)  # to the next member, and from the previous one
+
+    fiber.Ring(4, train).run()
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable
+from functools import partial
+from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
+from typing import Any, NamedTuple, NoReturn
+
+from fiber._runtime import options
+from fiber.connection import Connection, Pipe, wait
+from fiber.errors import ConnectionClosed, MemberLost
+from fiber.process import Process
+from fiber.resources import resources_of, with_resources
+
+__all__ = ["Member", "Ring", "current"]
+
+_member: Member | None = None
+
+
+def current() -> Member:
+    """The member of a ring that this process is; RuntimeError if it is none."""
+    if _member is None:
+        raise RuntimeError("this process is no member of a ring: fiber.Ring(...).run() starts some")
+    return _member
+
+
+class _End(NamedTuple):
+    """What members are told of one that has ended."""
+
+    rank: int
+    lost: bool
+    how: str
+
+
+class Member:
+    """A process of a ring: its ``rank``, from 0, among ``size``, and the way to its neighbours."""
+
+    def __init__(
+        self, rank: int, size: int, to_next: Connection, from_previous: Connection, news: Connection
+    ) -> None:
+        self.rank = rank
+        self.size = size
+        self._next = to_next
+        self._previous = from_previous
+        self._news = news
+        self._ends: dict[int, _End] = {}
+
+    @property
+    def lost(self) -> dict[int, str]:
+        """The ranks of those that are lost, as far as is known by now, and how each ended."""
+        while self._news.poll():
+            self._hear()
+        return {end.rank: end.how for end in self._ends.values() if end.lost}
+
+    def send(self, obj: Any) -> None:
+        """Send to the next member; MemberLost if that one has ended.
+
+        Above 256 KiB this waits until it is received: where all members send, use ``exchange``.
+        """
+        try:
+            self._next.send(obj)
+        except (BrokenPipeError, ConnectionClosed):
+            self._await_end((self.rank + 1) % self.size)
+
+    def recv(self) -> Any:
+        """Receive from the previous member.
+
+        MemberLost if nothing will come of it, or if any member is lost while this one waits.
+        """
+        while not self._previous.poll():
+            for rank, how in self.lost.items():
+                raise MemberLost(rank, how)
+            _wait([self._previous, self._news])
+        try:
+            return self._previous.recv()
+        except ConnectionClosed:
+            self._await_end((self.rank - 1) % self.size)
+
+    def exchange(self, obj: Any) -> Any:
+        """Send to the next member and receive from the previous one, as all members do now."""
+        if self.size == 1:
+            return obj
+        if self.rank % 2 == 0:
+            self.send(obj)
+            return self.recv()
+        received = self.recv()  # half of them do this first: else all could wait for each other
+        self.send(obj)
+        return received
+
+    def _await_end(self, rank: int) -> NoReturn:
+        """Its connection has closed: the reason, or the loss that made it end, is on its way."""
+        while rank not in self._ends:
+            self._hear()
+        first = next((end for end in self._ends.values() if end.lost), self._ends[rank])
+        raise MemberLost(first.rank, first.how)
+
+    def _hear(self) -> None:
+        end: _End = self._news.recv()
+        self._ends[end.rank] = end
+
+
+class Ring:
+    """So many ``processes``, each of which calls ``func(rank, size)``.
+
+    Before, each calls ``initializer(member, *initargs)`` with its ``Member``, which ``current()``
+    returns from then on.  On Kubernetes members are in pods, which have what ``fiber.meta`` says
+    that ``func`` needs.
+    """
+
+    def __init__(
+        self,
+        processes: int,
+        func: Callable[[int, int], Any],
+        initializer: Callable[..., object] | None = None,
+        initargs: Iterable[Any] = (),
+    ) -> None:
+        size = options.positive("processes", processes)
+        if size is None:
+            raise TypeError("processes must be a whole number, not None")
+        if not callable(func):
+            raise TypeError(f"func must be a callable, not {func!r}")
+        if initializer is not None and not callable(initializer):
+            raise TypeError("initializer must be a callable")
+        self.size = size
+        self._work = partial(_run, func=func, initializer=initializer, initargs=tuple(initargs))
+        self._wishes = resources_of(func)
+
+    def run(self) -> list[Any]:
+        """Start the members and wait until all have ended; returns their results, by rank.
+
+        When one raises or is lost, the others are told, by a MemberLost where they wait for it,
+        and what ended the first is raised once all have ended.  Ctrl-C kills them.
+        """
+        links = [Pipe(duplex=False) for _ in range(self.size)]
+        channels = [Pipe() for _ in range(self.size)]
+        processes: list[Process] = []
+        try:
+            for rank in range(self.size):
+                (_, to_next), (from_previous, _) = links[rank], links[rank - 1]
+                member = Member(rank, self.size, to_next, from_previous, channels[rank][1])
+                work = with_resources(self._work, self._wishes)
+                process = Process(target=work, args=(member,), name=f"RingMember-{rank}")
+                process.start()
+                processes.append(process)
+            _close([end for link in links for end in link])
+            _close([theirs for _, theirs in channels])
+            return _attend([ours for ours, _ in channels])
+        except BaseException:
+            for process in processes:
+                process.kill()
+            raise
+        finally:
+            for process in processes:
+                process.join()
+            _close([end for pair in (*links, *channels) for end in pair])
+
+
+def _attend(channels: list[Connection]) -> list[Any]:
+    """Wait for all ends, and tell those of whom they concern."""
+    running = dict(enumerate(channels))
+    results: list[Any] = [None] * len(channels)
+    failure: BaseException | None = None
+    while running:
+        ready = _wait(running.values())
+        for rank, channel in list(running.items()):
+            if channel in ready:
+                del running[rank]
+                end, results[rank], error = _outcome(rank, channel)
+                failure = failure or error
+                _tell(end, running, len(channels))
+    if failure is not None:
+        raise failure
+    return results
+
+
+def _outcome(rank: int, channel: Connection) -> tuple[_End, Any, BaseException | None]:
+    """How a member ended, its result, and what is to be raised."""
+    try:
+        result, error = channel.recv()
+    except ConnectionClosed as closed:
+        how = closed.reason or "its process ended"
+        return _End(rank, True, how), None, MemberLost(rank, how)
+    if error is not None:
+        return _End(rank, True, f"it raised {type(error).__name__}: {error}"), None, error
+    return _End(rank, False, "it has returned"), result, None
+
+
+def _tell(end: _End, running: dict[int, Connection], size: int) -> None:
+    """All hear of a loss, neighbours of any end."""
+    neighbours = {(end.rank - 1) % size, (end.rank + 1) % size}
+    for rank in running if end.lost else neighbours & running.keys():
+        with contextlib.suppress(BrokenPipeError, ConnectionClosed):
+            running[rank].send(end)
+
+
+def _wait(connections: Iterable[Any]) -> list[Any]:
+    return wait(connections)  # multiprocessing's, whose types know no other connections
+
+
+def _close(connections: list[Connection]) -> None:
+    for connection in connections:
+        connection.close()
+
+
+def _run(
+    member: Member,
+    func: Callable[[int, int], Any],
+    initializer: Callable[..., object] | None,
+    initargs: tuple[Any, ...],
+) -> None:
+    """What the process of a member does."""
+    global _member
+    _member = member
+    try:
+        if initializer is not None:
+            initializer(member, *initargs)
+        member._news.send((func(member.rank, member.size), None))
+    except Exception as error:  # also of a result that does not pickle
+        member._news.send((None, ExceptionWithTraceback(error, error.__traceback__)))
