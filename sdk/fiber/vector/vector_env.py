@@ -337,9 +337,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     def _check_running(self) -> None:
         if self.closed:
-            raise ClosedEnvironmentError(
-                f"Trying to operate on `{type(self).__name__}`, after a call to `close()`."
-            )
+            raise ClosedEnvironmentError(f"this {type(self).__name__} is closed")
+
+    # What these two say is Gymnasium's interface: its tests look for the words.
 
     def _check_idle(self, doing: str) -> None:
         self._check_running()
@@ -396,15 +396,13 @@ def _without_mask(
     if options is None or "reset_mask" not in options:
         return None, options
     mask = options["reset_mask"]
-    if not isinstance(mask, np.ndarray):
-        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        raise TypeError(f"options['reset_mask'] is a NumPy array of bools, not {mask!r}")
     if mask.shape != (count,):
-        raise ValueError(f"`options['reset_mask']` must have shape `{(count,)}`, got {mask.shape}")
-    if mask.dtype != np.bool_:
-        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
-    if not mask.any():
         raise ValueError(
-            "`options['reset_mask']` must contain a boolean array with at least one True value, "
-            f"got reset_mask={mask}"
+            f"options['reset_mask'] has a bool for each of {count} environments, and the shape "
+            f"{(count,)}, not {mask.shape}"
         )
+    if not mask.any():
+        raise ValueError("options['reset_mask'] is True nowhere: there is nothing to reset")
     return mask, {key: value for key, value in options.items() if key != "reset_mask"}
