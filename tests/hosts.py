@@ -12,6 +12,7 @@ from typing import Any
 from fiber._hub import client, handles
 from fiber._hub.hub import Hub
 from fiber._hub.hub_link import HubLink
+from fiber._runtime.state import runtime
 from fiber._transport.loop import Loop
 from fiber._wire import messages
 from fiber._wire.messages import OfHubs
@@ -56,6 +57,7 @@ class Hosts:
     """Hubs on one loop."""
 
     def __init__(self) -> None:
+        runtime()  # one that was made on one of these hosts would lose its own hub with it
         self.loop = Loop()
         self.loop.start_thread("hubs")
         self._hubs: dict[str, Hub] = {}

@@ -190,6 +190,8 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
 
     def connect(self) -> None:
         """Use a server that runs already, at the address that was given."""
+        if self._known_address is None:
+            raise ValueError("a manager that is to connect needs the address of a running one")
         super().connect()
         self._hold_session()
 

@@ -191,7 +191,7 @@ def test_a_handler_at_any_line_of_sharing_may_wait_for_the_hub(hosts: Hosts) -> 
 
         def ask() -> None:
             stream.say(Op.RELEASE, 0, form=ONE)
-            stream.ask(Op.SYNC)
+            stream.ask(Op.SYNC, 0, form=ONE)
 
         def share() -> None:
             with handles.collecting_grants() as grants:

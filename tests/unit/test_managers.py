@@ -384,6 +384,11 @@ def test_any_exception_of_a_signals_handler_ends_a_call_alone(manager: Any) -> N
 # From elsewhere
 
 
+def test_to_connect_takes_an_address() -> None:
+    with pytest.raises(ValueError, match="needs the address"):
+        BaseManager().connect()
+
+
 def test_a_process_connects_by_the_address(manager: Any) -> None:
     shared = manager.dict()
     call(connect_and_make, manager.address, shared)

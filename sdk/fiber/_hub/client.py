@@ -173,6 +173,8 @@ class HubStream:
     def __init__(self, home: HubAddress, greeting: Iterable[bytes] = ()) -> None:
         self._host = home.host
         self._number = 0
+        self._asked = 0
+        """The number of the last request that has an answer."""
         self._unsettled: Op | None = None
         self._end = "its hub is gone"
         self._sock, to_its_hub = _dial(home)
@@ -196,8 +198,8 @@ class HubStream:
     ) -> Reply:
         """Make a request and wait for its answer; NO once ``timeout`` seconds are over."""
         _refuse_on_loop()
+        number = self._asked = self._next()
         self._unsettled = operation
-        number = self._next()
         try:
             self._send(form.pack(operation, number, *values), buffers, fds)
             reply = self._reply(number, timeout)
@@ -217,7 +219,7 @@ class HubStream:
         back a token.
         """
         self._unsettled = operation
-        self._send(HEAD.pack(Op.SYNC, self._next()))
+        self._send(ONE.pack(Op.SYNC, self._next(), self._asked))
 
     def settle(self) -> tuple[Op, Reply] | None:
         """The answer to a request that was given up, if it was answered all the same."""
@@ -225,7 +227,7 @@ class HubStream:
         if operation is None:
             return None
         number = self._next()
-        self._send(HEAD.pack(Op.SYNC, number))
+        self._send(ONE.pack(Op.SYNC, number, self._asked))
         late = None
         while (reply := self.receive()).number != number:
             if reply.status is Status.OK and (reply.parts or operation is not Op.RECV):

@@ -88,6 +88,9 @@ class ClientHandler:
         self._joined: tuple[str, int, int] | None = None
         self._bound: set[int] = set()
         self._holder: str | None = None
+        """Whose token the stream keeps."""
+        self._granted_last: int | None = None
+        """The number of the request that got a token last, if anybody may still give it up."""
         self._place: int | None = None
         stream.handler = self
 
@@ -250,7 +253,11 @@ class ClientHandler:
 
         A token that it was given meanwhile it does not know of.
         """
-        self._give_back()
+        if self._holder is not None:
+            self._give_back()
+        elif ONE.unpack(message.payload)[2] == self._granted_last:
+            self._semaphore().release()
+        self._granted_last = None
         self._request(message).answer(Status.OK)
 
     # A channel
@@ -343,10 +350,12 @@ class ClientHandler:
     def acquire(self, message: Message) -> None:
         """Take a token, which is the stream's."""
         holder = bytes(message.buffers[0][:_NAME_BYTES]).decode(errors="replace")
-        self._semaphore().acquire(self._request(message), partial(self._granted_to, holder))
+        request = self._request(message)
+        self._semaphore().acquire(request, partial(self._granted_to, holder, request.number))
 
-    def _granted_to(self, holder: str) -> None:
-        self._holder = holder
+    def _granted_to(self, holder: str, number: int, keeps: bool) -> None:
+        self._holder = holder if keeps else None
+        self._granted_last = number
 
     def _give_back(self) -> None:
         if self._holder is not None:

@@ -30,12 +30,12 @@ class HostedSemaphore:
         self._doorbell = doorbell
         # A view of its own, and no recursive one: the tokens are not this process's.
         self._semaphore = SharedSemaphore(block, COUNTING)
-        self._waiters: deque[tuple[Waiter, Callable[[], None]]] = deque()
+        self._waiters: deque[tuple[Waiter, Callable[[bool], None]]] = deque()
         self._is_listening = False
         self._revival = threading.Thread()  # none yet
 
-    def acquire(self, waiter: Waiter, granted: Callable[[], None]) -> None:
-        """Answer once there is a token for it, having called ``granted`` if it is to keep it."""
+    def acquire(self, waiter: Waiter, granted: Callable[[bool], None]) -> None:
+        """Answer once there is a token for it, having told ``granted`` whether it is to keep it."""
         self._waiters.append((waiter, granted))
         self._serve()
         if self._waiters and not self._is_listening:
@@ -79,8 +79,7 @@ class HostedSemaphore:
         while self._waiters and (result := self._semaphore.try_acquire()):
             waiter, granted = self._waiters.popleft()
             tracked = not self._semaphore.is_untracked()
-            if tracked:
-                granted()
+            granted(tracked)
             holder = [memoryview(result.holder.encode())] if isinstance(result, Abandoned) else []
             waiter.answer(Status.OK, tracked, holder)
 
