@@ -40,10 +40,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    try:
-        return vars(_mp)[name]
-    except KeyError:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
+    if name not in vars(_mp):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return vars(_mp)[name]
 
 
 _LAST_MOMENT = 0.05

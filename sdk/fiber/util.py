@@ -48,7 +48,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    try:
-        return vars(_mp)[name]
-    except KeyError:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None
+    if name not in vars(_mp):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return vars(_mp)[name]
