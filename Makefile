@@ -34,9 +34,9 @@ test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-testsuite
 	@$(MAKE) --no-print-directory test-pythons
 	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS))
 
-## make test-fast     what to run at every save: style, unit, contract, simulation
+## make test-fast     what to run at every save: style, unit, contract, simulation, but for the slowest
 test-fast: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3
-	$(FAST)
+	$(FAST) -m "not slow"
 
 ## make test-pythons  the essential tests on every other supported Python that is found here
 test-pythons: $(VENV)/.made

@@ -26,7 +26,10 @@ def announcement(others: Sequence[str], environment: Mapping[str, str]) -> str:
     if left_out := list(_left_out(others, environment)):
         lines += ["left out:", *(f"  {what}" for what in left_out)]
     return "\n".join(
-        [*lines, "`make test-fast` is the first line alone, `make help` has the rest."]
+        [
+            *lines,
+            "`make test-fast` is the first line but for its slowest; `make help` has more.",
+        ]
     )
 
 

@@ -91,7 +91,7 @@ def test_what_is_left_out_of_the_classes_that_run_has_a_reason(tiers: set[str]) 
     groups, left_out = select(Target("multiprocessing", "spawn", frozenset(tiers), 60))
     assert not {id_ for group in groups for id_ in group} & left_out.keys()
     assert all(not line.endswith(": ") for line in left_out.values())
-    assert left_out["TestSimpleQueue.test_closed"].startswith("promised to nobody")
+    assert left_out["WithProcessesTestEvent.test_repr"].startswith("promised to nobody")
     for id_ in (
         "WithProcessesTestProcess.test_set_executable",
         "TestInitializers.test_pool_initializer",

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from fakes.store import Body, Store
+from fakes.store import Body, Failure, Store
 from fiber_api import names
 
 GRACE = 5.0
@@ -62,7 +62,7 @@ class AgentKubelet:
 
     async def _run(self, namespace: str, name: str) -> None:
         try:
-            process = await self._start(namespace, name)
+            process = await self._start_if_there(namespace, name)
             if process is not None:
                 await self._watch(namespace, name, process)
             with contextlib.suppress(KeyError):  # its pool took it along
@@ -74,6 +74,14 @@ class AgentKubelet:
                 await process.wait()
             if name in self._folders:
                 shutil.rmtree(self._folders.pop(name), ignore_errors=True)
+
+    async def _start_if_there(self, namespace: str, name: str) -> asyncio.subprocess.Process | None:
+        try:
+            return await self._start(namespace, name)
+        except Failure as failure:
+            if failure.status != 404:
+                raise
+            return None  # it was taken away meanwhile
 
     async def _start(self, namespace: str, name: str) -> asyncio.subprocess.Process | None:
         """The agent's process; None if the pod was deleted before."""

@@ -14,7 +14,6 @@ BACKENDS = ("local", "loopback")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "slow: takes more than a few seconds")
     config.addinivalue_line("markers", "lost_after(seconds): of silence, for the fixture `wire`")
 
 

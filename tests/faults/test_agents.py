@@ -25,8 +25,10 @@ LOST_AFTER = 1.5
 def backend() -> Iterator[LoopbackBackend]:
     settings = {"heartbeat_interval": 0.2, "suspect_after": 0.6, "lost_after": LOST_AFTER}
     with running(backend="loopback", agents=2, **settings) as runtime:
-        assert isinstance(runtime.backend, LoopbackBackend)
-        yield runtime.backend
+        loopback = runtime.backend
+        assert isinstance(loopback, LoopbackBackend)
+        wait_for(lambda: len(loopback.agents.agents) == 2)  # else one would get all processes
+        yield loopback
 
 
 def pid_of(backend: LoopbackBackend, host: str) -> int:

@@ -24,6 +24,8 @@ from fiber._runtime.worker_handle import WorkerHandle
 from simulation.explore import first_failure
 from simulation.suites import SUITES
 
+pytestmark = pytest.mark.slow
+
 SEEDS = range(10_100)
 """Among these each fault must show."""
 

@@ -96,6 +96,7 @@ FAULTS: dict[str, tuple[str, str, Any]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_it_finds(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     kind, name, instead = FAULTS[fault]

@@ -14,6 +14,8 @@ from simulation.ledger_master import LedgerMaster, for_ledger
 from simulation.schedule import draw
 from simulation.suites import SUITES, again
 
+pytestmark = pytest.mark.slow
+
 SEEDS = range(600)
 """Among these each fault must show."""
 

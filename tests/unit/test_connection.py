@@ -479,9 +479,9 @@ def test_a_client_does_not_believe_a_listener_that_welcomes_everybody() -> None:
 
         def welcome() -> None:
             with listener.accept() as accepted:
-                accepted.send_bytes(connection.CHALLENGE + b"x" * 20)
+                accepted.send_bytes(b"#CHALLENGE#" + b"x" * 20)
                 accepted.recv_bytes()
-                accepted.send_bytes(connection.WELCOME)
+                accepted.send_bytes(b"#WELCOME#")
                 accepted.recv_bytes()  # the client's own challenge
                 accepted.send_bytes(b"no idea")
                 accepted.recv_bytes()  # it says that it does not believe that

@@ -168,6 +168,7 @@ class Sets:
         self.latch.set()
 
 
+@pytest.mark.slow
 def test_a_finalizer_at_any_allocation_may_set_it() -> None:
     gc.collect()
     threshold = gc.get_threshold()

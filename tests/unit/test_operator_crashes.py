@@ -17,6 +17,8 @@ from fakes.store import Store
 from fakes.world import NAMESPACE, World, a_world
 from unit.operator_objects import MASTER
 
+pytestmark = pytest.mark.slow
+
 ENDING_TAKES = 3.0
 """Seconds that a deleted pod is still there."""
 

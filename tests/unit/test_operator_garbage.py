@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -39,6 +40,8 @@ from unit.operator_objects import (
 )
 
 Path = tuple[str | int, ...]
+pytestmark = pytest.mark.slow
+
 NO_SHRINKING = (Phase.explicit, Phase.reuse, Phase.generate)
 
 LEAVES = st.sampled_from(

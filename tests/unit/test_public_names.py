@@ -68,7 +68,7 @@ def test_what_libraries_import_beside_the_public_names_is_multiprocessings() -> 
 
     assert fiber.util._exit_function is vars(util)["_exit_function"]
     assert fiber.util.spawnv_passfds is vars(util)["spawnv_passfds"]
-    assert fiber.connection.CHALLENGE is vars(connection)["CHALLENGE"]
+    assert fiber.connection.BUFSIZE is vars(connection)["BUFSIZE"]
     assert fiber.connection.AuthenticationError is fiber.AuthenticationError
     assert fiber.reduction.HAVE_SEND_HANDLE is vars(reduction)["HAVE_SEND_HANDLE"]
     for module in (fiber.util, fiber.connection):

@@ -12,6 +12,8 @@ import pytest
 
 from unit.shipping_site import write
 
+pytestmark = pytest.mark.slow
+
 ELSEWHERE = """
 import os
 import fiber

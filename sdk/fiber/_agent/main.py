@@ -74,6 +74,9 @@ class Main:
             # Nothing of what the last master did or left may reach the next one.
             self._hand_on_credentials()
             os.execve(sys.executable, sys.orig_argv, self._environment)
+        signal.set_wakeup_fd(-1)
+        for end in self._signals:
+            end.close()
         return self._status
 
     def _hand_on_credentials(self) -> None:

@@ -24,6 +24,15 @@ class BackgroundThread:
         self._thread: threading.Thread | None = None
         self._stopped = False
 
+    def start(self) -> None:
+        """Have the thread now, before anything is submitted.
+
+        From Python 3.12 on none starts any more once the program ends.
+        """
+        thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+        thread.start()
+        self._thread = thread
+
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
         """Have it done, after what came before; False: it has been stopped, and drops it.
 
@@ -32,9 +41,7 @@ class BackgroundThread:
         if self._stopped:
             return False
         if self._thread is None:
-            thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-            thread.start()
-            self._thread = thread
+            self.start()
         self._queue.put((action, args))
         return True
 

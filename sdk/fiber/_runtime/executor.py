@@ -143,6 +143,9 @@ class Executor:
         Where hosts are made for them, they start with the first task.
         """
         try:
+            if self.options.calls_back_at_end:  # when no thread could be started any more
+                self._background.start()
+                self.callbacks.start()
             self._loop.depend(self)
         except BaseException:
             self._end()
