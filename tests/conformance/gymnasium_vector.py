@@ -1,11 +1,12 @@
 """Gymnasium's own tests of vector environments, with ``fiber.vector.VectorEnv`` in the place of
 ``AsyncVectorEnv``:
 
-    python tests/conformance/gymnasium_vector.py CHECKOUT [pytest's options]
+    python tests/conformance/gymnasium_vector.py CHECKOUT [--adopted] [pytest's options]
 
-where CHECKOUT is Gymnasium's repository, at the version that is installed: its package comes
-without these tests.  They need what Gymnasium's extra `testing` installs.  This module is the
-plugin, too, that has pytest do so.
+With ``--adopted`` it is Gymnasium's own ``AsyncVectorEnv`` that they test, with Fiber's processes,
+pipes and shared memory (``fiber.adopt``).  CHECKOUT is Gymnasium's repository, at the version that
+is installed: its package comes without these tests.  They need what Gymnasium's extra `testing`
+installs.  This module is the plugin, too, that has pytest do so.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ TESTS = (
     # Opens windows, and makes MuJoCo draw in them.
     "--ignore=tests/wrappers/vector/test_human_rendering.py",
 )
+
+TESTS_OF_ASYNC_VECTOR_ENV = ("tests/vector/test_async_vector_env.py",)
+ADOPTED = "--adopted"
 
 # A part of a test's id -> why it cannot pass.
 EXCLUSIONS = {
@@ -64,14 +68,24 @@ class AsyncVectorEnv(fiber.vector.VectorEnv):
         )
 
 
-def pytest_configure() -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """What ``main`` hands on."""
+    parser.addoption(ADOPTED, action="store_true")
+
+
+def pytest_configure(config: pytest.Config) -> None:
     """Before any test is imported."""
+    if config.getoption(ADOPTED):
+        fiber.adopt(async_vector_env.__name__)
+        return
     for module in (gymnasium.vector, async_vector_env):
         vars(module)["AsyncVectorEnv"] = AsyncVectorEnv
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """What cannot pass must not."""
+    if config.getoption(ADOPTED):
+        return
     for item in items:
         for name, reason in EXCLUSIONS.items():
             if name in item.nodeid:
@@ -81,7 +95,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def main(checkout: str, *options: str) -> int:
     """Run them; the exit status is pytest's."""
     folders = [str(Path(checkout).resolve()), str(Path(__file__).parents[1])]
-    command = [sys.executable, "-m", "pytest", "-p", "conformance.gymnasium_vector", "-rxX", *TESTS]
+    command = [sys.executable, "-m", "pytest", "-p", "conformance.gymnasium_vector", "-rxX"]
+    command += TESTS_OF_ASYNC_VECTOR_ENV if ADOPTED in options else TESTS
     return subprocess.run(
         [*command, *options],
         cwd=checkout,
