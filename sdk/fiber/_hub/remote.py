@@ -63,13 +63,17 @@ class RemoteObject:
         self._streams.append(stream)
         return stream
 
-    @contextmanager
-    def _take(self, idle: deque[HubStream]) -> Iterator[HubStream]:
+    def _pop(self, idle: deque[HubStream]) -> HubStream:
+        """A stream that nobody else uses, until it is put back."""
         self._check()
         try:
-            stream = idle.pop()
+            return idle.pop()
         except IndexError:
-            stream = self._open()
+            return self._open()
+
+    @contextmanager
+    def _take(self, idle: deque[HubStream]) -> Iterator[HubStream]:
+        stream = self._pop(idle)
         try:
             yield stream
         finally:

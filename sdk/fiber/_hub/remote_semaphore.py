@@ -39,11 +39,7 @@ class RemoteSemaphore(RemoteObject):
         if self.kind == RECURSIVE and self._is_mine():
             self._depth += 1
             return True
-        self._check()
-        try:
-            stream = self._idle.pop()
-        except IndexError:
-            stream = self._open()
+        stream = self._pop(self._idle)
         try:
             stream.settle()
             name = memoryview(self._name().encode())

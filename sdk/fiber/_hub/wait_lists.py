@@ -30,11 +30,7 @@ class RemoteWaitList(RemoteObject):
 
     def enter(self) -> HubStream:
         """A place for this thread."""
-        self._check()
-        try:
-            stream = self._idle.pop()
-        except IndexError:
-            stream = self._open()
+        stream = self._pop(self._idle)
         try:
             stream.settle()
             stream.ask(Op.ENTER)
