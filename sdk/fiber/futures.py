@@ -153,9 +153,7 @@ class Executor(concurrent.futures.Executor):
         util.Finalize(other, _close_queues, args=(other._queues,))
         return other
 
-    def submit(
-        self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs
-    ) -> CallFuture[_T]:
+    def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Have ``fn(*args, **kwargs)`` called in a worker; returns the future of its result.
 
         It is concurrent.futures', and coroutines of asyncio can await it.

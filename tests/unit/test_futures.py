@@ -115,9 +115,10 @@ def test_asyncio_awaits_them(executor: fiber.Executor) -> None:
     assert asyncio.run(main()) == ([n * n for n in range(10)], 81)
 
 
-def test_a_coroutine_awaits_them(executor: fiber.Executor, tmp_path: Path) -> None:
+def test_a_coroutine_awaits_them(executor: Any, tmp_path: Path) -> None:
     async def square(number: int) -> int:
-        return await executor.submit(tasks.square, number)
+        result: int = await executor.submit(tasks.square, number)
+        return result
 
     async def main() -> None:
         assert await asyncio.gather(*(square(n) for n in range(10))) == [n * n for n in range(10)]
