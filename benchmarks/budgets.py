@@ -140,11 +140,13 @@ def _executors() -> Iterator[Budget]:
             what = f"fiber.Executor: {case}"
             yield budget(what, "executors", case, 5, contender=ours, against=against)
     ours = "fiber-joblib"
-    for case in parallel_loops.cases(1.0):
+    for kind in parallel_loops.TASKS:
         # Where tasks sleep for longer than anything else takes, there is nothing to be gained.
-        bound = 0.98 if case.params["kind"] == parallel_loops.LONGER else 1.0
-        what = f"joblib: {case.name}"
-        yield budget(what, case.measure, case.name, bound, contender=ours, against="joblib")
+        bound = 0.98 if kind == parallel_loops.LONGER else 1.0
+        for size in parallel_loops.BATCH_SIZES:
+            case = parallel_loops.case_name(kind, size)
+            what = f"joblib: {case}"
+            yield budget(what, "parallel_loops", case, bound, contender=ours, against="joblib")
 
 
 def _overhead() -> Iterator[Budget]:

@@ -27,7 +27,7 @@ BASELINE = "joblib"
 BATCH_SIZES: dict[str, int | None] = {"batch_size=1": 1, "batch_size=auto": None}
 NO_OPS, SHORT, LONGER = "no-ops", "1 ms tasks", "10 ms tasks"
 DIFFERENT, SAME = "1 MB arrays", "the same 10 MB array"
-_TASKS = {NO_OPS: 5_000, SHORT: 1_000, LONGER: 200, DIFFERENT: 100, SAME: 50}
+TASKS = {NO_OPS: 5_000, SHORT: 1_000, LONGER: 200, DIFFERENT: 100, SAME: 50}
 _SECONDS = {SHORT: 0.001, LONGER: 0.01}
 _ARRAY_BYTES = {DIFFERENT: MEGABYTE, SAME: 10 * MEGABYTE}
 
@@ -50,7 +50,7 @@ def cases(size: float) -> list[Case]:
             baseline=BASELINE,
             limit=30.0,
         )
-        for kind, tasks in _TASKS.items()
+        for kind, tasks in TASKS.items()
         for name, batch_size in BATCH_SIZES.items()
     ]
 

@@ -23,7 +23,10 @@ def start(contender: str, make: Make, count: int, workers: int | None, batch: in
     `workers`: None for one a processor; no matter where each environment has a worker or none has.
     `batch`: the size of first-ready batches, 0 for a vector that is stepped as a whole.
     """
-    workers = workers or min(count, import_module("fiber").cpu_count())
+    if not workers:
+        # A power of two, as the counts are: not everyone can share environments unevenly.
+        processors = import_module("fiber").cpu_count()
+        workers = min(count, 1 << processors.bit_length() - 1)
     return _ADAPTERS[contender](make, count, workers, batch)
 
 
