@@ -29,7 +29,7 @@ class Sampling(gymnasium.Env[Any, Any]):
         length: int = 4,
     ) -> None:
         self.observation_space = deepcopy(observation_space)  # and with it its generator
-        self.action_space = action_space or spaces.Discrete(3)
+        self.action_space = spaces.Discrete(3) if action_space is None else action_space
         self.render_mode = "rgb_array"
         self.length = length
         self.steps = 0

@@ -231,7 +231,12 @@ def _run(
             initializer(member, *initargs)
         member._news.send((func(member.rank, member.size), None))
     except Exception as error:  # also of a result that does not pickle
-        try:
-            member._news.send((None, ExceptionWithTraceback(error, error.__traceback__)))
-        except UnpicklableError:
-            member._news.send((None, FiberError(f"{type(error).__name__}: {error}")))
+        with contextlib.suppress(BrokenPipeError, ConnectionClosed):  # the program is gone
+            _send_error(member._news, error)
+
+
+def _send_error(news: Connection, error: Exception) -> None:
+    try:
+        news.send((None, ExceptionWithTraceback(error, error.__traceback__)))
+    except UnpicklableError:
+        news.send((None, FiberError(f"{type(error).__name__}: {error}")))

@@ -85,6 +85,7 @@ def same(one: Any, other: Any) -> None:
 
 
 def play_both(env: Any, other: Any, steps: int = 20) -> None:
+    assert env.metadata == other.metadata
     for each in (env, other):
         each.seed(5)
         each.set_options({"a": 1})
@@ -129,6 +130,14 @@ def test_cart_poles_in_the_wrappers_of_stable_baselines3(vec_env: Make) -> None:
     )
     mine, its = (VecFrameStack(VecNormalize(env), 2) for env in (vec_env(makes), dummy(makes)))
     play_both(mine, its, 60)
+
+
+def test_spaces_that_differ(vec_env: Make) -> None:
+    makes = [partial(Sampling, spaces.Box(0, high, (2,))) for high in (1, 2, 3)]
+    play_both(vec_env(makes), dummy(makes))
+    makes[2] = partial(Sampling, spaces.Box(0, 1, (3,)))
+    with pytest.raises(RuntimeError, match=r"common shape .*environment 2, of worker '.*-1'"):
+        vec_env(makes)
 
 
 def test_make_vec_env() -> None:

@@ -192,7 +192,7 @@ def test_calls_and_attributes(vector_env: Make) -> None:
     assert env.get_attr("length") == (6, 7, 8)
     env.set_attr("length", 9)
     assert env.get_attr("length") == (9, 9, 9)
-    with pytest.raises(ValueError, match="one for each, not 2"):
+    with pytest.raises(ValueError, match="Got `2` values for 3 environments"):
         env.set_attr("length", [1, 2])
     with pytest.raises(AttributeError) as caught:
         env.call("nothing")
@@ -219,7 +219,7 @@ def test_actions_that_do_not_fit(vector_env: Make) -> None:
     env.reset()
     with pytest.raises(ValueError, match="actions for 3 environments are needed"):
         env.step([0, 0])
-    with pytest.raises(ValueError, match="seeds for 3 environments are needed"):
+    with pytest.raises(ValueError, match="num_envs=3 but got length=1"):
         env.reset(seed=[1])
     assert env.step([0, 0, 0])[0].tolist() == [[1], [1], [1]]
     checked = vector_env([partial(gymnasium.make, "CartPole-v1")] * 2)

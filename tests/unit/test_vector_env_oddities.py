@@ -15,6 +15,8 @@ import pytest
 from gymnasium import spaces
 
 import fiber
+from faults.program import alive, wait_for
+from fiber._runtime.state import runtime
 from fiber.vector import VectorEnv
 from fiber.vector.failures import ATTEMPTS
 from vector_envs import Faulty, Step
@@ -225,6 +227,19 @@ def test_a_making_that_hangs(vector_env: Make, tmp_path: Path) -> None:
     with pytest.raises(fiber.TimeoutError, match="longer than 3 s") as caught:
         env.step([Faulty.GOOD, Faulty.RAISE])
     assert "step of environment 1" in caught.value.__notes__[0]
+
+
+# Ends
+
+
+def test_one_that_the_collector_finds_in_fibers_own_thread(tmp_path: Path) -> None:
+    env = VectorEnv([partial(Faulty, tmp_path / "never")] * 2, num_workers=2)
+    env.reset()
+    pids = env.call("pid")
+    env.step_async([Faulty.WAIT] * 2)
+    runtime().loop.call_soon(env.__del__)
+    wait_for(lambda: not any(alive(pid) for pid in pids))
+    env.closed = True
 
 
 # Forks

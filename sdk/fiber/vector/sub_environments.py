@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -108,6 +109,11 @@ class SubEnvironments:
         """End the workers; kill those that have not ended when ``timeout`` is over."""
         if os.getpid() == self._owner:  # else nothing of the workers is here to end
             self.dispatcher.close(timeout)
+
+    def discard(self) -> None:
+        """End the workers at once, from a finalizer."""
+        with contextlib.suppress(RuntimeError):  # Fiber's own thread cannot wait for their ends
+            self.close(0)
 
     def check_owner(self) -> None:
         """RuntimeError in another process than that which made them."""

@@ -54,7 +54,7 @@ class VecEnv(vec_env.VecEnv):
             num_workers=num_workers,
             shared_memory=shared_memory,
             context=start_method,
-            observation_mode="same",
+            observation_mode="different",  # as far as DummyVecEnv goes: the first one's is for all
             autoreset=AutoresetMode.SAME_STEP,
             on_error=on_error,
             timeout=timeout,
@@ -64,6 +64,7 @@ class VecEnv(vec_env.VecEnv):
         self.closed = False
         spaces = self._sub_environments.spaces
         super().__init__(len(env_fns), spaces.single_observation_space, spaces.single_action_space)
+        self.metadata = self._sub_environments.metadata
 
     def reset(self) -> Any:
         """Reset all environments; observations.  A step that is under way is given up."""
@@ -122,7 +123,7 @@ class VecEnv(vec_env.VecEnv):
 
     def __del__(self) -> None:
         if not getattr(self, "closed", True):
-            self._sub_environments.close(0)
+            self._sub_environments.discard()
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
         """A frame of each environment, if its render mode is rgb_array."""

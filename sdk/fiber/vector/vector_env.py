@@ -246,8 +246,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             values = [values] * self.num_envs
         if len(values) != self.num_envs:
             raise ValueError(
-                f"values for {self.num_envs} environments are needed, one for each, not "
-                f"{len(values)}"
+                "Values must be a list or tuple with length equal to the number of environments. "
+                f"Got `{len(values)}` values for {self.num_envs} environments."
             )
         with self._given_up_if_interrupted():
             self._call("set_wrapper_attr", [(name, value) for value in values])
@@ -267,7 +267,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     def __del__(self) -> None:
         if not getattr(self, "closed", True):
-            self.close(terminate=True)
+            self._sub_environments.discard()
 
     # What they have in common
 
@@ -310,7 +310,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             return [int(seed) + number for number in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(
-                f"seeds for {self.num_envs} environments are needed, one for each, not {len(seed)}"
+                "If seeds are passed as a list the length must match "
+                f"num_envs={self.num_envs} but got length={len(seed)}."
             )
         return seed
 
@@ -409,13 +410,16 @@ def _without_mask(
     if options is None or "reset_mask" not in options:
         return None, options
     mask = options["reset_mask"]
-    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
-        raise TypeError(f"options['reset_mask'] is a NumPy array of bools, not {mask!r}")
+    # The words are Gymnasium's: its tests look for them.
+    if not isinstance(mask, np.ndarray):
+        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
     if mask.shape != (count,):
-        raise ValueError(
-            f"options['reset_mask'] has a bool for each of {count} environments, and the shape "
-            f"{(count,)}, not {mask.shape}"
-        )
+        raise ValueError(f"`options['reset_mask']` must have shape `({count},)`, got {mask.shape}")
+    if mask.dtype != np.bool_:
+        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
     if not mask.any():
-        raise ValueError("options['reset_mask'] is True nowhere: there is nothing to reset")
+        raise ValueError(
+            "`options['reset_mask']` must contain a boolean array with at least one True value, "
+            f"got reset_mask={mask}"
+        )
     return mask, {key: value for key, value in options.items() if key != "reset_mask"}

@@ -104,6 +104,13 @@ class WorkerProcess:
             node=(report and report.node) or None,
         )
 
+    def hang_up(self, *, kill: bool) -> None:
+        """Have it end: now, or when it hears that nobody listens."""
+        self.connection.close()
+        if kill:
+            with contextlib.suppress(ValueError):  # closed just before Ctrl-C
+                self.process.kill()
+
     def close(self, timeout: float | None) -> None:
         """Wait for its end; kill it when ``timeout`` is over."""
         self.connection.close()

@@ -87,7 +87,7 @@ class WorkerSet:
         deadline = None if timeout is None else time.monotonic() + timeout
         for worker in self._started:
             self._forget(worker)
-            worker.connection.close()  # which they hear
+            worker.hang_up(kill=timeout == 0)
         while self._started:
             worker = self._started[-1]  # until it is closed: Ctrl-C may come before
             worker.close(None if deadline is None else max(0.0, deadline - time.monotonic()))

@@ -1,0 +1,27 @@
+"""A ring whose program dies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from faults.program import PATIENCE, Program
+
+PROGRAM = """
+    import fiber
+
+    def wait(rank, size):
+        if rank == 0:
+            print("ready", flush=True)
+        fiber.ring.current().recv()
+
+    if __name__ == "__main__":
+        fiber.Ring(3, wait).run()
+"""
+
+
+def test_a_program_that_is_killed_leaves_nothing(launch: Callable[..., Program]) -> None:
+    program = launch(PROGRAM)
+    assert program.line() == "ready"
+    program.kill()
+    assert program.left(PATIENCE) == []
+    assert "Traceback" not in program.stderr
