@@ -183,7 +183,7 @@ def _pipes() -> Iterator[Budget]:
 
 
 def _vector() -> Iterator[Budget]:
-    """As issue 11 asks; where it names no number of environments, these are as many as CartPoles."""
+    """As issue 11 asks; where it says not how many environments, these are as many as CartPoles."""
 
     def budget(what: str, case: str, bound: float, **more: Any) -> Budget:
         rate = vector.RATE.name

@@ -113,7 +113,7 @@ def run(
     make: Callable[[], Any] = getattr(environment, kind)
     env = vector_peers.start(bench.contender, make, count, workers, batch)
     try:
-        step = _first_ready(env, batch) if batch else _all(env)
+        step = _first_ready(env, count, batch) if batch else _all(env)
         return {RATE.name: _rate(step, batch or count, seconds)}
     finally:
         env.close()
@@ -125,7 +125,7 @@ def _all(env: Any) -> Callable[[], object]:
     return lambda: env.step(actions)
 
 
-def _first_ready(env: Any, batch: int) -> Callable[[], object]:
+def _first_ready(env: Any, count: int, batch: int) -> Callable[[], object]:
     env.reset_async(seed=1)
     actions = env.action_space.sample()[:batch]
 
@@ -133,6 +133,9 @@ def _first_ready(env: Any, batch: int) -> Callable[[], object]:
         env.recv(batch)
         env.send(actions)
 
+    # So often that all environments are there and have made steps.
+    for _ in range(2 * count // batch):
+        step()
     return step
 
 

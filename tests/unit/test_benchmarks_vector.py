@@ -260,6 +260,9 @@ def test_actors_of_ray_get_their_actions_in_the_order_of_the_batch(
     actors.send(actions)
     expected = alone.step(np.array([0, 0, 0, 0, 0, 1, 1, 0]))[0]
     np.testing.assert_array_equal(actors.recv(4)[0], expected[4:])
+    actors.send(actions)
+    # The slow ones are there at last, with those that have made a step.
+    assert len(actors.recv(8)[0]) == 8
     alone.close()
 
 
