@@ -13,13 +13,14 @@ from conformance.runner import TESTS
 
 COMMAND = (
     *(sys.executable, "-m", "pytest", "--pyargs", "joblib.test.test_parallel"),
-    *("-p", "conformance.joblib_plugin", "-p", "no:cacheprovider", "-c", os.devnull, "-q", "-rX"),
+    *("-p", "conformance.joblib_plugin", "-p", "no:cacheprovider", "-c", "pytest.ini", "-q", "-rX"),
 )
 
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
 def test_joblibs_tests(tmp_path: Path) -> None:
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")  # else it would be this project's
     done = subprocess.run(
         [*COMMAND, "--timeout", "120"],
         cwd=tmp_path,
