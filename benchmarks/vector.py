@@ -77,7 +77,7 @@ def cases(size: float) -> list[Case]:
         _case(kind, count, f"{count:,} {ending}", group, size)
         for kind, (ending, group) in zip(_KINDS, PANELS.items(), strict=True)
         for count in COUNTS
-        if size >= 0.1 or count <= COUNTS[0]
+        if size >= 0.1 or count <= _EVERY_ROUND
     ]
 
 
