@@ -254,6 +254,8 @@ class Programs:
         """Of what is started beside the tests from now on."""
         self.node: str | None = None
         """Where what is started inside from now on runs; None: anywhere."""
+        self.image: str | None = None
+        """What is started from now on runs in pods of this image; None: of one of ours."""
         self._started: list[Program] = []
 
     def start(self, place: str, script: str, *arguments: object, **settings: object) -> Program:
@@ -262,7 +264,8 @@ class Programs:
         The settings are keys of Fiber's configuration.
         """
         words = [str(argument) for argument in arguments]
-        image = self._cluster.images["fiber-worker-rl" if "/" in script else "fiber-worker"]
+        ours = self._cluster.images["fiber-worker-rl" if "/" in script else "fiber-worker"]
+        image = self.image or ours
         start = self._outside if place == "outside" else self._inside
         program = start(path_to(script), words, image, settings)
         self._started.append(program)
