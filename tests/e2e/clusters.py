@@ -34,6 +34,7 @@ from cluster import (
     places,
 )
 from cluster.ability import Choice
+from cluster.images import Image
 from cluster.shell import ClusterError, output, wait_for
 
 NODES = 2
@@ -90,7 +91,7 @@ class Cluster:
         container_id = statuses[container]["containerID"].removeprefix("containerd://")
         self._kill(pod["spec"]["nodeName"], container_id)
 
-    def bring(self, image: images.Image) -> str:
+    def bring(self, image: Image) -> str:
         """Have one more image on the nodes, of those that few tests need; its reference."""
         raise NotImplementedError
 
@@ -146,7 +147,7 @@ class Own(Cluster):
     def _without_apiserver(self) -> AbstractContextManager[None]:
         return faults.stopped(faults.APISERVER)
 
-    def bring(self, image: images.Image) -> str:
+    def bring(self, image: Image) -> str:
         return images.bring(image)
 
     def fake_nodes(self, count: int) -> None:
@@ -177,7 +178,7 @@ class Kind(Cluster):
             self.close()
             raise
 
-    def bring(self, image: images.Image) -> str:
+    def bring(self, image: Image) -> str:
         reference = images.build(image)
         self._load(image)
         return reference
@@ -224,7 +225,7 @@ class Kind(Cluster):
         kill = ("tasks", "kill", "--signal", "SIGKILL", container_id)
         self._inside(node, "ctr", "--namespace", "k8s.io", *kill)
 
-    def _load(self, image: images.Image) -> None:
+    def _load(self, image: Image) -> None:
         output("kind", "load", "image-archive", image.archive, "--name", self._name)
 
     def _tag(self, reference: str, other: str) -> None:
@@ -248,7 +249,7 @@ class Given(Cluster):
         self.images = _given_images(environment)
         self._environment = environment
 
-    def bring(self, image: images.Image) -> str:
+    def bring(self, image: Image) -> str:
         variable = _variable(image.name)
         return self._environment.get(variable) or self._skip(
             f"have {image.dockerfile} built unless {variable} names the image"

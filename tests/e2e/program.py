@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -110,9 +111,11 @@ class Outside(Program):
     ) -> None:
         super().__init__(scene)
         self._status: int | None = None
+        # Of its own: one that is killed leaves its temporary files.
+        self._temporary = tempfile.TemporaryDirectory(prefix="program-")
         self._process = subprocess.Popen(
             [sys.executable, str(script), *arguments],
-            env={**environment, "PYTHONUNBUFFERED": "1"},
+            env={**environment, "PYTHONUNBUFFERED": "1", "TMPDIR": self._temporary.name},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -142,6 +145,7 @@ class Outside(Program):
     def close(self) -> None:
         self._process.kill()
         self._reader.join()
+        self._temporary.cleanup()
 
     def _read(self) -> None:
         assert self._process.stdout is not None

@@ -86,7 +86,6 @@ def test_an_environment_that_needs_too_much_memory_is_told_so(
 
 
 @pytest.mark.long
-@pytest.mark.may_leak("a process that is killed cannot remove its temporary folder")
 def test_a_learner_that_is_killed_takes_its_environments_with_it(programs: Programs) -> None:
     program = programs.start("outside", "environments.py")
     sent(program)
