@@ -9,6 +9,7 @@ BIN := $(VENV)/bin
 FAST_TESTS := tests/contract tests/simulation tests/unit
 SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
 FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
+WHOLE_PROGRAMS := tests/chart tests/examples tests/faults
 # What depends most on the interpreter: pickling, starting and ending processes, threads and locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback pool pool_deaths \
 	process queues reduction synchronize worker exit_functions futures) tests/faults/test_children.py \
@@ -32,7 +33,8 @@ test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-testsuite
 	$(CLUSTER) prepare
 	$(FAST)
 	@$(MAKE) --no-print-directory test-pythons
-	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS))
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not long" $(WHOLE_PROGRAMS)
+	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS) $(WHOLE_PROGRAMS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation, but for the slowest
 test-fast: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3
@@ -58,7 +60,7 @@ lint: $(VENV)/.with-dev
 	$(BIN)/lint-imports
 
 ## make bench         every measure beside the installed peers; writes docs/benchmarks
-bench: $(VENV)/.with-bench
+bench: $(VENV)/.with-bench $(VENV)/.with-vector-peers
 	$(BIN)/python -m benchmarks
 
 ## make bench-operator  FiberPools beside ReplicaSets at thousands of pretended pods (root, Go)
@@ -115,6 +117,14 @@ $(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench: $(VENV)/.made pyproject.
 # Without torch, which it needs to learn and is larger than all else together.
 $(VENV)/.with-stable-baselines3: $(VENV)/.with-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
+	touch $@
+
+# Beside which vector environments are measured. Without torch, as above; where one has no wheel the
+# others are measured.
+$(VENV)/.with-vector-peers: $(VENV)/.with-bench
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'pufferlib-core>=3'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: 'envpool>=1.2'
 	touch $@
 
 $(VENV)/.with-testsuite: $(VENV)/.made

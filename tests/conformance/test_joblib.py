@@ -14,7 +14,7 @@ from conformance.runner import TESTS
 
 COMMAND = (
     *(sys.executable, "-m", "pytest", "--pyargs", "joblib.test.test_parallel"),
-    *("-p", "conformance.joblib_plugin", "-p", "no:cacheprovider", "-c", os.devnull, "-q", "-rX"),
+    *("-p", "conformance.joblib_plugin", "-p", "no:cacheprovider", "-c", "pytest.ini", "-q", "-rX"),
 )
 
 
@@ -22,6 +22,7 @@ COMMAND = (
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("backend", ["local", "kubernetes"])
 def test_joblibs_tests(backend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")  # else it would be this project's
     variables = {**os.environ, "FIBER_BACKEND": backend, "PYTHONPATH": str(TESTS)}
     with ExitStack() as stack:
         if backend == "kubernetes":

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from conformance import executors
 from e2e.clusters import Cluster
 from e2e.kube import environment
 from e2e.scene import Scene
@@ -21,6 +22,8 @@ SECONDS = 1800
 @pytest.mark.timeout(SECONDS + 60, func_only=True)
 @pytest.mark.parametrize("script", ["run.py", "executors.py"])
 def test_cpythons_tests_on_pods(script: str, cluster: Cluster, scene: Scene, image: str) -> None:
+    if script == "executors.py" and not executors.available():
+        pytest.skip("this Python has no test.test_concurrent_futures")
     if cluster.outside is None:
         pytest.skip(f"{cluster.description}: pods cannot reach a program outside of it")
     variables = environment(
