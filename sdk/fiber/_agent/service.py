@@ -56,7 +56,7 @@ class AgentService:
         self._transmit(message)
 
     def _transmit(self, message: messages.Message) -> None:
-        self._link.send(message.encode())
+        self._link.send(*messages.pieces(message))
 
     def busy(self) -> bool:
         """Whether the link is so far behind that output should wait."""

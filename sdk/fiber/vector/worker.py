@@ -145,6 +145,10 @@ class Worker:
             operation, *arguments = self._connection.recv()
             self._operations[operation](*arguments)
 
+    def _tell(self, message: Answer | Results) -> None:
+        # That it has arrived is known when the next command comes.
+        self._connection._send_unconfirmed(message)
+
     # Operations
 
     def _step(
@@ -195,10 +199,10 @@ class Worker:
             except Exception as error:
                 failures.append(Failure.of(row, "a call", error))
         try:
-            self._connection.send(Results(generation, values, failures))
+            self._tell(Results(generation, values, failures))
         except UnpicklableError as error:
             failures.append(Failure.of(self._each(rows)[0], "a call", error))
-            self._connection.send(Results(generation, [], failures))
+            self._tell(Results(generation, [], failures))
 
     # What they have in common
 
@@ -263,10 +267,10 @@ class Worker:
 
     def _send(self, report: _Report, *, whole: bool) -> None:
         try:
-            self._connection.send(report.answer(self._arrays, whole=whole, shared=self._shared))
+            self._tell(report.answer(self._arrays, whole=whole, shared=self._shared))
         except UnpicklableError:
             self._blame(report)
-            self._connection.send(report.answer(self._arrays, whole=False, shared=self._shared))
+            self._tell(report.answer(self._arrays, whole=False, shared=self._shared))
 
     def _blame(self, report: _Report) -> None:
         """Some of it does not pickle: those environments have failed."""
