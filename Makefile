@@ -9,6 +9,7 @@ BIN := $(VENV)/bin
 FAST_TESTS := tests/contract tests/simulation tests/unit
 SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
 FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
+WHOLE_PROGRAMS := tests/chart tests/examples tests/faults
 # What depends most on the interpreter: pickling, starting and ending processes, threads and locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback pool pool_deaths \
 	process queues reduction synchronize worker exit_functions futures) tests/faults/test_children.py \
@@ -32,7 +33,8 @@ test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-testsuite
 	$(CLUSTER) prepare
 	$(FAST)
 	@$(MAKE) --no-print-directory test-pythons
-	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS))
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not long" $(WHOLE_PROGRAMS)
+	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS) $(WHOLE_PROGRAMS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation, but for the slowest
 test-fast: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3

@@ -95,6 +95,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def main(checkout: str, *options: str) -> int:
     """Run them; the exit status is pytest's."""
     folders = [str(Path(checkout).resolve()), str(Path(__file__).parents[1])]
+    folders += filter(None, [os.environ.get("PYTHONPATH")])
     command = [sys.executable, "-m", "pytest", "-p", "conformance.gymnasium_vector", "-rxX"]
     command += TESTS_OF_ASYNC_VECTOR_ENV if ADOPTED in options else TESTS
     return subprocess.run(

@@ -63,11 +63,12 @@ def main(checkout: str, *options: str) -> int:
     folders = [Path(checkout).resolve(), Path(__file__).parents[1]]
     if importlib.util.find_spec("torch") is None:
         folders.append(STAND_INS)
+    path = [*map(str, folders), *filter(None, [os.environ.get("PYTHONPATH")])]
     plugin = "conformance.stable_baselines3_vec_env"
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-p", plugin, "-rxX", *TESTS, *options],
         cwd=checkout,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
     ).returncode
 
 

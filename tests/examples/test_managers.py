@@ -20,7 +20,7 @@ def train(backend: str, picture: Path, *, envs: int, updates: int) -> list[float
     small = ("--envs", envs, "--updates", updates, "--ms", 1, "--out", picture)
     done = run(SCRIPT, *small, backend=backend)
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert not done.stderr
+    assert all("] waiting for pods: " in line for line in done.stderr.splitlines())
     rates = re.findall(r"^(?:one after|side by).*: +[\d,]+ steps a second$", done.stdout, re.M)
     assert len(rates) == 2
     returns = re.findall(r"^update .* mean return +([\d.]+)$", done.stdout, re.M)

@@ -32,3 +32,11 @@ def test_they_print_the_same(program: str, monkeypatch: pytest.MonkeyPatch) -> N
     assert len(expected.splitlines()) >= 3
     for backend in BACKENDS:
         assert printed(program, "fiber", backend) == expected
+
+
+@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
+def test_stable_baselines3_learns_the_same() -> None:
+    expected = printed("stable_baselines3_ppo.py", "multiprocessing")
+    assert len(expected.splitlines()) >= 3
+    for backend in BACKENDS:
+        assert printed("stable_baselines3_ppo.py", "fiber", backend) == expected

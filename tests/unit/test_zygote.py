@@ -415,6 +415,26 @@ def test_descriptors_that_nobody_took_are_closed_in_the_child(
     os.close(reader)
 
 
+def test_its_socket_blocks_whatever_the_programs_default_timeout_is(
+    monkeypatch: pytest.MonkeyPatch, progress_table: ProgressTable
+) -> None:
+    blocking = []
+
+    def run(control: int) -> subprocess.Popen[bytes]:
+        blocking.append(os.get_blocking(control))
+        return start(control)
+
+    start = zygote_process._run
+    monkeypatch.setattr(zygote_process, "_run", run)
+    socket.setdefaulttimeout(PATIENCE)
+    try:
+        master = Master(progress_table)
+    finally:
+        socket.setdefaulttimeout(None)
+    assert blocking == [True]
+    master.close()
+
+
 # Started before anything needs it
 
 

@@ -72,6 +72,8 @@ def is_standard_stream(fd: int) -> bool:
 def _start() -> ZygoteProcess:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
+        # The zygote waits for what it is told: socket.setdefaulttimeout() is for the user's own.
+        theirs.setblocking(True)
         return ZygoteProcess(_run(theirs.fileno()), ours)
     except BaseException:
         ours.close()
