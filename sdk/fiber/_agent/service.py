@@ -169,7 +169,8 @@ class _Observed:
         """Start it."""
         try:
             self._capture = Capture(loop, self._wrote, self._service.busy)
-            self._child = agent.child(replace(spec, stdio=self._capture.stdio), self)
+            spec = replace(spec, stdio=self._capture.stdio, passing=True)
+            self._child = agent.child(spec, self)
             self._child.start()
         except Exception as error:
             # Whatever keeps a child from starting here, the one who asked is the master.

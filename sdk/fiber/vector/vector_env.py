@@ -293,8 +293,10 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         if numbers is not None:
             batch = gymnasium.vector.VectorEnv()
             batch.num_envs = len(numbers)
+        order = range(self.num_envs) if numbers is None else numbers
+        rows = {number: row for row, number in enumerate(order)}
         for number, note in notes:
-            row = number if numbers is None else numbers.index(number)
+            row = rows[number]
             if note.final is not None:
                 ending = {"final_obs": note.final.observation, "final_info": note.final.info}
                 infos = batch._add_info(infos, ending, row)

@@ -89,11 +89,12 @@ class Results(NamedTuple):
 def serve(connection: Connection, setup: Setup) -> None:
     """The target of a worker process."""
     slots: list[Slot] = []
+    made: set[int] = set()
     try:
         for row, make in enumerate(setup.makes):
             try:
                 slots.append(Slot(row, make, setup.autoreset))
-                _check_that_it_is_new(slots)
+                _check_that_it_is_new(slots[-1], made)
             except Exception as error:
                 connection.send(Failure.of(row, "the making", error))
                 return
@@ -314,13 +315,15 @@ class _Report:
         return Answer(self.generation, rows, packed, self.notes, self.failures)
 
 
-def _check_that_it_is_new(slots: Sequence[Slot]) -> None:
-    newest = slots[-1].env.unwrapped
-    if any(slot.env.unwrapped is newest for slot in slots[:-1]):
+def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
+    """``made``: the ids of the environments before it, which are all still there."""
+    newest = id(slot.env.unwrapped)
+    if newest in made:
         raise ValueError(
             "it is the environment that the function has made before: have it make a new one at "
             "every call (`lambda: gymnasium.make(...)` instead of `lambda: env`)"
         )
+    made.add(newest)
 
 
 def _hello(slots: Sequence[Slot]) -> Hello:
