@@ -296,10 +296,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         if numbers is not None:
             batch = gymnasium.vector.VectorEnv()
             batch.num_envs = len(numbers)
+        order = range(self.num_envs) if numbers is None else numbers
+        rows = {number: row for row, number in enumerate(order)}
         for number, note in notes:
-            row = number if numbers is None else numbers.index(number)
             try:
-                infos = _with_note(batch, infos, note, row)
+                infos = _with_note(batch, infos, note, rows[number])
             except Exception as error:  # infos of one name and different types
                 error.add_note(f"an info of {self._dispatcher.name(number)}")
                 raise
