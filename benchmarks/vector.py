@@ -30,9 +30,9 @@ Fiber is `fiber.vector.VectorEnv`. AsyncVectorEnv and SyncVectorEnv are Gymnasiu
 process for each environment, forked, as stable-baselines3's SubprocVecEnv has, and more than
 {_MOST_PROCESSES} they are not asked for. Who shares workers has one a processor for CartPoles and
 for large observations, and for environments that sleep one for each, but at most {SLOW_WORKERS}:
-Fiber, PufferLib, Ray. PufferLib is its backend Multiprocessing, from the package pufferlib-core,
-which has no part that must be built. Ray's are plain actors, as RLlib's need torch: each has its
-share of the environments in a SyncVectorEnv, and the program puts together what they return.
+Fiber, PufferLib, Ray. PufferLib is its backend Multiprocessing, from the package pufferlib-core, as
+pufferlib itself has to be built with torch. Ray's are plain actors, as RLlib's need torch: each has
+its share of the environments in a SyncVectorEnv, and the program puts together what they return.
 EnvPool runs environments of its own alone, which are written in C++: of these its CartPole is
 measured, with a thread a processor, and it says what Python costs, not what its workers do.
 SubprocVecEnv and PufferLib import torch and do not use it here: where it is not installed, a

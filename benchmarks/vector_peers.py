@@ -43,7 +43,7 @@ def _sync(make: Make, count: int, workers: int, batch: int) -> Any:
 
 
 class _SubprocVecEnv:
-    """stable-baselines3's. Forked, as others are: a fork server takes a minute for a hundred."""
+    """stable-baselines3's. Forked, as AsyncVectorEnv's: a server's would import all anew."""
 
     def __init__(self, make: Make, count: int, workers: int, batch: int) -> None:
         vec_env = import_module("stable_baselines3.common.vec_env")
