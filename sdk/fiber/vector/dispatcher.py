@@ -141,9 +141,10 @@ class Dispatcher:
 
     def busy(self, numbers: Iterable[int]) -> int | None:
         """The first of these of which ``under_way`` is true; None if there is none."""
+        ready = set(self._ready)
         for number in numbers:
             worker = self._worker_of[number]
-            if number - worker.setup.first in worker.pending or number in self._ready:
+            if number - worker.setup.first in worker.pending or number in ready:
                 return number
         return None
 

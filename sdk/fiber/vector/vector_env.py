@@ -40,6 +40,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     * ``shared_memory``: on one host actions and observations lie in memory that the processes
       share; on other hosts they travel, those of a worker in one message.
     * ``copy``: observations are the caller's.  Otherwise the next step overwrites them.
+    * On Kubernetes a worker's pod has what ``fiber.meta`` says that its ``env_fns`` need: of each
+      resource the most that one of them asks for.
     * ``context`` is a start method, as of ``fiber.get_context()``.
     * ``observation_mode`` and ``autoreset_mode`` are ``AsyncVectorEnv``'s.
     * ``on_error="restart"``: an environment that raises, takes longer than ``timeout`` or whose
@@ -294,10 +296,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         if numbers is not None:
             batch = gymnasium.vector.VectorEnv()
             batch.num_envs = len(numbers)
+        order = range(self.num_envs) if numbers is None else numbers
+        rows = {number: row for row, number in enumerate(order)}
         for number, note in notes:
-            row = number if numbers is None else numbers.index(number)
             try:
-                infos = _with_note(batch, infos, note, row)
+                infos = _with_note(batch, infos, note, rows[number])
             except Exception as error:  # infos of one name and different types
                 error.add_note(f"an info of {self._dispatcher.name(number)}")
                 raise

@@ -103,12 +103,13 @@ def serve(connection: Connection, setup: Setup) -> None:
 def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
     """Make the environments and say hello; False if one could not be made."""
     limit = _limit(setup)
+    made: set[int] = set()
     spaces: list[tuple[Any, Any]] = []
     for row, make in enumerate(setup.makes):
         try:
             with limit:
                 slots.append(Slot(row, make, setup.autoreset))
-                _check_that_it_is_new(slots)
+                _check_that_it_is_new(slots[-1], made)
                 spaces.append((slots[row].env.observation_space, slots[row].env.action_space))
         except Exception as error:
             connection.send(Failure.of(row, "the making", error))
@@ -161,6 +162,10 @@ class Worker:
         while True:
             operation, *arguments = self._connection.recv()
             self._operations[operation](*arguments)
+
+    def _tell(self, message: Answer | Results) -> None:
+        # That it has arrived is known when the next command comes.
+        self._connection._send_unconfirmed(message)
 
     # Operations
 
@@ -215,10 +220,10 @@ class Worker:
                 failures.append(Failure.of(row, "a call", error))
         at_work[worker] = 0
         try:
-            self._connection.send(Results(generation, values, failures))
+            self._tell(Results(generation, values, failures))
         except UnpicklableError as error:
             failures.append(Failure.of(self._each(rows)[0], "a call", error))
-            self._connection.send(Results(generation, [], failures))
+            self._tell(Results(generation, [], failures))
 
     # What they have in common
 
@@ -288,10 +293,10 @@ class Worker:
 
     def _send(self, report: _Report, *, whole: bool) -> None:
         try:
-            self._connection.send(report.answer(self._arrays, whole=whole, shared=self._shared))
+            self._tell(report.answer(self._arrays, whole=whole, shared=self._shared))
         except UnpicklableError:
             self._blame(report)
-            self._connection.send(report.answer(self._arrays, whole=False, shared=self._shared))
+            self._tell(report.answer(self._arrays, whole=False, shared=self._shared))
 
     def _blame(self, report: _Report) -> None:
         """Some of it does not pickle: those environments have failed."""
@@ -335,13 +340,15 @@ class _Report:
         return Answer(self.generation, rows, packed, self.notes, self.failures)
 
 
-def _check_that_it_is_new(slots: Sequence[Slot]) -> None:
-    newest = slots[-1].env.unwrapped
-    if any(slot.env.unwrapped is newest for slot in slots[:-1]):
+def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
+    """``made``: the ids of the environments before it, which are all still there."""
+    newest = id(slot.env.unwrapped)
+    if newest in made:
         raise ValueError(
             "it is the environment that the function has made before: have it make a new one at "
             "every call (`lambda: gymnasium.make(...)` instead of `lambda: env`)"
         )
+    made.add(newest)
 
 
 def _limit(setup: Setup) -> contextlib.AbstractContextManager[None]:
