@@ -221,10 +221,10 @@ def test_one_that_raises_again_and_again_and_works_between_is_not_given_up(
 
 def test_a_making_that_hangs(vector_env: Make, tmp_path: Path) -> None:
     makes = [partial(Flagged, tmp_path / "flag", "hang")] * 2
-    env = vector_env(makes, on_error="restart", timeout=3)
+    env = vector_env(makes, on_error="restart", timeout=2)
     env.reset()
     (tmp_path / "flag").touch()
-    with pytest.raises(fiber.TimeoutError, match="longer than 3 s") as caught:
+    with pytest.raises(fiber.TimeoutError, match="longer than 2 s") as caught:
         env.step([Faulty.GOOD, Faulty.RAISE])
     assert "step of environment 1" in caught.value.__notes__[0]
 

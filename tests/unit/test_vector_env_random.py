@@ -19,7 +19,7 @@ from fiber.vector import VectorEnv
 from unit.test_vector_env import play_both, same
 from vector_envs import Sampling, Step
 
-MIXES = int(os.environ.get("RANDOM_VECTOR_ENVS", "6"))
+MIXES = int(os.environ.get("RANDOM_VECTOR_ENVS", "4"))
 
 DTYPES = (np.float16, np.float32, np.float64)
 INTEGERS = (np.int8, np.uint8, np.int16, np.uint16, np.int32, np.int64)
