@@ -7,8 +7,10 @@ import pickle
 import signal
 import threading
 import weakref
+from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
+from typing import Any
 
 import pytest
 
@@ -20,6 +22,7 @@ from fiber._runtime.input_stream import InputStream
 from fiber._runtime.latch import Latch
 from fiber._runtime.launcher import KILL_AFTER
 from fiber._runtime.outcome import Failure, Pickled
+from fiber._runtime.work_items import Call
 from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
 from fiber.errors import FiberError, WorkerDied
@@ -70,6 +73,33 @@ def test_many_short_calls_in_a_row_travel_together(rig: Rig) -> None:
         rig.answer_batch(next(iter(rig.ledger.batches.values())))
     assert [results.done for results in many] == [1] * 10
     assert len(list(rig.deliveries())) - sent < 10
+
+
+def test_a_loop_that_is_about_to_look_for_calls_is_not_told_of_each(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.call()
+    (handle,) = rig.busy
+    rig.say(handle, rig.child(handle).packets[0][0], 0, None, 1e-7, [9], [])
+    told: list[object] = []
+    call_soon = rig.loop.call_soon
+
+    def tell(callback: Callable[..., object], *args: Any) -> None:
+        told.append(callback)
+        call_soon(callback, *args)
+
+    monkeypatch.setattr(rig.loop, "call_soon", tell)
+    many = [rig.call() for _ in range(100)]
+    assert len(told) < 10
+    blocking = Call("now", b"", (), None, Results())
+    blocking.blocking = True
+    before = len(told)
+    rig.executor.calls.put(blocking)
+    assert len(told) == before + 1
+    rig.loop.pass_time(1.0)
+    while rig.ledger.batches:
+        rig.answer_batch(next(iter(rig.ledger.batches.values())))
+    assert [results.done for results in many] == [1] * 100
 
 
 def test_a_function_is_sent_once_to_each_worker(rig: Rig) -> None:

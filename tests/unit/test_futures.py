@@ -16,11 +16,12 @@ import pytest
 
 import fiber
 from fiber import futures
-from fiber._runtime import methods
+from fiber._runtime import executor_group, methods
 from fiber._runtime.call_future import CallFuture
 from fiber._runtime.calls import CallQueue
 from fiber._runtime.work_items import Call
 from unit import pool_tasks as tasks
+from unit.interrupting import INSTRUCTIONS, is_interrupted
 from unit.pool_programs import run_program, wait_until
 
 PATIENCE = tasks.PATIENCE
@@ -393,6 +394,25 @@ def test_a_task_that_comes_while_it_is_shut_down(
     with pytest.raises(RuntimeError, match="cannot schedule new futures after shutdown"):
         other.submit(tasks.square, 3)
     assert not other._group.executors()
+
+
+def test_ctrl_c_while_it_starts_leaves_nothing() -> None:
+    made: list[fiber.Executor] = []
+
+    def start() -> None:
+        made.append(fiber.Executor(1))
+        made[-1].submit(tasks.square, 2)
+
+    stop = 0
+    while is_interrupted(start, stop, {executor_group.__file__}, steps=INSTRUCTIONS):
+        if made:
+            made.pop().shutdown(cancel_futures=True)
+        stop += 1
+    made.pop().shutdown()
+    wait_until(
+        lambda: not any(thread.name.startswith("fiber-pool") for thread in threading.enumerate()),
+        "no thread of theirs is left",
+    )
 
 
 def test_forgotten_it_ends_after_its_tasks() -> None:

@@ -17,6 +17,7 @@ import pytest
 
 import fiber
 from census import wait_until
+from fiber import reduction
 from fiber._hub import client, handles, protocol
 from fiber._hub.client import HubStream, NoHub, Unreachable
 from fiber._hub.handles import collecting_grants
@@ -111,6 +112,12 @@ def test_a_pickling_that_was_interrupted_before_it_could_end_is_forgotten(hosts:
         pickle.loads(data).close()
         assert objects_kept(hub) == 0, "the handle worked once"
         one.close()
+
+
+def test_picklings_of_what_has_no_handles_are_forgotten() -> None:
+    for number in range(100):
+        reduction.encode_reusable(number)
+    assert len(handles._this_thread.picklings) <= 1
 
 
 def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:

@@ -363,6 +363,7 @@ def begin_pickling(*, reusable: bool = False) -> Pickling:
     pickling, which goes on then.
     """
     pickling = Pickling(reusable)
+    _current()  # forgets those that are done, which nobody else may ever do
     _this_thread.picklings.append(weakref.ref(pickling))
     return pickling
 

@@ -38,7 +38,7 @@ class CallFuture(Future[_T]):
         super().__init__()
         self._executor = executor
         self._queue = queue
-        self._undecided = [True]
+        self._undecided = bytearray(1)  # which the collector has no work with
         """Whoever takes it out decides: to give the call to a worker, or to cancel it."""
         self._claimed: bool | None = None
 
@@ -62,9 +62,10 @@ class CallFuture(Future[_T]):
 
     def _decide(self) -> bool:
         try:
-            return self._undecided.pop()
+            self._undecided.pop()
         except IndexError:
             return False
+        return True
 
     # What the executor says, on the loop's thread
 

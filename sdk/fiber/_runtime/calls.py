@@ -21,7 +21,7 @@ from fiber._wire import work
 class CallQueue:
     """Calls that share their options, in the order in which they were made."""
 
-    __slots__ = ("called", "item", "stale")
+    __slots__ = ("called", "item", "stale", "watched")
 
     def __init__(
         self,
@@ -37,13 +37,15 @@ class CallQueue:
         """Those that the loop has not taken.  Any thread appends."""
         self.stale = False
         """Whether the loop is about to drop those that were cancelled."""
+        self.watched = False
+        """Whether the loop is about to look for more, and need not be told.  Only the loop says so:
+        whoever is interrupted while calling leaves it as it is."""
 
 
 class Calls:
     """All the queues of one pool.
 
-    ``refusal`` says why no call is taken any more; ``advance`` is called when something follows,
-    ``wake_at`` to have it called at some time.
+    ``refusal`` says why no call is taken any more; ``advance`` is called when something follows.
     """
 
     def __init__(
@@ -54,7 +56,6 @@ class Calls:
         *,
         refusal: Callable[[], BaseException | None],
         advance: Callable[[], None],
-        wake_at: Callable[[float], None],
     ) -> None:
         self._loop = loop
         self._workers = scheduler.workers
@@ -62,7 +63,6 @@ class Calls:
         self._jobs = jobs
         self._refusal = refusal
         self._advance = advance
-        self._wake_at = wake_at
         self._queues: dict[CallQueue, None] = {}
         """Those with open jobs."""
         self._without_options = CallQueue()
@@ -75,7 +75,8 @@ class Calls:
         if queue is None:
             queue = self._without_options
         queue.called.append(call)
-        self._loop.call_soon(self._take, queue)
+        if call.blocking or not queue.watched:
+            self._loop.call_soon(self._take, queue)
 
     def drop_cancelled(self, queue: CallQueue) -> None:
         """Calls were cancelled: let no worker be started for them."""
@@ -147,10 +148,16 @@ class Calls:
             self._advance()
         together = calls[alone:]
         self._ledger.feed(job, together)
-        if hurried and busy and not (together and together[-1].blocking):
-            self._wake_at(now + TICK)
-        else:
+        if not hurried or not busy or (together and together[-1].blocking):
             self._advance()
+        elif not queue.watched:
+            queue.watched = True
+            self._loop.call_later(TICK, self._take_more, queue)
+
+    def _take_more(self, queue: CallQueue) -> None:
+        queue.watched = False
+        self._take(queue)
+        self._advance()
 
     def _job(self, queue: CallQueue) -> Job:
         if queue not in self._queues:

@@ -126,7 +126,6 @@ class Executor:
             self._jobs,
             refusal=self._refusal,
             advance=self._advance,
-            wake_at=self._wake_at,
         )
         """The calls of single functions."""
         self._wake: Timer | None = None

@@ -73,8 +73,12 @@ class ExecutorGroup:
                 executor = Executor(self._template._replace(resources=kind), self._runtime)
                 reference = weakref.ref(executor)
                 util.Finalize(executor, _finish, (reference,), exitpriority=_EXIT_PRIORITY)
-                executor.start()
-                self._executors[kind] = executor
+                try:
+                    executor.start()
+                    self._executors[kind] = executor
+                finally:
+                    if kind not in self._executors:  # interrupted: nobody else would end it
+                        executor.close()
             return executor
 
     def executors(self) -> list[Executor]:
