@@ -157,6 +157,29 @@ def test_what_has_not_begun_can_be_cancelled_and_never_runs(tmp_path: Path) -> N
     assert tasks.runs(log) == 10 - len(cancelled)
 
 
+def test_cancelling_that_is_interrupted_holds_up_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with fiber.Executor(1) as executor:
+        executor.submit(tasks.wait_for, tmp_path / "gate")
+        queued = [executor.submit(tasks.square, n) for n in range(10)]
+        (engine,) = executor._group.executors()
+        calls, call_soon = engine.calls, engine._loop.call_soon
+
+        def interrupt(callback: Any, *args: Any) -> None:
+            if callback == calls._drop_cancelled:
+                raise KeyboardInterrupt
+            call_soon(callback, *args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(calls._loop, "call_soon", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                queued[-1].cancel()
+        assert queued[-2].cancel()
+        assert futures.wait(queued[-2:], PATIENCE).done == set(queued[-2:])
+        (tmp_path / "gate").touch()
+
+
 def test_for_cancelled_tasks_no_worker_is_waited_for(tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     executor = fiber.Executor(1, initializer=tasks.start_slowly, initargs=(gate,))

@@ -82,7 +82,11 @@ class Calls:
         """Calls were cancelled: let no worker be started for them."""
         if not queue.stale:
             queue.stale = True
-            self._loop.call_soon(self._drop_cancelled, queue)
+            try:
+                self._loop.call_soon(self._drop_cancelled, queue)
+            except BaseException:  # interrupted: the next one must not rely on it
+                queue.stale = False
+                raise
 
     def close(self, queue: CallQueue) -> None:
         """No call of it will come any more."""
