@@ -67,7 +67,7 @@ class WorkerSet:
                 self._ended.append(worker)
             elif worker not in self._ended:  # else all that it said was heard already
                 try:
-                    heard.append((worker, worker.connection.recv()))
+                    heard.append((worker, worker.connection._recv_passing()))
                 except (EOFError, OSError):
                     self._ended.append(worker)
         while self._ended:
