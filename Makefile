@@ -60,7 +60,7 @@ lint: $(VENV)/.with-dev
 	$(BIN)/lint-imports
 
 ## make bench         every measure beside the installed peers; writes docs/benchmarks
-bench: $(VENV)/.with-bench
+bench: $(VENV)/.with-bench $(VENV)/.with-vector-peers
 	$(BIN)/python -m benchmarks
 
 ## make bench-operator  FiberPools beside ReplicaSets at thousands of pretended pods (root, Go)
@@ -117,6 +117,14 @@ $(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench: $(VENV)/.made pyproject.
 # Without torch, which it needs to learn and is larger than all else together.
 $(VENV)/.with-stable-baselines3: $(VENV)/.with-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
+	touch $@
+
+# Beside which vector environments are measured. Without torch, as above; where one has no wheel the
+# others are measured.
+$(VENV)/.with-vector-peers: $(VENV)/.with-bench
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'pufferlib-core>=3'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: 'envpool>=1.2'
 	touch $@
 
 $(VENV)/.with-testsuite: $(VENV)/.made

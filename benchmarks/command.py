@@ -10,7 +10,7 @@ from pathlib import Path
 
 from benchmarks import budgets, machine, processes, report
 from benchmarks.contenders import ALL, BY_NAME, Contender
-from benchmarks.model import BASELINE, Run
+from benchmarks.model import Run
 from benchmarks.rounds import Rounds, say, scratch_folder
 from benchmarks.session import ROOT
 from benchmarks.suite import MEASURES
@@ -28,6 +28,8 @@ def main(arguments: Sequence[str]) -> int:
     about = {**machine.about(able, command, options.rounds, options.size), "skipped": skipped}
     runs = {name: Run(dict(about)) for name in options.measure}
     cases = [case for name in options.measure for case in MEASURES[name].cases(options.size)]
+    for name in {case.baseline for case in cases} - {each.name for each in able}:
+        say(f"without {name} there are no ratios to it")
     processes.adopt_orphans()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with scratch_folder() as scratch:
@@ -112,8 +114,6 @@ def _able(contenders: Sequence[Contender]) -> tuple[list[Contender], dict[str, s
     skipped = {each.name: missing for each in contenders if (missing := each.missing())}
     for name, missing in skipped.items():
         say(f"{name} is skipped, not installed: {missing} (pip install 'fiberpool[bench]')")
-    if BASELINE not in {each.name for each in contenders}:
-        say(f"without {BASELINE} there are no ratios")
     return [each for each in contenders if each.name not in skipped], skipped
 
 

@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
-_EXECUTOR = frozenset({"map", "stream", "submit", "apply"})
+_CLIENT = frozenset({"map", "stream", "submit", "apply"})
+EXECUTOR = frozenset({"executor", "executor in chunks"})
+_PARALLEL = frozenset({"parallel"})
 _PROCESSES = frozenset({"pipes", "sharing", "start", "cold start"})
-_VECTOR = frozenset({"vector steps", "many vector steps"})
-_SLOW_VECTOR = frozenset({"slow vector steps"})
+VECTOR = frozenset({"vector steps", "cart poles"})
+FIRST_READY = frozenset({"first ready"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 
@@ -21,6 +23,8 @@ class Contender:
 
     `servers`: it keeps servers that use the processor even when idle, so it is started for its
     turn only, takes part in fewer rounds and gets a tenth of the no-op tasks.
+    `by_name`: packages that it imports and does not use here. Where one is not installed, a
+    stand-in that has every name takes its place.
     """
 
     name: str
@@ -32,6 +36,11 @@ class Contender:
     program: str = ""
     servers: bool = False
     environment: Mapping[str, str] = field(default_factory=dict)
+    by_name: tuple[str, ...] = ()
+
+    def needs_stand_in(self) -> bool:
+        """Whether something is not installed that it only imports."""
+        return not all(_found(name) for name in self.by_name)
 
     def missing(self) -> str:
         """What must be installed before it can take part; empty if nothing."""
@@ -55,12 +64,7 @@ ALL = (
         "fiber",
         "Fiber",
         ("fiber",),
-        _POOL
-        | _PROCESSES
-        | _AGAINST_BASELINE
-        | _VECTOR
-        | _SLOW_VECTOR
-        | {"fake workers", "first ready"},
+        _POOL | _PROCESSES | _AGAINST_BASELINE | VECTOR | FIRST_READY | {"fake workers"},
         "#0072B2",
         "o",
         environment={"FIBER_BACKEND": "local"},
@@ -69,7 +73,7 @@ ALL = (
         "fiber-loopback",
         "Fiber, loopback agents",
         ("fiber",),
-        _POOL | _PROCESSES | _VECTOR,
+        _POOL | _PROCESSES | VECTOR | FIRST_READY,
         "#56B4E9",
         "s",
         environment={"FIBER_BACKEND": "loopback"},
@@ -78,7 +82,7 @@ ALL = (
         "fiber-executor",
         "fiber.Executor",
         ("fiber",),
-        _EXECUTOR,
+        EXECUTOR | {"apply"},
         "#0072B2",
         "v",
         environment={"FIBER_BACKEND": "local"},
@@ -87,16 +91,16 @@ ALL = (
         "fiber-joblib",
         "joblib on Fiber",
         ("fiber", "joblib"),
-        frozenset({"map", "stream", "stream in chunks"}),
-        "#009E73",
-        "v",
+        _PARALLEL,
+        "#0072B2",
+        "^",
         environment={"FIBER_BACKEND": "local"},
     ),
     Contender(
         "multiprocessing",
         "multiprocessing, fork",
         (),
-        _POOL | _PROCESSES | _AGAINST_BASELINE | _SLOW_VECTOR | {"vector steps"},
+        _POOL | _PROCESSES | _AGAINST_BASELINE,
         "#000000",
         "D",
     ),
@@ -112,22 +116,32 @@ ALL = (
         "concurrent.futures",
         "concurrent.futures",
         (),
-        _EXECUTOR,
+        _CLIENT | EXECUTOR,
         "#999999",
         "v",
     ),
-    Contender("joblib", "joblib (loky)", ("joblib",), _POOL, "#009E73", "^"),
+    Contender("loky", "loky", ("joblib",), EXECUTOR, "#009E73", "v"),
+    Contender("joblib", "joblib (loky)", ("joblib",), _POOL | _PARALLEL, "#009E73", "^"),
+    Contender(
+        "joblib-dask",
+        "joblib on Dask",
+        ("joblib", "distributed"),
+        _PARALLEL,
+        "#E69F00",
+        "^",
+        servers=True,
+    ),
     Contender(
         "dask",
         "Dask",
         ("distributed", "dask.bag"),
-        _EXECUTOR,
+        _CLIENT | {"executor"},
         "#E69F00",
         "<",
         servers=True,
     ),
     Contender("ipyparallel", "ipyparallel", ("ipyparallel",), _POOL, "#CC79A7", ">", servers=True),
-    Contender("ray", "Ray's Pool", ("ray",), _POOL, "#D55E00", "P", servers=True),
+    Contender("ray", "Ray's Pool", ("ray",), _POOL | EXECUTOR, "#D55E00", "P", servers=True),
     Contender(
         "spark",
         "PySpark",
@@ -138,41 +152,56 @@ ALL = (
         program="java",
         servers=True,
     ),
+    Contender("async-vector-env", "AsyncVectorEnv", ("gymnasium",), VECTOR, "#000000", "D"),
+    Contender("sync-vector-env", "SyncVectorEnv", ("gymnasium",), VECTOR, "#999999", "p"),
     Contender(
-        "sync-vector-env",
-        "SyncVectorEnv",
-        ("gymnasium",),
-        _VECTOR | _SLOW_VECTOR,
-        "#999999",
-        "p",
+        "stable-baselines3",
+        "SubprocVecEnv",
+        ("stable_baselines3",),
+        VECTOR,
+        "#E69F00",
+        "H",
+        by_name=("torch",),
     ),
     Contender(
         "pufferlib",
         "PufferLib",
-        ("pufferlib", "torch"),
-        _VECTOR | _SLOW_VECTOR,
+        ("pufferlib",),
+        VECTOR | FIRST_READY,
         "#CC79A7",
         "h",
+        by_name=("torch",),
     ),
     Contender(
-        "stable-baselines3",
-        "SubprocVecEnv",
-        ("stable_baselines3", "torch"),
-        _SLOW_VECTOR | {"vector steps"},
-        "#E69F00",
-        "H",
+        "ray-actors",
+        "Ray actors",
+        ("ray",),
+        VECTOR | FIRST_READY,
+        "#D55E00",
+        "X",
+        servers=True,
     ),
+    Contender("envpool", "EnvPool", ("envpool",), frozenset({"cart poles"}), "#882255", "*"),
 )
 
 ON_PODS = Contender(
     "fiber-kubernetes",
     "Fiber, pods",
     ("fiber", "kubernetes"),
-    _POOL | _PROCESSES,
+    _POOL | _PROCESSES | VECTOR | FIRST_READY,
     "#117733",
     "*",
     environment={"FIBER_BACKEND": "kubernetes"},
 )
-"""Takes part where a cluster is: see kubernetes_run.py."""
+EXECUTOR_ON_PODS = Contender(
+    "fiber-executor-kubernetes",
+    "fiber.Executor, pods",
+    ("fiber", "kubernetes"),
+    EXECUTOR,
+    "#117733",
+    "v",
+    environment={"FIBER_BACKEND": "kubernetes"},
+)
+"""Both take part where a cluster is: see kubernetes_run.py."""
 
-BY_NAME = {contender.name: contender for contender in (*ALL, ON_PODS)}
+BY_NAME = {contender.name: contender for contender in (*ALL, ON_PODS, EXECUTOR_ON_PODS)}

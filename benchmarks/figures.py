@@ -13,8 +13,10 @@ mpl.use("Agg")
 from benchmarks import (
     agents,
     coldstart,
+    executors,
     latency,
     overhead,
+    parallel_loops,
     pipes,
     sharing,
     startup,
@@ -133,10 +135,32 @@ def _pipe_panel(
 
 
 def _vector(run: Run, path: Path) -> None:
+    figure, grid = plt.subplots(2, 3, figsize=(15, 9.5))
+    *panels, spare = grid.flat
+    for panel, (ending, title) in zip(panels, vector.PANELS.items(), strict=True):
+        points = [(float(count), f"{count:,} {ending}") for count in vector.COUNTS]
+        _lines(panel, run, points, vector.RATE)
+        panel.set(title=title[0].upper() + title[1:], xlabel="environments", xticks=vector.COUNTS)
+        _counts(panel.xaxis)
+    for panel in (grid[0, 0], grid[1, 0]):
+        panel.set_ylabel("environment steps a second (✗: not finished)")
+    spare.set_axis_off()
+    _finish(figure, path)
+
+
+def _executors(run: Run, path: Path) -> None:
+    figure, panel = plt.subplots(figsize=(10, 4))
+    names = [case.name for case in executors.cases(run.about["size"])]
+    _rows(panel, run, names, executors.RATE)
+    panel.set(title="Further right is better", xlabel="tasks a second")
+    _finish(figure, path)
+
+
+def _parallel_loops(run: Run, path: Path) -> None:
     figure, panel = plt.subplots(figsize=(10, 5))
-    names = [case.name for case in vector.cases(run.about["size"])]
-    _rows(panel, run, names, vector.RATE)
-    panel.set(title="Further right is better", xlabel="environment steps a second")
+    names = [case.name for case in parallel_loops.cases(run.about["size"])]
+    _rows(panel, run, names, parallel_loops.RATE)
+    panel.set(title="Further right is better", xlabel="tasks a second")
     _finish(figure, path)
 
 
@@ -197,6 +221,8 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "overhead": _overhead,
     "throughput": _throughput,
     "latency": _latency,
+    "executors": _executors,
+    "parallel_loops": _parallel_loops,
     "pipes": _pipes,
     "vector": _vector,
     "sharing": _sharing,

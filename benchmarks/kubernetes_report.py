@@ -9,6 +9,7 @@ from types import ModuleType
 
 from benchmarks import (
     budgets,
+    executors,
     figures,
     kubernetes_es,
     kubernetes_start,
@@ -16,6 +17,7 @@ from benchmarks import (
     overhead,
     pipes,
     throughput,
+    vector,
 )
 from benchmarks.model import Case, Run
 from benchmarks.report import budget_table, failures, group_table, origin, reading
@@ -24,7 +26,9 @@ MEASURES: dict[str, ModuleType] = {
     "overhead": overhead,
     "throughput": throughput,
     "latency": latency,
+    "executors": executors,
     "pipes": pipes,
+    "vector": vector,
     "kubernetes_es": kubernetes_es,
     "kubernetes_start": kubernetes_start,
 }
@@ -33,13 +37,20 @@ NOTES = "kubernetes-notes.md"
 """By hand."""
 _OF_ONE_HOST = {
     "throughput": ("map, chunksize 1", "map, default chunks", *throughput.ARRAY_KINDS),
+    "executors": (executors.SUBMIT, executors.MAP, executors.SLEEPING),
     "pipes": (pipes.environments(8),),
+    "vector": (
+        *(vector.cart_poles(count) for count in (8, 64)),
+        *(vector.uneven(64, first_ready=first) for first in (False, True)),
+    ),
 }
 """Of measures that have more cases: those that say something of pods."""
 _ABOUT = """\
 Fiber with its processes in pods, beside multiprocessing on the same machine and beside Ray's and
-Dask's own clusters of as many workers as processes on it. The program runs outside of the cluster,
-and each pod of Fiber's has one worker, if not said otherwise. Every pod is on this machine: what
+Dask's own clusters of as many workers as processes on it. Vector environments and executors are
+beside Fiber's own, and Gymnasium's or concurrent.futures', with processes of this machine. The
+program runs outside of the cluster, and each pod of Fiber's has one worker, if not said otherwise.
+Every pod is on this machine: what
 differs from one host is the way, through Kubernetes' network, encrypted, and not the distance."""
 
 
@@ -66,6 +77,7 @@ def write(folder: Path, runs: Mapping[str, Run]) -> None:
 def page(runs: Mapping[str, Run], *, notes: bool = False) -> str:
     """Every measure with a table for each of its groups."""
     first = runs["overhead"]
+    of_all = cases(first.about["size"])
     parts = [
         "<!-- Written by benchmarks/kubernetes_run.py; changes made by hand are lost. -->",
         "# Pods",
@@ -74,10 +86,9 @@ def page(runs: Mapping[str, Run], *, notes: bool = False) -> str:
         "## Budgets",
         budget_table(budgets.verdicts(runs, budgets.ON_PODS)),
         *([f"Why one is missed, and what was tried: [notes]({NOTES})."] if notes else []),
-        reading(first),
+        reading(first, of_all),
         f"![Overhead]({PICTURE})",
     ]
-    of_all = cases(first.about["size"])
     for name, run in runs.items():
         mine = [case for case in of_all if case.measure == name]
         parts += _section(MEASURES[name], run, mine)

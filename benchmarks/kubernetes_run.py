@@ -1,4 +1,4 @@
-"""Fiber on pods beside multiprocessing, Ray and Dask: `python -m benchmarks.kubernetes_run`.
+"""Fiber on pods beside others on processes: `python -m benchmarks.kubernetes_run`.
 
 Pods are made where Fiber's environment says: KUBECONFIG, FIBER_NAMESPACE, and FIBER_IMAGE, which
 has numpy. kubernetes_cluster.py has all of it ready first.
@@ -11,25 +11,40 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from benchmarks import budgets, kubernetes_report, machine, processes
-from benchmarks.contenders import BY_NAME, ON_PODS, Contender
+from benchmarks.contenders import (
+    BY_NAME,
+    EXECUTOR,
+    EXECUTOR_ON_PODS,
+    FIRST_READY,
+    ON_PODS,
+    VECTOR,
+    Contender,
+)
 from benchmarks.model import Run
 from benchmarks.rounds import Rounds, say, scratch_folder
 from benchmarks.session import ROOT
 
-_CONTENDERS = (ON_PODS, *(BY_NAME[name] for name in ("multiprocessing", "ray", "dask")))
+_OURS = (ON_PODS, EXECUTOR_ON_PODS)
+CONTENDERS = (
+    *_OURS,
+    replace(BY_NAME["fiber"], offers=VECTOR | FIRST_READY),
+    replace(BY_NAME["concurrent.futures"], offers=EXECUTOR),
+    *(BY_NAME[name] for name in ("multiprocessing", "async-vector-env", "ray", "dask")),
+)
 _QUICK_SIZE = 0.02
 
 
 def main(arguments: Sequence[str]) -> int:
     """0 if Fiber got through every case; 1 if not; 130 after Ctrl-C, and nothing is written."""
     options = _parse(arguments)
-    skipped = {each.name: missing for each in _CONTENDERS if (missing := each.missing())}
+    skipped = {each.name: missing for each in CONTENDERS if (missing := each.missing())}
     for name, missing in skipped.items():
         say(f"{name} is skipped, not installed: {missing}")
-    able = [each for each in _CONTENDERS if each.name not in skipped]
+    able = [each for each in CONTENDERS if each.name not in skipped]
     command = shlex.join(["python", "-m", "benchmarks.kubernetes_run", *arguments])
     about = {**machine.about(able, command, options.rounds, options.size), "skipped": skipped}
     runs = {name: Run(dict(about)) for name in kubernetes_report.MEASURES}
@@ -43,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
         say(f"{budget}: {verdict.verdict}")
     say(f"written to {options.output}")
     failed = {name for run in runs.values() for those in run.failures.values() for name in those}
-    return int(ON_PODS.name in failed | set(skipped))
+    return int(any(each.name in failed | set(skipped) for each in _OURS))
 
 
 def _measure(runs: dict[str, Run], able: list[Contender], options: argparse.Namespace) -> None:

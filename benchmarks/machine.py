@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks.contenders import Contender
 from benchmarks.samples import in_words
 
-_DISTRIBUTIONS = {"fiber": "fiberpool", "dask.bag": "dask"}
+_DISTRIBUTIONS = {"fiber": "fiberpool", "dask.bag": "dask", "pufferlib": "pufferlib-core"}
 _ALWAYS = ("numpy", "gymnasium")
 _MOMENT = 0.2
 _IDLE_FIELDS = slice(3, 5)  # of the times in /proc/stat: idle, and idle while a disk works

@@ -37,6 +37,8 @@ class Case:
     `limit`: seconds after which it counts as not finished and is not tried again.
     `fresh`: needs a contender process that has done nothing before.
     `rounds`: at most so many, however long they take.
+    `baseline`: the contender that ratios are to.
+    `not_run`: contenders that are not asked to, though they offer it, and why.
     """
 
     measure: str
@@ -48,6 +50,8 @@ class Case:
     limit: float = 15.0
     fresh: bool = False
     rounds: int | None = None
+    baseline: str = BASELINE
+    not_run: Mapping[str, str] = field(default_factory=dict)
 
 
 Series = list[float | None]

@@ -67,18 +67,25 @@ class PoolAdapter(Adapter):
         self.pool.join()
 
 
-class Ray(PoolAdapter):
-    """Ray's replacement for multiprocessing.Pool, on a Ray of its own."""
-
-    def __init__(self, workers: int) -> None:
-        self.ray = import_module("ray")
-        self.ray.init(
+def ray(workers: int) -> Any:
+    """Ray, with a cluster of so many processors in this program unless it has one already."""
+    module = import_module("ray")
+    if not module.is_initialized():
+        module.init(
             num_cpus=workers,
             include_dashboard=False,
             logging_level="ERROR",
             log_to_driver=False,
             _temp_dir=os.path.join(os.environ["TMPDIR"], "ray"),
         )
+    return module
+
+
+class Ray(PoolAdapter):
+    """Ray's replacement for multiprocessing.Pool, on a Ray of its own."""
+
+    def __init__(self, workers: int) -> None:
+        self.ray = ray(workers)
         super().__init__(import_module("ray.util.multiprocessing").Pool(workers))
 
     def close(self) -> None:
@@ -111,14 +118,22 @@ class Futures(Adapter):
         self.executor.shutdown()
 
 
+def fiber_executor(workers: int) -> Futures:
+    """fiber.Executor."""
+    return Futures(import_module("fiber").Executor(workers))
+
+
 class Joblib(Adapter):
     """joblib.Parallel on loky's executor or another: its default chunk is batch_size="auto"."""
 
-    def __init__(self, workers: int, executor: Any, backend: Any) -> None:
+    def __init__(
+        self, workers: int, executor: Any, backend: Any, close: Callable[[], object]
+    ) -> None:
         self.workers = workers
         self.joblib = import_module("joblib")
         self.executor = executor
         self.backend = backend
+        self._close = close
 
     def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
         return list(self._parallel(function, items, chunksize or "auto", "list"))
@@ -133,14 +148,14 @@ class Joblib(Adapter):
         return self.executor.submit(function, item).result()
 
     def close(self) -> None:
-        self.executor.shutdown(wait=True)
+        self._close()
 
     def _parallel(
         self, function: Function, items: Sequence[Any], batch: int | str, kind: str
     ) -> Iterable[Any]:
-        parallel = self.joblib.Parallel(
-            self.workers, backend=self.backend, batch_size=batch, return_as=kind
-        )
+        # By the context, as the name "dask" is known to nothing else.
+        with self.joblib.parallel_config(self.backend, n_jobs=self.workers):
+            parallel = self.joblib.Parallel(batch_size=batch, return_as=kind)
         call = self.joblib.delayed(function)
         results: Iterable[Any] = parallel(call(item) for item in items)
         return results
@@ -149,13 +164,20 @@ class Joblib(Adapter):
 def joblib_on_loky(workers: int) -> Joblib:
     """With the executor that joblib.Parallel gets too."""
     executor = import_module("joblib.executor").get_memmapping_executor(workers)
-    return Joblib(workers, executor, "loky")
+    return Joblib(workers, executor, "loky", executor.shutdown)
 
 
 def joblib_on_fiber(workers: int) -> Joblib:
     """With an executor of Fiber's."""
     executor = import_module("fiber").Executor(workers)
-    return Joblib(workers, executor, import_module("fiber.joblib").FiberBackend(executor=executor))
+    backend = import_module("fiber.joblib").FiberBackend(executor=executor)
+    return Joblib(workers, executor, backend, executor.shutdown)
+
+
+def joblib_on_dask(workers: int) -> Joblib:
+    """With a cluster of Dask's, which joblib finds by itself."""
+    dask = Dask(workers)
+    return Joblib(workers, dask.client.get_executor(), "dask", dask.close)
 
 
 class Dask(Adapter):
@@ -275,9 +297,14 @@ def processes_of(contender: str) -> Any:
 
 _ADAPTERS: dict[str, Callable[[int], Adapter]] = {
     "concurrent.futures": lambda workers: Futures(futures.ProcessPoolExecutor(workers)),
-    "fiber-executor": lambda workers: Futures(import_module("fiber").Executor(workers)),
+    "fiber-executor": fiber_executor,
+    "fiber-executor-kubernetes": fiber_executor,
+    "loky": lambda workers: Futures(
+        import_module("joblib.externals.loky").ProcessPoolExecutor(workers)
+    ),
     "fiber-joblib": joblib_on_fiber,
     "joblib": joblib_on_loky,
+    "joblib-dask": joblib_on_dask,
     "dask": Dask,
     "ipyparallel": IPyParallel,
     "ray": Ray,

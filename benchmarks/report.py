@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks import budgets, figures
 from benchmarks.contenders import BY_NAME
-from benchmarks.model import BASELINE, MANY, MANY_ROUNDS, Case, Metric, Run
+from benchmarks.model import MANY, MANY_ROUNDS, Case, Metric, Run
 from benchmarks.rounds import LONG, SERVER_ROUNDS
 from benchmarks.samples import Summary, in_words, is_idle, ratio, summary, times
 from benchmarks.suite import MEASURES
@@ -63,7 +63,7 @@ def page(name: str, run: Run) -> str:
         f"# {measure.TITLE}",
         measure.ABOUT,
         f"![{measure.TITLE}]({name}.png)",
-        reading(run),
+        reading(run, cases),
         *sections,
         failures(run),
         f"## Made on\n\n{origin(run.about)}",
@@ -134,14 +134,16 @@ def group_table(run: Run, cases: Sequence[Case]) -> str:
 
 
 def _rows(run: Run, case: Case, metric: Metric) -> list[tuple[str, ...]]:
-    baseline = run.series(case.name, BASELINE, metric.name)
+    baseline = run.series(case.name, case.baseline, metric.name)
     rows: list[tuple[str, ...]] = []
     for name, contender in BY_NAME.items():
         values = run.series(case.name, name, metric.name)
         found = summary(values)
         if not found:
+            if why := case.not_run.get(name):
+                rows.append((contender.label, f"not run: {why}", "", "", "", ""))
             continue
-        to_baseline = ratio(values, baseline) if name != BASELINE else None
+        to_baseline = ratio(values, baseline) if name != case.baseline else None
         spread = f"{in_words(found.least, metric.unit)} to {in_words(found.greatest, metric.unit)}"
         if found.rounds == 1:
             spread = "one round"
@@ -170,28 +172,28 @@ def ratio_in_words(found: Summary | None) -> str:
 def _verdict(run: Run, case: Case, metric: Metric, contender: str) -> tuple[str, str]:
     """Bounds and verdicts of the row, of which most have one or none."""
     found = [
-        (f"{budget.in_words()}{_to_whom(budget)}", budgets.judge(budget, {case.measure: run}))
+        (f"{budget.in_words()}{_to_whom(budget, case)}", budgets.judge(budget, {case.measure: run}))
         for budget in budgets.of(case.measure, case.name, metric.name, contender)
     ]
     return "; ".join(bound for bound, _ in found), "; ".join(v.verdict for _, v in found)
 
 
-def _to_whom(budget: budgets.Budget) -> str:
+def _to_whom(budget: budgets.Budget, case: Case) -> str:
     """Whose value the bound is a multiple of, where it is not the baseline's."""
-    if budget.unit or (budget.against == BASELINE and not budget.to_case):
+    if budget.unit or (budget.against == case.baseline and not budget.to_case):
         return ""
     return f" {_against(budget)}"
 
 
-def reading(run: Run) -> str:
+def reading(run: Run, cases: Sequence[Case]) -> str:
     """How to read the tables, and whether the machine was idle."""
     rounds = run.about["rounds"]
+    baselines = " or ".join(dict.fromkeys(BY_NAME[case.baseline].label for case in cases))
     text = (
         f"Median of {rounds} round{'s' if rounds > 1 else ''}; contenders with servers of their "
         f"own take part in at most {SERVER_ROUNDS}, cases with {MANY:,} workers and more are "
         f"measured in at most {MANY_ROUNDS}, and what else takes more than {LONG:g} s is measured "
-        "once. The ratio is to multiprocessing in the same round: its median, least and "
-        "greatest."
+        f"once. The ratio is to {baselines} in the same round: its median, least and greatest."
     )
     if run.in_use:
         text += f"\n\n{_company(run.in_use)}"

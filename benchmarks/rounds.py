@@ -85,6 +85,7 @@ class Rounds:
         key = (case.measure, case.name, contender.name)
         if (
             case.needs not in contender.offers
+            or contender.name in case.not_run
             or key in self._finished
             or turn >= (case.rounds or turn + 1)
         ):

@@ -18,6 +18,7 @@ from benchmarks.contenders import Contender
 from benchmarks.model import Case
 
 ROOT = Path(__file__).resolve().parent.parent
+_STAND_INS = ROOT / "tests" / "stand_ins"
 _ORDERLY = 20.0
 _STRAGGLERS = 3.0
 
@@ -173,6 +174,8 @@ def _environment(contender: Contender, scratch: Path) -> dict[str, str]:
     # Absolute, as a contender works in the scratch folder.
     given = os.environ.get("PYTHONPATH", "")
     paths = [str(ROOT), *(os.path.abspath(path) for path in given.split(os.pathsep) if path)]
+    if contender.needs_stand_in():
+        paths.append(str(_STAND_INS))
     return {
         **os.environ,
         **contender.environment,

@@ -41,4 +41,10 @@ def echo(connection: Any, processor: int | None = None) -> None:
         connection.send(connection.recv())
 
 
+def after(seconds: float, item: Any) -> Any:
+    """Sleep, then give the argument back."""
+    time.sleep(seconds)
+    return item
+
+
 sleep = time.sleep

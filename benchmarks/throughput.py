@@ -99,7 +99,7 @@ def _no_ops(bench: Bench, method: str, tasks: int, chunksize: int | None) -> dic
 
 def rate(batch: Callable[[int], Iterable[Any]], tasks: int) -> float:
     """Tasks a second, for a batch that gives the numbers below its argument back."""
-    return tasks / _time(lambda: sum(batch(tasks)), sum(range(tasks)))
+    return tasks / time_of(lambda: sum(batch(tasks)), sum(range(tasks)))
 
 
 def _arrays(bench: Bench, kind: str, tasks: int) -> dict[str, float]:
@@ -113,7 +113,7 @@ def _arrays(bench: Bench, kind: str, tasks: int) -> dict[str, float]:
         return sum(size(each) for each in bench.pool.map(no_op, arrays[:count], 1))
 
     batch(2 * WORKERS)
-    return {TIME.name: _time(lambda: batch(tasks), tasks * MEGABYTE)}
+    return {TIME.name: time_of(lambda: batch(tasks), tasks * MEGABYTE)}
 
 
 def _long(bench: Bench, tasks: int) -> dict[str, float]:
@@ -131,8 +131,11 @@ def nap(seconds: float) -> None:
         sleep(seconds)
 
 
-def _time(batch: Callable[[], int], expected: int) -> float:
-    """The median of up to five batches, or of as many as fit in half a second, at least one."""
+def time_of(batch: Callable[[], int], expected: int) -> float:
+    """Seconds of a batch whose results add up to this.
+
+    The median of up to five batches, or of as many as fit in half a second, at least one.
+    """
     clock, times, end = time.perf_counter, list[float](), time.perf_counter() + 0.5
     while not times or (len(times) < 5 and clock() < end):
         begin = clock()

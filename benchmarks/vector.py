@@ -5,105 +5,147 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.model import BASELINE, Case, Metric
+from benchmarks import environment, vector_peers
+from benchmarks.model import Case, Metric
 
 if TYPE_CHECKING:
     from benchmarks.contender import Bench
 
+COUNTS = (8, 64, 512, 4096)
+_EVERY_ROUND = 64
+SLOW_WORKERS = 16
+BASELINE = "async-vector-env"
+_A_PROCESS_EACH = (BASELINE, "stable-baselines3")
+_MOST_PROCESSES = 512
 TITLE = "Vector environments"
-ABOUT = """\
+ABOUT = f"""\
 Steps a second of all environments together. CartPole is Gymnasium's; the others do nothing but
 sleep for a millisecond, or change an observation of 84x84x4 bytes, or take five milliseconds in
-one step of ten and else a tenth of one. Fiber is `fiber.vector.VectorEnv`, with a worker for each
-processor; for each environment where these sleep for a millisecond, for four of those that are
-uneven. PufferLib's Multiprocessing backend has as many. multiprocessing is Gymnasium's
-AsyncVectorEnv, which always has a worker for each environment, and is not asked for 512. Behind
-loopback agents only what works is measured, as each worker there brings an agent of its own. First
-ready: `recv` of 16 environments of 64, and `send` for these."""
+one step of ten and else a tenth of one. First ready: a quarter of the uneven environments is
+received at a time, those that were ready first, and sent back; ratios are to Fiber's there.
+
+Fiber is `fiber.vector.VectorEnv`. AsyncVectorEnv and SyncVectorEnv are Gymnasium's; the first has a
+process for each environment, forked, as stable-baselines3's SubprocVecEnv has, and more than
+{_MOST_PROCESSES} they are not asked for. Who shares workers has one a processor for CartPoles and
+for large observations, and for environments that sleep one for each, but at most {SLOW_WORKERS}:
+Fiber, PufferLib, Ray. PufferLib is its backend Multiprocessing, from the package pufferlib-core, as
+pufferlib itself has to be built with torch. Ray's are plain actors, as RLlib's need torch: each has
+its share of the environments in a SyncVectorEnv, and the program puts together what they return.
+EnvPool runs environments of its own alone, which are written in C++: of these its CartPole is
+measured, with a thread a processor, and it says what Python costs, not what its workers do.
+SubprocVecEnv and PufferLib import torch and do not use it here: where it is not installed, a
+stand-in is.
+
+Before the clock starts a vector is reset and makes three steps, or as many as fit into a quarter of
+the time that is measured. More than {_EVERY_ROUND} environments take as long to make as to measure,
+and are measured in one round."""
 
 RATE = Metric("rate", "environment steps a second", "1/s")
-POLES = "CartPoles"
-OTHERS = "other environments"
-PIXELS = "64 with 84x84x4 bytes"
-UNEVEN = "64 uneven ones"
-FIRST_READY = f"{UNEVEN}, first ready"
+FIRST_READY = "first ready"
+PANELS = {
+    "CartPoles": "CartPoles",
+    "that sleep 1 ms": "environments that sleep 1 ms",
+    "with 84x84x4 bytes": "environments with 84x84x4 bytes",
+    "uneven ones": "environments with uneven steps",
+    f"uneven ones, {FIRST_READY}": f"environments with uneven steps, {FIRST_READY}",
+}
+"""The groups of cases, by what ends the names of theirs."""
+_KINDS = ("cart_pole", "Sleeping", "Pixels", "Uneven", "Uneven")
+_SLOW = ("Sleeping", "Uneven")
 
 
 def cart_poles(count: int) -> str:
     """The name of the case with `count` of them."""
-    return f"{count} {POLES}"
+    return f"{count:,} CartPoles"
+
+
+def pixels(count: int) -> str:
+    """The name of the case with `count` environments with large observations."""
+    return f"{count:,} with 84x84x4 bytes"
+
+
+def uneven(count: int, *, first_ready: bool = False) -> str:
+    """The name of the case with `count` environments with uneven steps."""
+    return f"{count:,} uneven ones" + (f", {FIRST_READY}" if first_ready else "")
 
 
 def cases(size: float) -> list[Case]:
     """The full measure at size 1; below, shorter, and with fewer environments if far below."""
-    tiny = size < 0.1
-    few: dict[str, Any] = {"count": 8 if tiny else 64}
-    asleep = {"kind": "Sleeping", **few, "workers": few["count"]}
-    uneven = {"kind": "Uneven", **few, "workers": few["count"] // 4}
-    found = [
-        (POLES, cart_poles(8), "vector steps", {"kind": "cart_pole", "count": 8}),
-        (POLES, cart_poles(64), "vector steps", {"kind": "cart_pole", **few}),
-        (POLES, cart_poles(512), "many vector steps", {"kind": "cart_pole", "count": 512}),
-        (OTHERS, "64 that sleep 1 ms", "slow vector steps", asleep),
-        (OTHERS, PIXELS, "vector steps", {"kind": "Pixels", **few}),
-        (OTHERS, UNEVEN, "slow vector steps", uneven),
-        (OTHERS, FIRST_READY, "first ready", uneven | {"batch": 16}),
-    ]
     return [
-        Case(
-            measure="vector",
-            name=name,
-            group=group,
-            needs=needs,
-            params={**params, "seconds": 2.0 * size},
-            metrics=(RATE,),
-            limit=30.0,
-        )
-        for group, name, needs, params in found
-        if not (tiny and params["count"] > 64)
+        _case(kind, count, f"{count:,} {ending}", group, size)
+        for kind, (ending, group) in zip(_KINDS, PANELS.items(), strict=True)
+        for count in COUNTS
+        if size >= 0.1 or count <= _EVERY_ROUND
     ]
+
+
+def _case(kind: str, count: int, name: str, group: str, size: float) -> Case:
+    batch = count // 4 if name.endswith(FIRST_READY) else 0
+    return Case(
+        measure="vector",
+        name=name,
+        group=group,
+        needs="first ready" if batch else "cart poles" if kind == "cart_pole" else "vector steps",
+        params={
+            "kind": kind,
+            "count": count,
+            "seconds": 0.6 * size,
+            "workers": min(count, SLOW_WORKERS) if kind in _SLOW else None,
+            "batch": batch,
+        },
+        metrics=(RATE,),
+        limit=60.0,
+        rounds=None if count <= _EVERY_ROUND else 1,
+        # Those that have a process for each environment have no batches that are ready first.
+        baseline="fiber" if batch else BASELINE,
+        not_run={}
+        if batch or count <= _MOST_PROCESSES
+        else dict.fromkeys(_A_PROCESS_EACH, f"{count:,} processes"),
+    )
 
 
 def run(
-    bench: Bench,
-    kind: str,
-    count: int,
-    seconds: float,
-    workers: int | None = None,
-    batch: int = 0,
+    bench: Bench, kind: str, count: int, seconds: float, workers: int | None, batch: int
 ) -> dict[str, float]:
     """Steps for so many seconds, in batches of `batch` that are ready first, or all together."""
-    make: Callable[[], Any] = getattr(import_module("benchmarks.environment"), kind)
-    env = _MAKERS[bench.contender](make, count, workers)
+    make: Callable[[], Any] = getattr(environment, kind)
+    env = vector_peers.start(bench.contender, make, count, workers, batch)
     try:
-        env.reset(seed=1)
-        if batch:
-            return {RATE.name: _first_ready(env, min(batch, count // 4), seconds)}
-        actions = env.action_space.sample()
-        return {RATE.name: _rate(lambda: env.step(actions), count, seconds)}
+        step = _first_ready(env, count, batch) if batch else _all(env)
+        return {RATE.name: _rate(step, batch or count, seconds)}
     finally:
         env.close()
 
 
-def _first_ready(env: Any, batch: int, seconds: float) -> float:
+def _all(env: Any) -> Callable[[], object]:
+    env.reset(seed=1)
     actions = env.action_space.sample()
-    env.send(actions)
+    return lambda: env.step(actions)
+
+
+def _first_ready(env: Any, count: int, batch: int) -> Callable[[], object]:
+    env.reset_async(seed=1)
+    actions = env.action_space.sample()[:batch]
 
     def step() -> None:
         env.recv(batch)
-        env.send(actions[:batch])
+        env.send(actions)
 
-    rate = _rate(step, batch, seconds)
-    env.recv()
-    return rate
+    # So often that all environments are there and have made steps.
+    for _ in range(2 * count // batch):
+        step()
+    return step
 
 
 def _rate(step: Callable[[], object], count: int, seconds: float) -> float:
+    """Environment steps a second, where each call makes `count` of them."""
+    warm = time.perf_counter() + seconds / 4
     for _ in range(3):
         step()
+        if time.perf_counter() > warm:
+            break
     begin = time.perf_counter()
     for steps in itertools.count(1):
         step()
@@ -111,56 +153,3 @@ def _rate(step: Callable[[], object], count: int, seconds: float) -> float:
         if took >= seconds:
             return steps * count / took
     raise AssertionError("there is no last number")
-
-
-def _fiber(make: Callable[[], Any], count: int, workers: int | None) -> Any:
-    return import_module("fiber.vector").VectorEnv([make] * count, num_workers=workers)
-
-
-def _async(make: Callable[[], Any], count: int, workers: int | None) -> Any:
-    return import_module("gymnasium.vector").AsyncVectorEnv([make] * count)
-
-
-def _sync(make: Callable[[], Any], count: int, workers: int | None) -> Any:
-    return import_module("gymnasium.vector").SyncVectorEnv([make] * count)
-
-
-def _puffer(make: Callable[[], Any], count: int, workers: int | None) -> Any:
-    vector, emulation = import_module("pufferlib.vector"), import_module("pufferlib.emulation")
-
-    def emulated(buf: Any = None, seed: int = 0) -> Any:
-        return emulation.GymnasiumPufferEnv(env=make(), buf=buf, seed=seed)
-
-    processors = import_module("fiber").cpu_count()
-    return vector.make(
-        emulated,
-        backend=vector.Multiprocessing,
-        num_envs=count,
-        num_workers=workers or min(count, processors),
-        overwork=True,
-    )
-
-
-class _SubprocVecEnv:
-    """stable-baselines3's, as the others are called."""
-
-    def __init__(self, make: Callable[[], Any], count: int, workers: int | None) -> None:
-        self._env = import_module("stable_baselines3.common.vec_env").SubprocVecEnv([make] * count)
-        spaces = import_module("gymnasium.vector.utils")
-        self.action_space = spaces.batch_space(self._env.action_space, count)
-        self.step = self._env.step
-        self.close = self._env.close
-
-    def reset(self, seed: int) -> None:
-        self._env.seed(seed)
-        self._env.reset()
-
-
-_MAKERS: dict[str, Callable[[Callable[[], Any], int, int | None], Any]] = {
-    "fiber": _fiber,
-    "fiber-loopback": _fiber,
-    BASELINE: _async,
-    "sync-vector-env": _sync,
-    "pufferlib": _puffer,
-    "stable-baselines3": _SubprocVecEnv,
-}

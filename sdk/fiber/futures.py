@@ -36,7 +36,7 @@ from fiber._runtime import methods, options
 from fiber._runtime.call_future import CallFuture, WorkerDied, translated
 from fiber._runtime.calls import CallQueue
 from fiber._runtime.executor import Executor as Engine
-from fiber._runtime.executor_group import ExecutorGroup
+from fiber._runtime.executor_group import AFTER_SHUTDOWN, ExecutorGroup
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.outcome import Failure
 from fiber._runtime.state import runtime
@@ -116,6 +116,7 @@ class Executor(concurrent.futures.Executor):
                 idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
                 resources=Resources(pool=pool),
                 calls_back_at_end=True,
+                refusal=AFTER_SHUTDOWN,
             ),
             runtime(),
         )
@@ -155,11 +156,12 @@ class Executor(concurrent.futures.Executor):
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Have ``fn(*args, **kwargs)`` called in a worker; returns the future of its result.
 
+        It is concurrent.futures', and coroutines of asyncio can await it.
         The arguments are pickled at once: what happens to them later changes nothing.
         """
         engine = self._group.executor_for(fn, self._wishes)
         queue = self._queues.get(engine) or self._queue(engine)
-        future = CallFuture(engine, queue)
+        future: CallFuture[_T] = CallFuture(engine, queue)
         engine.call(future, fn, args, kwargs, queue=queue)
         return future
 

@@ -9,13 +9,16 @@
         search.fit(X, y)  # of scikit-learn, for instance
 
 The backend makes a ``fiber.Executor`` of ``n_jobs`` workers, with the options that are given beside
-``backend=``: ``retries=0``, ``initializer=``.  ``executor=`` is one of yours in its place, perhaps
-with options: ``parallel_config(backend="fiber", executor=executor.options(memory="4Gi"))``.
+``backend=``: ``retries=0``, ``initializer=``.  The next loop with the same options has the same
+workers.  ``executor=`` is one of yours in its place, perhaps with options:
+``parallel_config(backend="fiber", executor=executor.options(memory="4Gi"))``.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from inspect import signature
@@ -69,10 +72,11 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
             nesting_level=nesting_level, inner_max_num_threads=inner_max_num_threads, **options
         )
         self._given = executor
-        self._own: Executor | None = None
-        self._own_options: dict[str, Any] = {}
+        self._own: _Own | None = None
         self._workers: Executor | None = None
-        """That of the loop that runs."""
+        """That of the loops that run."""
+        self._loops: deque[None] = deque()
+        """One for each: a loop over another's generator has the same backend."""
         self._unfinished: set[Future[Any]] = set()
 
     def effective_n_jobs(self, n_jobs: int | None) -> int:
@@ -94,14 +98,21 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         self.parallel = parallel
         own = {key: value for key, value in options.items() if key in _OPTIONS}
         self._workers = self._given or self._start({**self.backend_kwargs, **own}, n_jobs)
+        self._loops.append(None)
         return n_jobs
 
     def submit(self, func: Callable[[], Any], callback: Any = None) -> Future[Any]:
         """Have a batch of tasks run, and ``callback`` called with its future then."""
-        assert self._workers is not None
-        future = self._workers.submit(func)
-        self._unfinished.add(future)
-        future.add_done_callback(self._unfinished.discard)
+        future: Future[Any]
+        try:
+            assert self._workers is not None
+            future = self._workers.submit(func)
+        except Exception as error:  # joblib would print what is raised here, and wait for ever
+            future = Future()
+            future.set_exception(error)
+        else:
+            self._unfinished.add(future)
+            future.add_done_callback(self._unfinished.discard)
         if callback is not None:
             future.add_done_callback(callback)
         return future
@@ -117,30 +128,70 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         """The loop has failed: cancel what has not begun, and end workers of our own."""
         for future in tuple(self._unfinished):
             future.cancel()
-        if self._own is not None:
-            self._own.terminate_workers()
-            self._own = None
+        own, self._own = self._own, None
+        if own is not None:
+            own.executor.terminate_workers()
             if ensure_ready:
-                self._workers = self._start(self._own_options, self.parallel.n_jobs)
+                self._workers = self._start(own.options, self.parallel.n_jobs)
 
     def terminate(self) -> None:
-        """The loop is over.  Workers stay for the next one, until they are idle for too long."""
-        self._workers = None
+        """A loop is over.  Workers stay for the next one, until they are idle for too long."""
         self.reset_batch_stats()
+        if self._loops:
+            self._loops.pop()
+        if not self._loops:
+            self._workers = None
+            own, self._own = self._own, None
+            if own is not None:
+                _keep(own)
 
     def _start(self, options: dict[str, Any], n_jobs: int) -> Executor:
         """An executor with these options: the last one, if it has them."""
-        options = {**options, "max_workers": self.effective_n_jobs(n_jobs)}
-        if self._own is None or self._own_options != options:
-            if self._own is not None:
-                self._own.shutdown(wait=False)
-            threads = self._prepare_worker_env(options["max_workers"])
-            then = options.get("initializer"), options.get("initargs", ())
-            self._own = Executor(
-                **{**options, "initializer": _prepare, "initargs": (threads, *then)}
-            )
-            self._own_options = options
-        return self._own
+        workers = self.effective_n_jobs(n_jobs)
+        threads = self._prepare_worker_env(workers)
+        wanted = (workers, threads, options, os.getpid())
+        if self._own is None or not self._own.was_made_with(wanted):
+            self._own = _take(wanted) or _Own(*wanted)
+        return self._own.executor
+
+
+class _Own:
+    """An executor of the backend's own."""
+
+    def __init__(
+        self, workers: int, threads: dict[str, str], options: dict[str, Any], process: int
+    ) -> None:
+        self.options = options
+        self._made_with = (workers, threads, options, process)
+        then = options.get("initializer"), options.get("initargs", ())
+        prepared = {**options, "initializer": _prepare, "initargs": (threads, *then)}
+        self.executor = Executor(workers, **prepared)
+
+    def was_made_with(self, wanted: tuple[Any, ...]) -> bool:
+        """Whether another one would be the same."""
+        try:
+            return bool(self._made_with == wanted)
+        except Exception:  # as arrays have it that are compared
+            return False
+
+
+_kept: deque[_Own] = deque()
+"""That of the last loop, for the next one: starting workers takes longer than many a loop."""
+
+
+def _take(wanted: tuple[Any, ...]) -> _Own | None:
+    with contextlib.suppress(IndexError):  # there is none
+        own = _kept.pop()
+        if own.was_made_with(wanted):
+            return own
+        own.executor.shutdown(wait=False)
+    return None
+
+
+def _keep(own: _Own) -> None:
+    _kept.append(own)
+    while len(_kept) > 1:
+        _kept.popleft().executor.shutdown(wait=False)
 
 
 def _prepare(

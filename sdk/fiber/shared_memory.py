@@ -51,6 +51,8 @@ class SharedMemory(mp_shared_memory.SharedMemory):
             raise ValueError("'size' must be a positive number different from zero")
         if name is None and not create:
             raise ValueError("'name' can only be None if create=True")
+        if not isinstance(name, str | None):
+            raise TypeError(f"'name' must be a string, not {name!r}")
         if create:
             self._create(name, size, track)
         else:

@@ -58,6 +58,8 @@ class SemLock:
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
         """Take a token; False if there is none, nor within ``timeout`` seconds."""
+        if timeout is not None and math.isnan(timeout):
+            raise ValueError("timeout must be a number of seconds, not NaN")
         return self._semlock.acquire(block, timeout)
 
     def release(self) -> None:

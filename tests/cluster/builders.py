@@ -95,7 +95,9 @@ class Buildah(Builder):
 
     def _build(self, reference: str, context: Path, options: list[str]) -> None:
         command = ("bud", "--quiet", "--layers", "--isolation", "chroot", "--network", "host")
-        output(*BUILDAH, *command, "--tag", reference, *options, cwd=context)
+        # Where buildah keeps a step's cache, for longer than who asks for the image keeps files.
+        environment = {**os.environ, "TMPDIR": "/var/tmp"}
+        output(*BUILDAH, *command, "--tag", reference, *options, cwd=context, env=environment)
 
     def _save(self, reference: str, archive: Path) -> None:
         target = f"docker-archive:{archive}:{reference}"

@@ -40,6 +40,8 @@ class Image:
     sources: tuple[str, ...]
     arguments: Mapping[str, str] = field(default_factory=dict)
     """Of the Dockerfile, beside those that every build is told."""
+    made_from: Image | None = None
+    """The one of ours that it is built on, if it is not Python's."""
 
     @property
     def archive(self) -> Path:
@@ -98,6 +100,8 @@ WORKER = Image("fiber-worker", "sdk/Dockerfile", _WORKER_SOURCES)
 WORKER_RL = Image("fiber-worker-rl", "sdk/Dockerfile", _WORKER_SOURCES, {"EXTRAS": "kubernetes,rl"})
 """What the examples import is in it."""
 IMAGES = (OPERATOR, WORKER, WORKER_RL)
+SEARCH = Image("fiber-search", "examples/05-search/Dockerfile", (VERSION_FILE,), made_from=WORKER)
+"""What a user makes of the worker's: only the tests that need it build it."""
 
 
 def _is_cache(file: Path) -> bool:
@@ -131,6 +135,20 @@ def bring_images() -> dict[str, str]:
         return references
 
 
+def bring(image: Image) -> str:
+    """Build one where it is out of date and import it into every node; returns its reference."""
+    with _locked():
+        reference = _up_to_date(image)
+        load(image.archive, reference)
+        return reference
+
+
+def build(image: Image) -> str:
+    """Build one where it is out of date; returns its reference."""
+    with _locked():
+        return _up_to_date(image)
+
+
 def brought(image: Image) -> str | None:
     """The reference of what was built last, if all nodes of our cluster have it."""
     reference = image.archived()
@@ -145,18 +163,21 @@ def _locked() -> AbstractContextManager[None]:
 
 
 def _up_to_date(image: Image) -> str:
+    base = default_base() if image.made_from is None else _up_to_date(image.made_from)
     # Built from a copy: an image holds what its tag says, though files are edited meanwhile.
     with tempfile.TemporaryDirectory(prefix="fiber-build-") as folder:
         context = Path(folder)
         image.copy_inputs(places.CHECKOUT, context)
-        reference = image.reference(context, default_base())
+        reference = image.reference(context, base)
         if image.archived() != reference:
-            _build(image, reference, context)
+            _build(image, reference, base, context)
     return reference
 
 
-def _build(image: Image, reference: str, context: Path) -> None:
-    builder, base = builder_and_base()
+def _build(image: Image, reference: str, base: str, context: Path) -> None:
+    builder, python = builder_and_base()
+    if image.made_from is None:
+        base = python  # what the builder has under the name
     say(f"building {reference} on {base}")
     began = time.monotonic()
     previous = image.archived()

@@ -34,6 +34,7 @@ from cluster import (
     places,
 )
 from cluster.ability import Choice
+from cluster.images import Image
 from cluster.shell import ClusterError, output, wait_for
 
 NODES = 2
@@ -90,6 +91,10 @@ class Cluster:
         container_id = statuses[container]["containerID"].removeprefix("containerd://")
         self._kill(pod["spec"]["nodeName"], container_id)
 
+    def bring(self, image: Image) -> str:
+        """Have one more image on the nodes, of those that few tests need; its reference."""
+        raise NotImplementedError
+
     def fake_nodes(self, count: int) -> None:
         """Have this many nodes that only pretend to run pods."""
         self._skip(f"add {count} pretended nodes")
@@ -142,6 +147,9 @@ class Own(Cluster):
     def _without_apiserver(self) -> AbstractContextManager[None]:
         return faults.stopped(faults.APISERVER)
 
+    def bring(self, image: Image) -> str:
+        return images.bring(image)
+
     def fake_nodes(self, count: int) -> None:
         fake_nodes.set_count(count)
 
@@ -164,11 +172,16 @@ class Kind(Cluster):
             self.outside = _gateway()
             self.images = images.build_images()
             for image in images.IMAGES:
-                output("kind", "load", "image-archive", image.archive, "--name", name)
+                self._load(image)
                 self._tag(self.images[image.name], image.released(places.CHECKOUT))
         except BaseException:
             self.close()
             raise
+
+    def bring(self, image: Image) -> str:
+        reference = images.build(image)
+        self._load(image)
+        return reference
 
     @classmethod
     def make(cls, name: str = "fiber-e2e") -> Kind:
@@ -212,6 +225,9 @@ class Kind(Cluster):
         kill = ("tasks", "kill", "--signal", "SIGKILL", container_id)
         self._inside(node, "ctr", "--namespace", "k8s.io", *kill)
 
+    def _load(self, image: Image) -> None:
+        output("kind", "load", "image-archive", image.archive, "--name", self._name)
+
     def _tag(self, reference: str, other: str) -> None:
         names = map(images.full_name, (reference, other))
         tag = ("ctr", "--namespace", "k8s.io", "images", "tag", "--force", *names)
@@ -231,6 +247,13 @@ class Given(Cluster):
         self.kubeconfig = kubeconfig
         self.outside = environment.get("FIBER_E2E_OUTSIDE_ADDRESS")
         self.images = _given_images(environment)
+        self._environment = environment
+
+    def bring(self, image: Image) -> str:
+        variable = _variable(image.name)
+        return self._environment.get(variable) or self._skip(
+            f"have {image.dockerfile} built unless {variable} names the image"
+        )
 
 
 def choose(environment: Mapping[str, str] = os.environ) -> Cluster:

@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -110,9 +111,11 @@ class Outside(Program):
     ) -> None:
         super().__init__(scene)
         self._status: int | None = None
+        # Of its own: one that is killed leaves its temporary files.
+        self._temporary = tempfile.TemporaryDirectory(prefix="program-")
         self._process = subprocess.Popen(
             [sys.executable, str(script), *arguments],
-            env={**environment, "PYTHONUNBUFFERED": "1"},
+            env={**environment, "PYTHONUNBUFFERED": "1", "TMPDIR": self._temporary.name},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -142,6 +145,7 @@ class Outside(Program):
     def close(self) -> None:
         self._process.kill()
         self._reader.join()
+        self._temporary.cleanup()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
@@ -254,6 +258,8 @@ class Programs:
         """Of what is started beside the tests from now on."""
         self.node: str | None = None
         """Where what is started inside from now on runs; None: anywhere."""
+        self.image: str | None = None
+        """What is started from now on runs in pods of this image; None: of one of ours."""
         self._started: list[Program] = []
 
     def start(self, place: str, script: str, *arguments: object, **settings: object) -> Program:
@@ -262,7 +268,8 @@ class Programs:
         The settings are keys of Fiber's configuration.
         """
         words = [str(argument) for argument in arguments]
-        image = self._cluster.images["fiber-worker-rl" if "/" in script else "fiber-worker"]
+        ours = self._cluster.images["fiber-worker-rl" if "/" in script else "fiber-worker"]
+        image = self.image or ours
         start = self._outside if place == "outside" else self._inside
         program = start(path_to(script), words, image, settings)
         self._started.append(program)

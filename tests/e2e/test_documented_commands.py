@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CONSOLE = re.compile(r"^```console\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"^\$ (.+?)(?: +# .*)?$", re.MULTILINE)
 CLUSTER = 'eval "$(make -s cluster)"'
+BRING = "export FIBER_IMAGE=$(PYTHONPATH=tests python -m cluster bring fiber-search)"
 _OURS = re.compile(r"FIBER_|KUBECONFIG$|MAKE|MFLAGS$")
 
 SHOWN = {
@@ -33,12 +34,19 @@ SHOWN = {
         "kubectl get fiberpools": r"No resources found",
         "kubectl logs job/pi": r"Pi is roughly 3\.1[34]",
     },
+    "executors.md": {
+        "FIBER_BACKEND=kubernetes FIBER_NAMESPACE=default python examples/05-search/search.py": (
+            r"(?m)^study of 40 trials: 9\d\.\d%"
+        ),
+    },
 }
 """What some commands of a page print."""
+PAGES = ["fiberpools.md", "kubernetes.md", pytest.param("executors.md", marks=pytest.mark.long)]
 NOT_RUN = {
-    ". .venv/bin/activate && pip install --quiet --editable '.[kubernetes,rl]'": (
+    f". .venv/bin/activate && pip install --quiet --editable '.[kubernetes,{extra}]'": (
         "the tests' own environment, whose Python the shell has"
-    ),
+    )
+    for extra in ("rl", "search")
 }
 
 
@@ -120,8 +128,10 @@ def after(bare_cluster: None, release: Release, kube: Kube) -> Iterator[None]:
 
 @pytest.mark.timeout(600, func_only=True)  # `helm test` has five minutes of its own
 @pytest.mark.usefixtures("after")
-@pytest.mark.parametrize("page", SHOWN)
-def test_every_command_does_what_its_page_says(page: str, shell: Shell) -> None:
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_does_what_its_page_says(page: str, shell: Shell, cluster: Cluster) -> None:
+    if BRING in commands(page) and not isinstance(cluster, Own):
+        pytest.skip(f"{cluster.description} is not that of make cluster")
     assert commands(page)[0] == CLUSTER
     said = {command: shell.run(command) for command in commands(page)[1:] if command not in NOT_RUN}
     for command, pattern in SHOWN[page].items():

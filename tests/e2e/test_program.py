@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
 
 import pytest
 
@@ -13,15 +12,13 @@ from e2e.delays import prompt
 from e2e.kube import Body, path_of
 from e2e.leftovers import leaves_nothing
 from e2e.pools import Pool, is_live, is_ready
-from e2e.program import PLACES, Program, Programs, local
+from e2e.program import PLACES, Program, Programs
 from e2e.scene import Scene
 from fiber_api import names
 
 pytestmark = pytest.mark.timeout(240, func_only=True)
 
 SQUARES = sum(number * number for number in range(1000))
-ES = ("--env", "CartPole-v1", "--generations", 3, "--population", 16, "--seed", 1, "--workers", 3)
-ENVS = ("--envs", 3, "--steps", 40, "--ms", 0.2)
 GPU = "nvidia.com/gpu"
 WARM = 0.3
 """Seconds, at most, to the first result of a pool whose pods are there."""
@@ -49,49 +46,6 @@ def test_a_map_from_no_pods_to_none(place: str, programs: Programs, scene: Scene
     (pool,) = ever(scene, "fiberpools").values()
     assert pool["spec"]["minReplicas"] == 0
     assert scene.most_at_once(lambda pod: is_worker(pod) and is_live(pod)) == 3
-
-
-def es_lines(lines: Sequence[str]) -> list[str]:
-    return [line for line in lines if re.match(r"generation|  random|  trained", line)]
-
-
-def episodes(lines: Sequence[str]) -> list[str]:
-    return [line for line in lines if "episodes ended" in line]
-
-
-def sameness(lines: Sequence[str]) -> list[str]:
-    return [line for line in lines if line == "observations: the same"]
-
-
-def pi(lines: Sequence[str]) -> list[str]:
-    """Pi to one place: what is random has no seed here."""
-    return [line[: len("Pi is roughly 3.1")] for line in lines if line.startswith("Pi is")]
-
-
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize(
-    ("script", "arguments", "results"),
-    [
-        ("01-pi/pi.py", ("1e5",), pi),
-        ("02-es/main.py", (*ES, "--out", "/tmp/learning-curve.png"), es_lines),
-        ("03-vector-env/piped.py", ENVS, episodes),
-        ("03-vector-env/adopted.py", ENVS, sameness),
-    ],
-    ids=["pi", "es", "piped", "adopted"],
-)
-def test_an_example_gives_what_it_gives_on_one_machine(
-    place: str,
-    script: str,
-    arguments: tuple[object, ...],
-    results: Callable[[Sequence[str]], list[str]],
-    programs: Programs,
-) -> None:
-    program = programs.start(place, script, *arguments)
-    output = program.ends(seconds=120)
-    expected = results(local(script, *arguments))
-    assert expected
-    assert results(output.splitlines()) == expected
-    leaves_nothing(program)
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -226,7 +226,6 @@ def node_of(scene: Scene, pod: str) -> str:
 # -- The program itself
 
 
-@pytest.mark.may_leak("a process that is killed cannot remove its temporary folder")
 @pytest.mark.long
 @pytest.mark.parametrize("place", PLACES)
 def test_a_program_that_is_killed_leaves_nothing_after_its_grace(

@@ -96,7 +96,7 @@ def test_nowhere_to_write_is_said_when_something_is_shared(
     in_a_worker = program.line()
     assert program.wait() == 1
     for said in (in_a_worker, program.stderr):
-        assert "no pipe, queue or event can be shared" in said
+        assert "no pipe, queue, lock or value can be shared" in said
         assert "/no/such/directory" in said
         assert "Set FIBER_RUNTIME_DIRECTORY" in said
     assert program.left() == []

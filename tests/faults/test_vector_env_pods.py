@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import fiber
 from fakes.cluster import FakeCluster, fake_cluster
 from faults.runtime import running
 from fiber.vector import VectorEnv
@@ -25,6 +26,27 @@ def cluster(tmp_path: Path) -> Iterator[FakeCluster]:
         patch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, cluster.url)))
         with running(backend="kubernetes"):
             yield cluster
+
+
+@fiber.meta(memory=512)
+def small() -> Faulty:
+    return Faulty()
+
+
+@fiber.meta(cpu=2, memory=256)
+def quick() -> Faulty:
+    return Faulty()
+
+
+def test_a_worker_has_what_its_environments_need(cluster: FakeCluster) -> None:
+    env = VectorEnv([small, quick], num_workers=1)
+    try:
+        (pod,) = cluster.objects("pods")
+        requests = pod["spec"]["containers"][0]["resources"]["requests"]
+        assert requests["cpu"] == "2"
+        assert requests["memory"] == "512Mi"
+    finally:
+        env.close(terminate=True)
 
 
 def test_a_pod_that_is_deleted_between_send_and_recv(cluster: FakeCluster, tmp_path: Path) -> None:

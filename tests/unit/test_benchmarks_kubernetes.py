@@ -10,7 +10,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import budgets, kubernetes_cluster, kubernetes_report, report  # noqa: E402
+from benchmarks import (  # noqa: E402
+    budgets,
+    kubernetes_cluster,
+    kubernetes_report,
+    kubernetes_run,
+    report,
+)
 from benchmarks.contender import Bench  # noqa: E402
 from benchmarks.contenders import ALL, BY_NAME, ON_PODS  # noqa: E402
 from benchmarks.model import Run  # noqa: E402
@@ -78,6 +84,20 @@ def test_pods_are_no_part_of_what_needs_no_cluster() -> None:
     assert BY_NAME[PODS] is ON_PODS
     assert not {each.contender for each in budgets.BUDGETS} & {PODS}
     assert "pods" not in report.index({})
+
+
+def test_each_case_has_a_contender_on_pods_and_its_baseline() -> None:
+    for case in kubernetes_report.cases(1.0):
+        able = {each.name for each in kubernetes_run.CONTENDERS if case.needs in each.offers}
+        assert len(able & {PODS, "fiber-executor-kubernetes"}) == 1, case.name
+        assert case.baseline in able, case.name
+    vectors = [case for case in kubernetes_report.cases(1.0) if case.measure == "vector"]
+    assert [case.name for case in vectors] == [
+        "8 CartPoles",
+        "64 CartPoles",
+        "64 uneven ones",
+        "64 uneven ones, first ready",
+    ]
 
 
 @pytest.mark.parametrize("measure", ["kubernetes_start", "kubernetes_es"])

@@ -10,7 +10,7 @@ import pytest
 
 from cluster import builders, images, places
 from cluster.builders import Builder
-from cluster.images import IMAGES, OPERATOR, WORKER, WORKER_RL, Image
+from cluster.images import IMAGES, OPERATOR, SEARCH, WORKER, WORKER_RL, Image
 from cluster.shell import ClusterError
 
 BASE = "python:3.11-slim"
@@ -23,7 +23,7 @@ SHARED_MODULE = "crds/fiber_api/names.py"
 def checkout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A small tree with all that an image is made of."""
     root = tmp_path / "checkout"
-    dockerfiles = [image.dockerfile for image in IMAGES]
+    dockerfiles = [image.dockerfile for image in (*IMAGES, SEARCH)]
     for name in (*images.ALWAYS, *dockerfiles, SDK_MODULE, OPERATOR_MODULE, SHARED_MODULE):
         write(root / name, f"of {name}")
     write(root / images.VERSION_FILE, '__version__ = "1.2.3"\n')
@@ -185,6 +185,31 @@ def test_workers_differ_by_their_extras(builder: Notebook, checkout: Path) -> No
     assert "EXTRAS=kubernetes,rl" in builder.options  # the last that is built
     tags = {name: reference.partition(":")[2] for name, reference in references.items()}
     assert tags["fiber-worker"] != tags["fiber-worker-rl"]
+
+
+def test_an_image_on_top_of_ours_follows_it(builder: Notebook, checkout: Path) -> None:
+    first = images.build(SEARCH)
+    worker = WORKER.archived()
+    assert worker is not None
+    assert builder.asked == [worker, first]
+    assert f"BASE_IMAGE={worker}" in builder.options
+    assert images.build(SEARCH) == first
+    write(checkout / SDK_MODULE, "something else")
+    second = images.build(SEARCH)
+    assert second != first
+    assert builder.asked[2:] == [WORKER.archived(), second]
+    assert builder.removed == [worker, first]
+
+
+def test_an_image_that_few_need_is_brought_alone(
+    builder: Notebook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes = {index: FakeNode() for index in (1, 2)}
+    monkeypatch.setattr(places, "nodes", lambda: list(nodes))
+    monkeypatch.setattr(images, "Containerd", lambda index: nodes[index])
+    assert images.bring(SEARCH) == SEARCH.archived()
+    images.bring(SEARCH)
+    assert [node.loaded for node in nodes.values()] == [[SEARCH.archive]] * 2
 
 
 def test_a_build_that_fails_is_done_again(builder: Notebook, checkout: Path) -> None:

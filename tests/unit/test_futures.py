@@ -16,6 +16,10 @@ import pytest
 
 import fiber
 from fiber import futures
+from fiber._runtime import methods
+from fiber._runtime.call_future import CallFuture
+from fiber._runtime.calls import CallQueue
+from fiber._runtime.work_items import Call
 from unit import pool_tasks as tasks
 from unit.pool_programs import run_program, wait_until
 
@@ -109,6 +113,27 @@ def test_asyncio_awaits_them(executor: fiber.Executor) -> None:
         return await asyncio.gather(*squares), await one
 
     assert asyncio.run(main()) == ([n * n for n in range(10)], 81)
+
+
+def test_a_coroutine_awaits_them(executor: Any, tmp_path: Path) -> None:
+    async def square(number: int) -> int:
+        result: int = await executor.submit(tasks.square, number)
+        return result
+
+    async def main() -> None:
+        assert await asyncio.gather(*(square(n) for n in range(10))) == [n * n for n in range(10)]
+        with pytest.raises(ValueError, match="4"):
+            await executor.submit(tasks.raise_value_error, 4)
+        for _ in range(2):
+            executor.submit(tasks.wait_for, tmp_path / "gate")
+        waits = [executor.submit(tasks.square, n) for n in range(10)]
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(waits[-1], 0.01)
+        assert waits[-1].cancelled()
+        (tmp_path / "gate").touch()
+        assert await waits[0] == 0
+
+    asyncio.run(main())
 
 
 # Cancelling
@@ -348,6 +373,26 @@ def test_its_use_during_the_import_of_main_is_refused(monkeypatch: pytest.Monkey
 
 
 # Its end
+
+
+def test_a_task_that_comes_while_it_is_shut_down(
+    executor: fiber.Executor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    executor.submit(tasks.square, 1).result(PATIENCE)
+    (engine,) = executor._group.executors()
+    engine.close()  # as shutdown() does, after the group has said yes to another thread
+    wait_until(lambda: engine._scheduler.closing, "it takes nothing more")
+    with pytest.raises(RuntimeError, match="cannot schedule new futures after shutdown"):
+        executor.submit(tasks.square, 2)
+    late = CallFuture(engine, CallQueue())
+    engine.calls.put(Call("late", b"", [], None, late))
+    assert "after shutdown" in str(late.exception(PATIENCE))
+
+    other = fiber.Executor(1)
+    monkeypatch.setattr(methods, "check_main", other.shutdown)
+    with pytest.raises(RuntimeError, match="cannot schedule new futures after shutdown"):
+        other.submit(tasks.square, 3)
+    assert not other._group.executors()
 
 
 def test_forgotten_it_ends_after_its_tasks() -> None:

@@ -174,9 +174,9 @@ def test_everything_shared_travels(hosts: Hosts) -> None:
 def test_without_a_hub_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("_local_hub", "_address", "_starter"):
         monkeypatch.setattr(client, name, None)
-    _, end = fiber.Pipe()
-    with pytest.raises(NoHub, match="Start a process or pool first"):
-        pickle.dumps(end)
+    for shared in (fiber.Pipe()[1], fiber.SimpleQueue()):
+        with pytest.raises(NoHub, match=r"queue, lock, value .* Start a process or pool first"):
+            pickle.dumps(shared)
 
 
 def test_a_program_without_a_hub_makes_one(hosts: Hosts, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import os
-import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,14 @@ from unit import pool_tasks as tasks
 from unit.pool_programs import wait_until
 
 call = joblib.delayed
+
+
+@pytest.fixture(autouse=True)
+def _nothing_kept() -> Iterator[None]:
+    """The executor that the next loop would have is not for the next test."""
+    yield
+    while fiber.joblib._kept:
+        fiber.joblib._kept.pop().executor.shutdown()
 
 
 def squares(parallel: joblib.Parallel, count: int = 20) -> bool:
@@ -87,13 +94,45 @@ def test_a_time_limit(tmp_path: Path) -> None:
         parallel(call(tasks.wait_for)(tmp_path / "gate") for _ in range(2))
 
 
-def test_a_backend_that_is_forgotten_leaves_no_worker() -> None:
-    assert squares(joblib.Parallel(2, backend="fiber"))
-    gc.collect()  # joblib's objects know each other
-    wait_until(
-        lambda: not any(thread.name.startswith("fiber-pool") for thread in threading.enumerate()),
-        "its executor ends",
+def test_loops_one_after_the_other_have_the_same_workers() -> None:
+    def workers(**options: Any) -> set[int]:
+        parallel = joblib.Parallel(2, backend="fiber", **options)
+        return set(parallel(call(tasks.pid)() for _ in range(20)))
+
+    first = workers()
+    assert len(first | workers()) <= 2
+    assert not first & workers(initializer=os.getpid)
+    assert not first & workers()  # only the last ones are kept
+    arrays = [(np.zeros(2),), (np.zeros(2),)]
+    assert not set.intersection(*(workers(initializer=id, initargs=each) for each in arrays))
+
+
+def test_workers_that_no_loop_uses_leave() -> None:
+    assert squares(joblib.Parallel(2, backend="fiber", idle_timeout=0.05))
+    (kept,) = fiber.joblib._kept
+    wait_until(lambda: not kept.executor._processes, "they are idle for too long")
+
+
+def test_a_loop_over_the_results_of_another() -> None:
+    with joblib.parallel_config(backend="fiber", n_jobs=2):
+        outer = joblib.Parallel(return_as="generator", pre_dispatch=2, batch_size=1)
+        found = outer(call(tasks.square)(n) for n in range(50))
+        assert [next(found), squares(joblib.Parallel()), next(found)] == [0, True, 1]
+        assert list(found) == [n * n for n in range(2, 50)]
+
+
+def test_an_executor_that_is_shut_down_during_the_loop() -> None:
+    executor = fiber.Executor(2)
+    backend = fiber.joblib.FiberBackend(executor=executor)
+    parallel = joblib.Parallel(
+        2, backend=backend, return_as="generator", pre_dispatch=2, batch_size=1
     )
+    found = parallel(call(tasks.square)(n) for n in range(1_000_000))
+    assert next(found) == 0
+    executor.shutdown(wait=False)
+    with pytest.raises(RuntimeError, match="cannot schedule new futures after shutdown"):
+        list(found)
+    executor.shutdown()
 
 
 def in_a_task(count: int) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import pickle
 import threading
@@ -85,6 +86,16 @@ def test_one_at_a_time(make: Callable[[], Any]) -> None:
         assert not lock.acquire(timeout=0.01)
         assert not lock.acquire(timeout=-1)
         assert "SomeOtherProcess" in repr(lock)
+
+
+@pytest.mark.parametrize("make", [fiber.Lock, fiber.RLock, fiber.Condition])
+def test_what_is_no_time_is_refused_by_a_free_lock_too(make: Callable[[], Any]) -> None:
+    lock = make()
+    with pytest.raises(TypeError, match="must be real number, not str"):
+        lock.acquire(timeout="a")
+    with pytest.raises(ValueError, match="not NaN"):
+        lock.acquire(timeout=math.nan)
+    assert lock.acquire(timeout=1)
 
 
 def test_a_lock_says_who_has_it() -> None:

@@ -100,6 +100,13 @@ def test_bad_options(options: dict[str, Any]) -> None:
         SharedMemory(**options)
 
 
+@pytest.mark.parametrize("name", [5, 0, b"name", ["name"]])
+def test_what_is_no_name_is_refused(name: Any) -> None:
+    for options in ({}, {"create": True, "size": 5}):
+        with pytest.raises(TypeError, match="'name' must be a string, not"):
+            SharedMemory(name, **options)
+
+
 def test_a_list_is_shared() -> None:
     numbers = ShareableList([21, "text", None, b"bytes"])
     run(double, numbers)

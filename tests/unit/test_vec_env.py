@@ -18,6 +18,7 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.wrappers import TimeLimit
 
 import fiber
+from fiber.resources import Resources
 from vector_envs import Faulty, Sampling
 
 STAND_INS = Path(__file__).parents[1] / "stand_ins"
@@ -226,3 +227,14 @@ def test_gymnasium_alone_does_not_import_it() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert "gymnasium" in done.stdout.split()
     assert not {"torch", "stable_baselines3"} & set(done.stdout.split())
+
+
+def test_a_worker_has_what_its_environments_need(vec_env: Make) -> None:
+    env = vec_env([wishful, Faulty], num_workers=1)
+    (worker,) = env._dispatcher._workers
+    assert worker._wishes == Resources(memory=512)
+
+
+@fiber.meta(memory=512)
+def wishful() -> Faulty:
+    return Faulty()

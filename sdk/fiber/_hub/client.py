@@ -92,8 +92,9 @@ def local_hub() -> LocalHub | None:
     if _local_hub is None and _address is None:
         if _starter is None:
             raise NoHub(
-                "a pipe, queue or event cannot leave this process: nothing of Fiber runs here that "
-                "could keep it for the other side. Start a process or pool first."
+                "what processes share (a pipe, queue, lock, value and so on) cannot leave this "
+                "process: nothing of Fiber runs here that could keep it for the other side. Start "
+                "a process or pool first."
             )
         _starter()
     return _local_hub

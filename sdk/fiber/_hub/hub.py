@@ -256,8 +256,8 @@ def _listen(parent: str | None) -> tuple[socket.socket, str]:
 
 def _problem(error: OSError) -> str:
     return (
-        "no pipe, queue or event can be shared with another process of this host: Fiber keeps a "
-        f"socket for it in a temporary directory, and there can be none ({error}). Set "
+        "no pipe, queue, lock or value can be shared with another process of this host: Fiber "
+        f"keeps a socket for them in a temporary directory, and there can be none ({error}). Set "
         "FIBER_RUNTIME_DIRECTORY (runtime_directory) to a directory that can be written to and has "
         "a short path, and start the program again"
     )

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from concurrent.futures._base import CANCELLED, CANCELLED_AND_NOTIFIED, RUNNING
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from fiber import errors
 from fiber._runtime.calls import CallQueue
 from fiber._runtime.executor import Executor
 from fiber._runtime.outcome import Failure, Pickled
+
+_T = TypeVar("_T")
 
 
 class WorkerDied(errors.WorkerDied, BrokenProcessPool):
@@ -27,7 +28,7 @@ class WorkerDied(errors.WorkerDied, BrokenProcessPool):
 WorkerDied.__module__ = "fiber.futures"  # where its users have it from
 
 
-class CallFuture(Future[Any]):
+class CallFuture(Future[_T]):
     """The future of one call, as an executor sees it: ``work_items.Cancellable``.
 
     What runs the user's code, unpicklers and callbacks, does not run on the loop's thread.
@@ -37,9 +38,15 @@ class CallFuture(Future[Any]):
         super().__init__()
         self._executor = executor
         self._queue = queue
-        self._undecided = deque((True,))
+        self._undecided = [True]
         """Whoever takes it out decides: to give the call to a worker, or to cancel it."""
         self._claimed: bool | None = None
+
+    def __await__(self) -> Generator[Any, None, _T]:
+        """Its result; who is cancelled while waiting for it cancels it."""
+        import asyncio  # who awaits has it already, and it takes long to import
+
+        return asyncio.wrap_future(self).__await__()
 
     def cancel(self) -> bool:
         """As in concurrent.futures; ``wait`` and ``as_completed`` hear of it in a moment."""

@@ -332,7 +332,7 @@ class Executor:
     def _refusal(self) -> BaseException | None:
         if self.error is not None:
             return self.error
-        return ValueError("Pool not running") if self._scheduler.closing else None
+        return self.options.refusal() if self._scheduler.closing else None
 
     # Requests.  From here on all happens on the loop's thread.
 

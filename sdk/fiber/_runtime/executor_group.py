@@ -8,6 +8,7 @@ import weakref
 from collections.abc import Callable
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing import util
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -18,6 +19,9 @@ from fiber._runtime.executor import Executor
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import Runtime
 from fiber.resources import Resources, merged, resources_of
+
+AFTER_SHUTDOWN = partial(RuntimeError, "cannot schedule new futures after shutdown")
+"""What concurrent.futures says to who comes too late."""
 
 _EXIT_PRIORITY = 20
 """Before pools are terminated, which its tasks may use."""
@@ -47,9 +51,10 @@ class ExecutorGroup:
                 f"this executor belongs to process {self._owner}: a copy of it that came here by a "
                 "fork has no workers; make an executor in this process"
             )
-        if self._closed or util.is_exiting():
-            when = "shutdown" if self._closed else "interpreter shutdown"
-            raise RuntimeError(f"cannot schedule new futures after {when}")
+        if self._closed:
+            raise AFTER_SHUTDOWN()
+        if util.is_exiting():
+            raise RuntimeError("cannot schedule new futures after interpreter shutdown")
         kind = self._template.resources
         if self._runtime.elastic:
             kind = merged(kind, merged(resources_of(function), wishes))
@@ -61,6 +66,8 @@ class ExecutorGroup:
     def _start(self, kind: Resources) -> Executor:
         methods.check_main()
         with self._lock:
+            if self._closed:  # by another thread, just now
+                raise AFTER_SHUTDOWN()
             executor = self._executors.get(kind)
             if executor is None:
                 executor = Executor(self._template._replace(resources=kind), self._runtime)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
+from functools import partial
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
@@ -39,6 +40,8 @@ class PoolOptions(NamedTuple):
     """What workers wish of their hosts, besides what the first task's function does."""
     calls_back_at_end: bool = False
     """Whether callbacks run for calls that termination fails; not in multiprocessing."""
+    refusal: Callable[[], Exception] = partial(ValueError, "Pool not running")
+    """Makes the error of what is asked of it once it is closed."""
 
 
 def whole(name: str, value: Any) -> int:

@@ -15,6 +15,7 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common import vec_env
 
+from fiber.resources import resources_of, with_resources
 from fiber.vector.slot import MakeEnv, Note
 from fiber.vector.sub_environments import SubEnvironments
 
@@ -49,7 +50,7 @@ class VecEnv(vec_env.VecEnv):
         self.closed = True  # until there is something to close
         self.waiting = False
         self._sub_environments = SubEnvironments(
-            [partial(_make, make) for make in env_fns],
+            [with_resources(partial(_make, make), resources_of(make)) for make in env_fns],
             owner=type(self).__name__,
             num_workers=num_workers,
             shared_memory=shared_memory,
@@ -117,8 +118,8 @@ class VecEnv(vec_env.VecEnv):
     def close(self) -> None:
         """Close the environments and end their processes."""
         if not self.closed:
-            self.closed = True
             self._sub_environments.close(None)
+            self.closed = True  # now: Ctrl-C may have come before
 
     def __del__(self) -> None:
         if not getattr(self, "closed", True):
@@ -189,6 +190,7 @@ class VecEnv(vec_env.VecEnv):
     def _check_open(self) -> None:
         if self.closed:
             raise ClosedEnvironmentError(f"this {type(self).__name__} is closed")
+        self._sub_environments.check_owner()
 
 
 def _info(note: Note, info: dict[str, Any]) -> dict[str, Any]:

@@ -40,6 +40,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     * ``shared_memory``: on one host actions and observations lie in memory that the processes
       share; on other hosts they travel, those of a worker in one message.
     * ``copy``: observations are the caller's.  Otherwise the next step overwrites them.
+    * On Kubernetes a worker's pod has what ``fiber.meta`` says that its ``env_fns`` need: of each
+      resource the most that one of them asks for.
     * ``context`` is a start method, as of ``fiber.get_context()``.
     * ``observation_mode`` and ``autoreset_mode`` are ``AsyncVectorEnv``'s.
     * ``on_error="restart"``: an environment that raises, takes longer than ``timeout`` or whose
@@ -48,8 +50,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
       after any end of an episode.  By default the error is raised: it is what the environment
       raised, ``WorkerDied`` or ``multiprocessing.TimeoutError``, and names the environment and its
       worker.
-    * ``timeout``: seconds that a step or reset of one environment may take.  It is kept by an alarm
-      in the worker (SIGALRM), which ends also native code that keeps the interpreter.
+    * ``timeout``: seconds that the making, a step or a reset of one environment may take.  It is
+      kept by an alarm in the worker (SIGALRM); a worker whose native code does not return to the
+      interpreter is killed a little later.
     """
 
     def __init__(
@@ -296,13 +299,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         order = range(self.num_envs) if numbers is None else numbers
         rows = {number: row for row, number in enumerate(order)}
         for number, note in notes:
-            row = rows[number]
-            if note.final is not None:
-                ending = {"final_obs": note.final.observation, "final_info": note.final.info}
-                infos = batch._add_info(infos, ending, row)
-            if note.lost is not None:
-                infos = batch._add_info(infos, {"restarted": note.lost}, row)
-            infos = batch._add_info(infos, note.info, row)
+            try:
+                infos = _with_note(batch, infos, note, rows[number])
+            except Exception as error:  # infos of one name and different types
+                error.add_note(f"an info of {self._dispatcher.name(number)}")
+                raise
         return infos
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
@@ -340,6 +341,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def _check_running(self) -> None:
         if self.closed:
             raise ClosedEnvironmentError(f"this {type(self).__name__} is closed")
+        self._sub_environments.check_owner()
 
     # What these two say is Gymnasium's interface: its tests look for the words.
 
@@ -389,6 +391,18 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def _give_up(self) -> None:
         self._dispatcher.abandon()
         self._state = AsyncState.DEFAULT
+
+
+def _with_note(
+    batch: gymnasium.vector.VectorEnv[Any, Any, Any], infos: dict[str, Any], note: Note, row: int
+) -> dict[str, Any]:
+    """The infos of a batch with those of one more environment, in its row."""
+    if note.final is not None:
+        ending = {"final_obs": note.final.observation, "final_info": note.final.info}
+        infos = batch._add_info(infos, ending, row)
+    if note.lost is not None:
+        infos = batch._add_info(infos, {"restarted": note.lost}, row)
+    return batch._add_info(infos, note.info, row)
 
 
 def _without_mask(

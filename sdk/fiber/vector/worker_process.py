@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from multiprocessing import TimeoutError as TookTooLong
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ from fiber.connection import Connection, Pipe
 from fiber.context import BaseContext
 from fiber.errors import UnpicklableError, WorkerDied
 from fiber.process import Process
+from fiber.resources import largest, resources_of, with_resources
 from fiber.vector.arrays import StepArrays
 from fiber.vector.worker import Hello, Setup, serve
 
@@ -39,6 +41,7 @@ class WorkerProcess:
         self.numbers = range(setup.first, setup.first + len(setup.makes))
         """Its environments."""
         self._context = context
+        self._wishes = largest(map(resources_of, setup.makes))
         self.hello: Hello | None = None
         self.pending: dict[int, Pending] = {}
         """By row."""
@@ -59,7 +62,10 @@ class WorkerProcess:
         self.connection, theirs = Pipe()
         with theirs:
             self.process = self._context.Process(
-                target=serve, args=(theirs, self.setup), name=self.name, daemon=True
+                target=with_resources(serve, self._wishes),
+                args=(theirs, self.setup),
+                name=self.name,
+                daemon=True,
             )
             try:
                 self.process.start()
@@ -106,11 +112,12 @@ class WorkerProcess:
     def close(self, timeout: float | None) -> None:
         """Wait for its end; kill it when ``timeout`` is over."""
         self.connection.close()
-        self.process.join(timeout)
-        if self.process.exitcode is None:
-            self.process.kill()
-            self.process.join()
-        self.process.close()
+        with contextlib.suppress(ValueError):  # closed just before Ctrl-C
+            self.process.join(timeout)
+            if self.process.exitcode is None:
+                self.process.kill()
+                self.process.join()
+            self.process.close()
 
     def _check_pickling(self) -> None:
         for number, make in zip(self.numbers, self.setup.makes, strict=True):

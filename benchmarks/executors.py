@@ -1,0 +1,74 @@
+"""Executors: how many tasks a second go through submit and map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.model import WORKERS, Case, Metric
+from benchmarks.tasks import after, no_op
+from benchmarks.throughput import rate
+
+if TYPE_CHECKING:
+    from benchmarks.contender import Bench
+
+TITLE = "Executors"
+ABOUT = f"""\
+{WORKERS} workers of a concurrent.futures.Executor, each in its own library's executor; loky's is
+the one within joblib. Tasks give their argument, an int, back, at once or after a sleep of a
+millisecond. `submit` is one call for each task, and then all results; `map` has chunksize 1 if not
+said otherwise. Dask's are `Client.submit` and `Client.map`, which have no chunks, and Ray's
+`apply_async` and `map` of its Pool: both get a tenth of the no-op tasks. The value of a round is
+the median of up to five batches in a row."""
+
+RATE = Metric("rate", "tasks a second", "1/s")
+BASELINE = "concurrent.futures"
+SUBMIT = "submit, no-ops"
+MAP = "map, no-ops"
+IN_CHUNKS = "map, no-ops, chunksize 100"
+SLEEPING = "submit, 1 ms tasks"
+_CHUNKS = "executor in chunks"
+
+# Name, what it needs, chunk size (0: submit), seconds of a task, tasks.
+_CASES = (
+    (SUBMIT, "executor", 0, 0.0, 5_000),
+    (MAP, "executor", 1, 0.0, 5_000),
+    (IN_CHUNKS, _CHUNKS, 100, 0.0, 100_000),
+    (SLEEPING, "executor", 0, 0.001, 1_000),
+)
+
+
+def cases(size: float) -> list[Case]:
+    """The full measure at size 1; below, fewer tasks."""
+    return [
+        Case(
+            measure="executors",
+            name=name,
+            group="tasks",
+            needs=needs,
+            params={
+                "chunksize": chunksize,
+                "seconds": seconds,
+                "tasks": max(100, round(tasks * size)),
+            },
+            metrics=(RATE,),
+            baseline=BASELINE,
+            limit=30.0,
+        )
+        for name, needs, chunksize, seconds, tasks in _CASES
+    ]
+
+
+def run(bench: Bench, chunksize: int, seconds: float, tasks: int) -> dict[str, float]:
+    """Tasks a second."""
+    function = partial(after, seconds) if seconds else no_op
+
+    def batch(count: int) -> Iterable[Any]:
+        if chunksize:
+            return bench.pool.map(function, range(count), chunksize)
+        return bench.pool.submit(function, range(count))
+
+    batch(WORKERS)
+    few = not bench.light and not seconds
+    return {RATE.name: rate(batch, max(100, tasks // 10) if few else tasks)}
