@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from benchmarks.contender import Bench
 
 COUNTS = (8, 64, 512, 4096)
+_EVERY_ROUND = 64
 SLOW_WORKERS = 16
 BASELINE = "async-vector-env"
 _A_PROCESS_EACH = (BASELINE, "stable-baselines3")
@@ -29,16 +30,17 @@ Fiber is `fiber.vector.VectorEnv`. AsyncVectorEnv and SyncVectorEnv are Gymnasiu
 process for each environment, forked, as stable-baselines3's SubprocVecEnv has, and more than
 {_MOST_PROCESSES} they are not asked for. Who shares workers has one a processor for CartPoles and
 for large observations, and for environments that sleep one for each, but at most {SLOW_WORKERS}:
-Fiber, PufferLib, Ray. PufferLib is its backend Multiprocessing, from the package pufferlib-core,
-which has no part that must be built. Ray's are plain actors, as RLlib's need torch: each has its
-share of the environments in a SyncVectorEnv, and the program puts together what they return.
+Fiber, PufferLib, Ray. PufferLib is its backend Multiprocessing, from the package pufferlib-core, as
+pufferlib itself has to be built with torch. Ray's are plain actors, as RLlib's need torch: each has
+its share of the environments in a SyncVectorEnv, and the program puts together what they return.
 EnvPool runs environments of its own alone, which are written in C++: of these its CartPole is
 measured, with a thread a processor, and it says what Python costs, not what its workers do.
 SubprocVecEnv and PufferLib import torch and do not use it here: where it is not installed, a
 stand-in is.
 
 Before the clock starts a vector is reset and makes three steps, or as many as fit into a quarter of
-the time that is measured."""
+the time that is measured. More than {_EVERY_ROUND} environments take as long to make as to measure,
+and are measured in one round."""
 
 RATE = Metric("rate", "environment steps a second", "1/s")
 FIRST_READY = "first ready"
@@ -75,7 +77,7 @@ def cases(size: float) -> list[Case]:
         _case(kind, count, f"{count:,} {ending}", group, size)
         for kind, (ending, group) in zip(_KINDS, PANELS.items(), strict=True)
         for count in COUNTS
-        if size >= 0.1 or count <= COUNTS[0]
+        if size >= 0.1 or count <= _EVERY_ROUND
     ]
 
 
@@ -95,6 +97,7 @@ def _case(kind: str, count: int, name: str, group: str, size: float) -> Case:
         },
         metrics=(RATE,),
         limit=60.0,
+        rounds=None if count <= _EVERY_ROUND else 1,
         # Those that have a process for each environment have no batches that are ready first.
         baseline="fiber" if batch else BASELINE,
         not_run={}
@@ -110,7 +113,7 @@ def run(
     make: Callable[[], Any] = getattr(environment, kind)
     env = vector_peers.start(bench.contender, make, count, workers, batch)
     try:
-        step = _first_ready(env, batch) if batch else _all(env)
+        step = _first_ready(env, count, batch) if batch else _all(env)
         return {RATE.name: _rate(step, batch or count, seconds)}
     finally:
         env.close()
@@ -122,7 +125,7 @@ def _all(env: Any) -> Callable[[], object]:
     return lambda: env.step(actions)
 
 
-def _first_ready(env: Any, batch: int) -> Callable[[], object]:
+def _first_ready(env: Any, count: int, batch: int) -> Callable[[], object]:
     env.reset_async(seed=1)
     actions = env.action_space.sample()[:batch]
 
@@ -130,6 +133,9 @@ def _first_ready(env: Any, batch: int) -> Callable[[], object]:
         env.recv(batch)
         env.send(actions)
 
+    # So often that all environments are there and have made steps.
+    for _ in range(2 * count // batch):
+        step()
     return step
 
 

@@ -43,7 +43,7 @@ def _sync(make: Make, count: int, workers: int, batch: int) -> Any:
 
 
 class _SubprocVecEnv:
-    """stable-baselines3's. Forked, as others are: a fork server takes a minute for a hundred."""
+    """stable-baselines3's. Forked, as AsyncVectorEnv's: a server's would import all anew."""
 
     def __init__(self, make: Make, count: int, workers: int, batch: int) -> None:
         vec_env = import_module("stable_baselines3.common.vec_env")
@@ -103,6 +103,7 @@ class _RayActors:
         self.action_space = import_module("gymnasium.vector.utils").batch_space(space, count)
         self._under_way: dict[Any, Any] = {}
         self._ready: list[Any] = []
+        self.reset(seed=0)  # which waits until all are there, as others do
 
     def reset(self, seed: int) -> None:
         self._ray.get(self._reset(seed))
@@ -136,11 +137,9 @@ class _RayActors:
         return [actor.step.remote(part) for actor, part in zip(actors, parts, strict=True)]
 
     def _joined(self, results: list[Any]) -> tuple[Any, ...]:
-        """Observations, and rewards and endings where these were steps; infos are empty."""
-        return tuple(
-            self._numpy.concatenate(column)
-            for column in zip(*(result[:-1] for result in results), strict=True)
-        )
+        """Observations, and unless there is one of a reset, rewards and endings; not infos."""
+        columns = zip(*(result[:-1] for result in results), strict=False)
+        return tuple(self._numpy.concatenate(column) for column in columns)
 
 
 class _EnvPool:

@@ -15,6 +15,7 @@ from typing import Any
 from fiber._transport.handshake import Identity
 from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive
 from fiber._transport.resumable_link import ResumableLink
+from fiber._transport.stream import Datagram
 
 
 class SimulatedTimer:
@@ -152,9 +153,10 @@ class MemoryWire:
         self._link = link
         self._free_at = 0.0
 
-    def put(self, datagram: bytes) -> None:
+    def put(self, datagram: Datagram) -> None:
         """Send it, or lose it."""
         cable = self._cable
+        datagram = datagram if isinstance(datagram, bytes) else b"".join(datagram)
         lost = cable.is_cut or cable.random.random() < cable.drop
         if lost or self.other is None:
             return

@@ -114,3 +114,21 @@ class Faulty(gymnasium.Env[Any, Any]):
     def exit(self, row: float) -> None:
         if self.steps == row:
             os._exit(4)
+
+
+class Noticing(Sampling):
+    """Counts how often any of its kind was looked at, in the process."""
+
+    looked = 0
+
+    def __init__(self) -> None:
+        super().__init__(spaces.Discrete(2))
+
+    @property
+    def unwrapped(self) -> Any:
+        Noticing.looked += 1
+        return self
+
+    @property
+    def looks(self) -> int:
+        return Noticing.looked

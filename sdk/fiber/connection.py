@@ -74,11 +74,14 @@ class Connection:
         channel = self._channel
         if channel is None or not self._writable:
             raise self._misuse("read-only")
-        try:
-            payload, buffers = reduction.encode(obj)
-        except reduction.REFUSALS as error:
-            raise reduction.blame({"the object to send": obj}, error) from error
-        channel.send(payload, buffers)
+        channel.send(*_encoded(obj))
+
+    def _send_unconfirmed(self, obj: Any) -> None:
+        """``send`` without waiting for another host's answer: an error may come with the next."""
+        channel = self._channel
+        if channel is None or not self._writable:
+            raise self._misuse("read-only")
+        channel.send_unconfirmed(*_encoded(obj))
 
     def send_bytes(self, buf: BytesLike, offset: int = 0, size: int | None = None) -> None:
         """Send bytes as one message."""
@@ -253,6 +256,13 @@ def _as_bytes(message: Message) -> bytes:
         return message.tobytes()
     # It was sent by ``send``; whoever asks for bytes expects one pickle.
     return pickle.dumps(packet.loads(message), protocol=5)
+
+
+def _encoded(obj: Any) -> tuple[bytes, list[memoryview]]:
+    try:
+        return reduction.encode(obj)
+    except reduction.REFUSALS as error:
+        raise reduction.blame({"the object to send": obj}, error) from error
 
 
 def _check_window(length: int, offset: int, size: int | None) -> None:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from fiber._runtime import options
 from fiber.connection import Connection, Pipe, wait
-from fiber.errors import ConnectionClosed, MemberLost
+from fiber.errors import ConnectionClosed, FiberError, MemberLost, UnpicklableError
 from fiber.process import Process
 from fiber.resources import resources_of, with_resources
 
@@ -191,7 +191,11 @@ def _outcome(rank: int, channel: Connection) -> tuple[_End, Any, BaseException |
     except ConnectionClosed as closed:
         how = closed.reason or "its process ended"
         return _End(rank, True, how), None, MemberLost(rank, how)
+    except Exception as unreadable:  # what it is of cannot be imported here, for instance
+        unreadable.add_note(f"what member {rank} of the ring returned cannot be unpickled")
+        return _End(rank, True, "what it returned cannot be unpickled"), None, unreadable
     if error is not None:
+        error.add_note(f"raised by member {rank} of the ring")
         return _End(rank, True, f"it raised {type(error).__name__}: {error}"), None, error
     return _End(rank, False, "it has returned"), result, None
 
@@ -227,4 +231,7 @@ def _run(
             initializer(member, *initargs)
         member._news.send((func(member.rank, member.size), None))
     except Exception as error:  # also of a result that does not pickle
-        member._news.send((None, ExceptionWithTraceback(error, error.__traceback__)))
+        try:
+            member._news.send((None, ExceptionWithTraceback(error, error.__traceback__)))
+        except UnpicklableError:
+            member._news.send((None, FiberError(f"{type(error).__name__}: {error}")))

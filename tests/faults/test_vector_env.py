@@ -15,6 +15,7 @@ import pytest
 import fiber
 from faults.program import PATIENCE, Program, alive, wait_for
 from fiber.vector import VectorEnv, dispatcher
+from fiber.vector.failures import ATTEMPTS
 from vector_envs import Faulty
 
 GOOD = Faulty.GOOD
@@ -197,7 +198,7 @@ def test_one_that_kills_each_worker_is_given_up(vector_env: Make, tmp_path: Path
         pytest.raises(fiber.WorkerDied, match="the making of environments 0 to 1") as caught,
     ):
         env.step([Faulty.EXIT, GOOD, GOOD, GOOD])
-    assert len(warned) == dispatcher.ATTEMPTS
+    assert len(warned) == ATTEMPTS
     assert caught.value.exitcode == 3
 
 

@@ -16,6 +16,7 @@ from fiber._wire.arena import (
     Arena,
     Block,
     fill,
+    in_place,
     release,
 )
 
@@ -36,6 +37,38 @@ def test_a_block_is_used_again_once_its_reader_released_it(blocks: Arena) -> Non
     release(block.fd)
     assert blocks.claim(1000) is block
     blocks.settle(block, sent=False)
+
+
+def test_a_block_read_in_place_is_its_senders_again_once_nobody_looks_at_it(blocks: Arena) -> None:
+    block = blocks.claim(1000)
+    fill(block, [memoryview(b"content")], [DATA_OFFSET])
+    blocks.settle(block, sent=True)
+    memory = in_place(block.fd, 1000)
+    assert memory is not None
+    part = memory[DATA_OFFSET : DATA_OFFSET + 7]
+    del memory
+    if (child := os.fork()) == 0:
+        del part
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert part == b"content"
+    other = blocks.claim(1000)
+    assert other is not block, "its reader still looks at it"
+    blocks.settle(other, sent=True)
+    del part
+    assert blocks.claim(1000) is block
+    blocks.settle(block, sent=False)
+
+
+def test_only_what_its_sender_cannot_cut_is_read_in_place(blocks: Arena) -> None:
+    block = blocks.claim(1000)
+    with pytest.raises(PermissionError):
+        os.ftruncate(block.fd, 0)
+    blocks.settle(block, sent=False)
+    fd = os.memfd_create("a sender's own")
+    os.ftruncate(fd, 1000)
+    assert in_place(fd, 1000) is None
+    os.close(fd)
 
 
 def test_a_message_that_did_not_go_out_frees_its_block(blocks: Arena) -> None:

@@ -21,6 +21,7 @@ from fiber._hub.client import Unreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.remote import RemoteChannel, RemoteCounter
+from fiber._hub.tunnel import WINDOW
 from fiber.connection import Connection
 from fiber.errors import ConnectionClosed
 from hosts import PATIENCE, Far, Hosts, background, objects_kept
@@ -63,6 +64,29 @@ def test_large_messages_and_arrays_pass(far_pipe: tuple[Connection, Connection])
         for array, copy in zip(item["arrays"], got["arrays"], strict=True):
             assert (array == copy).all()
             assert copy.flags.writeable
+
+
+def test_what_is_sent_unconfirmed_keeps_its_place(far_pipe: tuple[Connection, Connection]) -> None:
+    here, there = far_pipe
+    there.send("first")
+    there._send_unconfirmed("second")
+    there._send_unconfirmed(np.zeros(3 * WINDOW, np.uint8))
+    sender = background(there.send, "last")
+    assert [here.recv() for _ in range(2)] == ["first", "second"]
+    assert here.recv().nbytes == 3 * WINDOW
+    assert here.recv() == "last"
+    sender.join()
+
+
+def test_the_next_one_says_that_what_was_sent_unconfirmed_was_not(
+    far_pipe: tuple[Connection, Connection],
+) -> None:
+    here, there = far_pipe
+    here.close()
+    for _ in range(2):
+        there._send_unconfirmed("nobody reads it")
+        with pytest.raises(BrokenPipeError):
+            there._send_unconfirmed("nor this")
 
 
 def test_poll(far_pipe: tuple[Connection, Connection]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import pickle
 import resource
@@ -91,6 +92,17 @@ def test_memory_used_again_does_not_change_what_was_received(pair: Pair) -> None
         packet.send(one, bytes([number]) * 200_000)
         received.append(packet.receive(other).payload)
     assert [bytes(payload[:1]) for payload in received] == [bytes([n]) for n in range(8)]
+
+
+def test_a_large_message_that_is_passed_on_stays_where_it_is(pair: Pair) -> None:
+    sender, receiver = pair
+    content = os.urandom(1 << 20)
+    for _ in range(3):
+        packet.send(sender, b"payload", [memoryview(content)])
+        message = packet.receive(receiver, passing=True)
+        (buffer,) = message.buffers
+        assert (message.payload, buffer) == (b"payload", content)
+        assert isinstance(buffer.obj, mmap.mmap)
 
 
 def test_messages_held_at_once_do_not_share_memory(pair: Pair) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -123,6 +124,7 @@ def test_what_a_member_raises_is_raised(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no such device") as caught:
         fiber.Ring(3, losing).run()
     assert "in lose_one" in str(caught.value.__cause__)
+    assert caught.value.__notes__ == ["raised by member 1 of the ring"]
     assert set(losing.heard().values()) == {"1 it raised ValueError: no such device"}
 
 
@@ -171,6 +173,37 @@ def test_who_has_returned_sends_no_more() -> None:
 def test_a_result_that_does_not_pickle() -> None:
     with pytest.raises(fiber.UnpicklableError):
         fiber.Ring(2, lambda rank, size: (n for n in range(3))).run()
+
+
+class Unreadable:
+    """Can be pickled, and not unpickled."""
+
+    def __reduce__(self) -> Any:
+        return int, ("no number",)
+
+
+def return_unreadable(rank: int, size: int) -> Any:
+    if rank == 1:
+        return Unreadable()
+    try:
+        fiber.ring.current().recv()
+    except MemberLost:
+        return "heard"
+
+
+def test_a_result_that_cannot_be_unpickled() -> None:
+    with pytest.raises(ValueError, match="no number") as caught:
+        fiber.Ring(2, return_unreadable).run()
+    assert caught.value.__notes__ == ["what member 1 of the ring returned cannot be unpickled"]
+
+
+def raise_a_lock(rank: int, size: int) -> None:
+    raise ValueError("no device", threading.Lock())
+
+
+def test_an_exception_that_does_not_pickle() -> None:
+    with pytest.raises(fiber.FiberError, match=r"ValueError: .*no device"):
+        fiber.Ring(1, raise_a_lock).run()
 
 
 def test_an_interrupt_ends_all(tmp_path: Path) -> None:

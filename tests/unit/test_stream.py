@@ -13,8 +13,10 @@ from fiber._transport.stream import (
     ACK_DELAY,
     BUDGET,
     HEARTBEAT,
+    LARGE,
     WINDOW,
     WINDOW_BYTES,
+    Datagram,
     Gap,
     ResumableStream,
 )
@@ -166,8 +168,12 @@ def test_a_break_at_any_step_loses_nothing(sizes: list[int], cuts: set[int], see
     network.check()
 
 
-def pair(now: float = 0.0) -> tuple[ResumableStream, ResumableStream]:
-    one, other = ResumableStream(now), ResumableStream(now)
+def joined(datagram: Datagram) -> bytes:
+    return datagram if isinstance(datagram, bytes) else b"".join(datagram)
+
+
+def pair(now: float = 0.0, *, budget: int = BUDGET) -> tuple[ResumableStream, ResumableStream]:
+    one, other = (ResumableStream(now, budget=budget) for _ in range(2))
     one.connected(0)
     other.connected(0)
     meet(one, other, now)
@@ -201,11 +207,33 @@ def test_frames_that_wait_travel_in_one_datagram() -> None:
     assert other.received(datagram, 0) == frames
 
 
+def test_a_frame_in_pieces_arrives_as_one_however_it_is_cut() -> None:
+    for sizes in ((0, 1, 0), (BUDGET_SMALL, 1), (1, 3 * BUDGET_SMALL, 0, 5), (BUDGET_SMALL - 4, 9)):
+        one, other = pair(budget=BUDGET_SMALL)
+        pieces = [random.Random(size).randbytes(size) for size in sizes]
+        one.send(*pieces)
+        one.send(b"after it")
+        frames = [f for datagram in one.outgoing(0) for f in other.received(joined(datagram), 0)]
+        assert frames == [b"".join(pieces), b"after it"]
+        assert one.statistics().queued_bytes == 0
+
+
+def test_a_large_piece_is_sent_from_where_it_is() -> None:
+    one, other = pair()
+    large = bytearray(LARGE)
+    one.send(b"head", large)
+    (datagram,) = one.outgoing(0)
+    large[-1] = 1  # so it is no copy that leaves
+    assert other.received(joined(datagram), 0) == [b"head" + large]
+    one.send(b"head", large[:-1])
+    assert isinstance(one.outgoing(0)[0], bytes), "small ones are put together at once"
+
+
 def test_the_window_bounds_what_is_under_way_in_bytes() -> None:
     one, other = pair()
     frame = bytes(2 * WINDOW_BYTES)
     one.send(frame)
-    first = one.outgoing(0)
+    first = [joined(datagram) for datagram in one.outgoing(0)]
     assert WINDOW_BYTES <= one.statistics().unacknowledged_bytes <= WINDOW_BYTES + BUDGET
     assert one.outgoing(0) == []
     acknowledgements = 0
@@ -215,7 +243,7 @@ def test_the_window_bounds_what_is_under_way_in_bytes() -> None:
             one.received(acknowledgement, 0)
             acknowledgements += 1
     assert acknowledgements == 4, "one for each quarter of the window"
-    second = one.outgoing(0)
+    second = [joined(datagram) for datagram in one.outgoing(0)]
     assert [f for datagram in second for f in other.received(datagram, 0)] == [frame]
 
 

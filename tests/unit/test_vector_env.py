@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import fiber.vector
 from fiber.vector import VectorEnv
 from fiber.vector.worker_process import WorkerProcess
-from vector_envs import Faulty, Sampling
+from vector_envs import Faulty, Noticing, Sampling
 
 MIXED = spaces.Dict(
     {
@@ -182,6 +182,11 @@ def test_workers_share_what_they_do_not_divide(vector_env: Make) -> None:
     pids = env.call("pid")
     assert [pids.count(pid) for pid in dict.fromkeys(pids)] == [1, 2, 2]
     assert len(set(vector_env([Faulty] * 2, num_workers=9).call("pid"))) == 2
+
+
+def test_many_environments_are_not_compared_with_each_other(vector_env: Make) -> None:
+    env = vector_env([Noticing] * 200, num_workers=1)
+    assert set(env.get_attr("looks")) == {200}
 
 
 def test_calls_and_attributes(vector_env: Make) -> None:

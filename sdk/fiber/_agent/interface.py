@@ -78,6 +78,8 @@ class ChildSpec:
     for an agent on the same host."""
     tasks: bool = False
     """Whether it is a pool worker, with a channel for tasks."""
+    passing: bool = False
+    """Whether what comes from there is passed on to another host (see ``packet.receive``)."""
     executable: str | None = None
     stdio: tuple[int, int] | None = field(default=None)
     """Descriptors for its stdout and stderr; None: those of the agent's process."""

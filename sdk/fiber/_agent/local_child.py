@@ -229,7 +229,7 @@ class LocalChild:
     def _hear(self) -> bool:
         assert self._ours is not None
         try:
-            message = packet.receive(self._ours)
+            message = packet.receive(self._ours, passing=self._spec.passing)
         except (BlockingIOError, EOFError):
             return False
         except TooManyOpenFiles as error:

@@ -56,7 +56,7 @@ class AgentService:
         self._transmit(message)
 
     def _transmit(self, message: messages.Message) -> None:
-        self._link.send(message.encode())
+        self._link.send(*messages.pieces(message))
 
     def busy(self) -> bool:
         """Whether the link is so far behind that output should wait."""
@@ -169,7 +169,8 @@ class _Observed:
         """Start it."""
         try:
             self._capture = Capture(loop, self._wrote, self._service.busy)
-            self._child = agent.child(replace(spec, stdio=self._capture.stdio), self)
+            spec = replace(spec, stdio=self._capture.stdio, passing=True)
+            self._child = agent.child(spec, self)
             self._child.start()
         except Exception as error:
             # Whatever keeps a child from starting here, the one who asked is the master.

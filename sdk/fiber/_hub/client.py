@@ -177,6 +177,8 @@ class HubStream:
         self._asked = 0
         """The number of the last request that has an answer."""
         self._unsettled: Op | None = None
+        self._begun: int | None = None
+        """The number of a request whose answer nobody has read."""
         self._end = "its hub is gone"
         self._sock, to_its_hub = _dial(home)
         try:
@@ -211,6 +213,21 @@ class HubStream:
             self.give_up(operation)
             raise
         self._unsettled = None
+        return reply
+
+    def begin(self, operation: Op, buffers: Sequence[memoryview]) -> None:
+        """Make a request and leave its answer for ``finish``."""
+        _refuse_on_loop()
+        number = self._next()
+        self._send(HEAD.pack(operation, number), buffers)
+        self._begun = number
+
+    def finish(self) -> Reply | None:
+        """The answer to what was begun; None if nothing was."""
+        if self._begun is None:
+            return None
+        reply = self._reply(self._begun, None)
+        self._begun = None
         return reply
 
     def give_up(self, operation: Op) -> None:

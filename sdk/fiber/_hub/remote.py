@@ -107,17 +107,30 @@ class RemoteChannel(RemoteObject):
         self._late: deque[Reply] = deque()
         # One; more once threads have asked for a descriptor at the same moment.
         self._watching: deque[HubStream] = deque()
+        self._unconfirmed: deque[HubStream] = deque()
         super().__init__(home, number, grant)
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message; returns when it can be received."""
-        try:
-            with self.stream() as stream:
-                reply = stream.ask(Op.SEND, buffers=[memoryview(payload), *buffers])
-        except Unreachable as error:
-            raise BrokenPipeError(str(error)) from error
-        if reply.status is Status.BROKEN:
-            raise BrokenPipeError("the other end is closed")
+        if self._unconfirmed:  # on streams of their own: they must not be overtaken
+            self.send_unconfirmed(payload, buffers)
+            self._confirm()
+            return
+        with _naming_the_end(), self.stream() as stream:
+            _check_sent(stream.ask(Op.SEND, buffers=[memoryview(payload), *buffers]))
+
+    def send_unconfirmed(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message and return at once.
+
+        The next one finds out first whether it could be sent, and raises what ``send`` would have.
+        """
+        with _naming_the_end(), self._take(self._unconfirmed) as stream:
+            _check_sent(stream.finish())
+            stream.begin(Op.SEND, [memoryview(payload), *buffers])
+
+    def _confirm(self) -> None:
+        with _naming_the_end(), self._take(self._unconfirmed) as stream:
+            _check_sent(stream.finish())
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """The same: a channel of another host takes a message when its hub has it."""
@@ -173,6 +186,7 @@ class RemoteChannel(RemoteObject):
         """Let go of this end."""
         super().close()
         _close_all(self._watching)
+        _close_all(self._unconfirmed)
 
     def _watch_again(self) -> None:
         """The descriptor says that there is something, and there is not."""
@@ -186,6 +200,7 @@ class RemoteChannel(RemoteObject):
     def _forked(self) -> None:
         super()._forked()
         self._watching.clear()
+        self._unconfirmed.clear()
 
     def _settled(self, operation: Op, reply: Reply) -> None:
         if reply.parts:
@@ -235,6 +250,19 @@ class RemoteCounter(RemoteObject):
     def _settled(self, operation: Op, reply: Reply) -> None:
         if operation is Op.TAKE:
             self.add(1)
+
+
+@contextmanager
+def _naming_the_end() -> Iterator[None]:
+    try:
+        yield
+    except Unreachable as error:
+        raise BrokenPipeError(str(error)) from error
+
+
+def _check_sent(reply: Reply | None) -> None:
+    if reply is not None and reply.status is Status.BROKEN:
+        raise BrokenPipeError("the other end is closed")
 
 
 def _close_all(streams: deque[HubStream]) -> None:

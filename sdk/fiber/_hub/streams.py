@@ -152,7 +152,7 @@ class SocketStream:
     def _read(self) -> None:
         for _ in range(_AT_ONCE):
             try:
-                message = packet.receive(self._sock, descriptors=True)
+                message = packet.receive(self._sock, descriptors=True, passing=True)
             except BlockingIOError:
                 return
             except (EOFError, ConnectionError):

@@ -27,10 +27,12 @@ from fiber._wire import messages
 from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
 from fiber._wire.packet import BytesLike, Message
 
-PIECE = 128 << 10
-"""More than packet.INLINE_LIMIT."""
+PIECE = 1 << 20
+"""More than packet.INLINE_LIMIT.  What is not larger arrives in one piece, and is not put together
+from several.
+"""
 
-WINDOW = 1 << 20
+WINDOW = 2 * PIECE
 
 _WHOLE, _FIRST, _MORE, _CREDIT = range(4)
 _KINDS = [bytes([kind]) for kind in range(4)]

@@ -22,6 +22,9 @@ class Channel(Protocol):
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message; BrokenPipeError when nobody can ever read it."""
 
+    def send_unconfirmed(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """The same without waiting for another host's answer: an error may come with the next."""
+
     def recv(self) -> Message:
         """The next message; ConnectionClosed when nobody can ever send one."""
 

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 from fiber._transport.handshake import Identity
-from fiber._transport.stream import HEARTBEAT, Frame, Statistics
+from fiber._transport.stream import HEARTBEAT, Datagram, Frame, Statistics
+from fiber._wire.messages import BytesLike
 
 
 class Keepalive(NamedTuple):
@@ -53,8 +54,11 @@ class Link(Protocol):
     def attach(self, observer: LinkObserver) -> None:
         """Whom to tell.  What arrives before waits for it."""
 
-    def send(self, frame: Frame) -> None:
-        """Send a frame as soon as there is room; dropped if the link has ended."""
+    def send(self, *frame: BytesLike) -> None:
+        """Send a frame as soon as there is room; dropped if the link has ended.
+
+        It may come in pieces.  Large ones are not copied, and must not change until they arrived.
+        """
 
     def close(
         self,
@@ -76,7 +80,7 @@ class Link(Protocol):
 class Wire(Protocol):
     """What a link puts its datagrams on: a connection, which keeps their order until it breaks."""
 
-    def put(self, datagram: bytes) -> None:
+    def put(self, datagram: Datagram) -> None:
         """Send it; never blocks and never raises."""
 
     def break_off(self) -> None:

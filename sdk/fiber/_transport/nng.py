@@ -33,9 +33,9 @@ from pynng import _nng
 
 from fiber._transport.link import SelectorEventLoop, Wire
 from fiber._transport.sealing import OVERHEAD, Opener, Sealer, Secrets
-from fiber._transport.stream import LARGEST, WINDOW
+from fiber._transport.stream import LARGEST, WINDOW, Datagram
 from fiber._transport.unix import naming_the_limit
-from fiber._wire.messages import BytesLike, ProtocolError
+from fiber._wire.messages import ProtocolError
 from fiber.errors import LinkError, TooManyOpenFiles
 
 _TURN = 64
@@ -91,17 +91,19 @@ class Connection:
         _live.add(self)
         loop.register(self._fd, self._readable)
 
-    def put(self, datagram: BytesLike) -> None:
+    def put(self, datagram: Datagram) -> None:
         """Send it, sealed; one that cannot be queued breaks the connection."""
         if self._closed:
             return
-        size = len(datagram) + OVERHEAD
+        # Pieces are put together at the last moment: in memory that the one before has just left.
+        data = datagram if isinstance(datagram, bytes) else b"".join(datagram)
+        size = len(data) + OVERHEAD
         message = self._message
         if _lib.nng_msg_alloc(message, size):
             self.break_off()
             return
         body = _ffi.buffer(_lib.nng_msg_body(message[0]), size)
-        self._sealer.seal_into(datagram, body)
+        self._sealer.seal_into(data, body)
         if _lib.nng_sendmsg(self._socket.socket, message[0], _lib.NNG_FLAG_NONBLOCK):
             _lib.nng_msg_free(message[0])
             self.break_off()

@@ -82,9 +82,9 @@ class ResumableLink:
         self._observer = observer
         self._loop.call_soon(self._hand_over)
 
-    def send(self, frame: Frame) -> None:
+    def send(self, *frame: BytesLike) -> None:
         """Send a frame as soon as there is room; dropped if the link has ended."""
-        self._loop.call_soon(self._send, frame)
+        self._loop.call_soon(self._send, *frame)
 
     def close(
         self,
@@ -190,9 +190,9 @@ class ResumableLink:
             self._observer = None
             observer.on_lost(self._lost)
 
-    def _send(self, frame: Frame) -> None:
+    def _send(self, *frame: BytesLike) -> None:
         if self._state is not _State.ENDED:
-            self._stream.send(frame)
+            self._stream.send(*frame)
             self._flush_soon()
 
     def _flush_soon(self) -> None:

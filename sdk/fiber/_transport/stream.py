@@ -24,15 +24,22 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 from fiber._wire.messages import BytesLike, ProtocolError
 
 Frame: TypeAlias = bytes | bytearray
 
+Datagram: TypeAlias = bytes | tuple[BytesLike, ...]
+"""As it leaves: in one piece, or in several that are sent one after the other."""
+
 WINDOW = 256
 WINDOW_BYTES = 4 << 20
 """What may be under way."""
+
+LARGE = 1 << 14
+"""Bytes from which on a piece of a frame is not copied: it stays where it is until it arrived."""
 
 BUDGET = 256 * 1024
 """Bytes of frames in a datagram: one is sealed while the one before it is sent."""
@@ -97,12 +104,14 @@ class ResumableStream:
         self._window_bytes = window_bytes
         self._budget = budget
         self._connected = False
-        self._queue: deque[Frame] = deque()
+        self._queue: deque[Sequence[BytesLike]] = deque()
+        """Frames, each in its pieces."""
+        self._rest: Sequence[BytesLike] = ()
+        """What has not left of the frame before those."""
         self._queued_bytes = 0
-        self._offset = 0
         self._sent = 0
         self._acknowledged = 0
-        self._unacknowledged: deque[bytes] = deque()
+        self._unacknowledged: deque[Datagram] = deque()
         """Datagrams from ``_acknowledged + 1`` to ``_sent``."""
         self._unacknowledged_bytes = 0
         self._repeat = False
@@ -120,7 +129,7 @@ class ResumableStream:
     @property
     def idle(self) -> bool:
         """Whether everything that was given to ``send`` is known to have arrived."""
-        return not self._queue and not self._unacknowledged
+        return not self._queue and not self._rest and not self._unacknowledged
 
     @property
     def arrived(self) -> int:
@@ -132,10 +141,13 @@ class ResumableStream:
         """Whether the peer has ever said anything."""
         return bool(self._counts["datagrams_received"])
 
-    def send(self, frame: Frame) -> None:
-        """Queue a frame; the next ``outgoing`` takes it along if there is room."""
+    def send(self, *frame: BytesLike) -> None:
+        """Queue a frame, in pieces; the next ``outgoing`` takes it along if there is room.
+
+        Pieces from LARGE bytes on must not change until ``idle``.
+        """
         self._queue.append(frame)
-        self._queued_bytes += len(frame)
+        self._queued_bytes += sum(map(len, frame))
         self._counts["frames_sent"] += 1
 
     def connected(self, arrived: int) -> None:
@@ -156,17 +168,17 @@ class ResumableStream:
         self._ack_due = None
         self._counts["breaks"] += 1
 
-    def outgoing(self, now: float) -> list[bytes]:
+    def outgoing(self, now: float) -> list[Datagram]:
         """What to put on the connection now."""
         if not self._connected:
             return []
-        datagrams: list[bytes] = []
+        datagrams: list[Datagram] = []
         if self._repeat:
             self._repeat = False
             datagrams += self._unacknowledged
             self._counts["resent"] += len(datagrams)
         fresh = len(datagrams)
-        while self._queue and self._has_room():
+        while self._may_send():
             datagrams.append(self._pack())
         if len(datagrams) > fresh:
             self._answered()
@@ -176,14 +188,12 @@ class ResumableStream:
         if datagrams:
             self._last_sent = now
             self._counts["datagrams_sent"] += len(datagrams)
-            self._counts["bytes_sent"] += sum(map(len, datagrams))
+            self._counts["bytes_sent"] += sum(map(_size, datagrams))
         return datagrams
 
     def wants_to_speak(self, now: float) -> bool:
         """Whether ``outgoing`` would have something."""
-        return self._connected and (
-            self._repeat or bool(self._queue and self._has_room()) or self._must_speak(now)
-        )
+        return self._connected and (self._repeat or self._may_send() or self._must_speak(now))
 
     def received(self, datagram: BytesLike, now: float) -> list[Frame]:
         """Take a datagram from the connection, and copy what is in it; the frames that it
@@ -239,7 +249,7 @@ class ResumableStream:
     def statistics(self) -> Statistics:
         """What it holds and has done."""
         return Statistics(
-            queued_frames=len(self._queue),
+            queued_frames=len(self._queue) + bool(self._rest),
             queued_bytes=self._queued_bytes,
             unacknowledged_datagrams=len(self._unacknowledged),
             unacknowledged_bytes=self._unacknowledged_bytes,
@@ -247,9 +257,10 @@ class ResumableStream:
             **self._counts,
         )
 
-    def _has_room(self) -> bool:
+    def _may_send(self) -> bool:
         return (
-            len(self._unacknowledged) < self._window
+            bool(self._rest or self._queue)
+            and len(self._unacknowledged) < self._window
             and self._unacknowledged_bytes < self._window_bytes
         )
 
@@ -262,41 +273,37 @@ class ResumableStream:
         self._speak_now = False
         self._unanswered = self._unanswered_bytes = 0
 
-    def _pack(self) -> bytes:
+    def _pack(self) -> Datagram:
         """Number and wrap as many queued frames as fit."""
-        flags = _CONTINUES if self._offset else 0
-        chunks: list[Frame | memoryview] = []
+        flags = _CONTINUES if self._rest else 0
+        pieces: list[BytesLike] = []
+        lengths: list[int] = []
         room = self._budget
-        while self._queue and room > 0:
-            frame = self._queue[0]
-            left = len(frame) - self._offset
-            whole = left <= room and not self._offset
-            chunk = frame if whole else memoryview(frame)[self._offset : self._offset + room]
-            chunks.append(chunk)
-            room -= len(chunk) + _LENGTH
-            self._queued_bytes -= len(chunk)
-            if len(chunk) < left:
-                self._offset += len(chunk)
+        while (self._rest or self._queue) and room > 0:
+            taken, self._rest = _split(self._rest or self._queue.popleft(), room)
+            pieces += taken
+            lengths.append(sum(map(len, taken)))
+            room -= lengths[-1] + _LENGTH
+            if self._rest:
                 flags |= _UNFINISHED
                 break
-            self._queue.popleft()
-            self._offset = 0
-        return self._number(flags, chunks)
+        self._queued_bytes -= sum(lengths)
+        return self._number(flags, lengths, pieces)
 
-    def _number(self, flags: int, chunks: list[Frame | memoryview]) -> bytes:
-        count = len(chunks)
+    def _number(self, flags: int, lengths: list[int], pieces: list[BytesLike]) -> Datagram:
+        count = len(lengths)
         self._sent += 1
         head = _HEADER.pack(DATA, flags, count, self._sent, self._received)
-        lengths = struct.pack(f"<{count}I", *map(len, chunks))
-        datagram = b"".join((head, lengths, *chunks))
+        whole = (head, struct.pack(f"<{count}I", *lengths), *pieces)
+        datagram = whole if max(map(len, pieces), default=0) >= LARGE else b"".join(whole)
         self._unacknowledged.append(datagram)
-        self._unacknowledged_bytes += len(datagram)
+        self._unacknowledged_bytes += _size(datagram)
         return datagram
 
     def _acknowledge(self, arrived: int) -> None:
         while self._acknowledged < arrived:
             self._acknowledged += 1
-            self._unacknowledged_bytes -= len(self._unacknowledged.popleft())
+            self._unacknowledged_bytes -= _size(self._unacknowledged.popleft())
 
     def _take(self, datagram: BytesLike, flags: int, count: int, now: float) -> list[Frame]:
         frames = self._unpack(datagram, flags, count)
@@ -332,3 +339,19 @@ class ResumableStream:
             self._partial = frame
             frames.pop()
         return frames
+
+
+def _split(
+    frame: Sequence[BytesLike], room: int
+) -> tuple[Sequence[BytesLike], Sequence[BytesLike]]:
+    """As much of a frame as there is room for, and the rest."""
+    for index, piece in enumerate(frame):
+        if len(piece) > room:
+            view = memoryview(piece)
+            return (*frame[:index], view[:room]), (view[room:], *frame[index + 1 :])
+        room -= len(piece)
+    return frame, ()
+
+
+def _size(datagram: Datagram) -> int:
+    return len(datagram) if isinstance(datagram, bytes) else sum(map(len, datagram))

@@ -123,6 +123,8 @@ class UnixChannel:
             poller.register(self._sock, select.POLLOUT)
             poller.poll()
 
+    send_unconfirmed = send
+
     def recv(self) -> Message:
         """The next message, ConnectionClosed at the end."""
         return packet.receive(self._sock)

@@ -2,13 +2,14 @@
 
 A fresh memfd costs a page fault for every 4 KiB written, several times the copy itself.  So a
 sender keeps a few memfds; their first byte says whether a reader still needs what is in them.  The
-reader copies the content out and clears the byte; a reader that dies leaves it set, and the block
-is forgotten when its turn comes.
+reader copies the content out, or uses it where it is, and then clears the byte; a reader that dies
+leaves it set, and the block is forgotten when its turn comes.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import mmap
 import os
 from collections import deque
@@ -40,8 +41,11 @@ class Block:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self._owner = opened(os.memfd_create, "fiber-message", os.MFD_CLOEXEC)
+        flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
+        self._owner = opened(os.memfd_create, "fiber-message", flags)
         self.fd = self._owner.fileno()
+        # Whoever reads it in place relies on that.
+        fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
         os.ftruncate(self.fd, mmap.PAGESIZE)
         self.flag = mmap.mmap(self.fd, mmap.PAGESIZE)
         self.flag[0] = _BUSY
@@ -114,3 +118,25 @@ def release(fd: int) -> None:
     """Tell the sender that the content of its block was copied out."""
     with contextlib.suppress(OSError):  # this process may write no file: RLIMIT_FSIZE is zero
         os.pwrite(fd, _CLEARED, 0)
+
+
+class _Lent(mmap.mmap):
+    """A sender's block as its reader has it: its sender's again once nobody looks at it."""
+
+    reader = 0
+    """A process that the reader forks has no say."""
+
+    def __del__(self) -> None:
+        if self.reader == os.getpid():
+            self[0] = _FREE
+
+
+def in_place(fd: int, size: int) -> memoryview | None:
+    """A sender's block, not copied; None if the sender could make it shorter, since to read beyond
+    the end of a file is the end of this process.
+    """
+    if not fcntl.fcntl(fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
+        return None
+    lent = _Lent(fd, size)
+    lent.reader = os.getpid()
+    return memoryview(lent)

@@ -14,6 +14,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
+from fiber._wire.packet import INLINE_LIMIT
 from fiber.errors import FiberError
 
 PROTOCOL = 1
@@ -125,7 +126,11 @@ class FromChild(NamedTuple):
 
     def encode(self) -> bytes:
         """The frame."""
-        return _packet(_NUMBER.pack(PROTOCOL, _FROM_CHILD, self.child), self.payload, self.buffers)
+        return b"".join(self.pieces())
+
+    def pieces(self) -> Sequence[BytesLike]:
+        """The frame, of which the buffers and a large payload are not copied."""
+        return _pieces(_NUMBER.pack(PROTOCOL, _FROM_CHILD, self.child), self.payload, self.buffers)
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -211,8 +216,12 @@ class TunnelData(NamedTuple):
 
     def encode(self) -> bytes:
         """The frame."""
+        return b"".join(self.pieces())
+
+    def pieces(self) -> Sequence[BytesLike]:
+        """The frame, of which the buffers and a large payload are not copied."""
         head = _NUMBER.pack(PROTOCOL, _TUNNEL_DATA, self.tunnel)
-        return _packet(head, self.payload, self.buffers)
+        return _pieces(head, self.payload, self.buffers)
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -317,12 +326,24 @@ _COUNT = struct.Struct("<I")
 _NO_BUFFERS = _COUNT.pack(0)
 
 
+def pieces(message: Message) -> Sequence[BytesLike]:
+    """A message's frame, in pieces if it has large ones: these are not copied."""
+    if isinstance(message, FromChild | TunnelData):
+        return message.pieces()
+    return (message.encode(),)
+
+
 def _packet(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> bytes:
-    if not buffers:
-        return b"".join((head, _NO_BUFFERS, payload))
-    sizes = [memoryview(buffer).nbytes for buffer in buffers]
-    table = struct.pack(f"<I{len(sizes)}Q", len(sizes), *sizes)
-    return b"".join((head, table, payload, *buffers))
+    return b"".join(_pieces(head, payload, buffers))
+
+
+def _pieces(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> tuple[BytesLike, ...]:
+    views = [memoryview(buffer).cast("B") for buffer in buffers]
+    sizes = [view.nbytes for view in views]
+    table = struct.pack(f"<I{len(sizes)}Q", len(sizes), *sizes) if sizes else _NO_BUFFERS
+    if memoryview(payload).nbytes > INLINE_LIMIT:
+        return (head + table, payload, *views)
+    return (b"".join((head, table, payload)), *views)  # a small payload may be borrowed
 
 
 def _read_packet(view: memoryview, at: int) -> tuple[memoryview, list[memoryview]]:

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from itertools import starmap
 from typing import Any, TypeAlias
 
-from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, release
+from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, in_place, release
 from fiber._wire.descriptor import own
 from fiber.errors import ConnectionClosed, FileTooLarge, TooManyOpenFiles
 
@@ -268,12 +268,15 @@ def receive_object(sock: socket.socket) -> Any:
     return loads(_receive_parts(buffer, received))
 
 
-def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True) -> Message:
+def receive(
+    sock: socket.socket, *, descriptors: bool = False, wait: bool = True, passing: bool = False
+) -> Message:
     """Receive one packet; ConnectionClosed when no one can ever send again.
 
     Without ``wait``, or on a non-blocking socket, BlockingIOError says that there is none.
     ``descriptors`` makes room for those that the sender attached; without it only the memfd of a
-    large message is taken.
+    large message is taken.  ``passing``: it is passed on soon, so that a large one may stay where
+    its sender wrote it, who has no other use for that memory until then.
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
@@ -287,7 +290,7 @@ def receive(sock: socket.socket, *, descriptors: bool = False, wait: bool = True
     size = received[0][0]
     if size and not buffer.data[0]:
         return Message(buffer.view[1:size], [], [], buffer)
-    return _receive_parts(buffer, received)
+    return _receive_parts(buffer, received, passing=passing)
 
 
 def _recvmsg(sock: socket.socket, data: bytearray, call: _Call) -> _Received:
@@ -320,7 +323,7 @@ def _rights(ancillary: _Ancillary) -> list[int]:
     ]
 
 
-def _receive_parts(buffer: _Buffer, received: _Received) -> Message:
+def _receive_parts(buffer: _Buffer, received: _Received, *, passing: bool = False) -> Message:
     (size, ancillary, flags, _), *memory = received
     view = buffer.view
     lent = Message(view[:0], [], _rights(ancillary)[len(memory) :], buffer)
@@ -337,7 +340,7 @@ def _receive_parts(buffer: _Buffer, received: _Received) -> Message:
             return _inline_parts(view[offset:size], sizes, lent)
         if not memory:
             raise ValueError("a large message without its memory")
-        return _memory_parts(sizes, lent, memory[0].fileno())
+        return _memory_parts(sizes, lent, memory[0].fileno(), passing=passing)
     except BaseException:
         lent.close_descriptors()
         lent.release()
@@ -353,13 +356,15 @@ def _inline_parts(body: memoryview, sizes: list[int], lent: Message) -> Message:
     return lent
 
 
-def _memory_parts(sizes: list[int], lent: Message, memory: int) -> Message:
+def _memory_parts(sizes: list[int], lent: Message, memory: int, *, passing: bool) -> Message:
     """Take the parts out of the sender's block: by a copy that frees it, or for good if it is
-    large.
+    large; or lend them, to who is ``passing`` them on.
     """
     offsets, total = _offsets(sizes)
-    if total > RETAINED_LIMIT:
+    mapped = in_place(memory, total) if passing else None
+    if total > RETAINED_LIMIT and mapped is None:
         mapped = memoryview(mmap.mmap(memory, total))
+    if mapped is not None:
         views = [mapped[at : at + size] for at, size in zip(offsets, sizes, strict=True)]
     else:
         views = [_copy_out(memory, at, size) for at, size in zip(offsets, sizes, strict=True)]

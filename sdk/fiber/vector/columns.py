@@ -71,7 +71,9 @@ class ArrayColumn:
         if not hasattr(value, "shape"):
             value = np.asarray(value)
         if value.shape != self._shape:
-            raise ValueError(f"its shape is {value.shape}, and that of its space {self._shape}")
+            raise ValueError(
+                f"an observation has the shape {value.shape}, where its space has {self._shape}"
+            )
         if self._views is None:
             self._array[row] = value
         else:

@@ -12,14 +12,11 @@ from typing import Any, NamedTuple
 from fiber import reduction
 from fiber._transport.loop import DOZE
 from fiber.vector.arrays import Shape, SharedMemory, StepArrays
-from fiber.vector.failures import Failure
+from fiber.vector.failures import ATTEMPTS, Failure
 from fiber.vector.slot import Note
 from fiber.vector.worker import Answer, Begin, Hello, Results
 from fiber.vector.worker_process import Pending, WorkerProcess
-from fiber.vector.worker_set import Ended, WorkerSet
-
-ATTEMPTS = 3
-"""How often in a row a worker may die before it has answered anything."""
+from fiber.vector.worker_set import Ended, Unreadable, WorkerSet
 
 GRACE = 5.0
 """Seconds beyond what its environments may take, after which a worker is taken for stuck."""
@@ -144,9 +141,10 @@ class Dispatcher:
 
     def busy(self, numbers: Iterable[int]) -> int | None:
         """The first of these of which ``under_way`` is true; None if there is none."""
+        ready = set(self._ready)
         for number in numbers:
             worker = self._worker_of[number]
-            if number - worker.setup.first in worker.pending or number in self._ready:
+            if number - worker.setup.first in worker.pending or number in ready:
                 return number
         return None
 
@@ -247,8 +245,11 @@ class Dispatcher:
                     self._stand_in(worker)
             case Failure():
                 self._lose(worker, self._told(worker, message)[1])
+            case Unreadable():
+                self._blame(worker, message.error)
             case Answer() | Results():
-                worker.deaths = 0
+                if not _only_reports_losses(message):
+                    worker.deaths = 0
                 if message.generation == self._generation:
                     self._failures += [self._told(worker, each) for each in message.failures]
                     if isinstance(message, Answer):
@@ -265,15 +266,27 @@ class Dispatcher:
         else:
             worker.arrays.unpack(rows, answer.packed)
             for row in rows:
-                del pending[row]
-                self._ready.append(first + row)
+                if pending.pop(row, None):  # else it was blamed for what could not be read
+                    self._ready.append(first + row)
         for failure in answer.failures:
-            del pending[failure.row]
+            pending.pop(failure.row, None)
         for note in answer.notes:
             self._notes[first + note.row] = note
             if note.lost not in (None, worker.lost):
                 self._warn(f"environment {first + note.row} made anew: {note.lost}")
         self._set_deadline(worker)
+
+    def _blame(self, worker: WorkerProcess, error: Exception) -> None:
+        """An answer is here and cannot be unpickled: nobody knows of which environments it was."""
+        whose = f"{worker.whose()}, of worker {worker.name!r},"
+        error.add_note(f"an answer of {whose} cannot be unpickled")
+        if worker.hello is None:
+            self._lose(worker, error)
+            return
+        worker.results = []
+        worker.pending.clear()
+        worker.deadline = None
+        self._failures.append((worker.setup.first, error))
 
     def _told(self, worker: WorkerProcess, failure: Failure) -> tuple[int, Exception]:
         number = worker.setup.first + failure.row
@@ -358,6 +371,13 @@ class Dispatcher:
                 worker.deadline = None
                 worker.stuck = True
                 worker.process.kill()
+
+
+def _only_reports_losses(message: Answer | Results) -> bool:
+    """Whether its environments have done nothing but say that their episodes were lost."""
+    if not isinstance(message, Answer) or message.rows is None:
+        return False
+    return all(note.lost for note in message.notes) and len(message.notes) == len(message.rows)
 
 
 class _Group(NamedTuple):

@@ -10,6 +10,9 @@ from typing import NamedTuple
 from fiber import reduction
 from fiber.errors import FiberError
 
+ATTEMPTS = 3
+"""How often in a row what fails is made anew before it has done anything."""
+
 
 class Failure(NamedTuple):
     """What one environment raised."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 from gymnasium import Env, Wrapper
@@ -64,7 +64,7 @@ class Slot:
         arrays.put(self.row, observation, 0.0, False, False)
         lost, self._lost = self._lost, None
         self._over = False
-        return Note(self.row, info, lost=lost) if info or lost else None
+        return self._note(info, lost=lost) if info or lost else None
 
     def call(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
         """What a method of the environment returns, or the value of an attribute."""
@@ -94,6 +94,10 @@ class Slot:
             env = env.env
         return isinstance(env, wrapper_class)
 
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
     def lose(self, why: str) -> None:
         """Its episode cannot go on."""
         self._lost = why
@@ -116,7 +120,7 @@ class Slot:
             observation, reward, terminated, truncated, info = self.env.step(action)
             self._over = bool(terminated or truncated)
             arrays.put(self.row, observation, reward, terminated, truncated)
-        return Note(self.row, info) if info else None
+        return self._note(info) if info else None
 
     def _step_and_reset(self, action: Any, arrays: StepArrays) -> Note | None:
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -125,14 +129,14 @@ class Slot:
             final = Final(observation, info)
             observation, info = self.env.reset()
         arrays.put(self.row, observation, reward, terminated, truncated)
-        return Note(self.row, info, final) if final or info else None
+        return self._note(info, final) if final or info else None
 
     def _step_only(self, action: Any, arrays: StepArrays) -> Note | None:
         assert not self._over, "its episode has ended, and autoreset is disabled: reset it first"
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._over = bool(terminated or truncated)
         arrays.put(self.row, observation, reward, terminated, truncated)
-        return Note(self.row, info) if info else None
+        return self._note(info) if info else None
 
     def _truncate(self, arrays: StepArrays) -> Note:
         """The end of an episode whose environment is gone: where it was seen last."""
@@ -145,4 +149,11 @@ class Slot:
             self._over = True
         arrays.put(self.row, observation, 0.0, False, True)
         self._lost = None
+        return self._note(info, final, lost)
+
+    def _note(
+        self, info: dict[str, Any], final: Final | None = None, lost: str | None = None
+    ) -> Note:
+        if not isinstance(info, Mapping):
+            raise TypeError(f"an info is a dictionary, not {info!r}")
         return Note(self.row, info, final, lost)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -34,6 +35,7 @@ class SubEnvironments:
         on_error: str,
         timeout: float | None,
     ) -> None:
+        self._owner = os.getpid()
         if not env_fns:
             raise ValueError("a vector environment has at least one environment: env_fns is empty")
         if on_error not in ("raise", "restart"):
@@ -104,7 +106,16 @@ class SubEnvironments:
 
     def close(self, timeout: float | None) -> None:
         """End the workers; kill those that have not ended when ``timeout`` is over."""
-        self.dispatcher.close(timeout)
+        if os.getpid() == self._owner:  # else nothing of the workers is here to end
+            self.dispatcher.close(timeout)
+
+    def check_owner(self) -> None:
+        """RuntimeError in another process than that which made them."""
+        if os.getpid() != self._owner:
+            raise RuntimeError(
+                f"this vector environment belongs to process {self._owner}: a copy of it that came "
+                "here by a fork has no workers; make one in this process"
+            )
 
 
 def _divided(count: int, parts: int) -> Iterator[slice]:

@@ -118,8 +118,8 @@ class VecEnv(vec_env.VecEnv):
     def close(self) -> None:
         """Close the environments and end their processes."""
         if not self.closed:
-            self.closed = True
             self._sub_environments.close(None)
+            self.closed = True  # now: Ctrl-C may have come before
 
     def __del__(self) -> None:
         if not getattr(self, "closed", True):
@@ -190,6 +190,7 @@ class VecEnv(vec_env.VecEnv):
     def _check_open(self) -> None:
         if self.closed:
             raise ClosedEnvironmentError(f"this {type(self).__name__} is closed")
+        self._sub_environments.check_owner()
 
 
 def _info(note: Note, info: dict[str, Any]) -> dict[str, Any]:

@@ -50,8 +50,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
       after any end of an episode.  By default the error is raised: it is what the environment
       raised, ``WorkerDied`` or ``multiprocessing.TimeoutError``, and names the environment and its
       worker.
-    * ``timeout``: seconds that a step or reset of one environment may take.  It is kept by an alarm
-      in the worker (SIGALRM), which ends also native code that keeps the interpreter.
+    * ``timeout``: seconds that the making, a step or a reset of one environment may take.  It is
+      kept by an alarm in the worker (SIGALRM); a worker whose native code does not return to the
+      interpreter is killed a little later.
     """
 
     def __init__(
@@ -295,14 +296,14 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         if numbers is not None:
             batch = gymnasium.vector.VectorEnv()
             batch.num_envs = len(numbers)
+        order = range(self.num_envs) if numbers is None else numbers
+        rows = {number: row for row, number in enumerate(order)}
         for number, note in notes:
-            row = number if numbers is None else numbers.index(number)
-            if note.final is not None:
-                ending = {"final_obs": note.final.observation, "final_info": note.final.info}
-                infos = batch._add_info(infos, ending, row)
-            if note.lost is not None:
-                infos = batch._add_info(infos, {"restarted": note.lost}, row)
-            infos = batch._add_info(infos, note.info, row)
+            try:
+                infos = _with_note(batch, infos, note, rows[number])
+            except Exception as error:  # infos of one name and different types
+                error.add_note(f"an info of {self._dispatcher.name(number)}")
+                raise
         return infos
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
@@ -340,6 +341,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def _check_running(self) -> None:
         if self.closed:
             raise ClosedEnvironmentError(f"this {type(self).__name__} is closed")
+        self._sub_environments.check_owner()
 
     # What these two say is Gymnasium's interface: its tests look for the words.
 
@@ -389,6 +391,18 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def _give_up(self) -> None:
         self._dispatcher.abandon()
         self._state = AsyncState.DEFAULT
+
+
+def _with_note(
+    batch: gymnasium.vector.VectorEnv[Any, Any, Any], infos: dict[str, Any], note: Note, row: int
+) -> dict[str, Any]:
+    """The infos of a batch with those of one more environment, in its row."""
+    if note.final is not None:
+        ending = {"final_obs": note.final.observation, "final_info": note.final.info}
+        infos = batch._add_info(infos, ending, row)
+    if note.lost is not None:
+        infos = batch._add_info(infos, {"restarted": note.lost}, row)
+    return batch._add_info(infos, note.info, row)
 
 
 def _without_mask(

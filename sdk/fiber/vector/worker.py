@@ -18,7 +18,7 @@ from fiber._hub import client
 from fiber.connection import Connection
 from fiber.errors import UnpicklableError
 from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays
-from fiber.vector.failures import Failure, summary
+from fiber.vector.failures import ATTEMPTS, Failure, summary
 from fiber.vector.slot import MakeEnv, Note, Slot
 from fiber.vector.time_limit import TimeLimit
 
@@ -41,7 +41,7 @@ class Setup(NamedTuple):
     restart: bool
     """Whether an environment that raises is made anew."""
     timeout: float | None
-    """Seconds for a step or reset of one environment."""
+    """Seconds for the making, a step or a reset of one environment."""
 
 
 class Hello(NamedTuple):
@@ -90,20 +90,38 @@ def serve(connection: Connection, setup: Setup) -> None:
     """The target of a worker process."""
     slots: list[Slot] = []
     try:
-        for row, make in enumerate(setup.makes):
-            try:
-                slots.append(Slot(row, make, setup.autoreset))
-                _check_that_it_is_new(slots)
-            except Exception as error:
-                connection.send(Failure.of(row, "the making", error))
-                return
-        connection.send(_hello(slots))
-        Worker(connection, setup, slots, connection.recv()).run()
+        if _make_all(connection, setup, slots):
+            Worker(connection, setup, slots, connection.recv()).run()
     except (EOFError, BrokenPipeError):
         pass  # whoever wanted them stepped is gone, or has closed them
     finally:
-        for slot in slots:
-            slot.env.close()
+        with contextlib.ExitStack() as ends:  # all are closed, whatever one of them raises
+            for slot in reversed(slots):
+                ends.callback(slot.close)
+
+
+def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
+    """Make the environments and say hello; False if one could not be made."""
+    limit = _limit(setup)
+    made: set[int] = set()
+    spaces: list[tuple[Any, Any]] = []
+    for row, make in enumerate(setup.makes):
+        try:
+            with limit:
+                slots.append(Slot(row, make, setup.autoreset))
+                _check_that_it_is_new(slots[-1], made)
+                spaces.append((slots[row].env.observation_space, slots[row].env.action_space))
+        except Exception as error:
+            connection.send(Failure.of(row, "the making", error))
+            return False
+    first = slots[0].env
+    try:
+        connection.send(Hello(client.host(), dict(first.metadata), first.render_mode, spaces))
+    except UnpicklableError as error:
+        row = next((row for row, pair in enumerate(spaces) if not _pickles(pair)), 0)
+        connection.send(Failure.of(row, "spaces or metadata that cannot be pickled", error))
+        return False
+    return True
 
 
 class Worker:
@@ -118,9 +136,9 @@ class Worker:
         self._all = range(len(slots))
         self._took = [0.0] * len(slots)
         """Seconds that a step of each environment takes, if it is slow: slowly forgotten."""
-        self._limit: contextlib.AbstractContextManager[None] = (
-            contextlib.nullcontext() if setup.timeout is None else TimeLimit(setup.timeout)
-        )
+        self._losses: dict[int, int] = {}
+        """How often in a row an environment was made anew and has done nothing."""
+        self._limit = _limit(setup)  # after the making, which may have set an alarm of its own
         self._shared = begin.memory is not None
         if begin.memory is None:
             self._arrays = StepArrays.private(begin.shape)
@@ -144,6 +162,10 @@ class Worker:
         while True:
             operation, *arguments = self._connection.recv()
             self._operations[operation](*arguments)
+
+    def _tell(self, message: Answer | Results) -> None:
+        # That it has arrived is known when the next command comes.
+        self._connection._send_unconfirmed(message)
 
     # Operations
 
@@ -189,16 +211,19 @@ class Worker:
     ) -> None:
         """A method of each slot: the results are what it returns."""
         values, failures = [], []
+        worker, at_work = self._setup.worker, self._at_work
         for row, mine in zip(self._each(rows), arguments, strict=True):
+            at_work[worker] = row + 1
             try:
                 values.append(getattr(self._slots[row], method)(*mine))
             except Exception as error:
                 failures.append(Failure.of(row, "a call", error))
+        at_work[worker] = 0
         try:
-            self._connection.send(Results(generation, values, failures))
+            self._tell(Results(generation, values, failures))
         except UnpicklableError as error:
             failures.append(Failure.of(self._each(rows)[0], "a call", error))
-            self._connection.send(Results(generation, [], failures))
+            self._tell(Results(generation, [], failures))
 
     # What they have in common
 
@@ -232,6 +257,8 @@ class Worker:
                 self._retry(row, operation, doing, error, report)
             else:
                 report.add(row, note)
+                if self._losses and (note is None or note.lost is None):
+                    self._losses.pop(row, None)
             now = clock()
             self._took[row] = max(now - began, MEMORY * self._took[row])
             if len(report.rows) == 1:
@@ -248,9 +275,12 @@ class Worker:
         report: _Report,
     ) -> None:
         """Try again with a new environment, if that is wished; else tell."""
-        if self._setup.restart:
+        losses = self._losses.get(row, 0) + 1
+        if self._setup.restart and losses <= ATTEMPTS:
+            self._losses[row] = losses
             try:
-                self._slots[row].make_anew(f"{doing} raised {summary(error)}")
+                with self._limit:
+                    self._slots[row].make_anew(f"{doing} raised {summary(error)}")
                 with self._limit:
                     note = operation(row)
             except Exception as again:
@@ -263,10 +293,10 @@ class Worker:
 
     def _send(self, report: _Report, *, whole: bool) -> None:
         try:
-            self._connection.send(report.answer(self._arrays, whole=whole, shared=self._shared))
+            self._tell(report.answer(self._arrays, whole=whole, shared=self._shared))
         except UnpicklableError:
             self._blame(report)
-            self._connection.send(report.answer(self._arrays, whole=False, shared=self._shared))
+            self._tell(report.answer(self._arrays, whole=False, shared=self._shared))
 
     def _blame(self, report: _Report) -> None:
         """Some of it does not pickle: those environments have failed."""
@@ -310,16 +340,24 @@ class _Report:
         return Answer(self.generation, rows, packed, self.notes, self.failures)
 
 
-def _check_that_it_is_new(slots: Sequence[Slot]) -> None:
-    newest = slots[-1].env.unwrapped
-    if any(slot.env.unwrapped is newest for slot in slots[:-1]):
+def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
+    """``made``: the ids of the environments before it, which are all still there."""
+    newest = id(slot.env.unwrapped)
+    if newest in made:
         raise ValueError(
             "it is the environment that the function has made before: have it make a new one at "
             "every call (`lambda: gymnasium.make(...)` instead of `lambda: env`)"
         )
+    made.add(newest)
 
 
-def _hello(slots: Sequence[Slot]) -> Hello:
-    envs = [slot.env for slot in slots]
-    spaces = [(env.observation_space, env.action_space) for env in envs]
-    return Hello(client.host(), dict(envs[0].metadata), envs[0].render_mode, spaces)
+def _limit(setup: Setup) -> contextlib.AbstractContextManager[None]:
+    return contextlib.nullcontext() if setup.timeout is None else TimeLimit(setup.timeout)
+
+
+def _pickles(obj: object) -> bool:
+    try:
+        reduction.dumps(obj)
+    except Exception:
+        return False
+    return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from multiprocessing import TimeoutError as TookTooLong
 from typing import Any, NamedTuple
 
@@ -111,11 +112,12 @@ class WorkerProcess:
     def close(self, timeout: float | None) -> None:
         """Wait for its end; kill it when ``timeout`` is over."""
         self.connection.close()
-        self.process.join(timeout)
-        if self.process.exitcode is None:
-            self.process.kill()
-            self.process.join()
-        self.process.close()
+        with contextlib.suppress(ValueError):  # closed just before Ctrl-C
+            self.process.join(timeout)
+            if self.process.exitcode is None:
+                self.process.kill()
+                self.process.join()
+            self.process.close()
 
     def _check_pickling(self) -> None:
         for number, make in zip(self.numbers, self.setup.makes, strict=True):

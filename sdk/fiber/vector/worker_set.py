@@ -6,13 +6,19 @@ import select
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from fiber.vector.worker_process import WorkerProcess
 
 
 class Ended:
     """In place of a message: there will be no more from this process."""
+
+
+class Unreadable(NamedTuple):
+    """In place of a message that cannot be unpickled here."""
+
+    error: Exception
 
 
 class WorkerSet:
@@ -47,8 +53,8 @@ class WorkerSet:
     def drop(self, worker: WorkerProcess) -> None:
         """Let go of a process that has ended."""
         self._forget(worker)
-        self._started.remove(worker)
         worker.close(0)
+        self._started.remove(worker)
 
     def send(self, worker: WorkerProcess, data: bytes) -> None:
         """Send a pickled command; if the worker is gone, that is the next thing to be heard."""
@@ -67,7 +73,7 @@ class WorkerSet:
                 self._ended.append(worker)
             elif worker not in self._ended:  # else all that it said was heard already
                 try:
-                    heard.append((worker, worker.connection.recv()))
+                    heard.append((worker, _received(worker)))
                 except (EOFError, OSError):
                     self._ended.append(worker)
         while self._ended:
@@ -83,8 +89,9 @@ class WorkerSet:
             self._forget(worker)
             worker.connection.close()  # which they hear
         while self._started:
-            worker = self._started.pop()
+            worker = self._started[-1]  # until it is closed: Ctrl-C may come before
             worker.close(None if deadline is None else max(0.0, deadline - time.monotonic()))
+            self._started.pop()
         self._poller.close()
 
     def _forget(self, worker: WorkerProcess) -> bool:
@@ -96,12 +103,21 @@ class WorkerSet:
         return bool(descriptors)
 
 
+def _received(worker: WorkerProcess) -> Any:
+    try:
+        return worker.connection.recv()
+    except (EOFError, OSError):
+        raise
+    except Exception as error:
+        return Unreadable(error)
+
+
 def _rest(worker: WorkerProcess) -> list[Any]:
     """What a worker had said before it ended."""
     messages = []
     try:
         while worker.connection.poll():
-            messages.append(worker.connection.recv())
+            messages.append(_received(worker))
     except (EOFError, OSError):
         pass
     return messages
