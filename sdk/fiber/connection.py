@@ -106,6 +106,12 @@ class Connection:
         except ConnectionClosed as error:
             raise self._explained(error) from None
 
+    def _recv_passing(self) -> Any:
+        """``recv`` of what is copied or let go of soon: large arrays may stay in shared memory."""
+        if self._channel is None:
+            raise self._misuse()
+        return self._channel.recv_object(passing=True)
+
     def recv_bytes(self, maxlength: int | None = None) -> bytes:
         """The next message as bytes; OSError, and the connection closed, if it is longer."""
         if maxlength is not None and maxlength < 0:

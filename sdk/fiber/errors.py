@@ -355,10 +355,16 @@ def _advice(exitcode: int | None, reason: str) -> str:
         )
     if exitcode < 0:
         return "find out who sends this signal to the program's processes."
-    return (
+    ended_itself = (
         "the task ended its process itself: by os._exit(), or by native code. "
         "Let it return, or raise an exception, instead."
     )
+    if exitcode == 1:  # also Python's own, of what nobody caught before the task began
+        return (
+            "if its last output tells of an error, mend that; a module that is missing in a pod "
+            f"belongs into its image. Else {ended_itself}"
+        )
+    return ended_itself
 
 
 def _block(title: str, lines: Sequence[str]) -> str:

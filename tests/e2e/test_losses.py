@@ -68,19 +68,36 @@ def test_environments_whose_pod_is_deleted_are_an_error(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("on_error", ["raise", "restart"])
-def test_an_environment_that_needs_too_much_memory_is_told_so(
-    on_error: str, programs: Programs
-) -> None:
-    program = programs.start("outside", "environments.py", "--swell", "--on-error", on_error)
+def test_an_environment_that_needs_too_much_memory_is_told_so(programs: Programs) -> None:
+    program = programs.start("outside", "environments.py", "--accident", "swell")
     sent(program)
-    if on_error == "raise":
-        said = [program.says("lost", seconds=VERDICT)["text"]]
-    else:
-        said = [*program.says("received", seconds=VERDICT)["restarted"].values()]
-    for text in said:
-        assert "OOMKilled" in text
-        assert "192Mi" in text
+    text = program.says("lost", seconds=VERDICT)["text"]
+    assert "OOMKilled" in text
+    assert "192Mi" in text
+    program.ends()
+    leaves_nothing(program)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("swell",), ("OOMKilled", "192Mi")),
+        (("crash",), ("SIGSEGV", "environments 2 to 3")),
+        (("hang", "--timeout", 2), ("took longer than 2 s", "environments 2 to 3")),
+    ],
+    ids=["swell", "crash", "hang"],
+)
+def test_environments_that_end_their_worker_are_made_anew(
+    arguments: tuple[object, ...], words: tuple[str, ...], programs: Programs
+) -> None:
+    restart = ("--on-error", "restart", "--accident")
+    program = programs.start("outside", "environments.py", *restart, *arguments)
+    sent(program)
+    received = program.says("received", seconds=VERDICT)
+    assert received["truncated"] == {"2": True, "3": True}
+    assert all(word in told for told in received["restarted"].values() for word in words), received
+    program.says("goes on")
     program.ends()
     leaves_nothing(program)
 

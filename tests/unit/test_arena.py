@@ -11,6 +11,7 @@ import pytest
 from fiber._wire import arena
 from fiber._wire.arena import (
     DATA_OFFSET,
+    LENT_BLOCKS,
     RETAINED_BLOCKS,
     RETAINED_LIMIT,
     Arena,
@@ -60,6 +61,20 @@ def test_a_block_read_in_place_is_its_senders_again_once_nobody_looks_at_it(bloc
     blocks.settle(block, sent=False)
 
 
+def test_only_so_many_blocks_are_read_in_place(blocks: Arena) -> None:
+    block = blocks.claim(1000)
+    read = [in_place(block.fd, 1000) for _ in range(LENT_BLOCKS)]
+    assert all(memory is not None for memory in read)
+    assert in_place(block.fd, 1000) is None
+    read.pop()
+    with pytest.raises(ValueError, match="greater than file size"):
+        in_place(block.fd, 1 << 20)
+    read.append(in_place(block.fd, 1000))
+    assert read[-1] is not None
+    read.clear()
+    blocks.settle(block, sent=False)
+
+
 def test_only_what_its_sender_cannot_cut_is_read_in_place(blocks: Arena) -> None:
     block = blocks.claim(1000)
     with pytest.raises(PermissionError):
@@ -69,6 +84,8 @@ def test_only_what_its_sender_cannot_cut_is_read_in_place(blocks: Arena) -> None
     os.ftruncate(fd, 1000)
     assert in_place(fd, 1000) is None
     os.close(fd)
+    with open(os.path.abspath(__file__), "rb") as file:
+        assert in_place(file.fileno(), 1000) is None
 
 
 def test_a_message_that_did_not_go_out_frees_its_block(blocks: Arena) -> None:

@@ -20,6 +20,7 @@ from benchmarks import (  # noqa: E402
     coldstart,
     contenders,
     latency,
+    link_floor,
     machine,
     processes,
     report,
@@ -254,6 +255,12 @@ def test_what_was_taken_back_was_run_before() -> None:
     child.recall()
     loop.run()
     assert (heard.words[2][0], heard.words[3]) == (9, [])
+
+
+def test_the_floor_of_a_link_is_measured() -> None:
+    floor = link_floor.measure(link_floor.PIECE + 1, rounds=2)
+    assert floor.keys() == {"one copy", "seal", "carry", "open"}
+    assert min(floor.values()) > 0
 
 
 def test_an_order_survives_its_line() -> None:

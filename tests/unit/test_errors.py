@@ -133,6 +133,7 @@ def test_worker_died_keeps_its_facts() -> None:
         (-signal.SIGSEGV, "PYTHONFAULTHANDLER=1"),
         (-signal.SIGTERM, "who sends this signal"),
         (0, "os._exit()"),
+        (1, "a module that is missing in a pod"),
         (3, "os._exit()"),
         (None, "not known"),
     ],

@@ -12,6 +12,7 @@ from typing import NoReturn
 
 from fiber import config
 from fiber._agent.agent import Agent
+from fiber._agent.allocator import keep_memory
 from fiber._agent.service import AgentService
 from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
@@ -232,6 +233,7 @@ def _required(variable: str) -> str:
 
 def main() -> int:
     """Run one agent to its end; the exit status."""
+    keep_memory()
     try:
         return Main().run()
     except (FiberError, AuthenticationError) as error:

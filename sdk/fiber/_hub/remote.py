@@ -146,7 +146,7 @@ class RemoteChannel(RemoteObject):
         assert message is not None
         return message
 
-    def recv_object(self) -> Any:
+    def recv_object(self, *, passing: bool = False) -> Any:
         """The next message, unpickled."""
         return packet.loads(self.recv())
 

@@ -28,8 +28,8 @@ class Channel(Protocol):
     def recv(self) -> Message:
         """The next message; ConnectionClosed when nobody can ever send one."""
 
-    def recv_object(self) -> Any:
-        """The same, unpickled."""
+    def recv_object(self, *, passing: bool = False) -> Any:
+        """The same, unpickled.  ``passing``: what is large in it is soon copied or let go of."""
 
     def try_recv(self) -> Message | None:
         """The next message if one is there."""

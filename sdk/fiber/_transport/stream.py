@@ -41,7 +41,7 @@ WINDOW_BYTES = 4 << 20
 LARGE = 1 << 14
 """Bytes from which on a piece of a frame is not copied: it stays where it is until it arrived."""
 
-BUDGET = 256 * 1024
+BUDGET = 512 * 1024
 """Bytes of frames in a datagram: one is sealed while the one before it is sent."""
 
 ACK_DELAY = 0.02

@@ -129,10 +129,12 @@ class UnixChannel:
         """The next message, ConnectionClosed at the end."""
         return packet.receive(self._sock)
 
-    def recv_object(self) -> Any:
+    def recv_object(self, *, passing: bool = False) -> Any:
         """The next message, unpickled; ConnectionClosed at the end."""
         message = self._looked_for()
-        return packet.receive_object(self._sock) if message is None else packet.loads(message)
+        if message is None:
+            return packet.receive_object(self._sock, passing=passing)
+        return packet.loads(message)
 
     def recv_answer(self) -> Message:
         """As ``recv``, for what is probably there soon."""

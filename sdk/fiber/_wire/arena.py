@@ -129,14 +129,31 @@ class _Lent(mmap.mmap):
     def __del__(self) -> None:
         if self.reader == os.getpid():
             self[0] = _FREE
+            _leave_to_lend.append(None)
+
+
+LENT_BLOCKS = 64
+"""Blocks of others that a process reads in place at a time; each holds a descriptor."""
+
+_leave_to_lend = deque([None] * LENT_BLOCKS)
 
 
 def in_place(fd: int, size: int) -> memoryview | None:
-    """A sender's block, not copied; None if the sender could make it shorter, since to read beyond
-    the end of a file is the end of this process.
+    """A sender's block, not copied; None if that has to be copied.
+
+    That is so where the sender could make it shorter, since to read beyond the end of a file is the
+    end of this process, and where LENT_BLOCKS are being read.
     """
-    if not fcntl.fcntl(fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
+    try:
+        if not fcntl.fcntl(fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
+            return None
+        _leave_to_lend.pop()
+    except (OSError, IndexError):  # no memfd at all, or enough of them
         return None
-    lent = _Lent(fd, size)
+    try:
+        lent = _Lent(fd, size)
+    except BaseException:
+        _leave_to_lend.append(None)
+        raise
     lent.reader = os.getpid()
     return memoryview(lent)

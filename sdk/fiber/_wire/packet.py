@@ -251,7 +251,7 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
     return offsets, end
 
 
-def receive_object(sock: socket.socket) -> Any:
+def receive_object(sock: socket.socket, *, passing: bool = False) -> Any:
     """``loads(receive(sock))``, without a Message between them where the packet is a small one."""
     free = _buffers.free
     buffer = free.pop() if free else _Buffer()
@@ -265,7 +265,7 @@ def receive_object(sock: socket.socket) -> Any:
     finally:
         if ours:
             free.append(buffer)
-    return loads(_receive_parts(buffer, received))
+    return loads(_receive_parts(buffer, received, passing=passing))
 
 
 def receive(
@@ -275,8 +275,8 @@ def receive(
 
     Without ``wait``, or on a non-blocking socket, BlockingIOError says that there is none.
     ``descriptors`` makes room for those that the sender attached; without it only the memfd of a
-    large message is taken.  ``passing``: it is passed on soon, so that a large one may stay where
-    its sender wrote it, who has no other use for that memory until then.
+    large message is taken.  ``passing``: it is passed on or copied soon, so that a large one may
+    stay where its sender wrote it, who has no other use for that memory until then.
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free

@@ -105,7 +105,7 @@ class WorkerSet:
 
 def _received(worker: WorkerProcess) -> Any:
     try:
-        return worker.connection.recv()
+        return worker.connection._recv_passing()
     except (EOFError, OSError):
         raise
     except Exception as error:

@@ -23,15 +23,18 @@ from fiber.vector import VectorEnv
 
 ENVS, WORKERS = 4, 2
 UNLUCKY = 2
-STEP, WAIT, SWELL = range(3)
-"""Actions: make a step; wait for the end; need more and more memory."""
+STEP, WAIT, SWELL, CRASH, HANG = range(5)
+"""Actions: make a step; wait for the end; need more and more memory; a fault of native code, and
+native code that does not return.
+"""
+ACCIDENTS = {"wait": WAIT, "swell": SWELL, "crash": CRASH, "hang": HANG}
 
 
 class Steps(gymnasium.Env[Any, Any]):
     """Observes how many steps it has made."""
 
     observation_space = spaces.Box(0, np.inf, (1,), np.float64)
-    action_space = spaces.Discrete(3)
+    action_space = spaces.Discrete(5)
 
     def __init__(self) -> None:
         self.steps = 0
@@ -46,6 +49,10 @@ class Steps(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if action == WAIT:
             signal.pause()
+        if action == CRASH:
+            signal.raise_signal(signal.SIGSEGV)
+        if action == HANG:
+            signal.raise_signal(signal.SIGSTOP)
         hoard = []
         while action == SWELL:
             hoard.append(bytearray(8 << 20))
@@ -64,12 +71,14 @@ def make() -> Steps:
 def main() -> None:
     """As the arguments say; status 0 also where some are lost: that is what is looked at."""
     options = _parse()
-    envs = VectorEnv([make] * ENVS, num_workers=WORKERS, on_error=options.on_error)
+    envs = VectorEnv(
+        [make] * ENVS, num_workers=WORKERS, on_error=options.on_error, timeout=options.timeout
+    )
     envs.reset(seed=1)
     everybody = np.full(ENVS, STEP)
     envs.step(everybody)
     actions = everybody.copy()
-    actions[UNLUCKY] = SWELL if options.swell else WAIT
+    actions[UNLUCKY] = ACCIDENTS[options.accident]
     hosts = envs.call("host")
     envs.send(actions)
     try:
@@ -105,7 +114,8 @@ def say(event: str, **facts: object) -> None:
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     parser.add_argument("--on-error", default="raise")
-    parser.add_argument("--swell", action="store_true", help="memory is what is lacking")
+    parser.add_argument("--accident", choices=ACCIDENTS, default="wait")
+    parser.add_argument("--timeout", type=float)
     return parser.parse_args()
 
 
