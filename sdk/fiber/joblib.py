@@ -33,6 +33,8 @@ from joblib.parallel import (
 )
 
 from fiber import cpu
+from fiber._memmapping import MemmappedArguments
+from fiber._runtime.state import runtime
 from fiber.futures import Executor
 
 __all__ = ["FiberBackend"]
@@ -75,6 +77,7 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         self._own: _Own | None = None
         self._workers: Executor | None = None
         """That of the loops that run."""
+        self._arguments: MemmappedArguments | None = None
         self._loops: deque[None] = deque()
         """One for each: a loop over another's generator has the same backend."""
         self._unfinished: set[Future[Any]] = set()
@@ -91,13 +94,15 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         return max(workers + 1 + n_jobs, 1)
 
     def configure(self, n_jobs: int = 1, parallel: Any = None, **options: Any) -> int:
-        """Be ready for one more loop; options that joblib has for loky mean nothing here."""
+        """Be ready for one more loop."""
         n_jobs = self.effective_n_jobs(n_jobs)
         if n_jobs == 1 and self._given is None:
             raise FallbackToBackend(SequentialBackend(nesting_level=self.nesting_level))
         self.parallel = parallel
         own = {key: value for key, value in options.items() if key in _OPTIONS}
         self._workers = self._given or self._start({**self.backend_kwargs, **own}, n_jobs)
+        if not self._loops:
+            self._arguments = MemmappedArguments(options, same_host=runtime().backend.same_host)
         self._loops.append(None)
         return n_jobs
 
@@ -106,7 +111,8 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         future: Future[Any]
         try:
             assert self._workers is not None
-            future = self._workers.submit(func)
+            assert self._arguments is not None
+            future = self._workers.submit(self._arguments.of(func))
         except Exception as error:  # joblib would print what is raised here, and wait for ever
             future = Future()
             future.set_exception(error)
@@ -141,6 +147,8 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
             self._loops.pop()
         if not self._loops:
             self._workers = None
+            if self._arguments is not None:
+                self._arguments.close()
             own, self._own = self._own, None
             if own is not None:
                 _keep(own)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import fiber.joblib
+from faults.runtime import running
 from unit import pool_tasks as tasks
 from unit.pool_programs import wait_until
 
@@ -22,6 +23,10 @@ call = joblib.delayed
 def _nothing_kept() -> Iterator[None]:
     """The executor that the next loop would have is not for the next test."""
     yield
+    end_kept_workers()
+
+
+def end_kept_workers() -> None:
     while fiber.joblib._kept:
         fiber.joblib._kept.pop().executor.shutdown()
 
@@ -173,3 +178,76 @@ def test_options_of_workers_that_are_there() -> None:
         pytest.raises(ValueError, match="give retries, inner_max_num_threads to that one"),
     ):
         fiber.joblib.FiberBackend(executor=executor, retries=1, inner_max_num_threads=2)
+
+
+# Large arrays
+
+
+def look(array: Any) -> tuple[int, bool, float]:
+    """What a task sees of an array: the inode of its memory, whether it is read-only, its sum."""
+    address = array.__array_interface__["data"][0]
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        limits, _, _, _, inode, *_ = line.split()
+        first, end = (int(limit, 16) for limit in limits.split("-"))
+        if first <= address < end:
+            return int(inode), not array.flags.writeable, float(array.sum())
+    raise AssertionError("memory that is not mapped")
+
+
+def seen(array: Any, **options: Any) -> list[tuple[int, bool]]:
+    """By each task of a loop over this array: inodes, and whether it is read-only."""
+    options = {"max_nbytes": LARGE, "batch_size": 1, **options}
+    found = joblib.Parallel(2, backend="fiber", **options)(call(look)(array) for _ in range(5))
+    assert {total for *_, total in found} == {float(array.sum())}
+    return [each[:2] for each in found]
+
+
+LARGE = 100_000
+"""Bytes; of memory that is not shared, and not that of the interpreter's small objects."""
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_an_array_that_is_sent_again_is_shared(order: Any) -> None:
+    array = np.arange(2.0 * LARGE).reshape((2, LARGE), order=order)
+    first, *others = seen(array)
+    assert first == (0, True), "pickling it once takes less time"
+    ((inode, read_only),) = set(others)
+    assert inode
+    assert read_only
+
+
+def test_arrays_that_are_small_or_not_to_be_shared_are_copied() -> None:
+    array = np.arange(float(LARGE))
+    for options in ({"max_nbytes": array.nbytes}, {"max_nbytes": None}, {"mmap_mode": None}):
+        assert set(seen(array, **options)) == {(0, False)}
+
+
+def test_too_many_arrays_are_copied() -> None:
+    arrays = [np.full(LARGE, n) for n in range(66)]
+    parallel = joblib.Parallel(2, backend="fiber", batch_size=1, max_nbytes=LARGE)
+    found = parallel(call(look)(array) for _ in range(2) for array in arrays)
+    assert len({inode for inode, *_ in found[66:]}) == 65
+    assert [total for *_, total in found] == [n * LARGE for n in range(66)] * 2
+
+
+def test_writing_to_arrays_is_as_the_mode_says() -> None:
+    array = np.zeros(LARGE)
+    options: Any = {"backend": "fiber", "batch_size": 1, "max_nbytes": LARGE}
+    for count in (1, 2):
+        with pytest.raises(ValueError, match="read-only"):
+            joblib.Parallel(2, **options)([call(np.ndarray.fill)(array, 1)] * count)
+    joblib.Parallel(2, **options, mmap_mode="c")([call(np.ndarray.fill)(array, 1)] * 3)
+    assert set(seen(array, mmap_mode="c")) == {(0, False)}
+
+
+def test_what_is_mapped_already_is_mapped(tmp_path: Path) -> None:
+    mapped = np.memmap(tmp_path / "array", mode="w+", shape=100)
+    parallel = joblib.Parallel(2, backend="fiber")
+    parallel(call(np.ndarray.fill)(half, 1) for half in np.split(mapped, 2))
+    assert mapped.all()
+
+
+def test_on_other_hosts_arrays_are_copied() -> None:
+    with running(backend="loopback"):
+        assert set(seen(np.arange(float(LARGE)))) == {(0, True)}
+        end_kept_workers()
