@@ -58,7 +58,7 @@ EXECUTORS: dict[str, dict[str, str]] = {
 }
 
 _REGISTERED_HERE = "starts another interpreter, which does not import fiber.joblib"
-_NO_MEMORY_MAPS = "large arrays are sent to a worker, and not mapped from a file"
+_NO_MEMORY_MAPS = "large arrays are in shared memory that has no name, and not in a file"
 
 # Of joblib's tests of a backend: name of the test -> reason
 JOBLIB: dict[str, str] = {

@@ -22,12 +22,13 @@ from fiber.vector.failures import ATTEMPTS, Failure, summary
 from fiber.vector.slot import MakeEnv, Note, Slot
 from fiber.vector.time_limit import TimeLimit
 
-REPORT_AFTER = 200e-6
-"""Seconds that what is done may wait for more, so that many quick steps make one message."""
+REPORT_AFTER, REPORT_AFTER_ELSEWHERE = 200e-6, 2e-3
+"""Seconds that what is done may wait for more, so that many quick steps make one message: to a
+learner of this host, and to one for which a message crosses links.
+"""
 
-
-MEMORY = 0.99
-"""What is left, a step later, of how slow an environment was."""
+WEIGHT = 0.1
+"""Of the last step in how long one of an environment is expected to take."""
 
 
 class Setup(NamedTuple):
@@ -134,12 +135,13 @@ class Worker:
         self._setup = setup
         self._slots = slots
         self._all = range(len(slots))
-        self._took = [0.0] * len(slots)
-        """Seconds that a step of each environment takes, if it is slow: slowly forgotten."""
+        self._expected = [0.0] * len(slots)
+        """Seconds that a step of each environment takes: a mean that forgets."""
         self._losses: dict[int, int] = {}
         """How often in a row an environment was made anew and has done nothing."""
         self._limit = _limit(setup)  # after the making, which may have set an alarm of its own
         self._shared = begin.memory is not None
+        self._report_after = REPORT_AFTER if self._shared else REPORT_AFTER_ELSEWHERE
         if begin.memory is None:
             self._arrays = StepArrays.private(begin.shape)
         else:
@@ -246,7 +248,7 @@ class Worker:
         now = clock()
         for row in self._each(rows):
             began = now
-            if report.rows and not together and began + self._took[row] > report.due:
+            if report.rows and not together and began + self._expected[row] > report.due:
                 self._send(report, whole=False)
                 report = _Report(report.generation)
             at_work[worker] = row + 1
@@ -260,9 +262,9 @@ class Worker:
                 if self._losses and (note is None or note.lost is None):
                     self._losses.pop(row, None)
             now = clock()
-            self._took[row] = max(now - began, MEMORY * self._took[row])
+            self._expected[row] += WEIGHT * (now - began - self._expected[row])
             if len(report.rows) == 1:
-                report.due = now + REPORT_AFTER
+                report.due = now + self._report_after
         at_work[worker] = 0
         self._send(report, whole=rows is None and len(report.rows) == len(self._all))
 

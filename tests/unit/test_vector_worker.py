@@ -1,0 +1,74 @@
+"""When a worker of a vector environment tells what is done: at once, or with what follows."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from gymnasium.spaces import Discrete
+from gymnasium.vector import AutoresetMode
+
+from fiber.vector import worker as worker_module
+from fiber.vector.arrays import Shape, SharedMemory
+from fiber.vector.slot import Slot
+from fiber.vector.worker import Begin, Setup, Worker
+
+ROWS = 4
+MS = 1e-3
+
+
+class Clock:
+    """Time that passes only in steps."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+class Steps(Slot):
+    """An environment whose steps take some time."""
+
+    def __init__(self, clock: Clock, seconds: float) -> None:
+        self._clock, self._seconds = clock, seconds
+
+    def step(self, action: Any, arrays: Any) -> None:
+        self._clock.now += self._seconds
+
+
+def told(
+    monkeypatch: pytest.MonkeyPatch, seconds: list[float], *, shared: bool, together: bool = False
+) -> list[list[int] | None]:
+    """The rows of each answer to a step, when it is known how long each takes."""
+    clock, answers = Clock(), []
+    monkeypatch.setattr(worker_module, "time", clock)
+    shape = Shape(Discrete(2), Discrete(2), ROWS, 1)
+    memory = SharedMemory.allocate(shape.size()) if shared else None
+    connection: Any = SimpleNamespace(_send_unconfirmed=lambda answer: answers.append(answer.rows))
+    setup = Setup(0, 0, [], AutoresetMode.NEXT_STEP, restart=False, timeout=None)
+    slots = [Steps(clock, each) for each in seconds]
+    worker = Worker(connection, setup, slots, Begin(shape, memory))
+    for _ in range(100):
+        worker._step(0, None, [0] * ROWS, together=True)
+    answers.clear()
+    worker._step(0, None, [0] * ROWS, together)
+    return answers
+
+
+def test_quick_ones_are_told_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    for shared in (True, False):
+        assert told(monkeypatch, [0.01 * MS] * ROWS, shared=shared) == [None]
+
+
+def test_what_is_done_does_not_wait_for_a_slow_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow_at_the_end = [0.01 * MS, 0.01 * MS, 0.01 * MS, 5 * MS]
+    for shared in (True, False):
+        assert told(monkeypatch, slow_at_the_end, shared=shared) == [[0, 1, 2], [3]]
+        assert told(monkeypatch, slow_at_the_end, shared=shared, together=True) == [None]
+
+
+def test_a_message_between_hosts_costs_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert told(monkeypatch, [0.5 * MS] * ROWS, shared=True) == [[0], [1], [2], [3]]
+    assert told(monkeypatch, [0.5 * MS] * ROWS, shared=False) == [None]
