@@ -141,6 +141,14 @@ def test_spaces_that_differ(vec_env: Make) -> None:
         vec_env(makes)
 
 
+def test_spaces_of_the_users_own(vec_env: Make) -> None:
+    class Word(spaces.Text):
+        """Of a kind that Gymnasium cannot batch with others."""
+
+    env = vec_env([partial(Sampling, Word(5))] * 3)
+    assert env.observation_space == Word(5)
+
+
 def test_make_vec_env() -> None:
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.monitor import Monitor

@@ -44,7 +44,7 @@ class Spaces(NamedTuple):
         """
         observations, actions = zip(*pairs, strict=True)
         single = mode[1] if isinstance(mode, tuple) else observations[0]
-        equivalent = _equal if mode == "same" else is_space_dtype_shape_equiv
+        equivalent = _equal if mode == "same" else _alike
         for number, (observation, action) in enumerate(pairs):
             # Those of one worker are often one object, as pickling keeps them.
             if observation is not single and not equivalent(observation, single):
@@ -76,10 +76,16 @@ def check_mode(mode: ObservationMode) -> None:
 def _batch_space(observations: Sequence[Space[Any]], mode: ObservationMode) -> Space[Any]:
     if isinstance(mode, tuple):
         return mode[0]
-    if mode == "same":
-        return batch_space(observations[0], len(observations))
+    first = observations[0]
+    if all(each is first or each == first for each in observations):  # of whatever kind they are
+        return batch_space(first, len(observations))
     return batch_differing_spaces(list(observations))
 
 
 def _equal(one: Space[Any], other: Space[Any]) -> bool:
     return one == other
+
+
+def _alike(one: Space[Any], other: Space[Any]) -> bool:
+    # Gymnasium compares the shapes of its own kinds of space alone.
+    return one == other or is_space_dtype_shape_equiv(one, other)
