@@ -188,13 +188,20 @@ def _to_whom(budget: budgets.Budget, case: Case) -> str:
 def reading(run: Run, cases: Sequence[Case]) -> str:
     """How to read the tables, and whether the machine was idle."""
     rounds = run.about["rounds"]
-    baselines = " or ".join(dict.fromkeys(BY_NAME[case.baseline].label for case in cases))
+    measured = [
+        case.baseline
+        for case in cases
+        if any(run.series(case.name, case.baseline, metric.name) for metric in case.metrics)
+    ]
+    baselines = " or ".join(dict.fromkeys(BY_NAME[name].label for name in measured))
     text = (
         f"Median of {rounds} round{'s' if rounds > 1 else ''}; contenders with servers of their "
         f"own take part in at most {SERVER_ROUNDS}, cases with {MANY:,} workers and more are "
         f"measured in at most {MANY_ROUNDS}, and what else takes more than {LONG:g} s is measured "
-        f"once. The ratio is to {baselines} in the same round: its median, least and greatest."
+        "once."
     )
+    if baselines:
+        text += f" The ratio is to {baselines} in the same round: its median, least and greatest."
     if run.in_use:
         text += f"\n\n{_company(run.in_use)}"
     if run.about["size"] < 1:
