@@ -18,9 +18,9 @@ ABOUT = f"""\
 Loops of `joblib.Parallel(n_jobs={WORKERS})` on Fiber's backend, on loky, which is joblib's own, and
 on Dask's, with workers that are there. Tasks give an int back, at once or after a sleep, or take an
 array: each another one of 1 MB, or all the same one of 10 MB, which loky writes to a file once and
-its workers map. The batch size counts the tasks that travel together; "auto" begins at 1 in each
-loop and lets batches grow as long as they are short. Dask gets a tenth of the no-ops. The value of
-a round is the median of up to five loops in a row."""
+Fiber copies to shared memory, for their workers to map. The batch size counts the tasks that travel
+together; "auto" begins at 1 in each loop and lets batches grow as long as they are short. Dask gets
+a tenth of the no-ops. The value of a round is the median of up to five loops in a row."""
 
 RATE = Metric("rate", "tasks a second", "1/s")
 BASELINE = "joblib"

@@ -40,7 +40,7 @@ class MemmappedArguments:
 
     def of(self, batch: Any) -> Any:
         """The batch, to be pickled at once and sent."""
-        if self._max_nbytes is None or self._mode is None or not isinstance(batch, BatchedCalls):
+        if not isinstance(batch, BatchedCalls):
             return batch
         sent = copy.copy(batch)
         sent.items = [
@@ -58,9 +58,9 @@ class MemmappedArguments:
         if type(value) not in (np.ndarray, np.memmap) or value.dtype.hasobject:
             return value
         mapped = _get_backing_memmap(value) if self._same_host else None
-        if mapped is not None:
+        if isinstance(mapped, np.memmap):  # and not memory without a name
             return _Reduced(*_reduce_memmap_backed(value, mapped))
-        if value.nbytes <= (self._max_nbytes or 0):
+        if self._max_nbytes is None or self._mode is None or value.nbytes <= self._max_nbytes:
             return value
         buffer = self._buffer(value) if self._same_host else None
         if buffer is None:

@@ -186,7 +186,7 @@ class ProgramTooLarge(FiberError):
             f"the program in {folder!r} cannot be sent to its workers: it has {size}, and what is "
             f"sent is at most {limit}.\n{_block('What takes most:', lines)}\n"
             f"Name what workers do not need in {folder}/.fiberignore, one line each, as in "
-            ".gitignore, or move it out of the folder; data that they do need belongs into their "
+            ".gitignore, or move it out of the folder; data that they do need belongs in their "
             "image or on a volume."
         )
         self.folder = folder
@@ -362,7 +362,7 @@ def _advice(exitcode: int | None, reason: str) -> str:
     if exitcode == 1:  # also Python's own, of what nobody caught before the task began
         return (
             "if its last output tells of an error, mend that; a module that is missing in a pod "
-            f"belongs into its image. Else {ended_itself}"
+            f"belongs in its image. Otherwise {ended_itself}"
         )
     return ended_itself
 

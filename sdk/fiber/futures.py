@@ -36,7 +36,7 @@ from fiber._runtime import methods, options
 from fiber._runtime.call_future import CallFuture, WorkerDied, translated
 from fiber._runtime.calls import CallQueue
 from fiber._runtime.executor import Executor as Engine
-from fiber._runtime.executor_group import AFTER_SHUTDOWN, ExecutorGroup
+from fiber._runtime.executor_group import ExecutorGroup, refusal
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.outcome import Failure
 from fiber._runtime.state import runtime
@@ -116,7 +116,7 @@ class Executor(concurrent.futures.Executor):
                 idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
                 resources=Resources(pool=pool),
                 calls_back_at_end=True,
-                refusal=AFTER_SHUTDOWN,
+                refusal=refusal,
             ),
             runtime(),
         )

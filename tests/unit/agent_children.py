@@ -100,6 +100,12 @@ def answer_sums() -> None:
         channel.send(pickle.dumps((seq, value + size)))
 
 
+def talk_nonsense(packet_of_it: bytes) -> NoReturn:
+    """A worker whose message is none."""
+    child.task_channel().sock.send(packet_of_it)
+    run_forever()
+
+
 class Handle:
     """Becomes, in the child, descriptor ``index`` of those that came with the start message."""
 

@@ -22,7 +22,7 @@ from fiber._agent.agent import Agent
 from fiber._agent.interface import ChildSpec
 from fiber._agent.local_child import LocalChild
 from fiber._transport.loop import Loop
-from fiber._wire import descriptor
+from fiber._wire import descriptor, packet
 from fiber.errors import TooManyOpenFiles
 from fiber.process import Process
 from unit.agent_children import (
@@ -31,6 +31,7 @@ from unit.agent_children import (
     answer_sums,
     read_never,
     run_forever,
+    talk_nonsense,
     write_own_index,
 )
 
@@ -296,6 +297,20 @@ def test_children_that_started_live_on_when_forking_became_unfit(own: Agent) -> 
     for child, observer in [spawned, *forked]:
         assert observer.events == ["started"]
         end(child, observer)
+
+
+@pytest.mark.parametrize(
+    ("nonsense", "why"),
+    [
+        (packet.PLAIN + bytes(packet.INLINE_LIMIT + 1), "a small message of 65538 bytes"),
+        (bytes([packet.PARTS_IN_MEMFD, *bytes(12)]), "a large message without its memory"),
+    ],
+)
+def test_a_child_whose_message_cannot_be_read_is_ended(
+    shared: Agent, nonsense: bytes, why: str
+) -> None:
+    _, observer = begin(shared, talk_nonsense, nonsense, tasks=True)
+    assert f"killed by its agent: {why}" in observer.wait_for_exit().reason
 
 
 def test_a_zygote_that_cannot_be_launched_is_an_error_of_the_start(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 from collections.abc import Iterator
@@ -72,6 +73,21 @@ def test_only_so_many_blocks_are_read_in_place(blocks: Arena) -> None:
     read.append(in_place(block.fd, 1000))
     assert read[-1] is not None
     read.clear()
+    blocks.settle(block, sent=False)
+
+
+def test_where_no_descriptor_is_left_a_block_is_copied(
+    blocks: Arena, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_fd: int, _size: int) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    block = blocks.claim(1000)
+    with monkeypatch.context() as full:
+        full.setattr(arena, "_Lent", refuse)
+        for _ in range(LENT_BLOCKS + 1):
+            assert in_place(block.fd, 1000) is None
+    assert in_place(block.fd, 1000) is not None, "none of those counts as read"
     blocks.settle(block, sent=False)
 
 

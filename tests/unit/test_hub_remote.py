@@ -17,7 +17,7 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._hub.client import Unreachable
+from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.remote import RemoteChannel, RemoteCounter
@@ -87,6 +87,25 @@ def test_the_next_one_says_that_what_was_sent_unconfirmed_was_not(
         there._send_unconfirmed("nobody reads it")
         with pytest.raises(BrokenPipeError):
             there._send_unconfirmed("nor this")
+
+
+def test_an_interrupted_confirmation_is_not_waited_for_again(
+    far_pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: Any) -> None:
+        reply(*arguments)
+        raise KeyboardInterrupt
+
+    here, there = far_pipe
+    reply = HubStream._reply
+    there._send_unconfirmed(1)
+    with monkeypatch.context() as ctrl_c:
+        ctrl_c.setattr(HubStream, "_reply", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            there._send_unconfirmed(2)
+    there._send_unconfirmed(3)
+    there.send(4)
+    assert [here.recv() for _ in range(3)] == [1, 3, 4]
 
 
 def test_poll(far_pipe: tuple[Connection, Connection]) -> None:

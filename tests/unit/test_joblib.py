@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -240,11 +241,17 @@ def test_writing_to_arrays_is_as_the_mode_says() -> None:
     assert set(seen(array, mmap_mode="c")) == {(0, False)}
 
 
-def test_what_is_mapped_already_is_mapped(tmp_path: Path) -> None:
+@pytest.mark.parametrize("max_nbytes", ["1M", None])
+def test_what_is_mapped_already_is_mapped(max_nbytes: Any, tmp_path: Path) -> None:
     mapped = np.memmap(tmp_path / "array", mode="w+", shape=100)
-    parallel = joblib.Parallel(2, backend="fiber")
+    parallel = joblib.Parallel(2, backend="fiber", max_nbytes=max_nbytes)
     parallel(call(np.ndarray.fill)(half, 1) for half in np.split(mapped, 2))
     assert mapped.all()
+
+
+def test_memory_without_a_name_is_copied() -> None:
+    array = np.ndarray(100, np.uint8, mmap.mmap(-1, 100))
+    assert set(seen(array)) == {(0, False)}
 
 
 def test_on_other_hosts_arrays_are_copied() -> None:

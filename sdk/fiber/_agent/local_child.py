@@ -232,7 +232,7 @@ class LocalChild:
             message = packet.receive(self._ours, passing=self._spec.passing)
         except (BlockingIOError, EOFError):
             return False
-        except TooManyOpenFiles as error:
+        except (TooManyOpenFiles, ValueError, struct.error) as error:  # nobody should wait for it
             self.abort(error)
             return True
         try:

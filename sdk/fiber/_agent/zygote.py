@@ -6,7 +6,7 @@ sends them signals (a pid that only we can reap cannot be someone else's).  It e
 it, when its agent's process does.
 
 Packets from the agent: ``(SETUP, ancestors, preload, cleanup directory, program's folder)``, first
-and once, with the descriptors of the progress table and, if there is a folder, of what belongs into
+and once, with the descriptors of the progress table and, if there is a folder, of what belongs in
 it; ``(START, child, start request)``, ``(SIGNAL, child, signum)``,
 ``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,

@@ -44,7 +44,7 @@ class Entry(NamedTuple):
 
 
 def list_files(layout: Layout) -> dict[str, Entry]:
-    """What belongs into the archive, by its name there; or ProgramTooLarge."""
+    """What belongs in the archive, by its name there; or ProgramTooLarge."""
     found: dict[str, Entry] = {}
     name_of = layout.places.name_of
     for top in dict.fromkeys((*layout.places, layout.program, *layout.files)):

@@ -224,11 +224,8 @@ class HubStream:
 
     def finish(self) -> Reply | None:
         """The answer to what was begun; None if nothing was."""
-        if self._begun is None:
-            return None
-        reply = self._reply(self._begun, None)
-        self._begun = None
-        return reply
+        number, self._begun = self._begun, None  # an answer that Ctrl-C interrupts is not repeated
+        return None if number is None else self._reply(number, None)
 
     def give_up(self, operation: Op) -> None:
         """Nobody wants the answer to the last request, which is such an operation.

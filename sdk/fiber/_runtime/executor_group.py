@@ -8,7 +8,6 @@ import weakref
 from collections.abc import Callable
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from functools import partial
 from multiprocessing import util
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -19,9 +18,6 @@ from fiber._runtime.executor import Executor
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import Runtime
 from fiber.resources import Resources, merged, resources_of
-
-AFTER_SHUTDOWN = partial(RuntimeError, "cannot schedule new futures after shutdown")
-"""What concurrent.futures says to who comes too late."""
 
 _EXIT_PRIORITY = 20
 """Before pools are terminated, which its tasks may use."""
@@ -52,7 +48,7 @@ class ExecutorGroup:
                 "fork has no workers; make an executor in this process"
             )
         if self._closed:
-            raise AFTER_SHUTDOWN()
+            raise refusal()
         if util.is_exiting():
             raise RuntimeError("cannot schedule new futures after interpreter shutdown")
         kind = self._template.resources
@@ -67,7 +63,7 @@ class ExecutorGroup:
         methods.check_main()
         with self._lock:
             if self._closed:  # by another thread, just now
-                raise AFTER_SHUTDOWN()
+                raise refusal()
             executor = self._executors.get(kind)
             if executor is None:
                 executor = Executor(self._template._replace(resources=kind), self._runtime)
@@ -128,3 +124,8 @@ def _finish(reference: weakref.ref[Executor]) -> None:
     if executor is not None:
         executor.close()
         executor.join()
+
+
+def refusal() -> RuntimeError:
+    """What concurrent.futures says to who comes after ``shutdown``."""
+    return RuntimeError("cannot schedule new futures after shutdown")

@@ -32,7 +32,7 @@ from fiber._wire.messages import BytesLike, ProtocolError
 Frame: TypeAlias = bytes | bytearray
 
 Datagram: TypeAlias = bytes | tuple[BytesLike, ...]
-"""As it leaves: in one piece, or in several that are sent one after the other."""
+"""As it leaves: in one piece, or in several, which whoever sends it puts together."""
 
 WINDOW = 256
 WINDOW_BYTES = 4 << 20
@@ -144,7 +144,7 @@ class ResumableStream:
     def send(self, *frame: BytesLike) -> None:
         """Queue a frame, in pieces; the next ``outgoing`` takes it along if there is room.
 
-        Pieces from LARGE bytes on must not change until ``idle``.
+        No piece may change until it has left, nor one from LARGE bytes on until ``idle``.
         """
         self._queue.append(frame)
         self._queued_bytes += sum(map(len, frame))

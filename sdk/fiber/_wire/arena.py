@@ -152,6 +152,9 @@ def in_place(fd: int, size: int) -> memoryview | None:
         return None
     try:
         lent = _Lent(fd, size)
+    except OSError:  # no descriptor or mapping is left: to copy it takes none
+        _leave_to_lend.append(None)
+        return None
     except BaseException:
         _leave_to_lend.append(None)
         raise

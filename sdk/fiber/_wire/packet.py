@@ -289,6 +289,9 @@ def receive(
         raise
     size = received[0][0]
     if size and not buffer.data[0]:
+        if size > INLINE_LIMIT + 1:  # by its size it would be taken for memory of its own
+            free.append(buffer)
+            raise ValueError(f"a small message of {size} bytes")
         return Message(buffer.view[1:size], [], [], buffer)
     return _receive_parts(buffer, received, passing=passing)
 
@@ -379,6 +382,6 @@ def _copy_out(memory: int, offset: int, size: int) -> memoryview:
     while done < size:
         read = os.preadv(memory, [content[done:]], offset + done)
         if not read:
-            raise EOFError(f"a large message ends after {done} of {size} bytes")
+            raise ValueError(f"a large message ends after {done} of {size} bytes")
         done += read
     return content
