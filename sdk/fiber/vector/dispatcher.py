@@ -18,9 +18,6 @@ from fiber.vector.worker import Answer, Begin, Hello, Results
 from fiber.vector.worker_process import Pending, WorkerProcess
 from fiber.vector.worker_set import Ended, Unreadable, WorkerSet
 
-GRACE = 5.0
-"""Seconds beyond what its environments may take, after which a worker is taken for stuck."""
-
 _STEP = Pending("step")
 
 
@@ -207,7 +204,7 @@ class Dispatcher:
 
     def _send(self, worker: WorkerProcess, data: bytes) -> None:
         self._workers.send(worker, data)
-        self._set_deadline(worker)
+        worker.set_deadline()
 
     def _begin(self, worker: WorkerProcess) -> None:
         """Tell a worker that has its environments where the arrays are."""
@@ -232,7 +229,8 @@ class Dispatcher:
                 raise WaitedTooLong(f"not all environments answered within {timeout:g} s")
             for worker, message in self._workers.receive(left):
                 self._hear(worker, message)
-            self._kill_stuck()
+            for each in self._workers:
+                each.kill_if_stuck()
         self._raise_failure()
 
     def _hear(self, worker: WorkerProcess, message: Any) -> None:
@@ -274,7 +272,7 @@ class Dispatcher:
             self._notes[first + note.row] = note
             if note.lost not in (None, worker.lost):
                 self._warn(f"environment {first + note.row} made anew: {note.lost}")
-        self._set_deadline(worker)
+        worker.set_deadline()
 
     def _blame(self, worker: WorkerProcess, error: Exception) -> None:
         """An answer is here and cannot be unpickled: nobody knows of which environments it was."""
@@ -355,22 +353,6 @@ class Dispatcher:
 
     def _warn(self, message: str) -> None:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
-
-    def _set_deadline(self, worker: WorkerProcess) -> None:
-        timeout, told = worker.setup.timeout, len(worker.pending)
-        worker.deadline = None
-        if timeout is not None and told:
-            worker.deadline = time.monotonic() + told * timeout + GRACE
-
-    def _kill_stuck(self) -> None:
-        """A worker's own alarm ends what takes too long, unless that keeps the interpreter, or the
-        worker is stopped or out of reach.
-        """
-        for worker in self._workers:
-            if worker.deadline is not None and worker.deadline < time.monotonic():
-                worker.deadline = None
-                worker.stuck = True
-                worker.process.kill()
 
 
 def _only_reports_losses(message: Answer | Results) -> bool:
