@@ -81,7 +81,7 @@ def test_an_answer_that_cannot_be_unpickled(vector_env: Make) -> None:
     assert env.reset()[0].tolist() == [[0]] * 4
 
 
-@pytest.mark.parametrize("info", [["a list"], 3])
+@pytest.mark.parametrize("info", [["a list"], 3, None, [], 0])
 def test_an_info_that_is_no_dictionary(info: Any, vector_env: Make) -> None:
     env = vector_env([partial(Saying, info)] * 4)
     env.reset()
