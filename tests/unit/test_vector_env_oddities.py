@@ -55,18 +55,24 @@ class Saying(Faulty):
 class Unreadable:
     """Can be pickled, and not unpickled."""
 
+    def __init__(self, load: Callable[..., Any]) -> None:
+        self._load = load
+
     def __reduce__(self) -> Any:
-        return int, ("no number",)
+        return self._load, ("no number",)
 
 
-def unreadable() -> dict[str, Any]:
-    return {"it": Unreadable()}
+def unreadable(load: Callable[..., Any] = int) -> dict[str, Any]:
+    return {"it": Unreadable(load)}
 
 
-def test_an_answer_that_cannot_be_unpickled(vector_env: Make) -> None:
-    env = vector_env([partial(Saying, unreadable)] * 4)
+@pytest.mark.parametrize(("load", "error"), [(int, ValueError), (os.stat, FileNotFoundError)])
+def test_an_answer_that_cannot_be_unpickled(
+    load: Callable[..., Any], error: type[Exception], vector_env: Make
+) -> None:
+    env = vector_env([partial(Saying, partial(unreadable, load))] * 4)
     env.reset()
-    with pytest.raises(ValueError, match="no number") as caught:
+    with pytest.raises(error, match="no number") as caught:
         env.step([0, 0, 1, 0])
     assert caught.value.__notes__ == [
         "an answer of environments 2 to 3, of worker 'VectorEnv-worker-1', cannot be unpickled"
@@ -74,7 +80,7 @@ def test_an_answer_that_cannot_be_unpickled(vector_env: Make) -> None:
     assert env.step([0] * 4)[0][3] == [2]
     # Nobody is waited for who has answered so.
     env.send([0, 0, 1, 0])
-    with pytest.raises(ValueError, match="no number"):
+    with pytest.raises(error, match="no number"):
         env.recv(4)
     while env._dispatcher.under_way():
         env.recv(1)
