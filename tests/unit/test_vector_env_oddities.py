@@ -167,6 +167,27 @@ def test_a_worker_that_dies_in_a_call_names_the_environment(vector_env: Make) ->
     assert caught.value.task == "a call of environment 3"
 
 
+class Locked(Faulty):
+    """One of them has a lock, which cannot be pickled."""
+
+    def __init__(self, lock: bool) -> None:
+        super().__init__()
+        self._lock = lock
+
+    def lock(self) -> Any:
+        return threading.Lock() if self._lock else None
+
+
+def test_a_result_that_cannot_be_pickled_names_its_environment(vector_env: Make) -> None:
+    env = vector_env([partial(Locked, number == 3) for number in range(4)])
+    with pytest.raises(TypeError, match="cannot pickle") as caught:
+        env.call("lock")
+    assert caught.value.__notes__ == [
+        "an answer that cannot be pickled of environment 3, of worker 'VectorEnv-worker-1'"
+    ]
+    assert len(env.call("pid")) == 4
+
+
 # Restarts
 
 

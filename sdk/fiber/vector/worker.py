@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from gymnasium.vector import AutoresetMode
@@ -212,20 +213,23 @@ class Worker:
         arguments: Sequence[tuple[Any, ...]],
     ) -> None:
         """A method of each slot: the results are what it returns."""
-        values, failures = [], []
+        values: dict[int, Any] = {}
+        failures = []
         worker, at_work = self._setup.worker, self._at_work
         for row, mine in zip(self._each(rows), arguments, strict=True):
             at_work[worker] = row + 1
             try:
-                values.append(getattr(self._slots[row], method)(*mine))
+                values[row] = getattr(self._slots[row], method)(*mine)
             except Exception as error:
                 failures.append(Failure.of(row, "a call", error))
         at_work[worker] = 0
         try:
-            self._tell(Results(generation, values, failures))
-        except UnpicklableError as error:
-            failures.append(Failure.of(self._each(rows)[0], "a call", error))
-            self._tell(Results(generation, [], failures))
+            self._tell(Results(generation, list(values.values()), failures))
+        except UnpicklableError:
+            for failure in _refused(values.items()):
+                del values[failure.row]
+                failures.append(failure)
+            self._tell(Results(generation, list(values.values()), failures))
 
     # What they have in common
 
@@ -303,12 +307,9 @@ class Worker:
     def _blame(self, report: _Report) -> None:
         """Some of it does not pickle: those environments have failed."""
         notes = {note.row: note for note in report.notes}
-        for row in list(report.rows):
-            told = notes.get(row), self._arrays.observations.pack([row], shared=self._shared)
-            try:
-                reduction.dumps(told)
-            except Exception as error:
-                report.fail(Failure.of(row, "an answer that cannot be pickled", error))
+        pack = partial(self._arrays.observations.pack, shared=self._shared)
+        for failure in _refused((row, (notes.get(row), pack([row]))) for row in report.rows):
+            report.fail(failure)
 
 
 class _Report:
@@ -351,6 +352,17 @@ def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
             "every call (`lambda: gymnasium.make(...)` instead of `lambda: env`)"
         )
     made.add(newest)
+
+
+def _refused(answers: Iterable[tuple[int, Any]]) -> list[Failure]:
+    """Those of the environments whose answers, given by row, cannot be pickled."""
+    failures = []
+    for row, answer in answers:
+        try:
+            reduction.dumps(answer)
+        except Exception as error:
+            failures.append(Failure.of(row, "an answer that cannot be pickled", error))
+    return failures
 
 
 def _limit(setup: Setup) -> contextlib.AbstractContextManager[None]:
