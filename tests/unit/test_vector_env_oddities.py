@@ -87,6 +87,25 @@ def test_an_answer_that_cannot_be_unpickled(
     assert env.reset()[0].tolist() == [[0]] * 4
 
 
+def test_what_its_worker_says_later_is_not_taken_for_the_next_answer(
+    vector_env: Make, tmp_path: Path
+) -> None:
+    gate = tmp_path / "gate"
+    makes = [partial(Saying, unreadable), partial(Faulty, gate), Faulty, Faulty]
+    env = vector_env(makes, shared_memory=False)
+    env.reset()
+    for _ in range(4):  # now it is known that nobody should wait for that one
+        env.step([0, Faulty.SLOW, 0, 0])
+    env.send([1, Faulty.WAIT, 0, 0])
+    with pytest.raises(ValueError, match="no number"):
+        env.recv(4)
+    assert sorted(env.recv(2)[4]["env_id"]) == [2, 3]
+    gate.touch()
+    second = np.array([False, True, False, False])
+    assert env.reset(options={"reset_mask": second})[0][1] == [0]
+    assert env.step([0] * 4)[0][1] == [1]
+
+
 @pytest.mark.parametrize("info", [["a list"], 3, None, [], 0])
 def test_an_info_that_is_no_dictionary(info: Any, vector_env: Make) -> None:
     env = vector_env([partial(Saying, info)] * 4)

@@ -52,6 +52,8 @@ class WorkerProcess:
         self._context = context
         self._wishes = largest(map(resources_of, setup.makes))
         self.hello: Hello | None = None
+        self.generation = 0
+        """Of commands: what came before it, nobody waits for any more."""
         self.pending: dict[int, Pending] = {}
         """By row."""
         self.results: list[Any] | None = None
@@ -117,6 +119,12 @@ class WorkerProcess:
             pod=(report and report.pod) or None,
             node=(report and report.node) or None,
         )
+
+    def give_up(self) -> None:
+        """Nobody waits any more for what it was told."""
+        self.generation += 1
+        self.pending.clear()
+        self.deadline = None
 
     def set_deadline(self) -> None:
         """It has been told something, or has answered: until when it has to answer the rest."""
