@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import threading
 import time
@@ -19,7 +20,7 @@ from faults.program import alive, wait_for
 from fiber._runtime.state import runtime
 from fiber.vector import VectorEnv
 from fiber.vector.failures import ATTEMPTS
-from vector_envs import Faulty, Step
+from vector_envs import Faulty, Sampling, Step
 
 Make = Callable[..., VectorEnv]
 
@@ -113,6 +114,44 @@ def test_an_info_that_is_no_dictionary(info: Any, vector_env: Make) -> None:
     with pytest.raises(TypeError, match="an info is a dictionary, not") as caught:
         env.step([0, 0, 0, 1])
     assert "step of environment 3" in caught.value.__notes__[0]
+
+
+class Filming(Sampling):
+    """All that it has to say is large."""
+
+    def __init__(self) -> None:
+        super().__init__(spaces.OneOf([spaces.Box(0, 255, (300, 300), np.uint8)]))
+
+    def step(self, action: Any) -> Step:
+        return (*super().step(action)[:2], True, False, {"frames": [self.render()]})
+
+    def render(self) -> Any:
+        return np.zeros((300, 300), np.uint8)
+
+
+def is_its_owners(array: Any) -> bool:
+    """Whether it lies in no memory that its sender has, too."""
+    memory = array
+    while isinstance(memory, np.ndarray):
+        memory = memory.base
+    return not isinstance(memory.obj if isinstance(memory, memoryview) else memory, mmap.mmap)
+
+
+def test_what_is_large_is_the_users_own(vector_env: Make) -> None:
+    env = vector_env([Filming] * 2, autoreset_mode="SameStep", copy=False)
+    env.reset()
+    observations, *_, infos = env.step([0, 0])
+    one_of: Any = env.single_observation_space
+    for array in (
+        one_of.spaces[0].high,
+        env.render()[0],
+        observations[0][1],
+        infos["final_obs"][0][1],
+        infos["final_info"]["frames"][0][0],
+    ):
+        assert array.shape == (300, 300)
+        assert is_its_owners(array)
+        assert array.flags.writeable
 
 
 def test_infos_of_types_that_do_not_go_together(vector_env: Make) -> None:

@@ -20,6 +20,7 @@ from fiber.connection import Connection
 from fiber.errors import UnpicklableError
 from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays
 from fiber.vector.failures import ATTEMPTS, Failure, summary
+from fiber.vector.in_band import in_band
 from fiber.vector.slot import MakeEnv, Note, Slot
 from fiber.vector.time_limit import TimeLimit
 
@@ -116,9 +117,10 @@ def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
         except Exception as error:
             connection.send(Failure.of(row, "the making", error))
             return False
-    first = slots[0].env
+    env = slots[0].env
+    metadata, mode = in_band(dict(env.metadata)), env.render_mode
     try:
-        connection.send(Hello(client.host(), dict(first.metadata), first.render_mode, spaces))
+        connection.send(Hello(client.host(), metadata, mode, in_band(spaces)))
     except UnpicklableError as error:
         row = next((row for row, pair in enumerate(spaces) if not _pickles(pair)), 0)
         connection.send(Failure.of(row, "spaces or metadata that cannot be pickled", error))
@@ -224,12 +226,12 @@ class Worker:
                 failures.append(Failure.of(row, "a call", error))
         at_work[worker] = 0
         try:
-            self._tell(Results(generation, list(values.values()), failures))
+            self._tell(Results(generation, in_band(list(values.values())), failures))
         except UnpicklableError:
             for failure in _refused(values.items()):
                 del values[failure.row]
                 failures.append(failure)
-            self._tell(Results(generation, list(values.values()), failures))
+            self._tell(Results(generation, in_band(list(values.values())), failures))
 
     # What they have in common
 
@@ -340,7 +342,8 @@ class _Report:
         """What is told; ``whole``: all environments of the worker are in it."""
         packed = arrays.pack(slice(None) if whole else self.rows, shared=shared)
         rows = None if whole else self.rows
-        return Answer(self.generation, rows, packed, self.notes, self.failures)
+        notes = in_band(self.notes) if self.notes else ()
+        return Answer(self.generation, rows, packed, notes, self.failures)
 
 
 def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
