@@ -106,11 +106,13 @@ class Connection:
         except ConnectionClosed as error:
             raise self._explained(error) from None
 
-    def _recv_passing(self) -> Any:
-        """``recv`` of what is copied or let go of soon: large arrays may stay in shared memory."""
+    def _recv_pickled(self) -> Message:
+        """The next object, not unpickled.  It is copied or let go of soon: large arrays may stay in
+        the memory of their sender.
+        """
         if self._channel is None:
             raise self._misuse()
-        return self._channel.recv_object(passing=True)
+        return self._channel.recv(passing=True)
 
     def recv_bytes(self, maxlength: int | None = None) -> bytes:
         """The next message as bytes; OSError, and the connection closed, if it is longer."""

@@ -14,7 +14,7 @@ import pytest
 
 import fiber
 from faults.program import PATIENCE, Program, alive, wait_for
-from fiber.vector import VectorEnv, dispatcher
+from fiber.vector import VectorEnv, worker_process
 from fiber.vector.failures import ATTEMPTS
 from vector_envs import Faulty
 
@@ -136,7 +136,7 @@ def test_one_that_hangs_is_made_anew(vector_env: Make) -> None:
 
 
 def test_a_worker_that_nothing_stops(vector_env: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatcher, "GRACE", 0.3)
+    monkeypatch.setattr(worker_process, "GRACE", 0.3)
     env = vector_env(timeout=1.5)
     with pytest.raises(fiber.TimeoutError, match=r"nothing but its end stopped worker '.*-0'"):
         env.step([GOOD, Faulty.HANG_NATIVE, GOOD, GOOD])

@@ -137,7 +137,7 @@ def test_spaces_that_differ(vec_env: Make) -> None:
     makes = [partial(Sampling, spaces.Box(0, high, (2,))) for high in (1, 2, 3)]
     play_both(vec_env(makes), dummy(makes))
     makes[2] = partial(Sampling, spaces.Box(0, 1, (3,)))
-    with pytest.raises(RuntimeError, match=r"common shape .*environment 2, of worker '.*-1'"):
+    with pytest.raises(RuntimeError, match=r"which one batch of them needs\. environment 2, .*-1'"):
         vec_env(makes)
 
 

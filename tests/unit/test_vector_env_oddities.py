@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import threading
 import time
@@ -19,7 +20,7 @@ from faults.program import alive, wait_for
 from fiber._runtime.state import runtime
 from fiber.vector import VectorEnv
 from fiber.vector.failures import ATTEMPTS
-from vector_envs import Faulty, Step
+from vector_envs import Faulty, Sampling, Step
 
 Make = Callable[..., VectorEnv]
 
@@ -55,18 +56,24 @@ class Saying(Faulty):
 class Unreadable:
     """Can be pickled, and not unpickled."""
 
+    def __init__(self, load: Callable[..., Any]) -> None:
+        self._load = load
+
     def __reduce__(self) -> Any:
-        return int, ("no number",)
+        return self._load, ("no number",)
 
 
-def unreadable() -> dict[str, Any]:
-    return {"it": Unreadable()}
+def unreadable(load: Callable[..., Any] = int) -> dict[str, Any]:
+    return {"it": Unreadable(load)}
 
 
-def test_an_answer_that_cannot_be_unpickled(vector_env: Make) -> None:
-    env = vector_env([partial(Saying, unreadable)] * 4)
+@pytest.mark.parametrize(("load", "error"), [(int, ValueError), (os.stat, FileNotFoundError)])
+def test_an_answer_that_cannot_be_unpickled(
+    load: Callable[..., Any], error: type[Exception], vector_env: Make
+) -> None:
+    env = vector_env([partial(Saying, partial(unreadable, load))] * 4)
     env.reset()
-    with pytest.raises(ValueError, match="no number") as caught:
+    with pytest.raises(error, match="no number") as caught:
         env.step([0, 0, 1, 0])
     assert caught.value.__notes__ == [
         "an answer of environments 2 to 3, of worker 'VectorEnv-worker-1', cannot be unpickled"
@@ -74,20 +81,77 @@ def test_an_answer_that_cannot_be_unpickled(vector_env: Make) -> None:
     assert env.step([0] * 4)[0][3] == [2]
     # Nobody is waited for who has answered so.
     env.send([0, 0, 1, 0])
-    with pytest.raises(ValueError, match="no number"):
+    with pytest.raises(error, match="no number"):
         env.recv(4)
     while env._dispatcher.under_way():
         env.recv(1)
     assert env.reset()[0].tolist() == [[0]] * 4
 
 
-@pytest.mark.parametrize("info", [["a list"], 3])
+def test_what_its_worker_says_later_is_not_taken_for_the_next_answer(
+    vector_env: Make, tmp_path: Path
+) -> None:
+    gate = tmp_path / "gate"
+    makes = [partial(Saying, unreadable), partial(Faulty, gate), Faulty, Faulty]
+    env = vector_env(makes, shared_memory=False)
+    env.reset()
+    for _ in range(4):  # now it is known that nobody should wait for that one
+        env.step([0, Faulty.SLOW, 0, 0])
+    env.send([1, Faulty.WAIT, 0, 0])
+    with pytest.raises(ValueError, match="no number"):
+        env.recv(4)
+    assert sorted(env.recv(2)[4]["env_id"]) == [2, 3]
+    gate.touch()
+    second = np.array([False, True, False, False])
+    assert env.reset(options={"reset_mask": second})[0][1] == [0]
+    assert env.step([0] * 4)[0][1] == [1]
+
+
+@pytest.mark.parametrize("info", [["a list"], 3, None, [], 0])
 def test_an_info_that_is_no_dictionary(info: Any, vector_env: Make) -> None:
     env = vector_env([partial(Saying, info)] * 4)
     env.reset()
     with pytest.raises(TypeError, match="an info is a dictionary, not") as caught:
         env.step([0, 0, 0, 1])
     assert "step of environment 3" in caught.value.__notes__[0]
+
+
+class Filming(Sampling):
+    """All that it has to say is large."""
+
+    def __init__(self) -> None:
+        super().__init__(spaces.OneOf([spaces.Box(0, 255, (300, 300), np.uint8)]))
+
+    def step(self, action: Any) -> Step:
+        return (*super().step(action)[:2], True, False, {"frames": [self.render()]})
+
+    def render(self) -> Any:
+        return np.zeros((300, 300), np.uint8)
+
+
+def is_its_owners(array: Any) -> bool:
+    """Whether it lies in no memory that its sender has, too."""
+    memory = array
+    while isinstance(memory, np.ndarray):
+        memory = memory.base
+    return not isinstance(memory.obj if isinstance(memory, memoryview) else memory, mmap.mmap)
+
+
+def test_what_is_large_is_the_users_own(vector_env: Make) -> None:
+    env = vector_env([Filming] * 2, autoreset_mode="SameStep", copy=False)
+    env.reset()
+    observations, *_, infos = env.step([0, 0])
+    one_of: Any = env.single_observation_space
+    for array in (
+        one_of.spaces[0].high,
+        env.render()[0],
+        observations[0][1],
+        infos["final_obs"][0][1],
+        infos["final_info"]["frames"][0][0],
+    ):
+        assert array.shape == (300, 300)
+        assert is_its_owners(array)
+        assert array.flags.writeable
 
 
 def test_infos_of_types_that_do_not_go_together(vector_env: Make) -> None:
@@ -159,6 +223,27 @@ def test_a_worker_that_dies_in_a_call_names_the_environment(vector_env: Make) ->
     with pytest.raises(fiber.WorkerDied) as caught:
         env.call("exit", 1)
     assert caught.value.task == "a call of environment 3"
+
+
+class Locked(Faulty):
+    """One of them has a lock, which cannot be pickled."""
+
+    def __init__(self, lock: bool) -> None:
+        super().__init__()
+        self._lock = lock
+
+    def lock(self) -> Any:
+        return threading.Lock() if self._lock else None
+
+
+def test_a_result_that_cannot_be_pickled_names_its_environment(vector_env: Make) -> None:
+    env = vector_env([partial(Locked, number == 3) for number in range(4)])
+    with pytest.raises(TypeError, match="cannot pickle") as caught:
+        env.call("lock")
+    assert caught.value.__notes__ == [
+        "an answer that cannot be pickled of environment 3, of worker 'VectorEnv-worker-1'"
+    ]
+    assert len(env.call("pid")) == 4
 
 
 # Restarts

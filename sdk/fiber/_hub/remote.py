@@ -140,13 +140,13 @@ class RemoteChannel(RemoteObject):
         """Never: to find out takes as long as to send."""
         return False
 
-    def recv(self) -> Message:
+    def recv(self, *, passing: bool = False) -> Message:
         """The next message; EOFError at the end."""
         message = self._receive(Op.RECV)
         assert message is not None
         return message
 
-    def recv_object(self, *, passing: bool = False) -> Any:
+    def recv_object(self) -> Any:
         """The next message, unpickled."""
         return packet.loads(self.recv())
 

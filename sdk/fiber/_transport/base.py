@@ -25,11 +25,14 @@ class Channel(Protocol):
     def send_unconfirmed(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """The same without waiting for another host's answer: an error may come with the next."""
 
-    def recv(self) -> Message:
-        """The next message; ConnectionClosed when nobody can ever send one."""
+    def recv(self, *, passing: bool = False) -> Message:
+        """The next message; ConnectionClosed when nobody can ever send one.
 
-    def recv_object(self, *, passing: bool = False) -> Any:
-        """The same, unpickled.  ``passing``: what is large in it is soon copied or let go of."""
+        ``passing``: what is large in it is soon copied or let go of.
+        """
+
+    def recv_object(self) -> Any:
+        """The same, unpickled."""
 
     def try_recv(self) -> Message | None:
         """The next message if one is there."""

@@ -125,15 +125,15 @@ class UnixChannel:
 
     send_unconfirmed = send
 
-    def recv(self) -> Message:
+    def recv(self, *, passing: bool = False) -> Message:
         """The next message, ConnectionClosed at the end."""
-        return packet.receive(self._sock)
+        return packet.receive(self._sock, passing=passing)
 
-    def recv_object(self, *, passing: bool = False) -> Any:
+    def recv_object(self) -> Any:
         """The next message, unpickled; ConnectionClosed at the end."""
         message = self._looked_for()
         if message is None:
-            return packet.receive_object(self._sock, passing=passing)
+            return packet.receive_object(self._sock)
         return packet.loads(message)
 
     def recv_answer(self) -> Message:

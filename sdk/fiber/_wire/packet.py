@@ -251,7 +251,7 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
     return offsets, end
 
 
-def receive_object(sock: socket.socket, *, passing: bool = False) -> Any:
+def receive_object(sock: socket.socket) -> Any:
     """``loads(receive(sock))``, without a Message between them where the packet is a small one."""
     free = _buffers.free
     buffer = free.pop() if free else _Buffer()
@@ -265,7 +265,7 @@ def receive_object(sock: socket.socket, *, passing: bool = False) -> Any:
     finally:
         if ours:
             free.append(buffer)
-    return loads(_receive_parts(buffer, received, passing=passing))
+    return loads(_receive_parts(buffer, received))
 
 
 def receive(

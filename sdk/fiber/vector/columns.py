@@ -14,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import Space, spaces
 
+from fiber.vector.in_band import in_band
+
 Array: TypeAlias = npt.NDArray[Any]
 Rows: TypeAlias = Sequence[int] | slice
 """Which rows; a slice for those that lie side by side."""
@@ -131,7 +133,7 @@ class ObjectColumn:
         return tuple(self._values[rows].tolist())
 
     def pack(self, rows: Rows, *, shared: bool) -> tuple[Any, ...]:
-        return self.batch(rows)
+        return in_band(self.batch(rows))
 
     def unpack(self, rows: Rows, packed: tuple[Any, ...]) -> None:
         self.fill(rows, packed)

@@ -18,9 +18,6 @@ from fiber.vector.worker import Answer, Begin, Hello, Results
 from fiber.vector.worker_process import Pending, WorkerProcess
 from fiber.vector.worker_set import Ended, Unreadable, WorkerSet
 
-GRACE = 5.0
-"""Seconds beyond what its environments may take, after which a worker is taken for stuck."""
-
 _STEP = Pending("step")
 
 
@@ -31,8 +28,6 @@ class Dispatcher:
         self._workers = workers
         self._worker_of = [worker for worker in workers for _ in worker.numbers]
         self._restart = restart
-        self._generation = 0
-        """Of commands: what came before it, nobody waits for any more."""
         self._calls: list[_Group] = []
         """Whose results are awaited."""
         self._ready: deque[int] = deque()
@@ -79,7 +74,8 @@ class Dispatcher:
                 where = slice(None) if group.rows is None else group.rows
                 payload = (group.worker.arrays.actions.pack(where, shared=False),)
             told = dict.fromkeys(group.each(), _STEP)
-            commands.append((group, told, self._encoded("step", group.rows, payload, together)))
+            data = _encoded(group.worker, "step", group.rows, payload, together)
+            commands.append((group, told, data))
         self._tell(commands)
 
     def reset(
@@ -95,7 +91,7 @@ class Dispatcher:
                 row: Pending("reset", seeds[position], options[position])
                 for row, position in zip(group.each(), group.positions, strict=True)
             }
-            commands.append((group, told, self._reset_command(group.rows, told)))
+            commands.append((group, told, _reset_command(group.worker, group.rows, told)))
         self._tell(commands)
 
     def call(
@@ -108,7 +104,8 @@ class Dispatcher:
         for group in groups:
             mine = [arguments[position] for position in group.positions]
             no_steps: dict[int, Pending] = {}
-            commands.append((group, no_steps, self._encoded("call", group.rows, method, mine)))
+            data = _encoded(group.worker, "call", group.rows, method, mine)
+            commands.append((group, no_steps, data))
         for group in groups:
             group.worker.results = None
         self._calls = groups
@@ -156,10 +153,8 @@ class Dispatcher:
 
     def abandon(self) -> None:
         """Nobody waits any more for what was asked for."""
-        self._generation += 1
         for worker in self._workers:
-            worker.pending.clear()
-            worker.deadline = None
+            worker.give_up()
         self._calls = []
         self._ready.clear()
         self._notes.clear()
@@ -191,13 +186,6 @@ class Dispatcher:
                 raise group.worker.error
         return groups
 
-    def _encoded(self, operation: str, rows: Sequence[int] | None, *rest: Any) -> bytes:
-        return reduction.dumps((operation, self._generation, rows, *rest))
-
-    def _reset_command(self, rows: Sequence[int] | None, told: dict[int, Pending]) -> bytes:
-        seeds = [each.seed for each in told.values()]
-        return self._encoded("reset", rows, seeds, [each.options for each in told.values()])
-
     def _tell(self, commands: Iterable[tuple[_Group, dict[int, Pending], bytes]]) -> None:
         for group, told, data in commands:
             group.worker.pending.update(told)
@@ -207,7 +195,7 @@ class Dispatcher:
 
     def _send(self, worker: WorkerProcess, data: bytes) -> None:
         self._workers.send(worker, data)
-        self._set_deadline(worker)
+        worker.set_deadline()
 
     def _begin(self, worker: WorkerProcess) -> None:
         """Tell a worker that has its environments where the arrays are."""
@@ -232,7 +220,8 @@ class Dispatcher:
                 raise WaitedTooLong(f"not all environments answered within {timeout:g} s")
             for worker, message in self._workers.receive(left):
                 self._hear(worker, message)
-            self._kill_stuck()
+            for each in self._workers:
+                each.kill_if_stuck()
         self._raise_failure()
 
     def _hear(self, worker: WorkerProcess, message: Any) -> None:
@@ -250,7 +239,7 @@ class Dispatcher:
             case Answer() | Results():
                 if not _only_reports_losses(message):
                     worker.deaths = 0
-                if message.generation == self._generation:
+                if message.generation == worker.generation:
                     self._failures += [self._told(worker, each) for each in message.failures]
                     if isinstance(message, Answer):
                         self._answer(worker, message)
@@ -266,15 +255,15 @@ class Dispatcher:
         else:
             worker.arrays.unpack(rows, answer.packed)
             for row in rows:
-                if pending.pop(row, None):  # else it was blamed for what could not be read
-                    self._ready.append(first + row)
+                del pending[row]
+                self._ready.append(first + row)
         for failure in answer.failures:
             pending.pop(failure.row, None)
         for note in answer.notes:
             self._notes[first + note.row] = note
             if note.lost not in (None, worker.lost):
                 self._warn(f"environment {first + note.row} made anew: {note.lost}")
-        self._set_deadline(worker)
+        worker.set_deadline()
 
     def _blame(self, worker: WorkerProcess, error: Exception) -> None:
         """An answer is here and cannot be unpickled: nobody knows of which environments it was."""
@@ -284,8 +273,7 @@ class Dispatcher:
             self._lose(worker, error)
             return
         worker.results = []
-        worker.pending.clear()
-        worker.deadline = None
+        worker.give_up()  # what it has yet to say of its other environments, too
         self._failures.append((worker.setup.first, error))
 
     def _told(self, worker: WorkerProcess, failure: Failure) -> tuple[int, Exception]:
@@ -329,8 +317,7 @@ class Dispatcher:
         """There is no worker for its environments any more."""
         worker.error = error
         worker.results = []
-        worker.pending.clear()
-        worker.deadline = None
+        worker.give_up()
         self._failures.append((worker.setup.first, error))
 
     def _at_work(self, worker: WorkerProcess) -> int | None:
@@ -349,28 +336,25 @@ class Dispatcher:
         resets = {row: told for row, told in worker.pending.items() if told is not _STEP}
         if steps:
             # Their episodes are lost, and no action goes on with them.
-            self._send(worker, self._encoded("step", steps, [None] * len(steps), False))
+            self._send(worker, _encoded(worker, "step", steps, [None] * len(steps), False))
         if resets:
-            self._send(worker, self._reset_command(list(resets), resets))
+            self._send(worker, _reset_command(worker, list(resets), resets))
 
     def _warn(self, message: str) -> None:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
 
-    def _set_deadline(self, worker: WorkerProcess) -> None:
-        timeout, told = worker.setup.timeout, len(worker.pending)
-        worker.deadline = None
-        if timeout is not None and told:
-            worker.deadline = time.monotonic() + told * timeout + GRACE
 
-    def _kill_stuck(self) -> None:
-        """A worker's own alarm ends what takes too long, unless that keeps the interpreter, or the
-        worker is stopped or out of reach.
-        """
-        for worker in self._workers:
-            if worker.deadline is not None and worker.deadline < time.monotonic():
-                worker.deadline = None
-                worker.stuck = True
-                worker.process.kill()
+def _encoded(
+    worker: WorkerProcess, operation: str, rows: Sequence[int] | None, *rest: Any
+) -> bytes:
+    return reduction.dumps((operation, worker.generation, rows, *rest))
+
+
+def _reset_command(
+    worker: WorkerProcess, rows: Sequence[int] | None, told: dict[int, Pending]
+) -> bytes:
+    seeds = [each.seed for each in told.values()]
+    return _encoded(worker, "reset", rows, seeds, [each.options for each in told.values()])
 
 
 def _only_reports_losses(message: Answer | Results) -> bool:

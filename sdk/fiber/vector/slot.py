@@ -64,7 +64,7 @@ class Slot:
         arrays.put(self.row, observation, 0.0, False, False)
         lost, self._lost = self._lost, None
         self._over = False
-        return self._note(info, lost=lost) if info or lost else None
+        return self._note(info, lost=lost)
 
     def call(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
         """What a method of the environment returns, or the value of an attribute."""
@@ -120,7 +120,7 @@ class Slot:
             observation, reward, terminated, truncated, info = self.env.step(action)
             self._over = bool(terminated or truncated)
             arrays.put(self.row, observation, reward, terminated, truncated)
-        return self._note(info) if info else None
+        return self._note(info)
 
     def _step_and_reset(self, action: Any, arrays: StepArrays) -> Note | None:
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -129,16 +129,16 @@ class Slot:
             final = Final(observation, info)
             observation, info = self.env.reset()
         arrays.put(self.row, observation, reward, terminated, truncated)
-        return self._note(info, final) if final or info else None
+        return self._note(info, final)
 
     def _step_only(self, action: Any, arrays: StepArrays) -> Note | None:
         assert not self._over, "its episode has ended, and autoreset is disabled: reset it first"
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._over = bool(terminated or truncated)
         arrays.put(self.row, observation, reward, terminated, truncated)
-        return self._note(info) if info else None
+        return self._note(info)
 
-    def _truncate(self, arrays: StepArrays) -> Note:
+    def _truncate(self, arrays: StepArrays) -> Note | None:
         """The end of an episode whose environment is gone: where it was seen last."""
         lost, last = self._lost, arrays.observations.get(self.row)
         if self._same_step:
@@ -153,7 +153,8 @@ class Slot:
 
     def _note(
         self, info: dict[str, Any], final: Final | None = None, lost: str | None = None
-    ) -> Note:
-        if not isinstance(info, Mapping):
-            raise TypeError(f"an info is a dictionary, not {info!r}")
-        return Note(self.row, info, final, lost)
+    ) -> Note | None:
+        for each in (info,) if final is None else (final.info, info):
+            if not isinstance(each, Mapping):
+                raise TypeError(f"an info is a dictionary, not {each!r}")
+        return Note(self.row, info, final, lost) if info or final or lost else None

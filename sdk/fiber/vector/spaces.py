@@ -14,8 +14,8 @@ _NOT_EQUIVALENT = (
     "`observation_mode='different'` instead."
 )
 _NOT_ALIKE = (
-    "the sub-environments observation spaces do not share a common shape and dtype, and one batch "
-    "has all. {}."
+    "the sub-environments observation spaces do not share a common shape and dtype, which one "
+    "batch of them needs. {}."
 )
 
 ObservationMode: TypeAlias = str | tuple[Space[Any], Space[Any]]

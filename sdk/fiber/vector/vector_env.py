@@ -52,7 +52,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
       worker.
     * ``timeout``: seconds that the making, a step or a reset of one environment may take.  It is
       kept by an alarm in the worker (SIGALRM); a worker whose native code does not return to the
-      interpreter is killed a little later.
+      interpreter from a step or a reset is killed a little later.  From the making it may return
+      as late as it likes: that is waited for.
     """
 
     def __init__(

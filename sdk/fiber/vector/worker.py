@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from gymnasium.vector import AutoresetMode
@@ -19,6 +20,7 @@ from fiber.connection import Connection
 from fiber.errors import UnpicklableError
 from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays
 from fiber.vector.failures import ATTEMPTS, Failure, summary
+from fiber.vector.in_band import in_band
 from fiber.vector.slot import MakeEnv, Note, Slot
 from fiber.vector.time_limit import TimeLimit
 
@@ -115,9 +117,10 @@ def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
         except Exception as error:
             connection.send(Failure.of(row, "the making", error))
             return False
-    first = slots[0].env
+    env = slots[0].env
+    metadata, mode = in_band(dict(env.metadata)), env.render_mode
     try:
-        connection.send(Hello(client.host(), dict(first.metadata), first.render_mode, spaces))
+        connection.send(Hello(client.host(), metadata, mode, in_band(spaces)))
     except UnpicklableError as error:
         row = next((row for row, pair in enumerate(spaces) if not _pickles(pair)), 0)
         connection.send(Failure.of(row, "spaces or metadata that cannot be pickled", error))
@@ -212,20 +215,23 @@ class Worker:
         arguments: Sequence[tuple[Any, ...]],
     ) -> None:
         """A method of each slot: the results are what it returns."""
-        values, failures = [], []
+        values: dict[int, Any] = {}
+        failures = []
         worker, at_work = self._setup.worker, self._at_work
         for row, mine in zip(self._each(rows), arguments, strict=True):
             at_work[worker] = row + 1
             try:
-                values.append(getattr(self._slots[row], method)(*mine))
+                values[row] = getattr(self._slots[row], method)(*mine)
             except Exception as error:
                 failures.append(Failure.of(row, "a call", error))
         at_work[worker] = 0
         try:
-            self._tell(Results(generation, values, failures))
-        except UnpicklableError as error:
-            failures.append(Failure.of(self._each(rows)[0], "a call", error))
-            self._tell(Results(generation, [], failures))
+            self._tell(Results(generation, in_band(list(values.values())), failures))
+        except UnpicklableError:
+            for failure in _refused(values.items()):
+                del values[failure.row]
+                failures.append(failure)
+            self._tell(Results(generation, in_band(list(values.values())), failures))
 
     # What they have in common
 
@@ -303,12 +309,9 @@ class Worker:
     def _blame(self, report: _Report) -> None:
         """Some of it does not pickle: those environments have failed."""
         notes = {note.row: note for note in report.notes}
-        for row in list(report.rows):
-            told = notes.get(row), self._arrays.observations.pack([row], shared=self._shared)
-            try:
-                reduction.dumps(told)
-            except Exception as error:
-                report.fail(Failure.of(row, "an answer that cannot be pickled", error))
+        pack = partial(self._arrays.observations.pack, shared=self._shared)
+        for failure in _refused((row, (notes.get(row), pack([row]))) for row in report.rows):
+            report.fail(failure)
 
 
 class _Report:
@@ -339,7 +342,8 @@ class _Report:
         """What is told; ``whole``: all environments of the worker are in it."""
         packed = arrays.pack(slice(None) if whole else self.rows, shared=shared)
         rows = None if whole else self.rows
-        return Answer(self.generation, rows, packed, self.notes, self.failures)
+        notes = in_band(self.notes) if self.notes else ()
+        return Answer(self.generation, rows, packed, notes, self.failures)
 
 
 def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
@@ -351,6 +355,17 @@ def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
             "every call (`lambda: gymnasium.make(...)` instead of `lambda: env`)"
         )
     made.add(newest)
+
+
+def _refused(answers: Iterable[tuple[int, Any]]) -> list[Failure]:
+    """Those of the environments whose answers, given by row, cannot be pickled."""
+    failures = []
+    for row, answer in answers:
+        try:
+            reduction.dumps(answer)
+        except Exception as error:
+            failures.append(Failure.of(row, "an answer that cannot be pickled", error))
+    return failures
 
 
 def _limit(setup: Setup) -> contextlib.AbstractContextManager[None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from multiprocessing import TimeoutError as TookTooLong
 from typing import Any, NamedTuple
 
@@ -17,6 +18,14 @@ from fiber.vector.worker import Hello, Setup, serve
 
 NEWS = 2.0
 """Seconds that the news of a process's end may take after that of its connection."""
+
+GRACE = 5.0
+"""Seconds beyond what its environments may take, after which a worker is taken for stuck."""
+
+LIMITS_OF_A_RESTART = 4
+"""How often ``timeout`` may pass for an environment that is made anew: the step, the end of the old
+one, the making of the new one, its step.
+"""
 
 
 class Pending(NamedTuple):
@@ -43,6 +52,8 @@ class WorkerProcess:
         self._context = context
         self._wishes = largest(map(resources_of, setup.makes))
         self.hello: Hello | None = None
+        self.generation = 0
+        """Of commands: what came before it, nobody waits for any more."""
         self.pending: dict[int, Pending] = {}
         """By row."""
         self.results: list[Any] | None = None
@@ -108,6 +119,29 @@ class WorkerProcess:
             pod=(report and report.pod) or None,
             node=(report and report.node) or None,
         )
+
+    def give_up(self) -> None:
+        """Nobody waits any more for what it was told."""
+        self.generation += 1
+        self.pending.clear()
+        self.deadline = None
+
+    def set_deadline(self) -> None:
+        """It has been told something, or has answered: until when it has to answer the rest."""
+        timeout, told = self.setup.timeout, len(self.pending)
+        self.deadline = None
+        if timeout is not None and told:
+            limits = told * (LIMITS_OF_A_RESTART if self.setup.restart else 1)
+            self.deadline = time.monotonic() + limits * timeout + GRACE
+
+    def kill_if_stuck(self) -> None:
+        """Its own alarm ends what takes too long, unless that keeps the interpreter, or the process
+        is stopped or out of reach.
+        """
+        if self.deadline is not None and self.deadline < time.monotonic():
+            self.deadline = None
+            self.stuck = True
+            self.process.kill()
 
     def hang_up(self, *, kill: bool) -> None:
         """Have it end: now, or when it hears that nobody listens."""

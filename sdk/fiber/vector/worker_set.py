@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+from fiber._wire import packet
 from fiber.vector.worker_process import WorkerProcess
 
 
@@ -104,11 +105,11 @@ class WorkerSet:
 
 
 def _received(worker: WorkerProcess) -> Any:
+    """What a worker says next; EOFError or OSError at its end."""
+    message = worker.connection._recv_pickled()
     try:
-        return worker.connection._recv_passing()
-    except (EOFError, OSError):
-        raise
-    except Exception as error:
+        return packet.loads(message)
+    except Exception as error:  # an OSError, too, is that of an environment's object
         return Unreadable(error)
 
 
