@@ -225,21 +225,31 @@ def test_a_worker_that_dies_in_a_call_names_the_environment(vector_env: Make) ->
     assert caught.value.task == "a call of environment 3"
 
 
-class Locked(Faulty):
-    """One of them has a lock, which cannot be pickled."""
+class Stubborn:
+    """Has a reason of its own why it cannot be pickled."""
 
-    def __init__(self, lock: bool) -> None:
+    def __reduce__(self) -> str:
+        raise ValueError("cannot pickle this")
+
+
+class Unpicklable(Faulty):
+    """One of them has what cannot be pickled."""
+
+    def __init__(self, make: Callable[[], Any]) -> None:
         super().__init__()
-        self._lock = lock
+        self._make = make
 
-    def lock(self) -> Any:
-        return threading.Lock() if self._lock else None
+    def get(self) -> Any:
+        return self._make()
 
 
-def test_a_result_that_cannot_be_pickled_names_its_environment(vector_env: Make) -> None:
-    env = vector_env([partial(Locked, number == 3) for number in range(4)])
-    with pytest.raises(TypeError, match="cannot pickle") as caught:
-        env.call("lock")
+@pytest.mark.parametrize(("make", "kind"), [(threading.Lock, TypeError), (Stubborn, ValueError)])
+def test_a_result_that_cannot_be_pickled_names_its_environment(
+    vector_env: Make, make: Callable[[], Any], kind: type[Exception]
+) -> None:
+    env = vector_env([partial(Unpicklable, make if number == 3 else int) for number in range(4)])
+    with pytest.raises(kind, match="cannot pickle") as caught:
+        env.call("get")
     assert caught.value.__notes__ == [
         "an answer that cannot be pickled of environment 3, of worker 'VectorEnv-worker-1'"
     ]

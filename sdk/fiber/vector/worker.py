@@ -17,7 +17,6 @@ from gymnasium.vector import AutoresetMode
 from fiber import reduction
 from fiber._hub import client
 from fiber.connection import Connection
-from fiber.errors import UnpicklableError
 from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays
 from fiber.vector.failures import ATTEMPTS, Failure, summary
 from fiber.vector.in_band import in_band
@@ -121,7 +120,7 @@ def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
     metadata, mode = in_band(dict(env.metadata)), env.render_mode
     try:
         connection.send(Hello(client.host(), metadata, mode, in_band(spaces)))
-    except UnpicklableError as error:
+    except Exception as error:  # whatever it raised
         row = next((row for row, pair in enumerate(spaces) if not _pickles(pair)), 0)
         connection.send(Failure.of(row, "spaces or metadata that cannot be pickled", error))
         return False
@@ -227,7 +226,7 @@ class Worker:
         at_work[worker] = 0
         try:
             self._tell(Results(generation, in_band(list(values.values())), failures))
-        except UnpicklableError:
+        except Exception:  # whatever it raised that cannot be pickled
             for failure in _refused(values.items()):
                 del values[failure.row]
                 failures.append(failure)
@@ -302,7 +301,7 @@ class Worker:
     def _send(self, report: _Report, *, whole: bool) -> None:
         try:
             self._tell(report.answer(self._arrays, whole=whole, shared=self._shared))
-        except UnpicklableError:
+        except Exception:  # whatever it raised that cannot be pickled
             self._blame(report)
             self._tell(report.answer(self._arrays, whole=False, shared=self._shared))
 
