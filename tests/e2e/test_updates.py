@@ -46,6 +46,7 @@ def test_on_idle_replaces_a_warm_pool_bit_by_bit(pool: Pool, agent: Body) -> Non
     before = pool.ready(4)
     start = len(scene.moments)
     pool.apply(newer(agent), minReplicas=4)
+    pool.wait("the change is seen", lambda: pool.seen_generation)
     pool.wait("all are updated", lambda: pool.status.get("updatedReplicas") == 4, seconds=60)
     assert set(pool.ready(4)).isdisjoint(before)
     ready = set(before)
