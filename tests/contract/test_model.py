@@ -168,6 +168,7 @@ def test_one_bad_item_does_not_cost_the_others() -> None:
     )
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(JSON)
 def test_no_status_is_too_odd(document: object) -> None:
@@ -177,6 +178,7 @@ def test_no_status_is_too_odd(document: object) -> None:
     assert complaints == ()
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(
     st.fixed_dictionaries(

@@ -122,6 +122,7 @@ class Cluster:
             self.later(max(wish.wake_at - self.now, 0.0) + 1e-6, "wake")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_thousand_scale_downs_lose_no_child_and_end_no_busy_agent(seed: int) -> None:
     cluster = Cluster(seed)

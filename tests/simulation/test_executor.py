@@ -11,11 +11,13 @@ from simulation.schedule import Job, Kill, Schedule, Task
 from simulation.suites import PARTS, SUITES, examine_part
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
 def test_the_executor_keeps_the_promises_of_a_pool(part: int) -> None:
     examine_part("executor", part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
 def test_it_keeps_them_over_real_links_to_real_agent_services(part: int) -> None:
     examine_part("remote", part)

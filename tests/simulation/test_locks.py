@@ -65,6 +65,7 @@ def acquires_all(semaphore: SharedSemaphore, tokens: int) -> None:
     assert not semaphore.acquire(False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_seeded_schedules(kind: str) -> None:
     for seed in range(SEEDS):

@@ -19,6 +19,7 @@ PARTS = 2
 STEPS = 300
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
 def test_schedules(part: int) -> None:
     run_all(range(part, SEEDS, PARTS))

@@ -234,6 +234,7 @@ def test_descriptors_travel_however_many_and_none_stays(shared: Agent) -> None:
     assert census.wait_until(lambda: len(os.listdir("/proc/self/fd")) <= before, PATIENCE)
 
 
+@pytest.mark.slow
 def test_the_death_of_the_zygote_is_the_death_of_its_children(own: Agent) -> None:
     children = [begin(own, run_forever) for _ in range(3)]
     for _, observer in children:

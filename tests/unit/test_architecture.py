@@ -37,6 +37,7 @@ def test_imports_follow_the_layers() -> None:
     run(str(Path(sys.executable).with_name("lint-imports")), "--no-cache")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_types() -> None:
     run(sys.executable, "-m", "mypy")

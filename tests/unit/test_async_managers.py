@@ -239,6 +239,7 @@ def test_the_managers_death_is_every_results_error(manager: Any) -> None:
             result.get(PATIENCE)
 
 
+@pytest.mark.slow
 def test_an_interruption_loses_no_other_result(
     manager: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

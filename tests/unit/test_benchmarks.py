@@ -225,6 +225,7 @@ def test_what_a_contender_raises_is_told(session: Session) -> None:
         session.run(latency_case(limit=20.0, calls=1))
 
 
+@pytest.mark.slow
 def test_a_contender_that_takes_too_long_is_stopped_with_its_workers(session: Session) -> None:
     with pytest.raises(Failed, match="not finished after 1 s"):
         session.run(latency_case(limit=1.0, calls=10**9, seconds=600.0))

@@ -100,6 +100,7 @@ def test_each_case_has_a_contender_on_pods_and_its_baseline() -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measure", ["kubernetes_start", "kubernetes_es"])
 def test_a_measure_runs(measure: str) -> None:
     module = kubernetes_report.MEASURES[measure]

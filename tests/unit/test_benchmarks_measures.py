@@ -268,6 +268,7 @@ def test_an_order_survives_its_line() -> None:
     assert Order.from_line(order.to_line()) == order
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)  # starts processes with the engine; the processors may be busy
 @pytest.mark.parametrize("measure", [agents, workers])
 def test_what_knows_the_engine_from_inside_works_with_it_as_it_is(

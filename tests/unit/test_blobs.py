@@ -147,6 +147,7 @@ def size_of_kept(_: object = None) -> int:
     return len(_kept[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_large_arguments_are_pickled_once_for_all_workers(method: str) -> None:
     Counted.pickled = 0
@@ -195,6 +196,7 @@ def blobs_at(backend: Any) -> int:
     return total
 
 
+@pytest.mark.slow
 def test_an_agent_is_sent_them_once_and_forgets_them_after_the_pool(backend: Any) -> None:
     with fiber.Pool(4, keep, (os.urandom(LARGE),)) as pool:
         assert pool.map(size_of_kept, range(8)) == [LARGE] * 8
@@ -226,6 +228,7 @@ def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: An
     assert state.runtime().backend is backend
 
 
+@pytest.mark.slow
 def test_the_agent_that_replaces_a_lost_one_is_sent_them_too(backend: Any) -> None:
     with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
         assert pool.apply(size_of_kept) == LARGE

@@ -76,6 +76,7 @@ def kill(pid: int) -> None:
 # Conditions
 
 
+@pytest.mark.slow
 def test_the_first_to_come_is_the_first_to_be_notified(brought: Callable[[Any], Any]) -> None:
     here, woken = fiber.Condition(), []
     there = brought(here)
@@ -223,6 +224,7 @@ def test_a_barrier_lets_all_go_at_once(brought: Callable[[Any], Any]) -> None:
     assert acted == [3]
 
 
+@pytest.mark.slow
 def test_a_barrier_is_used_again_from_several_hosts(hosts: Hosts) -> None:
     here = fiber.Barrier(2)
     there = Far(hosts)(here)

@@ -301,6 +301,7 @@ def test_a_task_that_kills_every_worker_breaks_nothing_else(
         list(executor.options(retries=0).map(tasks.die_if, [(1, 1)]))
 
 
+@pytest.mark.slow
 def test_an_initializer_that_raises_breaks_it() -> None:
     with fiber.Executor(1, initializer=tasks.refuse) as executor:
         error = executor.submit(tasks.square, 1).exception(PATIENCE)
@@ -331,6 +332,7 @@ def test_terminate_workers_tells_all_who_wait(tmp_path: Path) -> None:
 # Options
 
 
+@pytest.mark.slow
 def test_options_are_those_of_what_is_submitted_through_them(
     executor: fiber.Executor, tmp_path: Path
 ) -> None:
@@ -450,6 +452,7 @@ def test_forgotten_it_ends_after_its_tasks() -> None:
     assert engine.ended.wait(PATIENCE)
 
 
+@pytest.mark.slow
 def test_the_program_ends_after_its_tasks() -> None:
     done = run_program(
         """

@@ -79,6 +79,7 @@ def test_a_put_within_a_put_of_the_same_queue(monkeypatch: pytest.MonkeyPatch) -
     assert {queue.get(), queue.get()} == {"inner", "outer"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [0, MORE_THAN_FITS], ids=["direct", "fed"])
 def test_ctrl_c_at_any_line_of_a_put_leaves_a_queue_that_works(before: int) -> None:
     files = {queues.__file__, feeder.__file__}

@@ -100,6 +100,7 @@ def test_a_time_limit(tmp_path: Path) -> None:
         parallel(call(tasks.wait_for)(tmp_path / "gate") for _ in range(2))
 
 
+@pytest.mark.slow
 def test_loops_one_after_the_other_have_the_same_workers() -> None:
     def workers(**options: Any) -> set[int]:
         parallel = joblib.Parallel(2, backend="fiber", **options)
@@ -231,6 +232,7 @@ def test_too_many_arrays_are_copied() -> None:
     assert [total for *_, total in found] == [n * LARGE for n in range(66)] * 2
 
 
+@pytest.mark.slow
 def test_writing_to_arrays_is_as_the_mode_says() -> None:
     array = np.zeros(LARGE)
     options: Any = {"backend": "fiber", "batch_size": 1, "max_nbytes": LARGE}
@@ -254,6 +256,7 @@ def test_memory_without_a_name_is_copied() -> None:
     assert set(seen(array)) == {(0, False)}
 
 
+@pytest.mark.slow
 def test_on_other_hosts_arrays_are_copied() -> None:
     with running(backend="loopback"):
         assert set(seen(np.arange(float(LARGE)))) == {(0, True)}

@@ -357,6 +357,7 @@ def test_who_is_asked_to_come_back_later_than_there_is_time_does_not_wait(
     assert time.monotonic() - started < 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("status", [429, 503])
 def test_who_is_asked_to_come_back_later_does(server: Served, api: Api, status: int) -> None:
     server.api.faults.append(Fault(status=status, retry_after=1))

@@ -146,6 +146,7 @@ def test_only_the_newest_demand_is_written(rig: Rig, told: Told) -> None:
     assert rig.server.api.count("patch", names.PLURAL) == 1
 
 
+@pytest.mark.slow
 def test_a_demand_is_written_until_it_holds(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -351,6 +352,7 @@ def test_a_pool_of_which_nothing_comes_is_given_back_at_once(
     assert rig.server.objects(names.PLURAL) == []
 
 
+@pytest.mark.slow
 def test_an_operator_of_which_nothing_could_be_heard(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -140,6 +140,7 @@ def test_an_agent_may_close_too(site: Site) -> None:
     assert closed.wait(DEADLINE)
 
 
+@pytest.mark.slow
 def test_a_blocked_loop_does_not_lose_its_peers(site: Site) -> None:
     listener, master = site.listener()
     with remote_agent(listener, site.credentials):
@@ -151,6 +152,7 @@ def test_a_blocked_loop_does_not_lose_its_peers(site: Site) -> None:
         assert not any("lost" in event for event in master.events)
 
 
+@pytest.mark.slow
 def test_a_stopped_agent_is_suspect_until_it_goes_on(site: Site) -> None:
     listener, master = site.listener(keepalive=SHORT._replace(lost_after=60))
     with remote_agent(listener, site.credentials) as process:
@@ -163,6 +165,7 @@ def test_a_stopped_agent_is_suspect_until_it_goes_on(site: Site) -> None:
         master.wait(lambda: master.events[-1] == "trusted")
 
 
+@pytest.mark.slow
 def test_a_killed_agent_is_lost(site: Site) -> None:
     listener, master = site.listener()
     with remote_agent(listener, site.credentials) as process:

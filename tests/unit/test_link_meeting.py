@@ -64,6 +64,7 @@ def test_a_name_that_is_none_is_given_up_in_time_and_named(site: Site) -> None:
     assert "within 0.3 s: its name is none: " in str(agent.errors[0])
 
 
+@pytest.mark.slow
 def test_where_there_is_no_thread_for_a_moment_it_is_tried_again(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:

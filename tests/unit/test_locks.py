@@ -295,6 +295,7 @@ def test_a_handler_that_uses_it_within_its_own_use(one: SharedSemaphore) -> None
     assert inner == [None, True]
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_any_line_of_a_revival_releases_once(one: SharedSemaphore) -> None:
     steps = 0
     while True:

@@ -164,6 +164,7 @@ def test_what_children_write_reaches_stderr_with_their_names(
     assert all(line.startswith("[writer@loopback-") for line in lines)
 
 
+@pytest.mark.slow
 def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() -> None:
     with running() as backend:
         child = start()
@@ -207,6 +208,7 @@ class Reluctant:
         return self._popen(*args, **options)
 
 
+@pytest.mark.slow
 def test_an_agent_that_cannot_be_replaced_at_once_is_replaced_later_and_that_is_said(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -226,6 +228,7 @@ def test_an_agent_that_cannot_be_replaced_at_once_is_replaced_later_and_that_is_
     assert "next attempt in 0.2 s" in said
 
 
+@pytest.mark.slow
 def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.MonkeyPatch) -> None:
     with running() as backend:
         stop(start())
@@ -245,6 +248,7 @@ def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.Monke
         stop(start())
 
 
+@pytest.mark.slow
 def test_an_agent_that_cannot_be_watched_is_ended_before_the_next_attempt(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -277,6 +281,7 @@ def test_an_agent_that_can_never_be_started_is_an_error_with_the_cause(
     assert "loopback-2: its process cannot be started: [Errno 8]" in str(caught.value)
 
 
+@pytest.mark.slow
 def test_while_another_agent_is_there_no_place_is_given_up(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -330,6 +335,7 @@ def test_agents_that_do_not_answer_share_one_deadline_at_the_end(
     assert waits == [loopback._QUIT_TIMEOUT, 0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_the_runtime_can_be_shut_down_and_made_again() -> None:
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(2):

@@ -420,6 +420,7 @@ print(manager.Counter(7).step())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(90)  # it starts interpreters
 @pytest.mark.parametrize("module", ["fiber", "multiprocessing"])
 def test_another_program_connects_by_address_and_key(module: str, tmp_path: Path) -> None:

@@ -339,6 +339,7 @@ def test_a_user_without_a_name_can_watch(monkeypatch: pytest.MonkeyPatch) -> Non
     test()
 
 
+@pytest.mark.slow
 def test_the_thread_tells_the_loop_that_made_it_and_ends_with_it() -> None:
     """The whole program with kopf in its thread, in real time."""
 

@@ -29,6 +29,7 @@ def a_list(items: Any, **metadata: Any) -> dict[str, Any]:
     return {"kind": "PodList", "apiVersion": "v1", "metadata": metadata, "items": items}
 
 
+@pytest.mark.slow
 @given(OBJECTS, st.booleans(), st.sampled_from([None, 1]), st.randoms())
 def test_a_list_is_read_whole(items: Any, plain: bool, indent: int | None, random: Any) -> None:
     members = list(a_list(items, **{"continue": "next"}).items())
@@ -41,6 +42,7 @@ def test_the_last_part_has_no_more() -> None:
     assert read(json.dumps(a_list([])).encode()) == ([], "")
 
 
+@pytest.mark.slow
 @given(OBJECTS, st.integers(min_value=0))
 def test_half_an_answer_is_none(items: Any, length: int) -> None:
     data = json.dumps(a_list(items)).encode()

@@ -246,6 +246,7 @@ FIELDS = ["volumes", "securityContext", "tolerations", "initContainers", "hostNe
 CONTAINER_FIELDS = ["env", "volumeMounts", "securityContext", "resources", "command"]
 
 
+@pytest.mark.slow
 @given(
     spec=st.dictionaries(st.sampled_from(FIELDS), ANYTHING),
     container=st.dictionaries(st.sampled_from(CONTAINER_FIELDS), ANYTHING),

@@ -261,6 +261,7 @@ async def begin(world: World, tmp_path: Path) -> asyncio.subprocess.Process:
     )
 
 
+@pytest.mark.slow
 def test_the_process_works_until_sigterm(tmp_path: Path) -> None:
     async def main() -> None:
         async with a_world(operator=False) as world:
@@ -279,6 +280,7 @@ def test_the_process_works_until_sigterm(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
+@pytest.mark.slow
 def test_a_pool_that_is_nested_deeply_hides_no_other(tmp_path: Path) -> None:
     async def main() -> None:
         async with a_world(operator=False) as world:
@@ -305,6 +307,7 @@ def test_a_pool_that_is_nested_deeply_hides_no_other(tmp_path: Path) -> None:
         sys.setrecursionlimit(limit)
 
 
+@pytest.mark.slow
 def test_the_process_refuses_settings_that_make_no_sense(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "fiber_operator"],

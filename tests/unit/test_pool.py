@@ -387,6 +387,7 @@ def test_two_slow_inputs_do_not_hold_each_other_up(pool: Pool) -> None:
     assert list(first) == [1]
 
 
+@pytest.mark.slow
 def test_million_items_are_not_held_in_memory(pool: Pool) -> None:
     alive = 0
     most = 0

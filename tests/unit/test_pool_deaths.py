@@ -161,6 +161,7 @@ def test_without_retries_no_task_runs_twice(tmp_path: Path) -> None:
     assert all(tasks.runs(path) <= 1 for path in paths)
 
 
+@pytest.mark.slow
 def test_all_workers_killed_again_and_again(pool: Pool) -> None:
     # Three times: a task that is hit each time still has one try.
     result = pool.map_async(tasks.nap_and_return, range(2000), 1)
@@ -191,6 +192,7 @@ def test_results_around_a_death_are_kept(pool: Pool) -> None:
 # Time
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", ["apply", "map", "starmap", "imap"])
 def test_a_task_over_its_timeout_is_killed(pool: Pool, tmp_path: Path, call: str) -> None:
     path = tmp_path / "here"
@@ -283,6 +285,7 @@ def test_workers_that_die_at_birth_are_not_tried_for_ever(tmp_path: Path) -> Non
     assert tasks.runs(path) == 3
 
 
+@pytest.mark.slow
 def test_workers_are_tried_for_a_time_and_not_a_number_of_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -293,6 +296,7 @@ def test_workers_are_tried_for_a_time_and_not_a_number_of_times(
     assert tasks.runs(tmp_path / "runs") == 5
 
 
+@pytest.mark.slow
 def test_a_wave_of_kills_is_outlived(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_set, "KILLED_PATIENCE", PATIENCE)
     with fiber.Pool(4, tasks.killed_until, (tmp_path / "runs", 7)) as pool:
@@ -301,6 +305,7 @@ def test_a_wave_of_kills_is_outlived(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert tasks.runs(tmp_path / "runs") >= 8
 
 
+@pytest.mark.slow
 def test_who_waits_long_for_workers_is_told_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

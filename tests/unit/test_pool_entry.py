@@ -432,6 +432,7 @@ def at_exit() -> list[Any]:
     return [each for each in finalizers if each._callback is pool_module._abandon]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_signals_raise")
 @pytest.mark.filterwarnings("ignore:unclosed running:ResourceWarning")
 def test_a_pool_whose_start_was_interrupted_at_any_line_leaves_no_worker() -> None:
@@ -499,6 +500,7 @@ def forked(action: Callable[[], bytes]) -> bytes:
     return found
 
 
+@pytest.mark.slow
 def test_children_forked_by_another_thread_have_the_programs_handlers(pool: Pool) -> None:
     handler: Any = signal.getsignal(signal.SIGINT)
     expected = repr(handler).encode()

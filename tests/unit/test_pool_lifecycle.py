@@ -108,6 +108,7 @@ def test_terminate_is_prompt_and_ends_every_wait() -> None:
             iterator.next(PATIENCE)
 
 
+@pytest.mark.slow
 def test_terminate_ends_workers_that_ignore_sigterm(tmp_path: Path) -> None:
     pool = fiber.Pool(1)
     pool.apply(signal.signal, (signal.SIGTERM, signal.SIG_IGN))
@@ -422,6 +423,7 @@ def test_processes_look_like_processes() -> None:
     assert not set(processes) & set(fiber.active_children())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["local", "loopback"])
 def test_classes_of_a_main_that_goes_by_value_come_back_as_themselves(backend: str) -> None:
     done = run_program(

@@ -74,6 +74,7 @@ def test_a_child_sees_the_environment_and_directory_of_now(
     child.join()
 
 
+@pytest.mark.slow
 def test_processes_nest_to_any_depth(pipe: tuple[Any, Any]) -> None:
     child = fiber.Process(target=start_another, args=(pipe[1], 3))
     child.start()

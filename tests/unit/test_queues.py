@@ -270,6 +270,7 @@ def test_a_process_that_may_not_waits_until_they_are_read() -> None:
     assert process.exitcode == 0
 
 
+@pytest.mark.slow
 def test_many_processes_put_and_get_at_once() -> None:
     items, answers = fiber.Queue(100), fiber.Queue()
     getters = [start(get_all, items, answers) for _ in range(2)]
@@ -329,6 +330,7 @@ def get_and_report(queue: Any, taken: Any) -> None:
         taken.send(queue.get())
 
 
+@pytest.mark.slow
 def test_readers_killed_anywhere_take_at_most_the_item_they_hold() -> None:
     queue: Any = fiber.Queue()
     total, killed = 2000, 10

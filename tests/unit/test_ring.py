@@ -44,6 +44,7 @@ def pass_on(rank: int, size: int) -> int:
     return 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 2, 3, 4])
 def test_members_know_their_rank_and_their_neighbours(size: int) -> None:
     assert fiber.Ring(size, ranks).run() == [(rank, size, rank, size) for rank in range(size)]

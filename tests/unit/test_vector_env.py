@@ -132,6 +132,7 @@ def test_cart_poles_of_gymnasium(vector_env: Make) -> None:
         assert mine.normal() == its.normal()
 
 
+@pytest.mark.slow
 def test_spaces_that_differ(vector_env: Make) -> None:
     makes = [partial(Sampling, spaces.Box(0, high, (2,))) for high in (1, 2, 3)]
     env = vector_env(makes, observation_mode="different")

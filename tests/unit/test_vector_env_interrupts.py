@@ -38,6 +38,7 @@ def env() -> Iterator[VectorEnv]:
     env.close(terminate=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", CALLS)
 def test_a_call_that_is_interrupted_anywhere(call: str, env: VectorEnv) -> None:
     stop = 0

@@ -287,6 +287,7 @@ class Flagged(Faulty):
         return super().step(action)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("how", "error"), [("raise", ArithmeticError), ("die", fiber.WorkerDied)])
 def test_one_that_never_does_anything_again_is_given_up(
     how: str, error: type[Exception], vector_env: Make, tmp_path: Path
@@ -314,6 +315,7 @@ def test_one_that_raises_again_and_again_and_works_between_is_not_given_up(
         assert env.step([Faulty.GOOD, Faulty.RAISE])[3].tolist() == [False, False]
 
 
+@pytest.mark.slow
 def test_a_making_that_hangs(vector_env: Make, tmp_path: Path) -> None:
     makes = [partial(Flagged, tmp_path / "flag", "hang")] * 2
     env = vector_env(makes, on_error="restart", timeout=2)

@@ -54,6 +54,7 @@ def test_workers_that_do_not_come_in_time_are_counted() -> None:
     pool.join()
 
 
+@pytest.mark.slow
 def test_what_keeps_workers_from_starting_is_raised() -> None:
     with fiber.Pool(1, fail) as pool, pytest.raises(StartError, match="no such device"):
         pool.wait_until_workers_up(PATIENCE)

@@ -118,6 +118,7 @@ def gone(pid: int) -> bool:
     return found is None or found.state == "Z"
 
 
+@pytest.mark.slow
 def test_a_child_is_started_signalled_and_reaped(master: Master) -> None:
     pid = master.started(7)
     master.say(zygote.SIGNAL, 7, signal.SIGTERM)
@@ -153,6 +154,7 @@ def test_told_to_quit_it_kills_and_reports_its_children(master: Master) -> None:
     assert all(gone(pid) for pid in pids)
 
 
+@pytest.mark.slow
 def test_no_signal_of_the_terminal_ends_it(master: Master) -> None:
     first = master.started(1)
     for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -169,6 +171,7 @@ def test_its_children_do_not_outlive_its_own_sudden_death(master: Master) -> Non
     assert census.wait_until(lambda: all(gone(pid) for pid in pids), PATIENCE)
 
 
+@pytest.mark.slow
 def test_a_hang_up_ends_it(progress_table: ProgressTable) -> None:
     master = Master(progress_table)
     pid = master.started(1)
@@ -176,6 +179,7 @@ def test_a_hang_up_ends_it(progress_table: ProgressTable) -> None:
     assert gone(pid)
 
 
+@pytest.mark.slow
 def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
     script = """
         import os, signal, subprocess
@@ -194,6 +198,7 @@ def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
         os.kill(holder, signal.SIGKILL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["at once", "later"])
 def test_it_removes_the_directory_of_an_agent_that_was_killed(moment: str, tmp_path: Path) -> None:
     directory = tmp_path / "cleanup_directory"
@@ -245,6 +250,7 @@ def _run(script: str, expect: int, env: Mapping[str, str] = os.environ) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_once_its_imports_made_forking_unsafe_it_forks_no_more(
     progress_table: ProgressTable, method: str
@@ -261,6 +267,7 @@ def test_once_its_imports_made_forking_unsafe_it_forks_no_more(
     master.close()
 
 
+@pytest.mark.slow
 def test_the_main_module_is_imported_once_for_all(
     progress_table: ProgressTable, tmp_path: Path
 ) -> None:
@@ -274,6 +281,7 @@ def test_the_main_module_is_imported_once_for_all(
     assert log.read_text() == "imported\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", ["raise SystemExit(3)", "raise KeyboardInterrupt", "1 / 0"])
 def test_an_import_that_fails_does_not_end_it(
     progress_table: ProgressTable, tmp_path: Path, code: str
@@ -438,6 +446,7 @@ def test_its_socket_blocks_whatever_the_programs_default_timeout_is(
 # Started before anything needs it
 
 
+@pytest.mark.slow
 def test_one_that_was_started_early_is_the_next_one(progress_table: ProgressTable) -> None:
     zygote_process.start_early()
     early = zygote_process._early
