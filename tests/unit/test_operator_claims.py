@@ -165,7 +165,6 @@ def test_one_that_is_gone_is_followed_by_another(end: str, least: float, most: f
     test()
 
 
-@pytest.mark.slow
 @played()
 async def test_many_namespaces_cost_little(world: World) -> None:
     for number in range(12):

@@ -235,7 +235,6 @@ async def test_released_pods_go_and_no_other(world: World) -> None:
     assert world.names() == kept
 
 
-@pytest.mark.slow
 @played()
 async def test_the_status_keeps_up_with_a_long_deletion(world: World) -> None:
     world.make_pool(replicas=400)
