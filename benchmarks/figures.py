@@ -25,7 +25,7 @@ from benchmarks import (
     workers,
 )
 from benchmarks.contenders import BY_NAME
-from benchmarks.model import Metric, Run
+from benchmarks.model import Case, Metric, Run
 from benchmarks.samples import Summary, in_words, summary
 from matplotlib import pyplot as plt
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -149,17 +149,16 @@ def _vector(run: Run, path: Path) -> None:
 
 
 def _executors(run: Run, path: Path) -> None:
-    figure, panel = plt.subplots(figsize=(10, 4))
-    names = [case.name for case in executors.cases(run.about["size"])]
-    _rows(panel, run, names, executors.RATE)
-    panel.set(title="Further right is better", xlabel="tasks a second")
-    _finish(figure, path)
+    _rates(run, path, executors.cases(run.about["size"]), executors.RATE, height=4)
 
 
 def _parallel_loops(run: Run, path: Path) -> None:
-    figure, panel = plt.subplots(figsize=(10, 5))
-    names = [case.name for case in parallel_loops.cases(run.about["size"])]
-    _rows(panel, run, names, parallel_loops.RATE)
+    _rates(run, path, parallel_loops.cases(run.about["size"]), parallel_loops.RATE, height=5)
+
+
+def _rates(run: Run, path: Path, cases: Sequence[Case], rate: Metric, *, height: float) -> None:
+    figure, panel = plt.subplots(figsize=(10, height))
+    _rows(panel, run, [case.name for case in cases], rate)
     panel.set(title="Further right is better", xlabel="tasks a second")
     _finish(figure, path)
 
