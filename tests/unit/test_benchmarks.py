@@ -19,20 +19,9 @@ from benchmarks.rounds import in_turn  # noqa: E402
 from benchmarks.session import Failed, Session  # noqa: E402
 from benchmarks.suite import MEASURES  # noqa: E402
 
-ABOUT = {
-    "date": "2026-01-01 00:00 UTC",
-    "command": "python benchmarks/run.py",
-    "rounds": 3,
-    "size": 1.0,
-    "cores": 2,
-    "processor": "a processor",
-    "memory": "8.00 GB",
-    "load": 0.0,
-    "system": "Linux 6",
-    "python": "3.11.0",
-    "versions": {"numpy": "2.0"},
-    "skipped": {"ray": "ray"},
-}
+from unit.benchmark_runs import about  # noqa: E402
+
+ABOUT = about(rounds=3, versions={"numpy": "2.0"}, skipped={"ray": "ray"})
 
 
 def test_summary_ignores_rounds_without_a_value() -> None:

@@ -21,19 +21,9 @@ from benchmarks.contender import Bench  # noqa: E402
 from benchmarks.contenders import ALL, BY_NAME, ON_PODS  # noqa: E402
 from benchmarks.model import Run  # noqa: E402
 
-ABOUT = {
-    "date": "2026-01-01 00:00 UTC",
-    "command": "python -m benchmarks.kubernetes_run",
-    "rounds": 1,
-    "size": 1.0,
-    "cores": 2,
-    "processor": "a processor",
-    "memory": "8.00 GB",
-    "load": 0.0,
-    "system": "Linux 6",
-    "python": "3.11.0",
-    "versions": {},
-}
+from unit.benchmark_runs import about  # noqa: E402
+
+ABOUT = about(command="python -m benchmarks.kubernetes_run")
 PODS, BASELINE = ON_PODS.name, "multiprocessing"
 
 

@@ -37,21 +37,9 @@ from benchmarks.tasks import no_op  # noqa: E402
 from fiber._agent.interface import ChildSpec, ExitReport  # noqa: E402
 from fiber._wire import work  # noqa: E402
 from fiber._wire.packet import Message  # noqa: E402
+from unit.benchmark_runs import about  # noqa: E402
 
-ABOUT = {
-    "date": "2026-01-01 00:00 UTC",
-    "command": "python benchmarks/run.py",
-    "rounds": 2,
-    "size": 1.0,
-    "cores": 2,
-    "processor": "a processor",
-    "memory": "8.00 GB",
-    "load": 0.0,
-    "system": "Linux 6",
-    "python": "3.11.0",
-    "versions": {},
-    "skipped": {},
-}
+ABOUT = about(rounds=2)
 
 
 # What else the machine did

@@ -31,20 +31,9 @@ from benchmarks.environment import cart_pole  # noqa: E402
 from benchmarks.model import Case, Run  # noqa: E402
 from benchmarks.session import Session, _environment  # noqa: E402
 
-ABOUT = {
-    "date": "2026-01-01 00:00 UTC",
-    "command": "python benchmarks/run.py",
-    "rounds": 1,
-    "size": 1.0,
-    "cores": 2,
-    "processor": "a processor",
-    "memory": "8.00 GB",
-    "load": 0.0,
-    "system": "Linux 6",
-    "python": "3.11.0",
-    "versions": {},
-    "skipped": {},
-}
+from unit.benchmark_runs import about  # noqa: E402
+
+ABOUT = about()
 MANY = vector.cart_poles(4096)
 
 

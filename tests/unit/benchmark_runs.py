@@ -1,0 +1,25 @@
+"""Where and how a run of the benchmarks was made, as the tests of their pages have it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+_ABOUT = {
+    "date": "2026-01-01 00:00 UTC",
+    "command": "python benchmarks/run.py",
+    "rounds": 1,
+    "size": 1.0,
+    "cores": 2,
+    "processor": "a processor",
+    "memory": "8.00 GB",
+    "load": 0.0,
+    "system": "Linux 6",
+    "python": "3.11.0",
+    "versions": {},
+    "skipped": {},
+}
+
+
+def about(**differently: Any) -> dict[str, Any]:
+    """What ``Run.about`` has."""
+    return {**_ABOUT, **differently}
