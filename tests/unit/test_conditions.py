@@ -162,6 +162,8 @@ def test_who_was_killed_while_it_waited_is_passed_over() -> None:
     condition, woken = fiber.Condition(), []
     pid = fork_that(lambda: condition.acquire() and condition.wait())
     wait_until(lambda: condition._waiters.waiters() == 1, PATIENCE)
+    with condition:  # it has let go of it
+        pass
     kill(pid)
     thread = waiter(condition, woken, "living")
     with condition:
@@ -264,6 +266,8 @@ def test_a_member_killed_while_it_waits_breaks_the_barrier() -> None:
     barrier = fiber.Barrier(3)
     pid = fork_that(barrier.wait)
     wait_until(lambda: barrier.n_waiting == 1, PATIENCE)
+    with barrier._cond:  # it has let go of it
+        pass
     kill(pid)
     with pytest.raises(threading.BrokenBarrierError, match="have died"):
         barrier.wait(PATIENCE)
