@@ -276,6 +276,7 @@ async def test_sigterm_ends_a_scale_up_between_two_calls(world: World) -> None:
     world.slow("create", "pods", 0.5)
     world.make_pool(replicas=300)
     await world.until(lambda: len(world.pods()) > 10)
+    await asyncio.sleep(0.25)  # the calls of a wave are under way, none is about to be
     clock = asyncio.get_running_loop().time
     began, calls = clock(), len(world.api.calls)
     await world.stop()
