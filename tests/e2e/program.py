@@ -115,7 +115,8 @@ class Outside(Program):
         self._temporary = tempfile.TemporaryDirectory(prefix="program-")
         self._process = subprocess.Popen(
             [sys.executable, str(script), *arguments],
-            env={**environment, "PYTHONUNBUFFERED": "1", "TMPDIR": self._temporary.name},
+            # Buffered, as what pods say may come between the two writes of an unbuffered print.
+            env={**environment, "TMPDIR": self._temporary.name},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
