@@ -418,18 +418,17 @@ class ClientHandler:
         self._request(message).answer(Status.OK, self._wait_list().places.bury())
 
     def get(self, message: Message) -> None:
-        """Tell a word."""
-        value = self._wait_list().places.get(ONE.unpack(message.payload)[2] & 1)
-        self._request(message).answer(Status.OK, value & _WORD)
+        """Tell the word."""
+        self._request(message).answer(Status.OK, self._wait_list().places.get())
 
     def set(self, message: Message) -> None:
-        """Set a word."""
-        _, _, number, value = TWO.unpack(message.payload)
-        self._wait_list().places.set(number & 1, value - (1 << 64) if value >> 63 else value)
+        """Set the word."""
+        self._wait_list().places.set(ONE.unpack(message.payload)[2] & _LARGEST)
         self._request(message).answer(Status.OK)
 
 
-_WORD = (1 << 64) - 1
+_LARGEST = (1 << 63) - 1
+"""The largest word."""
 
 
 class _Joining:
