@@ -336,6 +336,25 @@ def test_agents_that_do_not_answer_share_one_deadline_at_the_end(
 
 
 @pytest.mark.slow
+def test_who_hangs_up_while_it_ends_is_not_reported(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with running() as backend:
+        host, port = backend._listener.address.removeprefix("tcp://").rsplit(":", 1)
+        caller = socket.create_connection((host, int(port)), PATIENCE)
+        close = backend._launcher.close
+
+        def refused_meanwhile() -> None:
+            caller.sendall(b"GET / HTTP/1.1")
+            while caller.recv(1 << 16):
+                pass
+            close()
+
+        monkeypatch.setattr(backend._launcher, "close", refused_meanwhile)
+    caller.close()
+    assert "refused" not in capfd.readouterr().err
+
+
 def test_the_runtime_can_be_shut_down_and_made_again() -> None:
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(2):

@@ -16,6 +16,7 @@ from operator import length_hint
 from typing import Any, Protocol
 
 from fiber._agent import by_reference
+from fiber._hub.remote import confirm_attached
 from fiber._wire import packet, work
 
 
@@ -148,6 +149,7 @@ class BatchResults:
         now = time.perf_counter()
         head = (self.seq, first, kept, now - self._last_sent)
         done = len(odd)
+        confirm_attached()
         try:
             data = pickle.dumps((*head, self.values[first:stop], odd), 5)
             self._channel.send(data, buffers)

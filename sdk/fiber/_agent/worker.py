@@ -19,6 +19,7 @@ from typing import Any
 from fiber._agent import child
 from fiber._agent.batch_results import BatchResults, Sender, encode_error
 from fiber._agent.watchdog import SPLIT_AFTER, Watchdog
+from fiber._hub.remote import confirm_attached
 from fiber._wire import work
 from fiber._wire.packet import Message
 
@@ -188,6 +189,7 @@ class Worker:
         return functions[head.function]
 
     def _reply(self, *words: Any) -> None:
+        confirm_attached()
         self._channel.send(pickle.dumps(words))
 
     # Running

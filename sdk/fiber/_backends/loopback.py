@@ -75,7 +75,7 @@ class LoopbackBackend:
             f"{config.listen_host or _LOOPBACK}:{config.listen_port}",
             credentials,
             on_agent=self._joined,
-            on_refused=lambda reason: self._output.write("fiber", f"refused an agent: {reason}"),
+            on_refused=self._refused,
             keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
         )
         self._launcher = AgentLauncher(
@@ -150,6 +150,10 @@ class LoopbackBackend:
         self.agents.join(name, link)
         self._fill_vacant()  # those that were given up: it can be done after all
         return None
+
+    def _refused(self, reason: str) -> None:
+        if not self._closing:  # else it is one of ours, ended before it was in
+            self._output.write("fiber", f"refused an agent: {reason}")
 
     def _shut_down(self) -> None:
         for slot in self._slots:

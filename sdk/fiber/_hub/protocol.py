@@ -17,7 +17,7 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 1
+VERSION = 2
 KEY_BYTES = 32
 
 
@@ -75,7 +75,7 @@ class Op(IntEnum):
     GRANT = 6  # object, flags -> object, grant
     RELEASE = 7  # grant; silent
     CANCEL = 8  # answers the request of this number NO, if it is still waiting; otherwise silent
-    SYNC = 9  # number of the request that is given up: takes back what it got -> nothing
+    SYNC = 9  # number of the request that is given up, or 0: takes back what it got -> nothing
     RING = 30  # something in shared memory of this host has changed; silent
     REPLICATE = 31  # an Origin beside it -> where in the segment whose descriptor is beside it
     # For an attached channel

@@ -7,6 +7,7 @@ are as many streams as threads ever used the object at once.
 from __future__ import annotations
 
 import os
+import weakref
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -18,6 +19,21 @@ from fiber._transport.unix import wait_readable
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import ConnectionClosed
+
+_attaching: weakref.WeakSet[RemoteObject] = weakref.WeakSet()
+"""Those whose hub may not have heard of it yet."""
+
+
+def confirm_attached() -> None:
+    """Returns once hubs elsewhere have heard who uses what this process has unpickled and still
+    has: whoever learns of that then may take back what it granted for it.
+    """
+    while _attaching:
+        try:
+            new = _attaching.pop()
+        except KeyError:  # another thread's now, or gone
+            return
+        new.confirm()
 
 
 class RemoteObject:
@@ -38,6 +54,13 @@ class RemoteObject:
         # Opened at once, so that the grant is used up, but without waiting: whoever unpickles this
         # may be the very thread that carries the answer.  An error shows at the first request.
         self._idle = deque([self._open(grant)])
+        _attaching.add(self)
+
+    def confirm(self) -> None:
+        """Returns once its hub knows that it is used, or cannot be asked."""
+        if self._pid == os.getpid():
+            with suppress(OSError, Unreachable), self.stream() as stream:
+                stream.ask(Op.SYNC, 0, form=ONE)
 
     @contextmanager
     def stream(self) -> Iterator[HubStream]:

@@ -1,0 +1,128 @@
+"""Whoever says that it has a handle says so after its hub knows: the grant may end then.
+
+Host ``a`` has the objects; this process is on host ``b``, and the link from there carries nothing
+until it is let go.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import fiber
+from census import wait_until
+from fiber import reduction
+from fiber._agent.worker import Worker
+from fiber._hub.client import HubStream
+from fiber._hub.dealer import arrive
+from fiber._hub.handles import collecting_grants
+from fiber._hub.local import LocalChannel
+from fiber._hub.protocol import Op
+from fiber._wire import packet, work
+from hosts import PATIENCE, Hosts, Wire, background
+
+
+@pytest.fixture
+def hosts() -> Iterator[Hosts]:
+    hosts = Hosts()
+    with hosts.at("b"):
+        yield hosts
+    hosts.close()
+
+
+@pytest.fixture
+def wire(hosts: Hosts) -> Wire:
+    up, _ = hosts.link("b", "a")
+    return up
+
+
+@pytest.fixture
+def is_confirming(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
+    """Whether the hub was asked if it knows."""
+    asked = []
+    ask = HubStream.ask
+
+    def noting(self: HubStream, operation: Op, *args: Any, **options: Any) -> Any:
+        asked.append(operation)
+        return ask(self, operation, *args, **options)
+
+    monkeypatch.setattr(HubStream, "ask", noting)
+    return lambda: Op.SYNC in asked
+
+
+class Results:
+    """What a worker sends."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+
+    def send(self, payload: bytes, buffers: Any = ()) -> None:
+        self.sent.append(payload)
+
+
+KEPT: list[Any] = []
+
+
+def keep(thing: Any) -> None:
+    KEPT.append(thing)
+
+
+def keep_and_return(thing: Any) -> list[str]:
+    """What no short answer can carry."""
+    KEPT.append(thing)
+    return ["a list"]
+
+
+@pytest.mark.parametrize("function", [keep, keep_and_return])
+def test_a_result_comes_after_what_the_task_keeps_is_attached(
+    hosts: Hosts, wire: Wire, is_confirming: Callable[[], bool], function: Callable[[Any], Any]
+) -> None:
+    with hosts.at("a"):
+        reader, writer = fiber.Pipe()
+        payload, buffers, grants = reduction.encode_reusable((function, (writer,), {}))
+    assert grants is not None
+    writer.close()
+    call = work.SEQ.pack(1) + work.pack_calls([(payload, buffers)])
+    results = Results()
+    worker = Worker(results, memoryview(bytearray(16)).cast("Q"))
+    wire.hold()
+    thread = background(worker.handle, packet.Message(memoryview(call), [], []))
+    wait_until(lambda: results.sent or is_confirming(), PATIENCE)
+    assert not results.sent
+    wire.let_go()
+    thread.join(PATIENCE)
+    assert len(results.sent) == 1
+    grants.release()
+    with KEPT.pop() as kept:
+        kept.send("still there")
+    assert reader.recv() == "still there"
+    reader.close()
+
+
+def test_a_reader_says_that_it_has_its_channel_after_that_is_attached(
+    hosts: Hosts, wire: Wire, is_confirming: Callable[[], bool]
+) -> None:
+    with hosts.at("a"):
+        ours, theirs = LocalChannel.pair()
+        with collecting_grants(reusable=False) as grants:
+            invitation = pickle.dumps(theirs)
+        theirs.close()
+    arrivals, door = LocalChannel.pair()
+    wire.hold()
+    arrived: list[Any] = []
+    thread = background(lambda: arrived.append(arrive(door)))
+    answer: Any = packet.loads(arrivals.recv())
+    answer.send(invitation)
+    wait_until(lambda: answer.poll(0) or is_confirming(), PATIENCE)
+    assert not answer.poll(0)
+    wire.let_go()
+    thread.join(PATIENCE)
+    answer.recv().release()
+    grants.release()
+    ours.send(b"an item")
+    assert arrived[0].recv().tobytes() == b"an item"
+    for channel in (*arrived, answer, arrivals, door, ours):
+        channel.close()
