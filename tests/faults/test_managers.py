@@ -106,7 +106,8 @@ def test_what_only_a_dead_process_referred_to_goes(manager: Any, victim: Any) ->
     made = manager.Queue()
     objects = manager._number_of_objects()
     victim("make", manager.address, made)
-    assert list(made.get(True, PATIENCE)) == ["made"]
+    # Not list(): the IndexError that ends it is a cycle with the proxy on some Pythons.
+    assert made.get(True, PATIENCE)[:] == ["made"]
     assert manager._number_of_objects() == objects + 1
     victim("die")
     wait_for(lambda: manager._number_of_objects() == objects)

@@ -32,6 +32,12 @@ def kill(pid: int) -> None:
         pass  # it was replaced meanwhile
 
 
+def kill_one(pool: Pool) -> None:
+    """Kill any of its workers, unless all were killed and none has come in their place yet."""
+    if living := pids(pool):
+        kill(random.choice(living))
+
+
 def works(pool: Pool) -> None:
     assert pool.map(abs, range(-5, 0)) == [5, 4, 3, 2, 1]
 
@@ -79,7 +85,7 @@ def test_killed_while_it_sends_large_results(size: int) -> None:
         for number, data in enumerate(results):
             assert len(data) == size
             if number % 4 == 0:
-                kill(random.choice(pids(pool)))
+                kill_one(pool)
 
 
 def test_killed_while_it_gets_large_arguments() -> None:
@@ -90,18 +96,17 @@ def test_killed_while_it_gets_large_arguments() -> None:
         for number, result in enumerate(results):
             assert result.get(PATIENCE) == len(data)
             if number % 4 == 0:
-                kill(random.choice(pids(pool)))
+                kill_one(pool)
 
 
 def test_ten_thousand_queued_and_workers_dying_all_the_time() -> None:
-    rng = random.Random(1)
     done = threading.Event()
     with fiber.Pool(3, retries=1000) as pool:
         works(pool)
 
         def kill_now_and_then() -> None:
             while not done.wait(0.05):
-                kill(rng.choice(pids(pool)))
+                kill_one(pool)
 
         killer = threading.Thread(target=kill_now_and_then)
         killer.start()
@@ -124,7 +129,7 @@ def test_callbacks_come_once_however_workers_die() -> None:
             for n in range(300)
         ]
         for _ in range(3):
-            kill(random.choice(pids(pool)))
+            kill_one(pool)
         assert [result.get(PATIENCE) for result in results] == list(range(300))
         wait_for(lambda: calls.total() >= 300)
     assert set(calls.values()) == {1}
@@ -137,7 +142,7 @@ def test_without_retries_nothing_runs_twice_and_nothing_is_forgotten(tmp_path: P
         results = [pool.apply_async(work, (n,)) for n in range(120)]
         for _ in range(3):
             wait_for(lambda: sum(r.ready() for r in results) > 20)
-            kill(random.choice(pids(pool)))
+            kill_one(pool)
         outcomes = [outcome(result) for result in results]
     runs = Counter(path.name.split("-")[0] for path in tmp_path.iterdir())
     assert max(runs.values()) == 1
