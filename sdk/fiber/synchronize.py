@@ -277,13 +277,16 @@ class Barrier(threading.Barrier):
                 self._bury()
                 self._break()
             self._join()
-            index = self._enter()
+            self._enter()
+            index = self._count
+            self._count += 1
             try:
                 if index + 1 == self._parties:
                     self._release()
                 else:
                     self._wait(self._timeout if timeout is None else timeout)
             finally:
+                self._count -= 1
                 self._exit()
         return index
 
@@ -293,41 +296,29 @@ class Barrier(threading.Barrier):
             # Who ends in good order is not missed.
             weakref.finalize(self, self._members.dismiss, self._members.enter())
 
-    def _enter(self) -> int:
-        """How many wait already, of whom this is one more."""
-        while (progress := self._progress)[0] in (_RESETTING, _DRAINING):
+    def _enter(self) -> None:
+        while self._state in (_RESETTING, _DRAINING):
             if not self._cond.wait(RECHECK) and self._bury():
                 self._break()
-        state, count = progress
-        if state < 0:
+        if self._state < 0:
             raise threading.BrokenBarrierError
-        self._progress = state, count + 1
-        return count
 
     def _wait(self, timeout: float | None) -> None:
         deadline = math.inf if timeout is None else time.monotonic() + timeout
-        state = _FILLING
-        while state == _FILLING:
+        while self._state == _FILLING:
             left = max(0.0, deadline - time.monotonic())
-            lost = 0 if (notified := self._cond.wait(min(left, RECHECK))) else self._bury()
-            state = self._state
-            if state == _FILLING and (lost or (left <= RECHECK and not notified)):
+            if self._cond.wait(min(left, RECHECK)):
+                continue
+            lost = self._bury()
+            if self._state == _FILLING and (lost or left <= RECHECK):
                 self._break()
                 raise threading.BrokenBarrierError(
                     f"{lost} of the processes that took part have died"
                     if lost
                     else f"the others did not come in {timeout} s"
                 )
-        if state < 0:
+        if self._state < 0:
             raise threading.BrokenBarrierError
-
-    def _exit(self) -> None:
-        state, count = self._progress
-        if count == 1 and state in (_RESETTING, _DRAINING):
-            self._progress = _FILLING, 0
-            self._cond.notify_all()
-        else:
-            self._progress = state, count - 1
 
     def _bury(self) -> int:
         """How many members died; they wait no more."""
@@ -335,39 +326,29 @@ class Barrier(threading.Barrier):
         self._count = max(0, self._count - waited)
         return int(waited + self._members.bury())
 
-    # What threading's class keeps, in one word of shared memory: it may be another host's
-
-    @property
-    def _progress(self) -> tuple[int, int]:
-        """The state, and how many wait."""
-        word = self._cond._waiters.get()
-        return (word & 3) - (4 if word & 2 else 0), word >> 2
-
-    @_progress.setter
-    def _progress(self, progress: tuple[int, int]) -> None:
-        state, count = progress
-        self._cond._waiters.set(count << 2 | state & 3)
+    # What threading's class keeps, in shared memory
 
     @property
     def _state(self) -> int:
-        return self._progress[0]
+        return self._cond._waiters.get(0)
 
     @_state.setter
-    def _state(self, state: int) -> None:
-        self._progress = state, self._count
+    def _state(self, value: int) -> None:
+        self._cond._waiters.set(0, value)
 
     @property
     def _count(self) -> int:
-        return self._progress[1]
+        return self._cond._waiters.get(1)
 
     @_count.setter
-    def _count(self, count: int) -> None:
-        self._progress = self._state, count
+    def _count(self, value: int) -> None:
+        self._cond._waiters.set(1, value)
 
     if TYPE_CHECKING:  # threading's own, of which its stub does not tell
 
         def _break(self) -> None: ...
         def _release(self) -> None: ...
+        def _exit(self) -> None: ...
 
 
 _FILLING, _DRAINING, _RESETTING = 0, 1, -1  # states of threading's barrier

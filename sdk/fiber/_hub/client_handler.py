@@ -418,17 +418,18 @@ class ClientHandler:
         self._request(message).answer(Status.OK, self._wait_list().places.bury())
 
     def get(self, message: Message) -> None:
-        """Tell the word."""
-        self._request(message).answer(Status.OK, self._wait_list().places.get())
+        """Tell a word."""
+        value = self._wait_list().places.get(ONE.unpack(message.payload)[2] & 1)
+        self._request(message).answer(Status.OK, value & _WORD)
 
     def set(self, message: Message) -> None:
-        """Set the word."""
-        self._wait_list().places.set(ONE.unpack(message.payload)[2] & _LARGEST)
+        """Set a word."""
+        _, _, number, value = TWO.unpack(message.payload)
+        self._wait_list().places.set(number & 1, value - (1 << 64) if value >> 63 else value)
         self._request(message).answer(Status.OK)
 
 
-_LARGEST = (1 << 63) - 1
-"""The largest word."""
+_WORD = (1 << 64) - 1
 
 
 class _Joining:

@@ -103,8 +103,8 @@ class Op(IntEnum):
     NOTIFY = 53  # how many
     WAITERS = 54  # -> how many
     BURY = 55  # -> how many
-    GET = 56  # -> the word
-    SET = 57  # the word
+    GET = 56  # which -> the word
+    SET = 57  # which, the word
 
 
 class Status(IntEnum):

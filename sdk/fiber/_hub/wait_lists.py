@@ -15,7 +15,7 @@ from fiber._hub.handles import (
     handle_for_remote_block,
     ring,
 )
-from fiber._hub.protocol import ONE, Extent, ObjectKind, Op, Status
+from fiber._hub.protocol import ONE, TWO, Extent, ObjectKind, Op, Status
 from fiber._hub.remote import RemoteObject
 from fiber._sync.wait_list import SIZE, WaitList
 
@@ -64,21 +64,23 @@ class RemoteWaitList(RemoteObject):
 
     def waiters(self) -> int:
         """How many wait."""
-        return self._ask(Op.WAITERS)
+        return self._ask(Op.WAITERS, 0)
 
     def bury(self) -> int:
         """How many died while they waited, since this was asked last."""
-        return self._ask(Op.BURY)
+        return self._ask(Op.BURY, 0)
 
-    def get(self) -> int:
-        """The user's word."""
-        return self._ask(Op.GET)
+    def get(self, number: int) -> int:
+        """One of the user's two words."""
+        value = self._ask(Op.GET, number)
+        return value - (1 << 64) if value >> 63 else value
 
-    def set(self, value: int) -> None:
+    def set(self, number: int, value: int) -> None:
         """Set it."""
-        self._ask(Op.SET, value)
+        with self.stream() as stream:
+            stream.ask(Op.SET, number, value & ((1 << 64) - 1), form=TWO)
 
-    def _ask(self, operation: Op, number: int = 0) -> int:
+    def _ask(self, operation: Op, number: int) -> int:
         with self.stream() as stream:
             (value,) = stream.ask(operation, number, form=ONE).values
         return value

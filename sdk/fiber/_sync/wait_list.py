@@ -3,7 +3,7 @@ changes.
 
 ::
 
-    next ticket │ a word of the user's │ end │ place │ place │ …
+    next ticket │ two words of the user's │ end │ place │ place │ …
 
 A *place* is for one thread that waits: what became of it, whose it is, when it came, and a
 semaphore on which it sleeps.  Each change is one store, so a holder that dies between two leaves
@@ -24,7 +24,7 @@ SIZE = 1 << 15
 # Words of 8 bytes
 _TICKET = 0
 _USERS = 1
-_END = 2  # of the places that anybody ever had
+_END = 3  # of the places that anybody ever had
 _PLACES = range(8, SIZE // 8, 8)
 # Of a place
 _STATE = 0
@@ -107,13 +107,13 @@ class WaitList:
             self._words[place + _WHO] = 0
         return len(dead)
 
-    def get(self) -> int:
-        """The user's word."""
-        return self._words[_USERS]
+    def get(self, number: int) -> int:
+        """One of the user's two words."""
+        return self._words[_USERS + number]
 
-    def set(self, value: int) -> None:
+    def set(self, number: int, value: int) -> None:
         """Set it."""
-        self._words[_USERS] = value
+        self._words[_USERS + number] = value
 
     def _free_place(self) -> int:
         for is_free in (self._is_unused, self._is_dead):
