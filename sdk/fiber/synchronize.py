@@ -286,7 +286,8 @@ class Barrier(threading.Barrier):
                 else:
                     self._wait(self._timeout if timeout is None else timeout)
             finally:
-                self._count -= 1
+                # None may be counted, if one was buried who had waited to come in.
+                self._count = max(0, self._count - 1)
                 self._exit()
         return index
 

@@ -8,6 +8,7 @@ import random
 import signal
 import threading
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +33,10 @@ def kill(pid: int) -> None:
         pass  # it was replaced meanwhile
 
 
-def kill_one(pool: Pool) -> None:
+def kill_one(pool: Pool, choose: Callable[[list[int]], int] = random.choice) -> None:
     """Kill any of its workers, unless all were killed and none has come in their place yet."""
     if living := pids(pool):
-        kill(random.choice(living))
+        kill(choose(living))
 
 
 def works(pool: Pool) -> None:
@@ -100,13 +101,13 @@ def test_killed_while_it_gets_large_arguments() -> None:
 
 
 def test_ten_thousand_queued_and_workers_dying_all_the_time() -> None:
-    done = threading.Event()
+    rng, done = random.Random(1), threading.Event()
     with fiber.Pool(3, retries=1000) as pool:
         works(pool)
 
         def kill_now_and_then() -> None:
             while not done.wait(0.05):
-                kill_one(pool)
+                kill_one(pool, rng.choice)
 
         killer = threading.Thread(target=kill_now_and_then)
         killer.start()

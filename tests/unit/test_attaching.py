@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -18,10 +19,11 @@ from fiber import reduction
 from fiber._agent.worker import Worker
 from fiber._hub.client import HubStream
 from fiber._hub.dealer import arrive
-from fiber._hub.handles import collecting_grants
+from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import Op
 from fiber._wire import packet, work
+from fiber.connection import Connection
 from hosts import PATIENCE, Hosts, Wire, background
 
 
@@ -76,20 +78,77 @@ def keep_and_return(thing: Any) -> list[str]:
     return ["a list"]
 
 
-@pytest.mark.parametrize("function", [keep, keep_and_return])
-def test_a_result_comes_after_what_the_task_keeps_is_attached(
-    hosts: Hosts, wire: Wire, is_confirming: Callable[[], bool], function: Callable[[Any], Any]
-) -> None:
-    with hosts.at("a"):
-        reader, writer = fiber.Pipe()
-        payload, buffers, grants = reduction.encode_reusable((function, (writer,), {}))
+def forget(thing: Any) -> int:
+    return 1
+
+
+def call(function: Callable[[Any], Any], thing: Any) -> tuple[bytes, GrantSet]:
+    """As ``apply`` sends it."""
+    payload, buffers, grants = reduction.encode_reusable((function, (thing,), {}))
     assert grants is not None
-    writer.close()
-    call = work.SEQ.pack(1) + work.pack_calls([(payload, buffers)])
+    return work.pack_calls([(payload, buffers)]), grants
+
+
+def several_calls(function: Callable[[Any], Any], thing: Any) -> tuple[bytes, GrantSet]:
+    """As ``apply_async`` sends them."""
+    payload, buffers, grants = reduction.encode_reusable((function, (thing,), {}))
+    assert grants is not None
+    return work.pack_calls([packet.dumps((abs, (-1,), {})), (payload, buffers)]), grants
+
+
+def batch(function: Callable[[Any], Any], thing: Any, stride: int = 0) -> tuple[bytes, GrantSet]:
+    """As ``map`` sends it."""
+    data = pickle.dumps(function)
+    payload, _, grants = reduction.encode_reusable([thing])
+    assert grants is not None
+    head = work.Head(work.MAP, stride, 1, 1, len(data), 0)
+    return work.pack_batch(head, data, payload), grants
+
+
+KINDS = [call, several_calls, batch, partial(batch, stride=1), partial(batch, stride=9)]
+
+
+@pytest.fixture(params=KINDS, ids=["call", "calls", "eager", "single", "stride"])
+def lend(
+    request: pytest.FixtureRequest, hosts: Hosts, wire: Wire
+) -> Iterator[Callable[[Any], tuple[Connection, packet.Message, GrantSet]]]:
+    """Have a function called with one end of a pipe: the other end, the message, what it grants."""
+    made = []
+
+    def lend(function: Callable[[Any], Any]) -> tuple[Connection, packet.Message, GrantSet]:
+        with hosts.at("a"):
+            reader, writer = fiber.Pipe()
+            message, grants = request.param(function, writer)
+        writer.close()
+        made.append(reader)
+        payload = memoryview(work.SEQ.pack(1) + message)
+        return reader, packet.Message(payload, [], []), grants
+
+    yield lend
+    for reader in made:
+        reader.close()
+
+
+@pytest.fixture
+def worker() -> Iterator[tuple[Worker, Results]]:
     results = Results()
     worker = Worker(results, memoryview(bytearray(16)).cast("Q"))
+    yield worker, results
+    worker.close()
+
+
+@pytest.mark.parametrize("function", [keep, keep_and_return])
+def test_a_result_comes_after_what_the_task_keeps_is_attached(
+    lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
+    worker: tuple[Worker, Results],
+    wire: Wire,
+    is_confirming: Callable[[], bool],
+    function: Callable[[Any], Any],
+) -> None:
+    reader, message, grants = lend(function)
+    runs, results = worker
     wire.hold()
-    thread = background(worker.handle, packet.Message(memoryview(call), [], []))
+    thread = background(runs.handle, message)
     wait_until(lambda: results.sent or is_confirming(), PATIENCE)
     assert not results.sent
     wire.let_go()
@@ -99,7 +158,38 @@ def test_a_result_comes_after_what_the_task_keeps_is_attached(
     with KEPT.pop() as kept:
         kept.send("still there")
     assert reader.recv() == "still there"
-    reader.close()
+
+
+def test_what_a_task_does_not_keep_is_not_waited_for(
+    lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
+    worker: tuple[Worker, Results],
+    wire: Wire,
+) -> None:
+    _, message, grants = lend(forget)
+    runs, results = worker
+    wire.hold()
+    runs.handle(message)
+    assert len(results.sent) == 1
+    wire.let_go()
+    grants.release()
+
+
+def use_and_keep(thing: Any) -> None:
+    thing.send("used")
+    KEPT.append(thing)
+
+
+def test_what_was_used_is_not_asked_about(
+    lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
+    worker: tuple[Worker, Results],
+    is_confirming: Callable[[], bool],
+) -> None:
+    reader, message, grants = lend(use_and_keep)
+    worker[0].handle(message)
+    grants.release()
+    assert not is_confirming()
+    assert reader.recv() == "used"
+    KEPT.pop().close()
 
 
 def test_a_reader_says_that_it_has_its_channel_after_that_is_attached(

@@ -251,6 +251,30 @@ def test_a_timeout_breaks_it_until_it_is_reset(brought: Callable[[Any], Any]) ->
     assert there.n_waiting == 0
 
 
+def test_who_leaves_and_is_not_counted_any_more_takes_nobodys_place() -> None:
+    barrier, broken = fiber.Barrier(2), []
+
+    def wait() -> None:
+        try:
+            barrier.wait(PATIENCE)
+        except threading.BrokenBarrierError:
+            broken.append(True)
+
+    slow = background(wait)
+    wait_until(lambda: barrier.n_waiting == 1, PATIENCE)
+    with barrier._cond:
+        barrier._count = 0  # as it is when one is buried who waited to come in
+        barrier.abort()
+    slow.join(PATIENCE)
+    assert broken == [True]
+    barrier.reset()
+    threads = [background(wait) for _ in range(2)]
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert broken == [True]
+    assert barrier.n_waiting == 0
+
+
 def test_a_barrier_for_nobody_is_refused() -> None:
     with pytest.raises(ValueError, match="0"):
         fiber.Barrier(0)

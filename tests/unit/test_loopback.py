@@ -335,7 +335,6 @@ def test_agents_that_do_not_answer_share_one_deadline_at_the_end(
     assert waits == [loopback._QUIT_TIMEOUT, 0.0, 0.0]
 
 
-@pytest.mark.slow
 def test_who_hangs_up_while_it_ends_is_not_reported(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -355,6 +354,7 @@ def test_who_hangs_up_while_it_ends_is_not_reported(
     assert "refused" not in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_runtime_can_be_shut_down_and_made_again() -> None:
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(2):

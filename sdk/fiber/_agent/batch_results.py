@@ -16,7 +16,7 @@ from operator import length_hint
 from typing import Any, Protocol
 
 from fiber._agent import by_reference
-from fiber._hub.remote import confirm_attached
+from fiber._hub.remote import Taken, confirm
 from fiber._wire import packet, work
 
 
@@ -28,7 +28,8 @@ class Sender(Protocol):
 
 
 class BatchResults:
-    """The results of batch ``seq``: of ``total`` tasks; ``remaining`` yields those to begin.
+    """The results of batch ``seq``: of ``total`` tasks; ``remaining`` yields those to begin, with
+    which ``taken`` came from other hosts.
 
     With ``eager``, each value is safe to send as soon as it is in ``values``; without, values come
     straight from the tasks, and ``encode_new`` makes them so.
@@ -46,6 +47,7 @@ class BatchResults:
         "eager",
         "remaining",
         "seq",
+        "taken",
         "total",
         "values",
     )
@@ -59,9 +61,11 @@ class BatchResults:
         *,
         eager: bool,
         started: float,
+        taken: Taken,
         retryable: tuple[type[BaseException], ...] = (),
     ) -> None:
         self.seq = seq
+        self.taken = taken
         self.remaining = remaining
         self.total = total
         self.eager = eager
@@ -146,10 +150,11 @@ class BatchResults:
             return
         odd = [(at - first, kind, data, n) for at, kind, data, n in self._encoded if at < stop]
         buffers = self._buffers[: sum(entry[3] for entry in odd)]
+        if stop >= self.total:  # what the tasks were lent ends with the last of them
+            confirm(self.taken)
         now = time.perf_counter()
         head = (self.seq, first, kept, now - self._last_sent)
         done = len(odd)
-        confirm_attached()
         try:
             data = pickle.dumps((*head, self.values[first:stop], odd), 5)
             self._channel.send(data, buffers)

@@ -19,7 +19,7 @@ from typing import Any
 from fiber._agent import child
 from fiber._agent.batch_results import BatchResults, Sender, encode_error
 from fiber._agent.watchdog import SPLIT_AFTER, Watchdog
-from fiber._hub.remote import confirm_attached
+from fiber._hub.remote import Taken, confirm, loads
 from fiber._wire import work
 from fiber._wire.packet import Message
 
@@ -111,17 +111,19 @@ class Worker:
             return
         if head.kind == work.CALLS:
             items: Any = list(work.unpack_calls(body, head.size))
-            function: Any = _Caller(buffers)
+            taken: Taken = []
+            function: Any = _Caller(buffers, taken)
         else:
             function = self._function(seq, head, body, buffers)
             if function is _REPLIED:
                 return
             try:
-                items = pickle.loads(body[head.size :], buffers=buffers[head.buffers :])
+                items, taken = loads(body[head.size :], buffers[head.buffers :])
             except BaseException as error:
                 self._reply(work.UNREADABLE, seq, encode_error(error))
                 return
-        batch = self._start(seq, items, started, eager=not head.stride)
+        batch = self._start(seq, items, started, taken, eager=not head.stride)
+        del items  # what is not kept is gone by the time that the last of them is done
         self._note(seq)
         self._run(batch, function, head, started)
         batch.flush()
@@ -131,27 +133,32 @@ class Worker:
     ) -> None:
         """A single call: the way of every ``apply``, and the shortest."""
         self._note(seq)
+        taken: Taken = []
         try:
             self._interruptible = True
-            function, args, kwargs = pickle.loads(body[work.CALL.size :], buffers=buffers)
+            (function, args, kwargs), taken = loads(body[work.CALL.size :], buffers)
             value = function(*args, **kwargs)
             self._interruptible = False
+            del function, args, kwargs  # what is not kept is gone
         except BaseException as error:
             self._interruptible = False
-            batch = self._start(seq, (), started, eager=True)
+            batch = self._start(seq, (), started, taken, eager=True)
             batch.fail(error)
             batch.flush()
             if isinstance(error, SystemExit):
                 raise
             return
         if type(value) in SMALL:
+            confirm(taken)
             self._reply(seq, 0, None, time.perf_counter() - started, [value], ())
         else:
-            batch = self._start(seq, (), started, eager=True)
+            batch = self._start(seq, (), started, taken, eager=True)
             batch.add(value)
             batch.flush()
 
-    def _start(self, seq: int, items: Any, started: float, *, eager: bool) -> BatchResults:
+    def _start(
+        self, seq: int, items: Any, started: float, taken: Taken, *, eager: bool
+    ) -> BatchResults:
         return BatchResults(
             self._channel,
             seq,
@@ -159,6 +166,7 @@ class Worker:
             len(items),
             eager=eager,
             started=started,
+            taken=taken,
             retryable=self._retryable,
         )
 
@@ -189,7 +197,6 @@ class Worker:
         return functions[head.function]
 
     def _reply(self, *words: Any) -> None:
-        confirm_attached()
         self._channel.send(pickle.dumps(words))
 
     # Running
@@ -308,10 +315,12 @@ def _spread(function: _Function) -> _Function:
 class _Caller:
     """Runs pickled calls, whose buffers lie one after the other in ``buffers``."""
 
-    def __init__(self, buffers: list[memoryview]) -> None:
+    def __init__(self, buffers: list[memoryview], taken: Taken) -> None:
         self._buffers = iter(buffers)
+        self._taken = taken
 
     def __call__(self, call: tuple[memoryview, int]) -> Any:
         data, count = call
-        function, args, kwargs = pickle.loads(data, buffers=list(islice(self._buffers, count)))
+        (function, args, kwargs), taken = loads(data, list(islice(self._buffers, count)))
+        self._taken += taken
         return function(*args, **kwargs)

@@ -152,7 +152,7 @@ class LoopbackBackend:
         return None
 
     def _refused(self, reason: str) -> None:
-        if not self._closing:  # else it is one of ours, ended before it was in
+        if not self._closing:  # else it may be one of ours, ended before it was in
             self._output.write("fiber", f"refused an agent: {reason}")
 
     def _shut_down(self) -> None:

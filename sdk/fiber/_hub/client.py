@@ -269,6 +269,11 @@ class HubStream:
             message.close_descriptors()
             message.release()
 
+    @property
+    def has_answered(self) -> bool:
+        """Whether the last request that has an answer has got it."""
+        return self._asked > 0 and self._unsettled is None
+
     def fileno(self) -> int:
         """The stream's descriptor."""
         return self._sock.fileno()

@@ -17,7 +17,7 @@ from collections import deque
 
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel
-from fiber._hub.remote import confirm_attached
+from fiber._hub.remote import RemoteObject
 from fiber._transport.base import Channel
 from fiber._wire import packet
 from fiber._wire.packet import Message
@@ -120,7 +120,8 @@ def arrive(arrivals: Channel) -> Channel:
             if arrivals.poll(0):  # nothing ever comes there but the end
                 raise ConnectionClosed()
         channel: Channel = ours.recv_object()
-        confirm_attached()  # or the answer could overtake that, and the grant be taken back
+        if isinstance(channel, RemoteObject):  # or the grant might be taken back before
+            channel.confirm()
         ours.send(b"")
         return channel
     except BrokenPipeError as error:

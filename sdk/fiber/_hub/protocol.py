@@ -17,7 +17,7 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 2
+VERSION = 1
 KEY_BYTES = 32
 
 

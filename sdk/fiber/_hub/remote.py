@@ -7,11 +7,12 @@ are as many streams as threads ever used the object at once.
 from __future__ import annotations
 
 import os
+import pickle
 import weakref
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, TypeAlias
 
 from fiber._hub.client import HubStream, Reply, Unreachable
 from fiber._hub.protocol import ONE, TWO, HubAddress, Op, Status
@@ -20,20 +21,31 @@ from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import ConnectionClosed
 
-_attaching: weakref.WeakSet[RemoteObject] = weakref.WeakSet()
-"""Those whose hub may not have heard of it yet."""
+Taken: TypeAlias = "list[weakref.ref[RemoteObject]]"
+"""Objects of other hosts that something unpickled has brought here."""
+
+_taken: Taken | None = None
 
 
-def confirm_attached() -> None:
-    """Returns once hubs elsewhere have heard who uses what this process has unpickled and still
-    has: whoever learns of that then may take back what it granted for it.
+def loads(data: BytesLike, buffers: Iterable[BytesLike]) -> tuple[Any, Taken]:
+    """Unpickle; and what was taken with it, for ``confirm``."""
+    global _taken
+    taken: Taken = []
+    before, _taken = _taken, taken
+    try:
+        return pickle.loads(data, buffers=buffers), taken
+    finally:
+        _taken = before
+
+
+def confirm(taken: Taken) -> None:
+    """Returns once the hubs of those that are still here know that they are: whoever learns of it
+    then may take back what it granted.
     """
-    while _attaching:
-        try:
-            new = _attaching.pop()
-        except KeyError:  # another thread's now, or gone
-            return
-        new.confirm()
+    for reference in taken:
+        remote = reference()
+        if remote is not None:
+            remote.confirm()
 
 
 class RemoteObject:
@@ -54,11 +66,12 @@ class RemoteObject:
         # Opened at once, so that the grant is used up, but without waiting: whoever unpickles this
         # may be the very thread that carries the answer.  An error shows at the first request.
         self._idle = deque([self._open(grant)])
-        _attaching.add(self)
+        if _taken is not None:
+            _taken.append(weakref.ref(self))
 
     def confirm(self) -> None:
         """Returns once its hub knows that it is used, or cannot be asked."""
-        if self._pid == os.getpid():
+        if not any(stream.has_answered for stream in tuple(self._streams)):
             with suppress(OSError, Unreachable), self.stream() as stream:
                 stream.ask(Op.SYNC, 0, form=ONE)
 
