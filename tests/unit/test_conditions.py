@@ -303,6 +303,7 @@ def test_a_member_killed_between_two_waits_breaks_the_barrier() -> None:
     barrier = fiber.Barrier(2)
     pid = fork_that(lambda: (barrier.wait(PATIENCE), os.kill(os.getpid(), 19)))
     barrier.wait(PATIENCE)
+    os.waitpid(pid, os.WUNTRACED)  # it has stopped, and waits no more
     kill(pid)
     with pytest.raises(threading.BrokenBarrierError, match="have died"):
         barrier.wait(PATIENCE)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import ctypes
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # malloc.h
 
 _MAPPED = 2 << 20
 """Bytes from which on a piece is memory of its own: more than a datagram has."""
 
 _KEPT = 16 << 20
-"""Bytes that may be free and are kept."""
+"""Bytes that may be free and are kept.  When there are more, half of that is."""
 
 
 def keep_memory() -> None:
@@ -24,3 +24,4 @@ def keep_memory() -> None:
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _MAPPED)
         mallopt(_M_TRIM_THRESHOLD, _KEPT)
+        mallopt(_M_TOP_PAD, _KEPT // 2)  # else nothing would be left of them
