@@ -28,17 +28,10 @@ from hosts import PATIENCE, Hosts, Wire, background
 
 
 @pytest.fixture
-def hosts() -> Iterator[Hosts]:
-    hosts = Hosts()
+def wire(hosts: Hosts, wires: tuple[Wire, Wire]) -> Iterator[Wire]:
+    """From here to host a."""
     with hosts.at("b"):
-        yield hosts
-    hosts.close()
-
-
-@pytest.fixture
-def wire(hosts: Hosts) -> Wire:
-    up, _ = hosts.link("b", "a")
-    return up
+        yield wires[0]
 
 
 @pytest.fixture
@@ -149,7 +142,7 @@ def test_a_result_comes_after_what_the_task_keeps_is_attached(
     runs, results = worker
     wire.hold()
     thread = background(runs.handle, message)
-    wait_until(lambda: results.sent or is_confirming(), PATIENCE)
+    assert wait_until(lambda: bool(results.sent) or is_confirming(), PATIENCE)
     assert not results.sent
     wire.let_go()
     thread.join(PATIENCE)
@@ -206,7 +199,7 @@ def test_a_reader_says_that_it_has_its_channel_after_that_is_attached(
     thread = background(lambda: arrived.append(arrive(door)))
     answer: Any = packet.loads(arrivals.recv())
     answer.send(invitation)
-    wait_until(lambda: answer.poll(0) or is_confirming(), PATIENCE)
+    assert wait_until(lambda: answer.poll(0) or is_confirming(), PATIENCE)
     assert not answer.poll(0)
     wire.let_go()
     thread.join(PATIENCE)

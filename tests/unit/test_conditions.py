@@ -95,7 +95,7 @@ def test_all_are_notified_from_elsewhere(brought: Callable[[Any], Any]) -> None:
     there = brought(here)
     threads = [waiter(condition, woken, "") for condition in (here, there, here, there)]
     # Who waits counts as waiting before it lets go of the lock, or it could miss who notifies.
-    wait_until(lambda: repr(here) == "<Condition(<Lock(owner=None)>, 4)>", PATIENCE)
+    assert wait_until(lambda: repr(here) == "<Condition(<Lock(owner=None)>, 4)>", PATIENCE)
     with there:
         there.notify(1)
         there.notify_all()

@@ -44,10 +44,10 @@ class BatchResults:
         "_lock",
         "_retryable",
         "_sent",
+        "_taken",
         "eager",
         "remaining",
         "seq",
-        "taken",
         "total",
         "values",
     )
@@ -65,7 +65,7 @@ class BatchResults:
         retryable: tuple[type[BaseException], ...] = (),
     ) -> None:
         self.seq = seq
-        self.taken = taken
+        self._taken = taken
         self.remaining = remaining
         self.total = total
         self.eager = eager
@@ -151,7 +151,7 @@ class BatchResults:
         odd = [(at - first, kind, data, n) for at, kind, data, n in self._encoded if at < stop]
         buffers = self._buffers[: sum(entry[3] for entry in odd)]
         if stop >= self.total:  # what the tasks were lent ends with the last of them
-            confirm(self.taken)
+            confirm(self._taken)
         now = time.perf_counter()
         head = (self.seq, first, kept, now - self._last_sent)
         done = len(odd)
