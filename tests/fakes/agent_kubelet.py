@@ -40,6 +40,8 @@ class AgentKubelet:
         """By the names of their pods."""
         self.services: dict[str, str] = {}
         """By the names of FiberPools, ``host:port`` that all their masters are at."""
+        self.cut_off = False
+        """Whether agents started from now on dial an address at which no master is."""
         store.pods_linger = True
         store.created = self._created
 
@@ -117,6 +119,8 @@ class AgentKubelet:
 
     def _address(self, namespace: str, pool: str) -> str | None:
         """Where the agents of the pool dial."""
+        if self.cut_off:
+            return "127.0.0.1:1"
         if pool in self.services:
             return self.services[pool]
         master = self._store.get("fiberpools", namespace, pool)["spec"].get("master")

@@ -51,6 +51,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeCluster]:
 def _nothing_is_left(cluster: FakeCluster) -> Iterator[None]:
     yield
     cluster.nodes.fails_with = None
+    cluster.nodes.cut_off = False
 
     def left() -> set[str]:
         found = [object_ for plural in KEPT for object_ in cluster.world.store.list(plural)]
@@ -499,6 +500,21 @@ def test_while_the_api_server_does_not_answer_that_is_what_is_said(
         assert pool.apply(square, (3,)) == 9
     cluster.do(cluster.world.api.faults.clear)
     assert "the API server 127.0.0.1 has not answered yet" in capfd.readouterr().err
+
+
+def test_pods_that_cannot_reach_the_program_are_an_error(
+    cluster: FakeCluster, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fiber._backends.kubernetes.reachability.DOUBTED_AFTER", 0.2)
+    monkeypatch.setattr("fiber._backends.kubernetes.reachability.GIVEN_UP_AFTER", 0.5)
+    cluster.nodes.cut_off = True
+    with running(backend="kubernetes"):
+        for _ in range(2):  # the second waits for the same pods
+            with fiber.Pool(2) as pool, pytest.raises(FiberPoolError) as caught:
+                pool.map(square, range(3))
+            assert caught.value.reason == "Unreachable"
+            assert "has reached this program at " in str(caught.value)
+    assert capfd.readouterr().err.count("Waiting for 60 s more") == 1
 
 
 FORKS = """

@@ -163,7 +163,7 @@ def test_an_end_while_it_is_opened_makes_no_pool_and_closes_what_listens(site: S
         asks.set()
         assert cancel.wait(PATIENCE)  # so it is not asked again and again
         some_listener: Any = listener
-        return PreparedPool(some_listener, attachment, 1, 0, 10)
+        return PreparedPool(some_listener, "10.0.0.7:41337", attachment, 1, 0, 10)
 
     site.pods(prepare)
     site.start()
@@ -235,7 +235,7 @@ def test_an_end_after_the_loop_has_failed(site: Site, monkeypatch: pytest.Monkey
         asks.set()
         assert failed.wait(PATIENCE)
         listener: Any = Listener()
-        return PreparedPool(listener, Attachment(), 1, 0, 10)
+        return PreparedPool(listener, "10.0.0.7:41337", Attachment(), 1, 0, 10)
 
     def damage() -> None:
         raise KeyboardInterrupt(DAMAGED)

@@ -9,16 +9,19 @@ import pytest
 
 from fiber._backends.kubernetes.problems import (
     PoolName,
+    Way,
     failure,
     new_problems,
     overdue,
     summary,
+    unreachable,
 )
 from fiber_api.times import parse_time
 
 POOL = PoolName("es-1a2b3c", "team")
 SINCE = "2026-11-21T14:56:13Z"
 NOW = parse_time(SINCE) + 14
+WAY = Way("10.0.0.7:41337")
 SCHEDULER = (
     "0/3 nodes are available: 1 node(s) had untolerated taint {node.kubernetes.io/disk: }, "
     "2 Insufficient cpu"
@@ -132,21 +135,38 @@ class TestFailure:
 class TestOverdue:
     def test_says_what_is_known(self) -> None:
         late = status(UNSCHEDULABLE, desiredReplicas=30, pendingReplicas=30)
-        error = overdue(POOL, late, 60.0, NOW)
+        error = overdue(POOL, late, 60.0, NOW, WAY)
         assert error.reason == "Unschedulable"
         for part in ("after 60 s", "0 of 30 pods ready", SCHEDULER, "Add nodes", "pod_timeout"):
             assert part in str(error)
         assert "kubectl describe fiberpool es-1a2b3c --namespace team" in str(error)
 
     def test_says_that_nothing_is(self) -> None:
-        error = overdue(POOL, {}, 60.0, NOW)
+        error = overdue(POOL, {}, 60.0, NOW, WAY)
         assert error.reason == "StartTimeout"
         assert "the operator has not looked at it yet. See kubectl describe" in str(error)
 
     def test_workers_that_are_ready_and_did_not_join_cannot_reach_the_program(self) -> None:
-        error = overdue(POOL, status(desiredReplicas=2, readyReplicas=2), 60.0, NOW)
+        error = overdue(POOL, status(desiredReplicas=2, readyReplicas=2), 60.0, NOW, WAY)
         assert "2 of 2 pods ready" in str(error)
-        assert "listen_host" in str(error)
+        assert WAY.advice in str(error)
+
+
+class TestUnreachable:
+    def test_says_the_address_the_reasons_and_the_remedies(self) -> None:
+        error = unreachable(POOL, status(readyReplicas=2), 8.0, WAY)
+        assert error.reason == "Unreachable"
+        assert "no agent of its 2 ready pods has reached this program at 10.0.0.7:41337" in str(
+            error
+        )
+        for part in ("within 8 s", "NAT", "NetworkPolicy", "in a pod", "FIBER_LISTEN_HOST"):
+            assert part in str(error)
+        assert "its ready pod has" in str(unreachable(POOL, status(readyReplicas=1), 8.0, WAY))
+
+    def test_of_a_pool_that_was_taken_over_names_its_last_master(self) -> None:
+        way = Way("10.0.0.7:41337", displaced="laptop-8:4712")
+        told = str(unreachable(POOL, status(readyReplicas=1), 8.0, way))
+        assert "Or the pods still serve laptop-8:4712" in told
 
 
 class TestSummary:

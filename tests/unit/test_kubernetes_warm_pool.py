@@ -149,6 +149,7 @@ def test_a_master_that_is_lost_is_replaced_and_its_demand_forgotten(rig: Rig, to
     set_status(rig, observedGeneration=generation, conditions=alive("False"), masterEpoch=4)
     client = rig.warm(told)
     has_master(rig, told, 5)
+    assert client._attachment.displaced == OTHER.identity
     client.close()
     assert spec(rig)["replicas"] == 0
 

@@ -30,6 +30,11 @@ class Master:
     lease_duration: int = 30
     lost_grace: int = 60
 
+    @property
+    def address(self) -> str:
+        """``host:port`` that the pool's Service leads to."""
+        return names.address_of(self.host, self.port)
+
     def spec(self, pool: str, epoch: int) -> Body:
         """``spec.master`` of ``pool``."""
         return {

@@ -39,6 +39,8 @@ class Attachment(Protocol):
     namespace: str
     doing: str
     """What ``attach`` does, in words that the pool follows."""
+    displaced: str
+    """Identity of the lost master whose place ``attach`` took; empty if there was none."""
 
     @property
     def remedy(self) -> str:

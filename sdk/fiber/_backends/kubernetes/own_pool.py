@@ -41,6 +41,7 @@ class OwnPool:
         self.name = str(body["metadata"]["name"])
         self.namespace = namespace
         self.doing = "make"
+        self.displaced = ""
         self.remedy = f"kubectl delete fiberpool {self.name} -n {namespace}"
         """What removes it when ``detach`` does not."""
 

@@ -13,7 +13,7 @@ from fiber._backends.kubernetes.attached_pool import LOST
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._backends.kubernetes.pod_reasons import node_of, pod_end
 from fiber._backends.kubernetes.preparation import Preparation
-from fiber._backends.kubernetes.problems import PoolName
+from fiber._backends.kubernetes.problems import PoolName, Way
 from fiber._backends.kubernetes.program import ListenerObserver, PreparedPool
 from fiber._backends.kubernetes.waiting import Waiting
 from fiber._backends.output import Output
@@ -186,11 +186,13 @@ class Pods:
 
     def on_refused(self, why: str) -> None:
         """Somebody dialled who is not served."""
+        self._waiting.reached()
         if not self._closing.is_set():  # else that is how it is to be
             self._output.write("fiber", f"an agent was refused: {why}")
 
     def on_agent(self, link: Link) -> str | None:
         """An agent has dialled; why it is not wanted, if it is not."""
+        self._waiting.reached()
         name = link.peer.name
         if name in self._given_up:
             return f"{name}, which had been given up"
@@ -267,6 +269,8 @@ class Pods:
     def on_attached(self) -> None:
         """The pool is there, with this program as its master."""
         self._waiting.attached = True
+        if (prepared := self._prepared) is not None:
+            self._waiting.way = Way(prepared.address, prepared.attachment.displaced)
 
     def on_warning(self, message: str) -> None:
         """Something that keeps the pool waiting, and may pass."""

@@ -30,6 +30,31 @@ class PoolName(NamedTuple):
         )
 
 
+class Way(NamedTuple):
+    """How agents come to this program."""
+
+    address: str
+    """``host:port`` that the pool's Service leads to."""
+    displaced: str = ""
+    """Identity of the lost master that this program took the pool from."""
+
+    @property
+    def advice(self) -> str:
+        """Reasons why agents do not arrive, and remedies."""
+        others = (
+            f". Or the pods still serve {self.displaced}, which had this pool before and does not "
+            "renew its Lease: end that program"
+            if self.displaced
+            else ""
+        )
+        return (
+            "Pods cannot connect to that address: it is behind NAT, or a firewall or a "
+            "NetworkPolicy is in between. Run the program in a pod of the cluster, or set "
+            "listen_host (FIBER_LISTEN_HOST) to an address of this machine that pods reach, or "
+            f"allow the connection{others}"
+        )
+
+
 # ---- what to warn of ------------------------------------------------------------------------
 
 
@@ -79,10 +104,12 @@ def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | Non
     return None
 
 
-def overdue(pool: PoolName, status: Status, waited: float, now: float) -> FiberPoolError:
+def overdue(pool: PoolName, status: Status, waited: float, now: float, way: Way) -> FiberPoolError:
     """No worker came in time: what is known of why.  ``now`` is in unix seconds."""
     worst = next(_problems(status), None)
-    why = _UNREACHED if status.get("readyReplicas") else "" if worst is None else _told(worst)
+    why = f"{way.advice}." if status.get("readyReplicas") else ""
+    if not why and worst is not None:
+        why = _told(worst)
     return pool.error(
         f"no worker has joined after {waited:g} s: {summary(status, now)}. {why}".rstrip()
         + f" See kubectl describe fiberpool {pool.name} --namespace {pool.namespace}, or allow "
@@ -91,10 +118,15 @@ def overdue(pool: PoolName, status: Status, waited: float, now: float) -> FiberP
     )
 
 
-_UNREACHED = (
-    "Those cannot reach this program: let listen_host be an address of this machine that pods "
-    "reach, and look at firewalls and NetworkPolicies between them."
-)
+def unreachable(pool: PoolName, status: Status, waited: float, way: Way) -> FiberPoolError:
+    """Return the error for ready pods whose agents do not arrive."""
+    ready = status.get("readyReplicas") or 0
+    pods = f"its {ready} ready pods" if ready != 1 else "its ready pod"
+    return pool.error(
+        f"no agent of {pods} has reached this program at {way.address} within {waited:.0f} s. "
+        f"{way.advice}",
+        "Unreachable",
+    )
 
 
 def _concerns_all(problem: Mapping[str, Any], status: Status) -> bool:

@@ -46,6 +46,8 @@ class PreparedPool(NamedTuple):
     """A FiberPool that this program is about to be the master of, and listens for."""
 
     listener: MasterListener
+    address: str
+    """``host:port`` at which pods are to reach this program."""
     attachment: Attachment
     slots: int
     """Processes that each of its pods runs."""
@@ -86,11 +88,10 @@ class Program:
         template = pod_template(shape, own, container, sys.executable)
         body = fiber_pool_body(name, template, self._config)
         # Last: whatever fails before leaves nothing open.
-        host, listener = self._listen(name, credentials, loop, observer)
-        master = self._master(host, listener)
+        master, listener = self._listen(name, credentials, loop, observer)
         attachment = OwnPool(self._api, self.namespace, body, credentials, master, self._owner(own))
         slots = self._config.processes_per_pod
-        return PreparedPool(listener, attachment, slots, 0, self._config.max_pods)
+        return PreparedPool(listener, master.address, attachment, slots, 0, self._config.max_pods)
 
     def prepare_warm(
         self, name: str, loop: Loop, observer: ListenerObserver, cancel: threading.Event
@@ -102,10 +103,11 @@ class Program:
             credentials = read_credentials(self._api, self.namespace, name, spec, cancel)
         except ApiError as error:
             raise self._explained(error, f"attach to the FiberPool {name!r}", name) from error
-        host, listener = self._listen(name, credentials, loop, observer)
-        attachment = WarmPool(self._api, self.namespace, name, self._master(host, listener))
+        master, listener = self._listen(name, credentials, loop, observer)
+        attachment = WarmPool(self._api, self.namespace, name, master)
         return PreparedPool(
             listener,
+            master.address,
             attachment,
             int(spec.get("processesPerPod", 1)),
             int(spec.get("minReplicas", 0)),
@@ -114,7 +116,7 @@ class Program:
 
     def _listen(
         self, pool: str, credentials: MasterCredentials, loop: Loop, observer: ListenerObserver
-    ) -> tuple[str, MasterListener]:
+    ) -> tuple[Master, MasterListener]:
         config = self._config
         host = reachable_address(self._api, config.listen_host, pool=pool, namespace=self.namespace)
         patience = config.heartbeat_interval, config.suspect_after, config.lost_after
@@ -138,7 +140,7 @@ class Program:
                 "all functions the same fiber.meta"
             ) from error
         self._listens = True
-        return host, listener
+        return self._master(host, listener), listener
 
     def _master(self, host: str, listener: MasterListener) -> Master:
         port = int(listener.address.rpartition(":")[2])

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.problems import PoolName, failure, new_problems, overdue, summary
+from fiber._backends.kubernetes.problems import (
+    PoolName,
+    Way,
+    failure,
+    new_problems,
+    overdue,
+    summary,
+    unreachable,
+)
 from fiber._backends.kubernetes.progress import Progress
+from fiber._backends.kubernetes.reachability import (
+    DOUBTED_AFTER,
+    GIVEN_UP_AFTER,
+    Reachability,
+    Verdict,
+)
 from fiber._backends.output import Output
 from fiber._transport.link import Timer
 from fiber.errors import FiberError
@@ -32,6 +47,8 @@ class Waiting:
     ) -> None:
         self.pool = PoolName("", "")
         """What they wait for, once that has a name."""
+        self.way = Way("")
+        """How its agents come, once it has a name."""
         self.status: Mapping[str, Any] = {}
         """The pool's, as it is now."""
         self.attached = False
@@ -43,6 +60,10 @@ class Waiting:
         self._timeout = timeout
         self._on_begin = on_begin
         self._patience: Timer | None = None
+        self._reachability = Reachability()
+        self._verdict = Verdict.OPEN
+        self._told_of_verdict = False
+        self._next_judgement: Timer | None = None
         self._told_of_limit = False
         self._progress = Progress(agents.loop, output, self._describe)
 
@@ -50,6 +71,7 @@ class Waiting:
         """Nobody waits any more."""
         self._progress.stop()
         self._wait_no_more()
+        self._cancel_judgement()
 
     def _wait_no_more(self) -> None:
         if self._patience is not None:
@@ -64,6 +86,12 @@ class Waiting:
         error = failure(self.pool, status, len(self._placement.loads))
         if error is not None:
             self.refuse(error)
+        self._judge_reachability()
+
+    def reached(self) -> None:
+        """Note that something has dialled: pods reach this program."""
+        self._reachability.prove()
+        self._judge_reachability()
 
     def refuse(self, error: Exception) -> None:
         """Nobody is to wait any longer."""
@@ -76,11 +104,12 @@ class Waiting:
     def look(self, most: int) -> None:
         """Somebody has come or gone; there are to be at most so many pods."""
         placement = self._placement
-        alone = bool(placement.waiting) and not placement.loads
-        known = self._agents.error or failure(self.pool, self.status, 0)
+        alone = self._alone
+        known = self._agents.error or failure(self.pool, self.status, 0) or self._unreachable()
         if alone and known is not None:
             self.refuse(known)  # it was heard before they came
             return
+        self._tell_of_doubts()
         if self.pool.name:
             self._look_at_limit(most)
         # A pool works with the workers that it has: nobody waits for the others.
@@ -93,6 +122,11 @@ class Waiting:
         elif self._patience is None:
             self._patience = self._agents.loop.call_later(self._timeout, self._give_up)
             self._on_begin()
+
+    @property
+    def _alone(self) -> bool:
+        """Whether somebody waits and no agent is there."""
+        return bool(self._placement.waiting) and not self._placement.loads
 
     @property
     def _has_processes(self) -> bool:
@@ -116,10 +150,47 @@ class Waiting:
                 "a pool of somebody else's its maxReplicas, or processes_per_pod",
             )
 
+    def _judge_reachability(self) -> None:
+        loop = self._agents.loop
+        self._cancel_judgement()
+        ready = self.status.get("readyReplicas") or 0
+        self._verdict = self._reachability.judge(ready, now := loop.now())
+        if self._verdict is Verdict.OPEN:
+            self._told_of_verdict = False
+        if self._reachability.due < math.inf:
+            pause = self._reachability.due - now
+            self._next_judgement = loop.call_later(pause, self._judge_reachability)
+        error = self._unreachable()
+        if error is not None and self._alone:
+            self.refuse(error)
+        else:
+            self._tell_of_doubts()
+
+    def _cancel_judgement(self) -> None:
+        if self._next_judgement is not None:
+            self._next_judgement.cancel()
+            self._next_judgement = None
+
+    def _unreachable(self) -> FiberError | None:
+        # The agents of a pool that was taken over may serve its last master, for as long as that
+        # lives.
+        if self._verdict is not Verdict.UNREACHABLE or self.way.displaced:
+            return None
+        return unreachable(self.pool, self.status, DOUBTED_AFTER + GIVEN_UP_AFTER, self.way)
+
+    def _tell_of_doubts(self) -> None:
+        if self._verdict is Verdict.OPEN or self._told_of_verdict or not self._alone:
+            return
+        self._told_of_verdict = True
+        doubt = unreachable(self.pool, self.status, DOUBTED_AFTER, self.way)
+        patience = "" if self.way.displaced else f". Waiting for {GIVEN_UP_AFTER:g} s more"
+        self._output.write("fiber", f"{doubt}{patience}")
+
     def _give_up(self) -> None:
         self._patience = None
         if self.pool.name:
-            self.refuse(overdue(self.pool, self.status, self._timeout, time.time()))
+            error = overdue(self.pool, self.status, self._timeout, time.time(), self.way)
+            self.refuse(error)
         else:
             self.refuse(
                 FiberError(
@@ -131,7 +202,9 @@ class Waiting:
 
     def _describe(self) -> str:
         state = summary(self.status, time.time()) if self.attached else self._api_state()
-        return f"waiting for pods: {state}"
+        unreached = self._verdict is not Verdict.OPEN
+        where = f", no agent has reached {self.way.address}" if unreached else ""
+        return f"waiting for pods: {state}{where}"
 
     def _api_state(self) -> str:
         trouble = self._api.trouble

@@ -63,6 +63,7 @@ class WarmPool:
         self.name = name
         self.namespace = namespace
         self.doing = "attach to"
+        self.displaced = ""
 
     @property
     def remedy(self) -> str:
@@ -121,6 +122,7 @@ class WarmPool:
             return True  # by an attempt whose answer was lost
         if there:
             self._check_lost(found, there)
+        self.displaced = str(there.get("identity") or there.get("host") or "")
         seen = int((found.get("status") or {}).get("masterEpoch") or 0)
         attached = self._as_master(found, 1 + max(epoch, seen))
         self._replicas = 0 if there else int(found["spec"].get("replicas") or 0)
