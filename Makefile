@@ -15,6 +15,7 @@ ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback
 	process queues reduction synchronize worker exit_functions futures) tests/faults/test_children.py \
 	tests/conformance/test_executors.py
 OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
+PARTS = test-prepare test-modules $(addprefix test-python-,$(OTHER_PYTHONS)) test-programs test-on-cluster
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
@@ -27,13 +28,24 @@ help:
 demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
-## make test          every test
+## make test          every test: all parts run, and the last lines say which of them failed
 test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-testsuite
 	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
+	@failed=; \
+	for part in $(PARTS); do $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; done; \
+	[ -z "$$failed" ] || { echo "make test: failed:$$failed (each is a target of make)" >&2; exit 1; }
+
+.PHONY: test-prepare test-modules test-programs test-on-cluster
+test-prepare:
 	$(CLUSTER) prepare
+
+test-modules:
 	$(FAST)
-	@$(MAKE) --no-print-directory test-pythons
+
+test-programs:
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not long" $(WHOLE_PROGRAMS)
+
+test-on-cluster:
 	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS) $(WHOLE_PROGRAMS))
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation, but for the slowest

@@ -15,22 +15,15 @@ import pytest
 from hypothesis import settings
 
 from leaks import Snapshot, Watch, shut_down_runtime
+from patience import PATIENCE
 
 if TYPE_CHECKING:
     from fiber.connection import Connection
 
-# Seconds for one test, by folder; a test with its own timeout marker keeps that. They are there to
-# end a hang: about ten times what the slowest needs alone on a machine, as it may have company.
-LIMITS = {
-    "chart": 30,
-    "conformance": 900,
-    "contract": 60,
-    "e2e": 180,
-    "examples": 180,
-    "faults": 60,
-    "simulation": 60,
-    "unit": 60,
-}
+# Seconds for one test; a test with its own timeout marker keeps that. The limit ends a hang that no
+# deadline of the test ends, so it is longer than two of them.
+LIMIT = 3 * PATIENCE
+CONFORMANCE_LIMIT = 900  # one test of this folder runs a whole test suite of someone else's
 
 _CALL = pytest.StashKey[pytest.CallInfo[None]]()
 _WATCH = pytest.StashKey[Watch]()
@@ -49,9 +42,9 @@ def pytest_configure() -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     root = Path(__file__).parent
     for item in items:
-        limit = LIMITS.get(item.path.relative_to(root).parts[0])
-        if limit is not None and item.get_closest_marker("timeout") is None:
-            item.add_marker(pytest.mark.timeout(limit))
+        if item.get_closest_marker("timeout") is None:
+            conformance = item.path.is_relative_to(root / "conformance")
+            item.add_marker(pytest.mark.timeout(CONFORMANCE_LIMIT if conformance else LIMIT))
 
 
 @pytest.hookimpl(wrapper=True)

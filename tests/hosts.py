@@ -16,6 +16,7 @@ from fiber._runtime.state import runtime
 from fiber._transport.loop import Loop
 from fiber._wire import messages
 from fiber._wire.messages import OfHubs
+from patience import PATIENCE
 
 
 class Wire:
@@ -104,9 +105,6 @@ class Hosts:
         for hub in self._hubs.values():
             self.loop.call_soon(hub.close)
         self.loop.stop()
-
-
-PATIENCE = 15.0
 
 
 def objects_kept(hub: Hub) -> int:

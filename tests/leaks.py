@@ -20,8 +20,9 @@ from typing import NamedTuple
 import census
 from fiber._hub.heap import SIZES
 from fiber._wire.arena import RETAINED_BLOCKS
+from patience import PATIENCE
 
-SETTLE = 5.0  # seconds for what is ending to have ended
+SETTLE = PATIENCE  # seconds for processes, threads and files that are ending to end
 _RUNTIME_THREADS = ("fiber-io",)
 _ZYGOTE = "fiber._agent.zygote import main"
 _AGENT = "'fiber.agent'"

@@ -19,12 +19,11 @@ from fiber._transport.loop import Loop
 from fiber.errors import AuthenticationError
 from fiber_api import names
 from fiber_api.certificates import Certificates, make_pool_certificates
+from patience import PATIENCE
 
 # Once used, nng keeps threads and two descriptors for as long as the process lives.  The census of
 # what tests leave behind begins after the collection, and so after this.
 pynng.Pair1().close()
-
-DEADLINE = 10.0
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +61,7 @@ class Observer:
     def on_lost(self, reason: str) -> None: ...
 
     def first(self) -> Any:
-        assert self._said.wait(DEADLINE)
+        assert self._said.wait(PATIENCE)
         return self._what[0]
 
 
@@ -87,12 +86,12 @@ class Wire:
         def close() -> None:
             closed = threading.Event()
             listener.close("", linger=0.1, then=closed.set)
-            assert closed.wait(DEADLINE)
+            assert closed.wait(PATIENCE)
 
         self._closing.append(close)
         return listener.address, observer
 
-    def dial(self, address: str, credentials: Credentials, timeout: float = DEADLINE) -> Observer:
+    def dial(self, address: str, credentials: Credentials, timeout: float = PATIENCE) -> Observer:
         observer = Observer()
         dialer = AgentDialer(
             self._loop,

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from e2e.delays import prompt
+from e2e.delays import record
 from e2e.kube import Body, Kube
 from e2e.pools import Pool, is_live, says
 from e2e.release import Release
@@ -170,7 +170,7 @@ def test_a_worker_that_somebody_deletes_is_replaced(pool: Pool, agent: Body) -> 
     assert (failures.get("disrupted", 0), failures.get("total", 0)) == (0, 0)
     asked = scene.first("pods", lambda pod: "deletionTimestamp" in pod["metadata"])
     came = scene.first("pods", lambda pod: pod["metadata"]["name"] == new)
-    prompt("a deleted worker is replaced", came - asked)
+    record("a deleted worker is replaced", came - asked)
 
 
 def test_an_evicted_worker_is_replaced(pool: Pool, agent: Body) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from e2e.delays import prompt
+from e2e.delays import record
 from e2e.kube import Body
 from e2e.pools import Pool, has_ended, says, template, waits_for
 from e2e.scene import Scene
@@ -55,7 +55,7 @@ def pools(module_scene: Scene, image: str) -> Pools:
 
 
 def is_told_soon(pool: Pool, reported: Callable[[Body], bool], reason: str, **fields: Any) -> None:
-    prompt(f"{pool.name}: {reason}", pool.told_after(reported, reason, **fields))
+    record(f"{pool.name}: {reason}", pool.told_after(reported, reason, **fields))
 
 
 def test_an_image_that_cannot_be_pulled(pools: Pools) -> None:

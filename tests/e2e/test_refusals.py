@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from contract.bad_manifests import BAD, BAD_UPDATES, DUPLICATE_RELEASE, GOOD, Bad, BadUpdate
-from e2e.delays import prompt
+from e2e.delays import record
 from e2e.kube import Body, Failed, Kube, Refused, path_of
 from e2e.pools import Pool, condition_in, problem_in, says
 from e2e.scene import Scene, watching
@@ -88,7 +88,7 @@ def test_a_quota(pool: Pool, agent: Body) -> None:
     assert pool.status["phase"] == "Degraded"
     second = sorted(scene.first("pods", _is(name)) for name in pool.ever)[1]
     told = scene.first("fiberpools", lambda body: problem_in(body, "QuotaExceeded"))
-    prompt("a quota is exceeded", told - second)
+    record("a quota is exceeded", told - second)
     scene.kube.patch(f"{quota}/small", {"spec": {"hard": {"pods": "9"}}})
     pool.ready(4)
     assert not pool.status["problems"]
@@ -103,7 +103,7 @@ def test_a_template_that_is_no_pod(pool: Pool, agent: Body) -> None:
     assert pool.condition("Accepted")["status"] == "False"
     made = pool.scene.first("fiberpools", bool)
     told = pool.scene.first("fiberpools", lambda p: problem_in(p, "InvalidTemplate"))
-    prompt("a template is no valid pod", told - made)
+    record("a template is no valid pod", told - made)
     assert not pool.ever
     pool.apply(agent, minReplicas=1)
     pool.ready(1)
@@ -127,7 +127,7 @@ def test_a_template_that_becomes_none_leaves_workers_alone(pool: Pool, agent: Bo
     pool.has_problem("InvalidTemplate", terminal=True)
     asked = pool.scene.first("fiberpools", lambda p: p["metadata"]["generation"] == 2)
     told = pool.scene.first("fiberpools", lambda p: problem_in(p, "InvalidTemplate"))
-    prompt("an update is no valid pod", told - asked)
+    record("an update is no valid pod", told - asked)
     pool.scene.never("a worker goes", lambda: len(pool.live) < 2, seconds=2)
     assert sorted(pool.names) == before
     pool.apply(agent, minReplicas=2, update={"strategy": "Recreate"})

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from patience import PATIENCE
+
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
@@ -68,7 +70,7 @@ def test_an_interrupt_leaves_nothing_behind(tmp_path: Path, scratch: Path) -> No
         below = processes.descendants(process.pid)
         process.send_signal(signal.SIGINT)
         said = process.stderr.read()
-        assert process.wait(30) == 130
+        assert process.wait(PATIENCE) == 130
     assert len(below) == 6
     assert "nothing is written" in said
     assert not any(os.path.exists(f"/proc/{pid}") for pid in below)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from examples.run_example import command, environment, run
+from patience import PATIENCE
 
 SCRIPT = "02-es/main.py"
 SMALL = ("--env", "CartPole-v1", "--generations", 6, "--population", 16, "--seed", 1)
@@ -61,7 +62,7 @@ def test_interrupted(tmp_path: Path) -> None:
             if line.startswith("generation"):
                 break
         os.killpg(process.pid, signal.SIGINT)  # to all of them, as a terminal does
-        output, errors = process.communicate(timeout=30)
+        output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 128 + signal.SIGINT
     assert "interrupted after" in output
     assert not errors

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from examples.run_example import EXAMPLES
+from patience import PATIENCE
 
 
 @pytest.fixture
@@ -59,7 +60,7 @@ def test_one_table_however_many_make_it_at_once(
 ) -> None:
     """All start before the first one ends, and all end up with the same file."""
     table = es("noise").NoiseTable("test", seed=3, length=3_000_000)
-    together = threading.Barrier(4, timeout=10)
+    together = threading.Barrier(4, timeout=PATIENCE)
     link = os.link
 
     def link_together(source: str, target: str) -> None:

@@ -19,9 +19,8 @@ import fiber.joblib
 from examples.run_example import BACKENDS
 from fakes.cluster import fake_cluster
 from faults.runtime import running
+from patience import PATIENCE
 from unit.kubernetes_rig import kubeconfig
-
-PATIENCE = 60
 
 
 @pytest.fixture(scope="module", params=[*BACKENDS, "kubernetes"])

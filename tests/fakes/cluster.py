@@ -12,10 +12,9 @@ from typing import TypeVar
 from fakes.agent_kubelet import AgentKubelet
 from fakes.store import Body
 from fakes.world import World, a_world
+from patience import PATIENCE
 
 T = TypeVar("T")
-
-PATIENCE = 30.0
 
 
 class FakeCluster:

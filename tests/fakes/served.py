@@ -13,6 +13,7 @@ from typing import TypeVar
 
 from fakes.kubernetes_api import KubernetesApi
 from fakes.store import Body, Store
+from patience import PATIENCE
 
 T = TypeVar("T")
 
@@ -36,7 +37,7 @@ class Served:
                 done.set_exception(error)
 
         self._loop.call_soon_threadsafe(call)
-        return done.result(10)
+        return done.result(PATIENCE)
 
     def objects(self, plural: str) -> list[Body]:
         """Those that are there, in all namespaces."""
@@ -58,7 +59,7 @@ def served(tls: ssl.SSLContext | None = None) -> Iterator[Served]:
     thread = threading.Thread(target=asyncio.run, args=(serve(),), name="fake API")
     thread.start()
     try:
-        server = started.result(10)
+        server = started.result(PATIENCE)
         yield server
     finally:
         server.do(end.set)

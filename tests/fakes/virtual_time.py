@@ -15,11 +15,13 @@ import termios
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
+from patience import PATIENCE
+
 T = TypeVar("T")
 
 IN_FLIGHT = 0.001
 """Seconds within which what was sent arrives, or its confirmation does."""
-STUCK = 5.0
+STUCK = PATIENCE
 
 
 class _Selector(selectors.EpollSelector):

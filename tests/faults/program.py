@@ -21,15 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import census
-
-PATIENCE = 20.0
-"""Seconds that a program may take for one step; a busy machine is slow."""
+from patience import PATIENCE
 
 LOOPBACK = {"FIBER_BACKEND": "loopback", "FIBER_AGENTS": "1"}
 """The environment that puts a program's processes behind an agent."""
-
-GONE = 2.0
-"""Seconds after the end of a program within which nothing of it may be left."""
 
 
 class Program:
@@ -135,8 +130,8 @@ class Program:
                 f"it still runs after {seconds:g} s; stderr:\n{self.stderr}\nand:\n{family}"
             ) from None
 
-    def left(self, seconds: float = GONE) -> list[str]:
-        """What is left of it ``seconds`` after its end, in words: processes, temporary files."""
+    def left(self, seconds: float = PATIENCE) -> list[str]:
+        """Name the processes and temporary files that are still there after ``seconds``."""
 
         def nothing() -> bool:
             return not self.family() and not any(self.temporary.iterdir())

@@ -29,9 +29,7 @@ import fiber
 from faults.random_work import add, fail, nothing, square
 from fiber._runtime import state
 from fiber.pool import Pool
-
-PATIENCE = 20.0
-"""Seconds that any call may take."""
+from patience import PATIENCE
 
 MODES = ("raise", "enter", "collect", "all")
 """Handlers raise; handlers use pools; finalizers do; all of it at once."""

@@ -14,9 +14,10 @@ import pytest
 import census
 import fiber
 from faults import targets
-from faults.program import LOOPBACK, PATIENCE, Program, alive, stop_and_wait, wait_for
+from faults.program import LOOPBACK, Program, alive, stop_and_wait, wait_for
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
+from patience import PATIENCE
 
 LOST_AFTER = 1.5
 
@@ -64,7 +65,7 @@ def test_a_killed_agent_ends_its_own_processes_and_no_other(
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL
         assert "agent loopback-0 lost" in child._popen.report.reason
-        wait_for(partial(_gone, child.pid), 2)
+        wait_for(partial(_gone, child.pid))
     for child in spared:
         assert child.is_alive()
         child.terminate()

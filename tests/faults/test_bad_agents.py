@@ -6,7 +6,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from faults.program import Program
 from fiber._transport import handshake
 from fiber._transport.credentials import make_credentials
 from fiber._wire import messages
+from patience import PATIENCE
 
 AGENT = """
     import runpy, sys
@@ -76,10 +76,10 @@ def test_an_agent_that_fits_is_taken(master: Callable[..., tuple[Program, Progra
 
 def test_wrong_credentials(master: Callable[..., tuple[Program, Program]], tmp_path: Path) -> None:
     make_credentials("test").agent_half().to_directory(tmp_path / "other")
-    before = time.monotonic()
-    _, agent = master(FIBER_AGENT_CREDENTIALS=str(tmp_path / "other"))
+    other = str(tmp_path / "other")
+    # It gives up long before its timeout.
+    _, agent = master(FIBER_AGENT_CREDENTIALS=other, FIBER_START_TIMEOUT=str(9 * PATIENCE))
     assert agent.wait() == 1
-    assert time.monotonic() - before < 8, "it does not try for the whole timeout"
     assert "do not trust each other" in agent.stderr
     assert "Traceback" not in agent.stderr
 
@@ -154,7 +154,7 @@ def test_an_agent_that_is_told_nonsense(
 )
 def test_an_agent_with_a_command_line(arguments: list[str], status: int, words: str) -> None:
     command = [sys.executable, "-m", "fiber.agent", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == status
     assert words in (done.stderr if status else done.stdout)
     assert "Traceback" not in done.stderr

@@ -115,7 +115,7 @@ NO_NUMBER = """
 def test_a_number_of_processes_that_is_none(
     launch: Callable[..., Program], processes: object
 ) -> None:
-    assert launch(NO_NUMBER.format(processes=processes)).rest(3) == "True\n"
+    assert launch(NO_NUMBER.format(processes=processes)).rest() == "True\n"
 
 
 def test_a_misspelt_option_of_a_pool_is_the_only_thing_on_stderr(

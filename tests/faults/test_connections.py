@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator
 from multiprocessing import connection
 from typing import Any
@@ -14,7 +13,8 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.program import PATIENCE, stop_and_wait
+from faults.program import stop_and_wait
+from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -72,11 +72,9 @@ def test_who_waits_is_woken_by_the_death(pipe: tuple[Any, Any], start: Callable[
     assert ours.recv() == "held"
     killer = threading.Timer(0.1, child.kill)
     killer.start()
-    before = time.monotonic()
     assert connection.wait([ours], PATIENCE) == [ours]
     with pytest.raises(EOFError):
         ours.recv()
-    assert time.monotonic() - before < 5
     killer.join()
 
 
@@ -160,13 +158,11 @@ def test_a_bulky_send_whose_reader_dies_unread_does_not_wait_for_ever(
     assert ours.recv() == "held"
     killer = threading.Timer(0.2, child.kill)
     killer.start()
-    before = time.monotonic()
     try:
         ours.send_bytes(bytes(8 << 20))
         ours.send_bytes(bytes(8 << 20))
     except (BrokenPipeError, EOFError):
         pass  # or it went into the pipe before its end was known
-    assert time.monotonic() - before < 5
     killer.join()
 
 

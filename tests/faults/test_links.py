@@ -11,10 +11,11 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.program import PATIENCE, alive, wait_for
+from faults.program import alive, wait_for
 from faults.proxy import Proxy
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
+from patience import PATIENCE
 
 SHORT = 0.5
 """Seconds of a cut that must cost nothing."""
@@ -110,10 +111,8 @@ def test_a_long_cut_is_told_ends_its_processes_and_brings_a_new_agent(wire: Wire
     child = wire.start(targets.report_and_block, theirs)
     theirs.close()
     pid = ours.recv()
-    before = time.monotonic()
     getattr(wire.proxy, way)()
     child.join(PATIENCE)
-    assert 1 < time.monotonic() - before < 6
     assert child.exitcode == -signal.SIGKILL
     assert "loopback-0" in child._popen.report.reason
     with pytest.raises(EOFError):

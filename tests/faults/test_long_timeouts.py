@@ -12,8 +12,9 @@ import pytest
 import fiber
 from faults import pool_targets as tasks
 from faults import targets
-from faults.program import PATIENCE, Program
+from faults.program import Program
 from faults.runtime import running
+from patience import PATIENCE
 
 LONG = pytest.mark.parametrize("long", [math.inf, 1e7])
 

@@ -12,12 +12,11 @@ from faults import test_pods
 from faults.runtime import running
 from fiber.errors import ConnectionClosed
 from fiber.managers import AsyncManager, BaseManager
+from patience import PATIENCE
 
 pytestmark = [
     pytest.mark.may_leak("the operator's connections, for as long as the cluster is there"),
-    pytest.mark.timeout(180),  # pods are interpreters, and a busy machine starts them slowly
 ]
-PATIENCE = test_pods.PATIENCE
 
 cluster = test_pods.cluster
 _nothing_is_left = test_pods._nothing_is_left

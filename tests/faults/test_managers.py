@@ -14,8 +14,9 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.program import PATIENCE, wait_for
+from faults.program import wait_for
 from fiber.errors import ConnectionClosed
+from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
 

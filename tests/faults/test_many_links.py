@@ -1,10 +1,9 @@
-"""A thousand agents dial one master: each is taken, and costs it little."""
+"""A thousand agents dial one master, and each is taken.  The agents benchmark has the cost."""
 
 from __future__ import annotations
 
 import resource
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from fiber._transport.link import Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber._transport.stream import Frame
+from patience import PATIENCE
 
 COUNT = 1024
 PROCESSES = 2
@@ -87,7 +87,7 @@ class Master:
     def close(self) -> None:
         closed = threading.Event()
         self.listener.close(linger=0.1, then=closed.set)
-        assert closed.wait(30)
+        assert closed.wait(PATIENCE)
         self.loop.stop()
 
 
@@ -102,28 +102,16 @@ def descriptors() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("descriptors")
-def test_a_thousand_agents_join_and_cost_little(
-    launch: Callable[..., Program], tmp_path: Path
-) -> None:
+def test_a_thousand_agents_join_and_answer(launch: Callable[..., Program], tmp_path: Path) -> None:
     credentials = make_credentials("test")
     credentials.agent_half().to_directory(tmp_path / "agent")
     master = Master(credentials)
-    before, began = resident_kilobytes(), time.process_time()
     for _ in range(PROCESSES):
         count = COUNT // PROCESSES
         launch(AGENTS, master.listener.address, str(tmp_path / "agent"), str(count))
-    assert master.joined.wait(50)
-    spent = time.process_time() - began
+    assert master.joined.wait(PATIENCE)
     for link in master.links:
         link.send(b"are you there?")
-    assert master.answered.wait(30)
-    a_link = (resident_kilobytes() - before) / COUNT
+    assert master.answered.wait(PATIENCE)
     assert master.lost == []
     master.close()
-    assert spent < 3.0, "seconds of the master's processor time, however busy the machine is"
-    assert a_link < 100
-
-
-def resident_kilobytes() -> int:
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmRSS:")[2].split()[0])

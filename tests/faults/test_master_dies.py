@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from faults.program import GONE, LOOPBACK, Program, alive, stop_and_wait, wait_for
+from faults.program import LOOPBACK, Program, alive, stop_and_wait, wait_for
 
 IDLE_AND_BUSY = """
     import fiber, time
@@ -78,7 +78,7 @@ def test_a_nested_parent_that_is_killed_takes_its_descendants_and_only_them(
     program, pids = nested(launch)
     parent, middle, *below = pids
     os.kill(middle, signal.SIGKILL)
-    wait_for(lambda: not any(map(alive, below)), GONE)
+    wait_for(lambda: not any(map(alive, below)))
     # Each generation above ends by itself: its child did.
     program.rest()
     assert program.wait() == 0
@@ -162,7 +162,7 @@ def test_killed_together_with_its_zygotes_it_leaves_no_process(
         os.kill(pid, signal.SIGKILL)
     program.kill()
     # Nobody is left who could remove its directory.
-    wait_for(lambda: not program.family(), GONE)
+    wait_for(lambda: not program.family())
     for directory in program.temporary.iterdir():
         shutil.rmtree(directory)
 

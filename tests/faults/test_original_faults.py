@@ -21,11 +21,12 @@ import pytest
 import fiber
 from faults import pool_targets as tasks
 from faults import targets
-from faults.program import PATIENCE, wait_for
+from faults.program import wait_for
 from fiber._backends import loopback
 from fiber._runtime import state
 from fiber.errors import StartError, WorkerDied
 from fiber.pool import Pool
+from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
 

@@ -25,17 +25,16 @@ from fiber._backends.kubernetes.api import Api
 from fiber._runtime import state
 from fiber.errors import ConfigError, FiberPoolError, MemberLost, WorkerDied
 from fiber_api import names
+from patience import PATIENCE
 from unit.kubernetes_rig import kubeconfig
 
 KEPT = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
 OPERATORS = {names.operator_lease_name("fiber-operator"), "fiberpools.fiber.dev"}
 """Leases that stay."""
 
-PATIENCE = 60
 
 pytestmark = [
     pytest.mark.may_leak("the operator's connections, for as long as the cluster is there"),
-    pytest.mark.timeout(180),  # each pod is several interpreters that start
 ]
 
 

@@ -16,8 +16,9 @@ import pytest
 
 import fiber
 from faults import pool_targets as tasks
-from faults.program import PATIENCE, alive, stop_and_wait, wait_for
+from faults.program import alive, stop_and_wait, wait_for
 from fiber.pool import Pool
+from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
 

@@ -10,9 +10,9 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.program import PATIENCE
 from fiber.errors import ConnectionClosed
 from fiber.queues import SimpleQueuePush
+from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
 

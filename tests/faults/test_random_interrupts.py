@@ -12,8 +12,9 @@ from collections.abc import Callable
 
 import pytest
 
-from faults.program import LOOPBACK, PATIENCE, Program
+from faults.program import LOOPBACK, Program
 from faults.random_calls import MODES
+from patience import PATIENCE
 
 SECONDS = float(os.environ.get("RANDOM_INTERRUPTS_SECONDS", "8"))
 SEED = os.environ.get("RANDOM_INTERRUPTS_SEED")

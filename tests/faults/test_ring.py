@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from faults.program import PATIENCE, Program
+from faults.program import Program
+from patience import PATIENCE
 
 PROGRAM = """
     import fiber

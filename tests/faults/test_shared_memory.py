@@ -11,12 +11,13 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.program import PATIENCE, wait_for
+from faults.program import wait_for
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 from fiber._hub import client
 from fiber._hub.client import Unreachable
 from fiber.managers import SharedMemoryManager
+from patience import PATIENCE
 
 
 def start(target: Any, *args: Any) -> Any:

@@ -16,11 +16,12 @@ import pytest
 
 import fiber
 from faults import targets
-from faults.program import LOOPBACK, PATIENCE, Program, wait_for
+from faults.program import LOOPBACK, Program, wait_for
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 from fiber._transport import tls
 from fiber._transport.credentials import make_credentials
+from patience import PATIENCE
 from unit.link_site import say
 
 GARBAGE = [

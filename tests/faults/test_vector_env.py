@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 import fiber
-from faults.program import PATIENCE, Program, alive, wait_for
+from faults.program import Program, alive, wait_for
 from fiber.vector import VectorEnv, worker_process
 from fiber.vector.failures import ATTEMPTS
+from patience import PATIENCE
 from vector_envs import Faulty
 
 GOOD = Faulty.GOOD

@@ -12,12 +12,11 @@ from fakes.cluster import FakeCluster, fake_cluster
 from faults.runtime import running
 from fiber.vector import VectorEnv
 from fiber_api import names
+from patience import PATIENCE
 from unit.kubernetes_rig import kubeconfig
 from vector_envs import Faulty
 
 pytestmark = pytest.mark.may_leak("the operator's connections, for as long as the cluster is there")
-
-PATIENCE = 30
 
 
 @pytest.fixture

@@ -10,8 +10,7 @@ from typing import Any, NoReturn
 from fiber._agent import child
 from fiber._agent.interface import ExitReport
 from fiber._wire import packet
-
-PATIENCE = 10
+from patience import PATIENCE
 
 
 class Recorder:

@@ -23,6 +23,7 @@ from fiber._backends.kubernetes.warm_pool import WarmPool
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
 from fiber_api import names
+from patience import PATIENCE
 
 NAMESPACE = "lab"
 MASTER = Master("10.0.0.7", 41337, "laptop-7:4711")
@@ -92,7 +93,7 @@ class Told:
             self.ended = True
             self._changed.notify_all()
 
-    def wait(self, what: Callable[[], object], timeout: float = 20.0) -> None:
+    def wait(self, what: Callable[[], object], timeout: float = PATIENCE) -> None:
         """Until it is so; it is asked after each thing that is told."""
         with self._changed:
             assert self._changed.wait_for(what, timeout), self

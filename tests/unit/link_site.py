@@ -18,13 +18,13 @@ from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber._transport.stream import Frame
+from patience import PATIENCE
 
 # Once used, nng keeps threads and two descriptors for as long as the process lives.  The census of
 # what tests leave behind begins after the collection, and so after this.
 pynng.Pair1().close()
 
 T = TypeVar("T")
-DEADLINE = 10.0
 SHORT = Keepalive(heartbeat=0.1, suspect_after=0.8, lost_after=2.0)
 
 
@@ -46,7 +46,7 @@ class Notes:
 
     def wait(self, condition: Callable[[], Any]) -> None:
         with self.changed:
-            assert self.changed.wait_for(condition, DEADLINE), vars(self)
+            assert self.changed.wait_for(condition, PATIENCE), vars(self)
 
     def on_frame(self, frame: Frame) -> None:
         self.add(self.frames, frame)
@@ -106,7 +106,7 @@ class Site:
         *,
         credentials: Credentials | None = None,
         identity: Identity | None = None,
-        timeout: float | None = DEADLINE,
+        timeout: float | None = PATIENCE,
         connect: Callable[[str], socket.socket] | None = None,
     ) -> tuple[AgentDialer, Notes]:
         notes = Notes()
@@ -138,13 +138,13 @@ class Site:
             done.set()
 
         self.loop.call_soon(call)
-        assert done.wait(DEADLINE)
+        assert done.wait(PATIENCE)
         return results[0]
 
     def close(self, listener: MasterListener, reason: str = "", *, linger: float = 1.0) -> None:
         closed = threading.Event()
         listener.close(reason, linger=linger, then=closed.set)
-        assert closed.wait(DEADLINE)
+        assert closed.wait(PATIENCE)
 
     def end(self) -> None:
         for close in reversed(self._closing):
@@ -198,4 +198,4 @@ def complete(handshake: tls.Handshake, steps: Generator[int, None, T]) -> T:
         except StopIteration as finished:
             value: T = finished.value
             return value
-        assert poller.poll(DEADLINE * 1000)
+        assert poller.poll(PATIENCE * 1000)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from unit.pool_tasks import PATIENCE
+from patience import PATIENCE
 
 ENVIRON = {
     "PYTHONPATH": os.pathsep.join(

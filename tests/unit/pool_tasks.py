@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 def identity(value: Any) -> Any:

@@ -16,7 +16,8 @@ from fiber._transport import acceptor, admission, refusals, tls
 from fiber._transport.admission import Admission
 from fiber._transport.credentials import make_credentials
 from fiber._transport.handshake import Hello, Identity
-from unit.link_site import DEADLINE, Notes, Site, complete, port_of, say
+from patience import PATIENCE
+from unit.link_site import Notes, Site, complete, port_of, say
 
 SOON = 0.3
 HELLO = Hello(Identity.of_this_process("stranger"), "0" * 32, 0, False).encode()
@@ -32,7 +33,7 @@ class Visitor:
 
     def __init__(self, site: Site, address: str) -> None:
         half = site.credentials.agent_half()
-        self.sock = socket.create_connection(("127.0.0.1", port_of(address)), DEADLINE)
+        self.sock = socket.create_connection(("127.0.0.1", port_of(address)), PATIENCE)
         self.handshake = tls.Handshake(
             self.sock, tls.context_of(half, listens=False), half.server_name
         )
@@ -55,7 +56,7 @@ class Visitor:
         """All that still comes, up to the end."""
         sock = self.handshake.sock
         raw = socket.socket(fileno=os.dup(sock.fileno()))
-        raw.settimeout(DEADLINE)
+        raw.settimeout(PATIENCE)
         data = b""
         try:
             while more := raw.recv(1 << 16):
@@ -130,7 +131,7 @@ def test_a_certificate_of_another_pool_is_told_with_its_fault(site: Site) -> Non
     context = tls.context_of(half, listens=False)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
-    with socket.create_connection(("127.0.0.1", port_of(listener.address)), DEADLINE) as sock:
+    with socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE) as sock:
         stranger = context.wrap_socket(sock)
         with pytest.raises(ssl.SSLError, match=r"(?i)unknown.ca|decrypt"):
             stranger.recv(1)  # it hears why, though the master has nothing to say to it
@@ -192,7 +193,7 @@ def test_without_descriptors_it_goes_on_later_and_says_so_once(
 def test_connections_that_break_before_they_are_taken_harm_nobody(site: Site) -> None:
     listener, master = site.listener()
     for _ in range(20):
-        sock = socket.create_connection(("127.0.0.1", port_of(listener.address)), DEADLINE)
+        sock = socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
         sock.close()  # by a reset
     _, agent = site.dialer(listener.address)
@@ -213,7 +214,7 @@ class _BreaksAfterTheCheck(socket.socket):
 
 def test_one_that_breaks_as_it_is_taken_stays_open_nowhere(site: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        other = socket.create_connection(server.getsockname(), DEADLINE)
+        other = socket.create_connection(server.getsockname(), PATIENCE)
         accepted, _ = server.accept()
     taken = _BreaksAfterTheCheck(fileno=accepted.detach())
     taken.other = other
@@ -235,7 +236,7 @@ def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:
     for end in ends:
         end.start()
     for end in ends:
-        end.join(DEADLINE)
+        end.join(PATIENCE)
         assert not end.is_alive()
 
 

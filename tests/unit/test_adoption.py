@@ -24,6 +24,7 @@ import pytest
 from fiber import adoption
 from fiber.adoption import Adoption, adopt
 from fiber.errors import AdoptionError
+from patience import PATIENCE
 
 
 class Process(multiprocessing.process.BaseProcess):
@@ -360,7 +361,7 @@ class TestDuration:
 
     def test_many_threads(self, module: Any, fiber: Any) -> None:
         wrong: list[object] = []
-        together = threading.Barrier(4, timeout=10)
+        together = threading.Barrier(4, timeout=PATIENCE)
 
         def work() -> None:
             together.wait()
@@ -373,7 +374,7 @@ class TestDuration:
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(timeout=20)
+            thread.join(timeout=PATIENCE)
         assert not wrong
         assert module.multiprocessing is multiprocessing
 

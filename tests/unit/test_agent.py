@@ -25,6 +25,7 @@ from fiber._transport.loop import Loop
 from fiber._wire import descriptor, packet
 from fiber.errors import TooManyOpenFiles
 from fiber.process import Process
+from patience import PATIENCE
 from unit.agent_children import (
     Handle,
     Recorder,
@@ -34,8 +35,6 @@ from unit.agent_children import (
     talk_nonsense,
     write_own_index,
 )
-
-PATIENCE = 10
 
 Start = Callable[..., tuple[LocalChild, Recorder]]
 

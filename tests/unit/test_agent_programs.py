@@ -17,7 +17,7 @@ from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
 from fiber._wire.blob import Blob
 from fiber._wire.descriptor import contents
-from unit.agent_children import PATIENCE
+from patience import PATIENCE
 from unit.shipping_site import packed, write
 from unit.test_agent import begin, end, settled
 

@@ -13,8 +13,8 @@ import pytest
 import fiber
 from census import wait_until
 from fiber.managers import AsyncBaseProxy, AsyncManager, AsyncProxyResult, RemoteError
+from patience import PATIENCE
 
-PATIENCE = 15.0
 ALL = 100
 MEETING = threading.Barrier(ALL)
 """In the manager's process: of all the objects there."""

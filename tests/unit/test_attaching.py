@@ -24,7 +24,8 @@ from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import Op
 from fiber._wire import packet, work
 from fiber.connection import Connection
-from hosts import PATIENCE, Hosts, Wire, background
+from hosts import Hosts, Wire, background
+from patience import PATIENCE
 
 
 @pytest.fixture

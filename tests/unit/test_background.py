@@ -12,8 +12,7 @@ from typing import Any, NoReturn
 import pytest
 
 from fiber._runtime.background import BackgroundThread
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 @pytest.fixture

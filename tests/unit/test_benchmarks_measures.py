@@ -257,7 +257,6 @@ def test_an_order_survives_its_line() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(60)  # starts processes with the engine; the processors may be busy
 @pytest.mark.parametrize("measure", [agents, workers])
 def test_what_knows_the_engine_from_inside_works_with_it_as_it_is(
     measure: Any, tmp_path: Path

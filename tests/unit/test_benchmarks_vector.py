@@ -131,7 +131,6 @@ def test_steps_as_long_as_the_measure_are_made_twice(monkeypatch: pytest.MonkeyP
     assert len(made) == 2
 
 
-@pytest.mark.timeout(60)  # starts processes with the engine; the processors may be busy
 def test_fiber_sends_what_is_ready_first(tmp_path: Path) -> None:
     session = Session(contenders.BY_NAME["fiber"], tmp_path)
     try:

@@ -23,7 +23,8 @@ from fiber._wire import messages
 from fiber._wire.blob import Blob
 from fiber._wire.descriptor import contents
 from memory_link import SimulatedLoop
-from unit.test_loopback import PATIENCE, running
+from patience import PATIENCE
+from unit.test_loopback import running
 
 LARGE = 3 << 20
 

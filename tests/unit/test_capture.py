@@ -15,8 +15,7 @@ import pytest
 import census
 from fiber._agent.capture import LAST_LINES, Capture
 from fiber._transport.loop import Loop
-
-PATIENCE = 10
+from patience import PATIENCE
 
 
 class Captured:

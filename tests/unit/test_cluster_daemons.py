@@ -11,6 +11,7 @@ import pytest
 from cluster import control_plane, places
 from cluster.daemons import Daemon, all_daemons
 from cluster.shell import ClusterError, wait_for
+from patience import PATIENCE
 
 SLEEP = ("sleep", "300.0625")
 
@@ -82,7 +83,7 @@ def test_one_that_executes_another_program_has_not_ended() -> None:
     """Its words are other ones then, and for a moment, long on a busy machine, it has none."""
     daemon = Daemon("changeable")
     daemon.start("sh", "-c", 'exec sh -c "echo changed; exec sleep 300.0625"', "unchanged")
-    wait_for("the other program", lambda: "changed" in daemon.log.read_text(), seconds=10)
+    wait_for("the other program", lambda: "changed" in daemon.log.read_text(), seconds=PATIENCE)
     assert daemon.runs()
 
 
@@ -101,10 +102,10 @@ def test_what_it_started_ends_with_it() -> None:
     daemon = Daemon("parent")
     script = 'sleep 300.125 & echo "child $!"; wait; true'
     daemon.start("sh", "-c", script)
-    wait_for("the child", lambda: "child" in daemon.log.read_text(), seconds=10)
+    wait_for("the child", lambda: "child" in daemon.log.read_text(), seconds=PATIENCE)
     child = int(daemon.log.read_text().split()[1])
     daemon.kill()
-    wait_for("the end of the child", lambda: not is_alive(child), seconds=10)
+    wait_for("the end of the child", lambda: not is_alive(child), seconds=PATIENCE)
 
 
 def is_alive(pid: int) -> bool:
@@ -119,7 +120,7 @@ def test_it_knows_nothing_of_who_started_it(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("SECRET_OF_THE_TESTS", "yes")
     daemon = Daemon("printer")
     daemon.start("env")
-    wait_for("its end", lambda: not daemon.runs(), seconds=10)
+    wait_for("its end", lambda: not daemon.runs(), seconds=PATIENCE)
     assert "SECRET_OF_THE_TESTS" not in daemon.log.read_text()
     assert f"{places.programs()}:" in daemon.log.read_text()
 

@@ -11,6 +11,7 @@ import pytest
 from cluster import control_plane, diagnosis, lifecycle, memory, places
 from cluster.daemons import Daemon, all_daemons
 from cluster.shell import ClusterError, wait_for
+from patience import PATIENCE
 
 
 @pytest.fixture(autouse=True)
@@ -28,7 +29,7 @@ def ended() -> Callable[[str], str]:
     def say(script: str) -> str:
         daemon = Daemon("node-2-containerd")
         daemon.start("sh", "-c", script)
-        wait_for("its end", lambda: not daemon.runs(), seconds=10)
+        wait_for("its end", lambda: not daemon.runs(), seconds=PATIENCE)
         return diagnosis.end_of([daemon]) or "nothing"
 
     return say
@@ -99,7 +100,7 @@ def test_what_the_machine_lacks_is_said(
 def test_one_that_runs_and_does_not_answer_is_quoted() -> None:
     daemon = Daemon("apiserver")
     daemon.start("sh", "-c", "echo waiting for etcd; sleep 300.0625; true")
-    wait_for("its words", lambda: "etcd" in daemon.log.read_text(), seconds=10)
+    wait_for("its words", lambda: "etcd" in daemon.log.read_text(), seconds=PATIENCE)
     said = diagnosis.silence_of([daemon], "connection refused\n")
     assert said.startswith("the last answer: connection refused\napiserver runs; ")
     assert "\nwaiting for etcd\n" in said

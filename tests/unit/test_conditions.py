@@ -16,7 +16,8 @@ from fiber import synchronize
 from fiber._hub import hosted_wait_list
 from fiber._hub.client import HubStream
 from fiber._hub.protocol import Op
-from hosts import PATIENCE, Far, Hosts, background
+from hosts import Far, Hosts, background
+from patience import PATIENCE
 
 # From Python 3.12 on os.fork() warns of any thread, and the runtime's loop may be one.
 pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")

@@ -18,6 +18,7 @@ from fiber import config, inherited
 from fiber._agent import main as agent
 from fiber.config import Config, load
 from fiber.errors import ConfigError, FiberError
+from patience import PATIENCE
 
 
 @pytest.fixture(autouse=True)
@@ -331,7 +332,7 @@ class TestCurrent:
         assert config.current() is first
 
     def test_is_one_for_many_threads(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        all_there = threading.Barrier(4, timeout=10)
+        all_there = threading.Barrier(4, timeout=PATIENCE)
 
         def load_at_the_same_time() -> Config:
             all_there.wait()
@@ -357,7 +358,7 @@ class TestCurrent:
         found: list[Config] = []
         thread = threading.Thread(target=lambda: found.append(config.current()), daemon=True)
         thread.start()
-        thread.join(10)
+        thread.join(PATIENCE)
         assert not thread.is_alive(), "deadlock"
         assert found[0] is inner[0] is config.current()
 
@@ -376,13 +377,13 @@ class TestCurrent:
 
         def slow_load() -> Config:
             reading.set()
-            assert forked.wait(10)
+            assert forked.wait(PATIENCE)
             return load()
 
         monkeypatch.setattr(config, "load", slow_load)
         thread = threading.Thread(target=config.current)
         thread.start()
-        assert reading.wait(10)
+        assert reading.wait(PATIENCE)
         pid = os.fork()
         if pid == 0:
             signal.alarm(10)

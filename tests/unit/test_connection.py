@@ -23,8 +23,7 @@ from fiber._transport.unix import UnixChannel
 from fiber._wire.packet import Message
 from fiber.connection import Connection, Pipe
 from fiber.errors import ConnectionClosed, UnpicklableError
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
@@ -364,7 +363,7 @@ def test_what_could_not_be_sent_keeps_no_end_of_another_pipe_open() -> None:
     with pytest.raises(UnpicklableError, match=r"\(at \[1\]\)"):
         one.send([inner_other, threading.Lock()])
     inner_other.close()
-    assert inner.poll(10), "the hub keeps it"
+    assert inner.poll(PATIENCE), "the hub keeps it"
 
 
 # Looking for an answer before sleeping
@@ -470,7 +469,7 @@ def test_listener_and_client_prove_to_each_other_that_they_know_the_key(
         accepting.start()
         with pytest.raises(connection.AuthenticationError):
             connection.Client(listener.address, authkey=keys[1])
-        accepting.join(5)
+        accepting.join(PATIENCE)
     assert len(errors) == 1
 
 
@@ -490,4 +489,4 @@ def test_a_client_does_not_believe_a_listener_that_welcomes_everybody() -> None:
         welcoming.start()
         with pytest.raises(connection.AuthenticationError):
             connection.Client(listener.address, authkey=b"one")
-        welcoming.join(5)
+        welcoming.join(PATIENCE)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from fiber._agent.interface import ExitReport
-from fiber._engine.ledger import PATIENCE
+from fiber._engine import ledger
 from fiber._runtime import worker_view
 from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
@@ -26,10 +26,10 @@ from fiber._runtime.work_items import Call
 from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
 from fiber.errors import FiberError, WorkerDied
+from patience import PATIENCE
 from unit import pool_tasks as tasks
 from unit.executor_rig import Results, Rig
 
-SECONDS = 10
 """For what another thread does."""
 
 
@@ -153,7 +153,7 @@ def test_idle_workers_get_what_busy_ones_have_not_read(rig: Rig) -> None:
     for seq, _ in list(rig.children[0].packets):
         rig.answer(idle, seq, [seq])
     assert rig.children[1].recalls == 0
-    rig.loop.pass_time(PATIENCE)
+    rig.loop.pass_time(ledger.PATIENCE)
     assert rig.children[1].recalls == 1
     unread = rig.children[1].packets[1][0]
     busy.recalled([unread])
@@ -471,7 +471,7 @@ def test_nobody_waits_for_workers_of_a_pool_that_has_ended(
     rig.executor.terminate(RuntimeError("terminated"))
     for handle in rig.handles:
         rig.lose(handle)
-    assert str(found.exception(SECONDS)) == "Pool not running"
+    assert str(found.exception(PATIENCE)) == "Pool not running"
 
 
 def test_nobody_waits_for_workers_of_a_loop_that_has_failed(
@@ -481,7 +481,7 @@ def test_nobody_waits_for_workers_of_a_loop_that_has_failed(
     rig.loop.held = True  # it does nothing any more
     found = wait_in_a_thread(rig.executor, monkeypatch)
     rig.executor.broken(FiberError("the loop has failed"))
-    assert str(found.exception(SECONDS)) == "the loop has failed"
+    assert str(found.exception(PATIENCE)) == "the loop has failed"
 
 
 def wait_in_a_thread(executor: Executor, patch: pytest.MonkeyPatch) -> Future[bool]:
@@ -502,7 +502,7 @@ def wait_in_a_thread(executor: Executor, patch: pytest.MonkeyPatch) -> Future[bo
 
     patch.setattr(worker_view, "Latch", Noted)
     threading.Thread(target=wait, daemon=True).start()
-    assert asked.wait(SECONDS)
+    assert asked.wait(PATIENCE)
     return found
 
 

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 import fiber
+from patience import PATIENCE
 
-PATIENCE = 15
 METHODS = ["forkserver", "spawn"]
 
 

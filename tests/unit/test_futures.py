@@ -20,11 +20,10 @@ from fiber._runtime import executor_group, methods
 from fiber._runtime.call_future import CallFuture
 from fiber._runtime.calls import CallQueue
 from fiber._runtime.work_items import Call
+from patience import PATIENCE
 from unit import pool_tasks as tasks
 from unit.interrupting import INSTRUCTIONS, is_interrupted
 from unit.pool_programs import run_program, wait_until
-
-PATIENCE = tasks.PATIENCE
 
 
 @pytest.fixture

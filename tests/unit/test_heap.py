@@ -15,7 +15,8 @@ from fiber._hub import handles, heap
 from fiber._hub.handles import BlockHandle
 from fiber._hub.heap import ALIGNMENT, LARGE, SEGMENT, Block, allocate
 from fiber._hub.protocol import ObjectKind
-from hosts import PATIENCE, Hosts
+from hosts import Hosts
+from patience import PATIENCE
 from unit.interrupting import is_interrupted
 
 

@@ -25,8 +25,7 @@ from fiber._hub.protocol import TWO, HubAddress, Op
 from fiber._wire import packet
 from fiber.connection import Connection
 from hosts import Hosts, objects_kept
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 def start(target: Callable[..., Any], *args: Any) -> fiber.Process:

@@ -24,7 +24,8 @@ from fiber._hub.remote import RemoteChannel, RemoteCounter
 from fiber._hub.tunnel import WINDOW
 from fiber.connection import Connection
 from fiber.errors import ConnectionClosed
-from hosts import PATIENCE, Far, Hosts, background, objects_kept
+from hosts import Far, Hosts, background, objects_kept
+from patience import PATIENCE
 
 # Channels
 

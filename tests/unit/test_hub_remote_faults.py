@@ -22,7 +22,8 @@ from fiber._hub.client import Unreachable
 from fiber._hub.local import LocalCounter
 from fiber._hub.protocol import HubAddress
 from fiber.connection import Connection
-from hosts import PATIENCE, Far, Hosts, Wire, background, objects_kept
+from hosts import Far, Hosts, Wire, background, objects_kept
+from patience import PATIENCE
 
 # Processes that die, links that break
 

@@ -21,8 +21,7 @@ from fiber._wire import messages
 from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
 from fiber._wire.packet import INLINE_LIMIT, Message
 from hosts import Hosts
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 class Listener:

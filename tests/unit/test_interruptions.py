@@ -37,7 +37,8 @@ from fiber._wire import arena, descriptor, packet
 from fiber._wire.arena import Arena, Block
 from fiber.connection import Connection, wait
 from fiber.results import IMapIterator
-from hosts import PATIENCE, Hosts, objects_kept
+from hosts import Hosts, objects_kept
+from patience import PATIENCE
 from unit.interrupting import INSTRUCTIONS, is_interrupted
 from unit.pool_programs import run_program
 

@@ -19,6 +19,7 @@ from fiber._backends.kubernetes import fiber_pool, informer, scaling
 from fiber._backends.kubernetes.api_errors import Forbidden
 from fiber._transport.credentials import MasterCredentials
 from fiber_api import names
+from patience import PATIENCE
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told
 from unit.kubernetes_rig import rig as make_rig
 
@@ -230,7 +231,7 @@ def test_who_begins_to_wait_is_told_what_others_were_told_before(
     client = rig.own(told)
     client.demand(1)
     for _ in range(4):
-        tries.get(timeout=10)
+        tries.get(timeout=PATIENCE)
     told.wait(lambda: told.warnings)
     assert len(told.warnings) == 1
     client.warn_anew()
@@ -405,7 +406,7 @@ def test_a_pool_that_was_made_without_our_knowledge_is_deleted(rig: Rig, told: T
     never_answered = Fault("create", names.PLURAL, carried_out=True, times=math.inf)
     rig.server.api.faults.append(never_answered)
     client = rig.own(told)
-    assert made.wait(10)
+    assert made.wait(PATIENCE)
     client.close()
     assert rig.server.objects(names.PLURAL) == []
 

@@ -12,6 +12,7 @@ from fakes.kubernetes_api import Call, Fault
 from fiber._backends.kubernetes import informer
 from fiber._backends.kubernetes.informer import Informer
 from fiber._backends.kubernetes.resources import PODS
+from patience import PATIENCE
 from unit.kubernetes_rig import NAMESPACE, Rig
 from unit.kubernetes_rig import rig as make_rig
 
@@ -46,11 +47,11 @@ class Case:
         self.rig.remove("pods", name)
 
     def next(self, number: int = 1) -> list[str]:
-        return [self.told.get(timeout=20) for _ in range(number)]
+        return [self.told.get(timeout=PATIENCE) for _ in range(number)]
 
     def end(self) -> None:
         self.watch.stop()
-        self.watch.join(10)
+        self.watch.join(PATIENCE)
 
 
 @pytest.fixture
@@ -115,7 +116,7 @@ def test_after_an_end_it_goes_on_without_a_list(case: Case) -> None:
 def test_what_keeps_it_from_going_on_is_told_until_it_passes(case: Case) -> None:
     case.server.api.faults.append(Fault("list", "pods", status=403, message="no right", times=2))
     case.watch.start()
-    assert [str(case.troubles.get(timeout=10)) for _ in range(2)] == ["no right"] * 2
+    assert [str(case.troubles.get(timeout=PATIENCE)) for _ in range(2)] == ["no right"] * 2
     case.add("a")
     assert case.next() == ["+a"]
 
@@ -155,7 +156,7 @@ def test_an_api_that_ends_every_watch_at_once_is_not_flooded(
     monkeypatch.setattr(case.watch._stopped, "wait", wait)
     case.server.api.faults.append(Fault("watch", "pods", text="", times=99))
     case.watch.start()
-    case.watch.join(10)
+    case.watch.join(PATIENCE)
     drawn = [pauses.get_nowait() for _ in range(4)]
     assert drawn[0] <= informer._PAUSE_MIN
     assert drawn[-1] >= 4 * informer._PAUSE_MIN
@@ -171,7 +172,7 @@ def test_who_is_asked_to_come_back_later_does(case: Case, monkeypatch: pytest.Mo
     monkeypatch.setattr(case.watch._stopped, "wait", wait)
     case.server.api.faults.append(Fault("list", "pods", status=429, retry_after=20))
     case.watch.start()
-    case.watch.join(10)
+    case.watch.join(PATIENCE)
     assert pauses.get_nowait() == 20
 
 
@@ -180,7 +181,7 @@ def test_an_event_that_no_api_server_sends_is_a_fault_and_not_a_silence(case: Ca
         Fault("watch", "pods", text='{"type": "ADDED", "object": {"metadata": {}}}\n')
     )
     case.watch.start()
-    assert isinstance(case.faults.get(timeout=10), KeyError)
+    assert isinstance(case.faults.get(timeout=PATIENCE), KeyError)
 
 
 def test_one_that_was_never_started_is_stopped(case: Case) -> None:

@@ -16,6 +16,7 @@ from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber._backends.kubernetes.lease import LeaseRenewer
 from fiber.errors import FiberPoolError
 from fiber_api import names
+from patience import PATIENCE
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, pool_body
 from unit.kubernetes_rig import rig as make_rig
 
@@ -167,9 +168,9 @@ def test_the_thread_renews_until_it_is_stopped(rig: Rig) -> None:
     renewed: queue.Queue[str] = queue.Queue()
     rig.server.api.after = lambda call: renewed.put(call.plural)
     case.renewer.start()
-    assert [renewed.get(timeout=10) for _ in range(3)] == ["leases"] * 3
+    assert [renewed.get(timeout=PATIENCE) for _ in range(3)] == ["leases"] * 3
     case.renewer.stop()
-    case.renewer.join(10)
+    case.renewer.join(PATIENCE)
     assert case.troubles.empty()
 
 
@@ -178,17 +179,17 @@ def test_the_thread_ends_when_the_pool_is_lost(rig: Rig) -> None:
     rig.remove(names.PLURAL, "es-1")
     case.now += 7
     case.renewer.start()
-    assert "did not renew its Lease for 7 s" in str(case.lost.get(timeout=10))
-    case.renewer.join(10)
+    assert "did not renew its Lease for 7 s" in str(case.lost.get(timeout=PATIENCE))
+    case.renewer.join(PATIENCE)
 
 
 def test_the_thread_tells_what_keeps_it_from_renewing(rig: Rig) -> None:
     case = Case(rig, duration=0)
     rig.server.api.faults.append(Fault("patch", "leases", status=422))
     case.renewer.start()
-    assert "this is a test" in str(case.troubles.get(timeout=10))
+    assert "this is a test" in str(case.troubles.get(timeout=PATIENCE))
     case.renewer.stop()
-    case.renewer.join(10)
+    case.renewer.join(PATIENCE)
 
 
 def test_a_busy_api_server_is_asked_later_and_in_time(case: Case) -> None:
@@ -207,10 +208,10 @@ def test_a_login_or_right_that_stays_away_ends_the_thread(
     case = Case(rig, duration=0)
     rig.server.api.faults.append(Fault("patch", "leases", status=status, times=9))
     case.renewer.start()
-    assert "this is a test" in str(case.troubles.get(timeout=10))
+    assert "this is a test" in str(case.troubles.get(timeout=PATIENCE))
     case.now += 1
-    assert "this is a test" in str(case.refusals.get(timeout=10))
-    case.renewer.join(10)
+    assert "this is a test" in str(case.refusals.get(timeout=PATIENCE))
+    case.renewer.join(PATIENCE)
 
 
 def test_an_api_server_that_was_away_may_refuse_as_it_comes_back(case: Case) -> None:
@@ -241,5 +242,5 @@ def test_a_fault_of_ours_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> N
     case = Case(rig, duration=0)
     monkeypatch.setattr(case.renewer, "renew", lambda: 1 / 0)
     case.renewer.start()
-    assert isinstance(case.faults.get(timeout=10), ZeroDivisionError)
-    case.renewer.join(10)
+    assert isinstance(case.faults.get(timeout=PATIENCE), ZeroDivisionError)
+    case.renewer.join(PATIENCE)

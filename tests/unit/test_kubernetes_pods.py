@@ -20,9 +20,9 @@ from fiber._backends.remote import RemoteChild
 from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import FiberError, FiberPoolError
+from patience import PATIENCE
 from unit.kubernetes_rig import kubeconfig
 
-PATIENCE = 20
 DAMAGED = "the loop is to fail in this test"
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,8 +12,7 @@ import pytest
 
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.latch import Latch, Waiters, acquire
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 class Stop(BaseException):
@@ -215,18 +213,22 @@ def test_a_signal_that_did_not_wake_the_waiting_thread_is_not_slept_over() -> No
         signal.pthread_kill(threading.get_ident(), signal.SIGUSR1)
 
     striker = threading.Thread(target=strike)
-    begin = time.monotonic()
+    rescuer = threading.Timer(PATIENCE, latch.set)
     striker.start()
+    rescuer.start()
     with pytest.raises(Stop):
-        latch.wait(PATIENCE)
+        latch.wait()
+    rescuer.cancel()
     striker.join()
-    assert time.monotonic() - begin < PATIENCE / 2
+    rescuer.join()
+    assert not latch.is_set(), "the signal was slept over until the latch was set"
 
 
 @pytest.mark.usefixtures("_signals_raise")
 def test_nor_is_it_by_a_thread_that_reads_what_a_pool_is_to_do() -> None:
     stream = InputStream(1, lambda: None)
     reads, over = threading.Event(), threading.Event()
+    struck = list[bool]()
 
     class Items:
         def __iter__(self) -> Iterator[int]:
@@ -238,17 +240,16 @@ def test_nor_is_it_by_a_thread_that_reads_what_a_pool_is_to_do() -> None:
         while not asleep(threading.main_thread()):
             pass
         signal.pthread_kill(threading.get_ident(), signal.SIGUSR1)
-        over.wait(PATIENCE)
+        struck.append(over.wait(PATIENCE))
         stream.end()
 
     striker = threading.Thread(target=strike)
-    begin = time.monotonic()
     striker.start()
     with pytest.raises(Stop):
         stream.read(Items())
-    assert time.monotonic() - begin < PATIENCE / 2
     over.set()
     striker.join()
+    assert struck == [True], "the signal was slept over until the stream ended"
 
 
 def asleep(thread: threading.Thread) -> bool:

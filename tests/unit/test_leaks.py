@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 import leaks
+from patience import PATIENCE
 
 MARKER = "LEAK_CHECK_TEST=1"
 WAIT_FOR_EVER = "import threading; threading.Event().wait()"
@@ -52,7 +53,7 @@ def daemon() -> Iterator[int]:
 
 def test_nothing_is_found_where_nothing_is_left(watch: leaks.Watch) -> None:
     before = watch.look()
-    subprocess.run([sys.executable, "-c", ""], check=True, timeout=20)
+    subprocess.run([sys.executable, "-c", ""], check=True, timeout=PATIENCE)
     assert watch.left_since(before) == []
 
 

@@ -14,8 +14,8 @@ import pytest
 import fiber
 from hosts import Far, Hosts, background
 from linearizability import Operation, call, is_linearizable, queue, semaphore
+from patience import PATIENCE
 
-PATIENCE = 30.0
 PROCESSES = 3
 OPERATIONS = 12
 

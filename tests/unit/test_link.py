@@ -17,7 +17,8 @@ from fiber._transport.credentials import MasterCredentials
 from fiber._transport.handshake import Identity
 from fiber._transport.link import Keepalive
 from fiber._transport.listener import MasterListener
-from unit.link_site import DEADLINE, SHORT, Site, break_connections, vanish
+from patience import PATIENCE
+from unit.link_site import SHORT, Site, break_connections, vanish
 
 
 def test_frames_of_all_sizes_cross_both_ways(site: Site) -> None:
@@ -121,13 +122,11 @@ def test_close_tells_the_other_side_why(site: Site) -> None:
     listener, master = site.listener()
     _, agent = site.dialer(listener.address)
     master.link.send(b"last words")
-    began = time.monotonic()
-    site.close(listener, "the pool is closed", linger=5)
+    site.close(listener, "the pool is closed", linger=9 * PATIENCE)
     agent.wait(lambda: agent.events)
     assert agent.frames == [b"last words"]
     assert agent.events == ["lost: the pool is closed"]
     assert master.events == []
-    assert time.monotonic() - began < 3
 
 
 def test_an_agent_may_close_too(site: Site) -> None:
@@ -137,7 +136,7 @@ def test_an_agent_may_close_too(site: Site) -> None:
     agent.link.close("drained", then=closed.set)
     master.wait(lambda: master.events)
     assert (master.frames, master.events) == ([b"result"], ["lost: drained"])
-    assert closed.wait(DEADLINE)
+    assert closed.wait(PATIENCE)
 
 
 @pytest.mark.slow
@@ -224,7 +223,7 @@ def remote_agent(
         yield process
     finally:
         process.kill()
-        process.wait(DEADLINE)
+        process.wait(PATIENCE)
 
 
 FORKER = """
@@ -248,7 +247,7 @@ if child == 0:
 status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 closed = threading.Event()
 listener.close(then=closed.set)
-closed.wait(10)
+closed.wait(60)
 loop.stop()
 sys.exit(status)
 """

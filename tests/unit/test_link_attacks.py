@@ -17,8 +17,9 @@ from fiber._transport import tls
 from fiber._transport.handshake import Hello, Identity, Refusal, decode
 from fiber._transport.listener import MasterListener
 from fiber.errors import AuthenticationError, LinkError
+from patience import PATIENCE
 from unit.attacker import CUT, DOWN, MESSAGE, TLS, UP, Path, Unit
-from unit.link_site import DEADLINE, Notes, Site, port_of, say
+from unit.link_site import Notes, Site, port_of, say
 
 FRAMES = [b"%d " % number * 50 for number in range(30)]
 HOPS = 8 + 4
@@ -186,7 +187,7 @@ def test_a_whole_conversation_replayed_is_nobody(site: Site, path_of: Any) -> No
     once = Once(lambda _: False, lambda *_: [])
     path, listener, master = path_of(once)
     talk(site, path, listener, master)
-    with socket.create_connection(("127.0.0.1", port_of(listener.address)), DEADLINE) as again:
+    with socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE) as again:
         for unit in [unit for unit in once.seen if unit.direction == UP]:
             try:
                 again.sendall(unit.data)

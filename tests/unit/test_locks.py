@@ -18,7 +18,7 @@ from fiber._hub import shared_semaphores
 from fiber._sync import semaphore as module
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, SharedSemaphore
 from fiber.synchronize import Abandoned
-from hosts import PATIENCE
+from patience import PATIENCE
 from unit.interrupting import LINES, is_interrupted
 
 # From Python 3.12 on os.fork() warns of any thread, and the runtime's loop may be one.

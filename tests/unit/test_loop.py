@@ -17,8 +17,7 @@ from census import wait_until
 from fiber._transport import loop as loop_module
 from fiber._transport.loop import Loop
 from fiber.errors import FiberError
-
-PATIENCE = 10
+from patience import PATIENCE
 
 
 @pytest.fixture

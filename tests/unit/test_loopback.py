@@ -30,9 +30,8 @@ from fiber._runtime import state
 from fiber._wire import messages
 from fiber.errors import LinkError, StartError
 from memory_link import SimulatedLoop
+from patience import PATIENCE
 from unit.agent_children import Recorder, run_forever
-
-PATIENCE = 15
 
 
 @contextlib.contextmanager

@@ -188,7 +188,6 @@ def five_workers() -> Store:
     return virtual_time.run(_five_workers())
 
 
-@pytest.mark.timeout(100)
 @pytest.mark.parametrize("name", STORIES)
 def test_a_crash_after_any_call_changes_nothing_in_the_end(name: str, five_workers: Store) -> None:
     has_past, story = STORIES[name]

@@ -26,6 +26,7 @@ from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.planning.pods import State
 from fiber_operator.watches import Watches
 from fiber_operator.workqueue import Statistics
+from patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -271,7 +272,7 @@ def test_the_process_works_until_sigterm(tmp_path: Path) -> None:
                 await world.until_settled(3)
             finally:
                 process.send_signal(signal.SIGTERM)
-                _, said = await asyncio.wait_for(process.communicate(), 10)
+                _, said = await asyncio.wait_for(process.communicate(), PATIENCE)
             assert process.returncode == 0, said
             assert b'"message": "stopped"' in said
             lease = world.store.get("leases", "fiber-system", OWN_LEASE)
@@ -296,7 +297,7 @@ def test_a_pool_that_is_nested_deeply_hides_no_other(tmp_path: Path) -> None:
                 await world.until_settled(3)
             finally:
                 process.terminate()
-                _, said = await asyncio.wait_for(process.communicate(), 10)
+                _, said = await asyncio.wait_for(process.communicate(), PATIENCE)
             assert b"RecursionError" not in said
 
     limit = sys.getrecursionlimit()

@@ -14,6 +14,7 @@ from fiber_operator.cluster import Configuration, Refused, Unavailable
 from fiber_operator.program import Program
 from fiber_operator.settings import Settings
 from fiber_operator.watches import Watches
+from patience import PATIENCE
 
 SAID = 'pods is forbidden: User "operator" cannot watch resource "pods" at the cluster scope'
 REFUSED = Refused(SAID, what="watch pods", status=403, reason="Forbidden")
@@ -110,6 +111,6 @@ async def ask(program: Program) -> tuple[int, str]:
 async def until(world: World, program: Program, said: str) -> None:
     """Wait until /readyz says so."""
     await world.until(lambda: bool(program.port), within=10)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(PATIENCE):
         while said not in (await ask(program))[1]:
             await asyncio.sleep(0.05)

@@ -17,8 +17,8 @@ from fiber._transport.outbox import Outbox
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
 from fiber.errors import TooManyOpenFiles
+from patience import PATIENCE
 
-PATIENCE = 10
 FULL = bytes(60_000)
 """A few of these fill a socket's buffer."""
 

@@ -12,8 +12,8 @@ import pytest
 
 from fiber._backends import output
 from fiber._backends.output import Output
+from patience import PATIENCE
 
-PATIENCE = 10
 SAID = re.compile(r"\[fiber\] (\d+) lines are left out here")
 
 

@@ -20,6 +20,7 @@ from fiber._wire import packet
 from fiber._wire.arena import RETAINED_LIMIT
 from fiber._wire.packet import BULK, INLINE_LIMIT
 from fiber.errors import TooManyOpenFiles
+from patience import PATIENCE
 
 SIZES = [0, 1, 2047, 2048, INLINE_LIMIT - 1, INLINE_LIMIT, INLINE_LIMIT + 1, BULK + 1, 3_000_000]
 
@@ -241,7 +242,7 @@ def test_a_bulky_message_fills_the_socket_until_it_is_read(pair: Pair) -> None:
     thread.start()
     assert not writable.wait(0.05)
     assert len(packet.receive(other).payload) == BULK + 1
-    assert writable.wait(10)
+    assert writable.wait(PATIENCE)
     thread.join()
     assert packet.receive(other).tobytes() == b"small"
 

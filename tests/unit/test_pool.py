@@ -16,9 +16,8 @@ import pytest
 import fiber
 from census import wait_until
 from fiber.pool import Pool
+from patience import PATIENCE
 from unit import pool_tasks as tasks
-
-PATIENCE = tasks.PATIENCE
 
 
 @pytest.fixture

@@ -15,9 +15,8 @@ from census import wait_until
 from fiber._engine import worker_set
 from fiber.errors import StartError, WorkerDied
 from fiber.pool import Pool
+from patience import PATIENCE
 from unit import pool_tasks as tasks
-
-PATIENCE = tasks.PATIENCE
 
 
 @pytest.fixture

@@ -15,9 +15,8 @@ import fiber
 from fiber._runtime.background import BackgroundThread
 from fiber.errors import UnpicklableError
 from fiber.pool import AsyncResult, Pool
+from patience import PATIENCE
 from unit import pool_tasks as tasks
-
-PATIENCE = tasks.PATIENCE
 
 
 @pytest.fixture
@@ -234,7 +233,7 @@ def test_of_what_cannot_be_sent_results_hear_on_the_loop_as_of_all_else(
     told: list[BaseException] = []
     result = ask(pool, told.append)
     with pytest.raises(Exception) as caught:
-        result.get(tasks.PATIENCE)
+        result.get(PATIENCE)
     assert told == [caught.value]
     assert on_loop == [True]
 

@@ -12,9 +12,8 @@ import pytest
 
 import fiber
 from fiber.pool import Pool
+from patience import PATIENCE
 from unit import pool_tasks as tasks
-
-PATIENCE = tasks.PATIENCE
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import pytest
 import fiber
 from fiber.errors import FiberError
 from fiber.pool import Pool
+from patience import PATIENCE
 from unit.pool_programs import wait_until
-from unit.pool_tasks import PATIENCE
 
 
 class Asking:

@@ -18,9 +18,8 @@ from fiber import config, process
 from fiber._agent.interface import ExitReport
 from fiber._runtime import popen, state
 from fiber.errors import StartError, UnpicklableError
+from patience import PATIENCE
 from unit.agent_children import run_forever
-
-PATIENCE = 10
 
 
 @pytest.fixture(scope="module", autouse=True)

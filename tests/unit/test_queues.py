@@ -17,11 +17,10 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
+from patience import PATIENCE
 
 MORE_THAN_FITS = 3000
 """Items that no socket's buffer holds."""
-
-PATIENCE = 15.0
 
 
 def start(target: Callable[..., Any], *args: Any) -> fiber.Process:

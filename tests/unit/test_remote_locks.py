@@ -18,7 +18,8 @@ from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.protocol import Op, Status
 from fiber._hub.remote_semaphore import RemoteSemaphore
 from fiber.synchronize import Abandoned
-from hosts import PATIENCE, Far, Hosts, Wire, background, objects_kept
+from hosts import Far, Hosts, Wire, background, objects_kept
+from patience import PATIENCE
 
 MAKERS = {
     "Lock": fiber.Lock,

@@ -16,7 +16,8 @@ from fiber._hub.heap import Block
 from fiber._hub.protocol import KEY_BYTES, Origin
 from fiber._hub.replicas import Replicas
 from fiber._wire.messages import Memory, ProtocolError
-from hosts import PATIENCE, Far, Hosts, Wire, objects_kept
+from hosts import Far, Hosts, Wire, objects_kept
+from patience import PATIENCE
 
 
 @pytest.fixture

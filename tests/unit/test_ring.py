@@ -13,8 +13,7 @@ import pytest
 
 import fiber
 from fiber.errors import MemberLost
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 def ranks(rank: int, size: int) -> tuple[int, int, int, int]:

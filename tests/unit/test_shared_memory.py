@@ -18,8 +18,7 @@ from census import wait_until
 from fiber.managers import SharedMemoryManager
 from fiber.shared_memory import ShareableList, SharedMemory
 from hosts import Hosts
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 @pytest.fixture

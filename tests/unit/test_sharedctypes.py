@@ -17,8 +17,7 @@ import pytest
 
 import fiber
 from fiber import sharedctypes
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 class Point(ctypes.Structure):

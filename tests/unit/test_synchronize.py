@@ -12,8 +12,7 @@ import pytest
 
 import fiber
 from fiber import synchronize
-
-PATIENCE = 15.0
+from patience import PATIENCE
 
 
 def start(target: Callable[..., Any], *args: Any) -> fiber.Process:

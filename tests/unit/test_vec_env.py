@@ -28,8 +28,6 @@ if importlib.util.find_spec("stable_baselines3") is None:
 
 Make = Callable[..., Any]
 
-pytestmark = pytest.mark.timeout(60)  # processes that import Gymnasium; the machine may be busy
-
 
 @pytest.fixture(scope="module", autouse=True)
 def torch() -> Iterator[None]:

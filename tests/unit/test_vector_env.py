@@ -38,8 +38,6 @@ SPACES = {
 
 Make = Callable[..., VectorEnv]
 
-pytestmark = pytest.mark.timeout(60)  # processes that import Gymnasium; the machine may be busy
-
 
 @pytest.fixture
 def vector_env() -> Iterator[Make]:

@@ -25,7 +25,6 @@ CALLS: dict[str, Callable[[VectorEnv], object]] = {
 }
 
 pytestmark = [
-    pytest.mark.timeout(120),
     # Python itself drops an interrupt that strikes while a generator is being closed.
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]

@@ -24,8 +24,6 @@ from vector_envs import Faulty, Sampling, Step
 
 Make = Callable[..., VectorEnv]
 
-pytestmark = pytest.mark.timeout(60)
-
 
 @pytest.fixture
 def vector_env() -> Iterator[Make]:

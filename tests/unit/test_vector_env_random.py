@@ -25,7 +25,6 @@ DTYPES = (np.float16, np.float32, np.float64)
 INTEGERS = (np.int8, np.uint8, np.int16, np.uint16, np.int32, np.int64)
 
 pytestmark = [
-    pytest.mark.timeout(60),
     pytest.mark.filterwarnings("ignore:.*WARN:UserWarning"),  # Gymnasium's, of odd spaces
 ]
 

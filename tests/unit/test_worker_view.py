@@ -11,8 +11,7 @@ import fiber
 from fiber._runtime.worker_resources import WorkerResources
 from fiber.errors import StartError, TimeoutError
 from fiber.resources import Resources
-
-PATIENCE = 20
+from patience import PATIENCE
 
 
 def square(number: int) -> int:

@@ -26,9 +26,8 @@ from fiber._agent.progress import ProgressTable
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
 from fiber.process import Process
+from patience import PATIENCE
 from unit.agent_children import run_forever
-
-PATIENCE = 10
 
 
 class Master:
