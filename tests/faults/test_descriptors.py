@@ -288,7 +288,7 @@ AGENT_WITHOUT = (
     PRELUDE
     + """
     import subprocess
-    from fiber._engine import worker_set
+    from fiber._engine import start_failures
 
     def agent():
         found = subprocess.run(
@@ -297,7 +297,7 @@ AGENT_WITHOUT = (
         return int(found.stdout)
 
     if __name__ == "__main__":
-        worker_set.KILLED_PATIENCE = 1.0  # the real one is half of what the test may take
+        start_failures.KILLED_PATIENCE = 1.0  # the real one is half of what the test may take
         pool = fiber.Pool(2, retries=0)
         pool.map(abs, range(10))
         pid = agent()

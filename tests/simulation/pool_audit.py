@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Loss
 from fiber._engine.scheduler import Decisions
-from fiber._engine.worker_set import (
+from fiber._engine.start_failures import (
     KILLED_PATIENCE,
     LAST_PAUSE,
     LAST_PAUSE_AT_WORK,
     RAISED_PATIENCE,
     SAID_AFTER,
     TRIES,
-    Member,
     StartFailure,
 )
+from fiber._engine.worker_set import Member
 from fiber._runtime.executor import Executor
 from fiber._runtime.host import TICK
 from fiber._runtime.input_stream import AHEAD, InputStream
@@ -201,7 +201,7 @@ class PoolAudit:
         self._lasts("size", short, self._pause, "there is work, but the pool does not grow")
 
     def _pause(self) -> float:
-        if not self._workers._pause:
+        if not self._workers._failures.pause:
             return GRACE
         at_work = self._workers.size > self._workers.starting
         return GRACE + (LAST_PAUSE_AT_WORK if at_work else LAST_PAUSE)
@@ -283,6 +283,6 @@ class PoolAudit:
     def check_rest(self) -> None:
         """Nothing was to be done for long."""
         workers = self._workers
-        if self._world.has_links or workers.error is not None or workers._pause:
+        if self._world.has_links or workers.error is not None or workers._failures.pause:
             return
         require(workers.size == workers.minimum, f"the pool rests with {workers.size} workers")

@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 
-from fiber._engine import worker_set
+from fiber._engine import start_failures, worker_set
 from fiber._engine.ledger import Batch, Job, Loss, Receipt, Worker
 from fiber._engine.scheduler import Decisions, Scheduler
-from fiber._engine.worker_set import Member, StartFailure
+from fiber._engine.start_failures import StartFailure
+from fiber._engine.worker_set import Member
 from fiber._runtime.calls import CallQueue, Calls
 from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
@@ -94,8 +95,8 @@ def forgets_that_somebody_left(patch: Patch) -> None:
 
 def gives_up_at_once(patch: Patch) -> None:
     """As if not the time decided, but the number."""
-    patch.setattr(worker_set, "RAISED_PATIENCE", 0.0)
-    patch.setattr(worker_set, "KILLED_PATIENCE", 0.0)
+    patch.setattr(start_failures, "RAISED_PATIENCE", 0.0)
+    patch.setattr(start_failures, "KILLED_PATIENCE", 0.0)
 
 
 def never_gives_up(patch: Patch) -> None:

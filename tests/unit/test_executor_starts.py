@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import pytest
 
 from fiber._agent.interface import Cause, ExitReport
-from fiber._engine import worker_set
+from fiber._engine import start_failures, worker_set
 from fiber._runtime.launcher import KILL_AFTER
 from fiber._wire import work
 from fiber.errors import FiberError
@@ -97,7 +97,7 @@ def test_without_a_thread_to_start_them_workers_are_tried_again(rig: Rig) -> Non
 def test_without_a_thread_to_say_it_bad_news_stop_nothing(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_set, "SAID_AFTER", -1.0)
+    monkeypatch.setattr(start_failures, "SAID_AFTER", -1.0)
     for handle in rig.members:
         rig.lose(handle)
     assert not rig.members
@@ -144,7 +144,7 @@ def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
 def test_what_an_end_says_of_a_worker_is_told_by_its_cause_in_whatever_words(
     cause: Cause, told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    failures: list[worker_set.StartFailure | None] = []
+    failures: list[start_failures.StartFailure | None] = []
     gone = worker_set.WorkerSet.gone
 
     def noting(self: Any, member: Any, now: float, failure: Any = None) -> None:
@@ -163,8 +163,8 @@ def test_what_an_end_says_of_a_worker_is_told_by_its_cause_in_whatever_words(
 def test_a_pool_that_gives_up_kills_the_workers_that_do_not_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(worker_set, "TRIES", 1)
-    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", 0.0)
+    monkeypatch.setattr(start_failures, "TRIES", 1)
+    monkeypatch.setattr(start_failures, "RAISED_PATIENCE", 0.0)
     rig = Rig(2, ready=False)
     results = rig.map(range(5))
     rig.handles[0].exited(ExitReport(1, "exit status 1"))

@@ -25,6 +25,8 @@ from fiber._agent.interface import ChildSpec
 from fiber._backends import agent_process, loopback
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._engine import start_failures
+from fiber._engine.start_failures import TRIES
 from fiber._hub.protocol import HubAddress
 from fiber._runtime import state
 from fiber._wire import messages
@@ -178,18 +180,43 @@ def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() ->
         stop(another)
 
 
-def test_agents_that_die_before_they_join_are_not_started_for_ever(
+def test_agents_that_die_before_they_join_are_an_error_until_one_joins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    dies = [sys.executable, "-c", "raise SystemExit(3)"]
-    monkeypatch.setattr(agent_process, "interpreter_arguments", lambda *_: dies)
-    with running(start_timeout=PATIENCE) as backend:
-        with pytest.raises(StartError, match="its process ended with status 3"):
-            start()
-        assert census.wait_until(lambda: len(backend._failures) == 3, PATIENCE)
-        with pytest.raises(StartError, match="none joined") as caught:
-            start()
-    assert "loopback-2: its process ended with status 3" in str(caught.value)
+    dies, works = [sys.executable, "-c", "raise SystemExit(3)"], agent_process.interpreter_arguments
+    broken = True
+    monkeypatch.setattr(
+        agent_process, "interpreter_arguments", lambda *them: dies if broken else works(*them)
+    )
+    with running():
+        for _ in range(2):
+            with pytest.raises(StartError, match="none joined") as caught:
+                start()
+            assert "its process ended with status 3" in str(caught.value)
+            assert caught.value.attempts >= TRIES
+        with fiber.Pool(1) as pool, pytest.raises(StartError, match="none joined"):
+            pool.map(abs, range(3))
+        broken = False
+        stop(start())
+        with fiber.Pool(1) as pool:
+            assert pool.map(abs, range(3)) == [0, 1, 2]
+
+
+def test_agents_that_are_killed_while_they_start_cost_a_pool_nothing_but_time() -> None:
+    with running() as backend, fiber.Pool(1) as pool:
+        assert pool.map(abs, range(3)) == [0, 1, 2]
+        killed: set[int | None] = {None}
+
+        def kill_next() -> bool:
+            pid = backend._slots[0].process.pid
+            if pid is not None and pid not in killed:
+                killed.add(pid)
+                os.kill(pid, signal.SIGKILL)
+            return len(killed) > TRIES + 2
+
+        assert census.wait_until(kill_next, PATIENCE)
+        assert pool.map(abs, range(3)) == [0, 1, 2]
+        stop(start())
 
 
 class Reluctant:
@@ -272,28 +299,27 @@ def test_an_agent_that_cannot_be_watched_is_ended_before_the_next_attempt(
 def test_an_agent_that_can_never_be_started_is_an_error_with_the_cause(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(agent_process.subprocess, "Popen", Reluctant(99, errno.ENOEXEC))
-    with running() as backend:
-        assert census.wait_until(lambda: len(backend._failures) == 3, PATIENCE)
-        with pytest.raises(StartError, match="none joined") as caught:
-            start()
-    assert "loopback-2: its process cannot be started: [Errno 8]" in str(caught.value)
+    monkeypatch.setattr(agent_process.subprocess, "Popen", Reluctant(999, errno.ENOEXEC))
+    with running(), pytest.raises(StartError, match="none joined") as caught:
+        start()
+    assert "its process cannot be started: [Errno 8]" in str(caught.value)
 
 
 @pytest.mark.slow
 def test_while_another_agent_is_there_no_place_is_given_up(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(start_failures, "SAID_AFTER", 0.0)
     with running(agents=2) as backend:
         assert census.wait_until(lambda: len(backend.agents.agents) == 2, PATIENCE)
         monkeypatch.setattr(agent_process.subprocess, "Popen", Reluctant(4, errno.ENOEXEC))
         os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
-        assert census.wait_until(lambda: len(backend._failures) >= 3, PATIENCE)
+        assert census.wait_until(lambda: backend._failures.count >= TRIES, PATIENCE)
         child = start()  # on the other one
         assert child._popen._child.host == "loopback-1"
         assert census.wait_until(lambda: len(backend.agents.agents) == 2, PATIENCE)
         stop(child)
-    assert "The others go on; the next attempt is in 0.1 s" in capfd.readouterr().err
+    assert capfd.readouterr().err.count("no loopback agent has joined for") == 1
 
 
 def test_a_port_in_use_is_named_and_leaves_nothing() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._engine import worker_set
+from fiber._engine import start_failures
 from fiber.errors import StartError, WorkerDied
 from fiber.pool import Pool
 from patience import PATIENCE
@@ -233,8 +233,8 @@ def test_a_timeout_for_all_tasks(tmp_path: Path) -> None:
 @pytest.fixture
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """What fails to start is given up as soon as it may be."""
-    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", 0.0)
-    monkeypatch.setattr(worker_set, "KILLED_PATIENCE", 0.0)
+    monkeypatch.setattr(start_failures, "RAISED_PATIENCE", 0.0)
+    monkeypatch.setattr(start_failures, "KILLED_PATIENCE", 0.0)
 
 
 @pytest.mark.usefixtures("_impatient")
@@ -288,7 +288,7 @@ def test_workers_that_die_at_birth_are_not_tried_for_ever(tmp_path: Path) -> Non
 def test_workers_are_tried_for_a_time_and_not_a_number_of_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", PATIENCE)
+    monkeypatch.setattr(start_failures, "RAISED_PATIENCE", PATIENCE)
     with fiber.Pool(1, tasks.fail_until, (tmp_path / "runs", 4)) as pool:
         assert pool.apply(tasks.square, (3,)) == 9
     pool.join()
@@ -297,7 +297,7 @@ def test_workers_are_tried_for_a_time_and_not_a_number_of_times(
 
 @pytest.mark.slow
 def test_a_wave_of_kills_is_outlived(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_set, "KILLED_PATIENCE", PATIENCE)
+    monkeypatch.setattr(start_failures, "KILLED_PATIENCE", PATIENCE)
     with fiber.Pool(4, tasks.killed_until, (tmp_path / "runs", 7)) as pool:
         assert pool.map(tasks.square, range(10)) == [x * x for x in range(10)]
     pool.join()
@@ -308,8 +308,8 @@ def test_a_wave_of_kills_is_outlived(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_who_waits_long_for_workers_is_told_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(worker_set, "RAISED_PATIENCE", PATIENCE)
-    monkeypatch.setattr(worker_set, "SAID_AFTER", 0.0)
+    monkeypatch.setattr(start_failures, "RAISED_PATIENCE", PATIENCE)
+    monkeypatch.setattr(start_failures, "SAID_AFTER", 0.0)
     with fiber.Pool(1, tasks.fail_until, (tmp_path / "runs", 4)) as pool:
         assert pool.apply(tasks.square, (3,)) == 9
     pool.join()

@@ -7,7 +7,8 @@ from typing import Any
 
 from fiber._engine.ledger import PATIENCE, Job, Worker
 from fiber._engine.scheduler import Decisions, Scheduler
-from fiber._engine.worker_set import FIRST_PAUSE, IDLE_DEATHS, RAISED_PATIENCE, StartFailure
+from fiber._engine.start_failures import FIRST_PAUSE, RAISED_PATIENCE, StartFailure
+from fiber._engine.worker_set import IDLE_DEATHS
 from unit.ledger_steps import answer, known
 
 RAISED = StartFailure("pool worker 'w'", "exit status 1", "no such device")

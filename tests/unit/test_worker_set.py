@@ -6,11 +6,8 @@ from typing import Any
 
 import pytest
 
-from fiber._engine.tasks import Worker
-from fiber._engine.worker_set import (
+from fiber._engine.start_failures import (
     FIRST_PAUSE,
-    IDLE_DEATHS,
-    IDLE_PAUSE,
     KILLED_PATIENCE,
     LAST_PAUSE,
     LAST_PAUSE_AT_WORK,
@@ -18,8 +15,9 @@ from fiber._engine.worker_set import (
     SAID_AFTER,
     TRIES,
     StartFailure,
-    WorkerSet,
 )
+from fiber._engine.tasks import Worker
+from fiber._engine.worker_set import IDLE_DEATHS, IDLE_PAUSE, WorkerSet
 from fiber.errors import StartError
 
 RAISED = StartFailure("pool worker 'w'", "exit status 1", "no such device")

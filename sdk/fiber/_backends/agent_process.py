@@ -28,11 +28,12 @@ _STATEMENT = "import runpy; runpy.run_module('fiber.agent', run_name='__main__')
 class AgentProcess:
     """One process, from before its start to after its end.
 
-    ``on_end`` is called once with how it ended, or why it never began, on the loop's thread.
+    ``on_end`` is called once, on the loop's thread: with how the process ended or why it never
+    began, and whether a signal or a lack of resources was the reason.
     """
 
     def __init__(
-        self, loop: Loop, on_end: Callable[[str], None], directory: str | None = None
+        self, loop: Loop, on_end: Callable[[str, bool], None], directory: str | None = None
     ) -> None:
         """``directory``: the one to start it in, if that is not this program's."""
         self._loop = loop
@@ -73,9 +74,9 @@ class AgentProcess:
             self._process = process
         self._loop.register(self._watched, self._ended)
 
-    def fail(self, reason: str) -> None:
+    def fail(self, reason: str, *, may_pass: bool) -> None:
         """It will not be started."""
-        self._loop.call_soon(self._on_end, reason)
+        self._loop.call_soon(self._on_end, reason, may_pass)
 
     def kill(self) -> None:
         """It is out of reach, though it may run: nothing of it is wanted any more."""
@@ -103,7 +104,7 @@ class AgentProcess:
             return
         self._loop.unregister(self._watched)
         os.close(self._watched)
-        self._on_end(f"its process ended with status {status}")
+        self._on_end(f"its process ended with status {status}", status < 0)
 
 
 class AgentLauncher:
@@ -151,8 +152,9 @@ class AgentLauncher:
                 return
             except OSError as error:
                 reason = f"its process cannot be started: {error}"
-                if error.errno not in _MAY_PASS or time.monotonic() + pause > deadline:
-                    process.fail(reason)
+                may_pass = error.errno in _MAY_PASS
+                if not may_pass or time.monotonic() + pause > deadline:
+                    process.fail(reason, may_pass=may_pass)
                     return
             self._on_trouble(f"agent {name} has to wait, {reason}; next attempt in {pause:g} s")
             if self._closing.wait(pause):

@@ -10,6 +10,7 @@ import math
 import os
 import threading
 import time
+from collections import deque
 from functools import partial
 from typing import NamedTuple
 
@@ -19,19 +20,17 @@ from fiber._backends.agent_set import AgentSet
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
+from fiber._engine.start_failures import StartFailure, StartFailures
 from fiber._hub.hub import Hub
 from fiber._transport.credentials import make_credentials
-from fiber._transport.link import Keepalive, Link
+from fiber._transport.link import Keepalive, Link, Timer
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import StartError
 
-_ATTEMPTS = 3
-"""Agents in a row that may fail to join, and none be there, before nothing more is started."""
-
-_PAUSE_MIN, _PAUSE_MAX = 0.1, 30.0
-"""Seconds before another one is started after those, if there are others to work with."""
+_REASONS = 3
+"""Failed agents that an error lists."""
 
 _LOOPBACK = "127.0.0.1"
 
@@ -41,6 +40,9 @@ _QUIT_TIMEOUT = 5.0
 
 class LoopbackBackend:
     """Starts its agents at once and replaces each at the moment it is lost.
+
+    After agents that did not join, one has to succeed before others are started.  When that takes
+    too long, the children that wait are refused, and from then on each new child is one more try.
 
     Only the loop's thread changes what it holds; others read it, without a lock.
     """
@@ -58,7 +60,11 @@ class LoopbackBackend:
         self._hub = hub
         self._config = config
         self._output = Output()
-        self._failures: tuple[str, ...] = ()
+        self._failures = StartFailures()
+        self._reasons: deque[str] = deque(maxlen=_REASONS)
+        self._gave_up = False
+        self._alone_since = 0.0
+        self._retry: Timer | None = None
         self._closing = False
         self._numbers = itertools.count()
         self._limit = config.processes_per_agent or math.inf
@@ -67,7 +73,12 @@ class LoopbackBackend:
         self._vacant: list[_Slot] = []
         """Those whose agents are lost and not yet replaced."""
         self.agents = AgentSet(
-            loop, hub, self._output, Placement(self._limit, spread=True), on_lost=self._lost
+            loop,
+            hub,
+            self._output,
+            Placement(self._limit, spread=True),
+            on_change=self._changed,
+            on_lost=self._lost,
         )
         credentials = make_credentials("loopback")
         self._listener = MasterListener(
@@ -93,11 +104,11 @@ class LoopbackBackend:
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """A child for the agent with the fewest; StartError if none can take one more."""
-        there = len(self._slots) - len(self._vacant)
-        if there and self.agents.children >= there * self._limit:
+        agents = len(self._slots)
+        if self.agents.children >= agents * self._limit:
             raise StartError(
                 "one more process",
-                f"all {there} agents run {self._limit} processes already (processes_per_agent); "
+                f"all {agents} agents run {self._limit} processes already (processes_per_agent); "
                 "raise FIBER_AGENTS or FIBER_PROCESSES_PER_AGENT",
             )
         return self.agents.child(spec, observer)
@@ -115,17 +126,13 @@ class LoopbackBackend:
         done.wait(_QUIT_TIMEOUT)
         self._output.close()
 
-    def _launch(self, index: int, pause: float = 0.0) -> None:
+    def _launch(self, index: int) -> None:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
         process = AgentProcess(self._loop, partial(self._ended, name), self.elsewhere)
         self._by_name[name] = slot = _Slot(index, name, process)
         self._slots[index : index + 1] = [slot]
-        launch = self._launcher.launch, process, name, self._environment(name)
-        if pause:
-            self._loop.call_later(pause, *launch)
-        else:
-            launch[0](*launch[1:])
+        self._launcher.launch(process, name, self._environment(name))
 
     def _environment(self, name: str) -> dict[str, str]:
         environment = dict(os.environ)
@@ -146,9 +153,11 @@ class LoopbackBackend:
         name = link.peer.name
         if name not in self._by_name or name in self.agents.agents:
             return f"the master expects no agent named {name}"
-        self._failures = ()
+        self._failures = StartFailures()
+        self._reasons.clear()
+        self._gave_up = False
         self.agents.join(name, link)
-        self._fill_vacant()  # those that were given up: it can be done after all
+        self._fill_vacant()
         return None
 
     def _refused(self, reason: str) -> None:
@@ -163,44 +172,69 @@ class LoopbackBackend:
             else:
                 agent.close()
 
-    def _ended(self, name: str, reason: str) -> None:
+    def _ended(self, name: str, reason: str, killed: bool) -> None:
         """Its process is gone, or was never there."""
         agent = self.agents.agents.get(name)
         if agent is not None:
             agent.lose(reason)
-        elif name in self._by_name:
-            self._failures += (f"{name}: {reason}",)
-            self._replace(name, reason)
+        elif name in self._by_name and not self._closing:
+            self._vacate(name)
+            self._failed(name, reason, killed)
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
-        self._replace(agent.host, reason)
+        if not self.agents.agents:
+            self._alone_since = self._loop.now()
+        if not self._closing:
+            self._vacate(agent.host)
+            self._fill_vacant()
 
-    def _replace(self, name: str, reason: str) -> None:
-        if self._closing:
-            return
+    def _vacate(self, name: str) -> None:
         slot = self._by_name.pop(name)
         slot.process.kill()
         self._vacant.append(slot)
-        in_a_row = len(self._failures)
-        if in_a_row < _ATTEMPTS:
-            self._fill_vacant()
-        elif self.agents.agents:
-            pause = min(_PAUSE_MIN * 2 ** (in_a_row - _ATTEMPTS), _PAUSE_MAX)
+
+    def _failed(self, name: str, reason: str, killed: bool) -> None:
+        now = self._loop.now()
+        self._reasons.append(f"{name}: {reason}")
+        text = "\n".join(self._reasons)
+        failure = StartFailure("the loopback agents", "none joined", text, killed)
+        at_work = bool(self.agents.agents)
+        self._failures.add(failure, now, at_work=at_work)
+        if not at_work and self._failures.last(failure, now, self._alone_since):
+            self._gave_up = True
+            self.agents.refuse_waiting(failure.error(self._failures.count))
+        elif self._failures.are_news(now):
             self._output.write(
                 "fiber",
-                f"agent {name} was lost before it joined, as {in_a_row - 1} before it: "
-                f"{reason}. The others go on; the next attempt is in {pause:g} s",
+                f"no loopback agent has joined for {self._failures.lasted(now):.0f} s, "
+                f"{self._failures.count} tries: {name}: {reason}. Trying again",
             )
-            self._fill_vacant(pause)
-        else:
-            reasons = "\n".join(self._failures)
-            error = StartError("the loopback agents", "none joined", reasons, _ATTEMPTS)
-            self.agents.fail(error)
+        self._fill_vacant()
 
-    def _fill_vacant(self, pause: float = 0.0) -> None:
-        vacant, self._vacant = self._vacant, []
-        for slot in vacant:
-            self._launch(slot.position, pause)
+    def _changed(self) -> None:
+        if self._gave_up:
+            self._fill_vacant()
+
+    def _fill_vacant(self) -> None:
+        """Start the agents that are missing; after failures one, once the pause is over."""
+        if self._retry is not None:
+            self._retry.cancel()
+            self._retry = None
+        if self._closing or (self._gave_up and not self.agents.placement.waiting):
+            return
+        if not self._failures.count:
+            vacant, self._vacant = self._vacant, []
+            for slot in vacant:
+                self._launch(slot.position)
+        elif self._vacant and not self._are_starting():
+            try_at = self._failures.try_at(at_work=bool(self.agents.agents))
+            if (pause := try_at - self._loop.now()) > 0:
+                self._retry = self._loop.call_later(pause, self._fill_vacant)
+            else:
+                self._launch(self._vacant.pop(0).position)
+
+    def _are_starting(self) -> bool:
+        return len(self._slots) > len(self._vacant) + len(self.agents.agents)
 
 
 class _Slot(NamedTuple):

@@ -23,7 +23,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from fiber._engine.ledger import Batch, Job, Ledger, Loss, Worker
-from fiber._engine.worker_set import Member, StartFailure, WorkerSet
+from fiber._engine.start_failures import StartFailure
+from fiber._engine.worker_set import Member, WorkerSet
 
 
 class Decisions(NamedTuple):

@@ -5,27 +5,11 @@ Pure: ``now`` is an argument.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
+from fiber._engine.start_failures import StartFailure, StartFailures
 from fiber._engine.tasks import Worker
-from fiber.errors import FiberError, StartError
-
-RAISED_PATIENCE = 1.0
-"""Seconds for which workers may fail to start by their own doing, as by an initializer that raises,
-before that is the answer."""
-
-KILLED_PATIENCE = 10.0
-"""The same for those that are killed, or refused by the system: spot nodes and OOM killers come in
-waves, and go."""
-
-TRIES = 3
-"""Workers that must have failed, however long it took."""
-
-FIRST_PAUSE, LAST_PAUSE = 0.05, 1.0
-"""Seconds from one wave of failures to the next try, doubled from wave to wave."""
-
-LAST_PAUSE_AT_WORK = 60.0
-"""The same, at most, while other workers are at work."""
+from fiber.errors import FiberError
 
 IDLE_DEATHS = 3
 """Workers more than the pool's maximum that may die with nothing to do before they are replaced
@@ -33,9 +17,6 @@ slowly."""
 
 IDLE_PAUSE = 1.0
 """Seconds before one is replaced then."""
-
-SAID_AFTER = 2.0
-"""Seconds of failures after which whoever waits is told."""
 
 
 class Member(Protocol):
@@ -45,28 +26,6 @@ class Member(Protocol):
     """Its entry in the ledger, once it is ready."""
     leaving: bool
     """It was told to go, or will be at once."""
-
-
-class StartFailure(NamedTuple):
-    """Why a worker was gone before it was ready."""
-
-    who: str
-    reason: str
-    text: str = ""
-    """What it said."""
-    killed: bool = False
-    """By a signal, or the system had no room for it: it may have done nothing wrong."""
-    cause: BaseException | None = None
-    final: FiberError | None = None
-    """What keeps every worker from starting: another try is of no use."""
-
-    def error(self, attempts: int) -> FiberError:
-        """What the pool's user hears."""
-        if self.final is not None:
-            return self.final
-        error = StartError(self.who, self.reason, self.text, attempts)
-        error.__cause__ = self.cause
-        return error
 
 
 class WorkerSet:
@@ -83,17 +42,16 @@ class WorkerSet:
         self.members: dict[Member, None] = {}
         self.size = 0
         self.starting = 0
-        self.failures = 0
         self.trouble: FiberError | None = None
         self.error: FiberError | None = None
-        self._failing_since = 0.0
-        self._raises = 0  # those of the failures that were the workers' own doing
-        self._raising_since = 0.0
+        self._failures = StartFailures()
         self._alone_since = 0.0  # when the last one at work was lost
-        self._said = False
-        self._pause = 0.0
-        self._wave_at = 0.0
         self._idle_deaths = 0
+
+    @property
+    def failures(self) -> int:
+        """How many have failed to start since the last that did."""
+        return self._failures.count
 
     def staying(self) -> list[Member]:
         """Those that were not told to go."""
@@ -110,13 +68,13 @@ class WorkerSet:
 
     def startable(self, missing: int, now: float) -> int:
         """How many of them to start now: after failures one, and only once the pause is over."""
-        if not self._pause:
+        if not self._failures.pause:
             return missing
         return min(missing, 1) if now >= self._try_at() and not self._trying() else 0
 
     def next_try(self) -> float | None:
         """When the pause after failures is over; None while one is tried, or there is none."""
-        return self._try_at() if self._pause and not self._trying() else None
+        return self._try_at() if self._failures.pause and not self._trying() else None
 
     def _trying(self) -> bool:
         """Whether one that is to show that workers can start again is under way."""
@@ -126,8 +84,7 @@ class WorkerSet:
         return self.size > self.starting
 
     def _try_at(self) -> float:
-        last = LAST_PAUSE_AT_WORK if self._at_work() else LAST_PAUSE
-        return self._wave_at + min(self._pause, last)
+        return self._failures.try_at(at_work=self._at_work())
 
     # What happens to them
 
@@ -141,18 +98,17 @@ class WorkerSet:
         """It is ready to work."""
         member.worker = worker
         self.starting -= 1
-        self.failures = 0
-        self._said = False
+        self._failures.forget()
         self.trouble = None
         if self._idle_deaths <= IDLE_DEATHS + self.maximum:
-            self._pause = 0.0
+            self._failures.pause = 0.0
 
     def did_something(self) -> None:
         """Some worker had a result."""
         if self._idle_deaths:
             self._idle_deaths = 0
             if not self.failures:
-                self._pause = 0.0
+                self._failures.pause = 0.0
 
     def let_go(self, member: Member) -> None:
         """It is not to stay; the caller sees to it that it hears of that, or dies."""
@@ -182,40 +138,22 @@ class WorkerSet:
     def _died_idle(self, now: float) -> None:
         self._idle_deaths += 1
         if self._idle_deaths > IDLE_DEATHS + self.maximum:
-            self._pause = IDLE_PAUSE
-            self._wave_at = now
+            self._failures.hold(IDLE_PAUSE, now)
 
     def _failed(self, failure: StartFailure, now: float) -> None:
-        if not self.failures:
-            self._failing_since = now
-            self._raises = 0
-        self.failures += 1
-        if not failure.killed:
-            self._raising_since = self._raising_since if self._raises else now
-            self._raises += 1
-        if not self._pause or now >= self._try_at():  # else it is of the same wave
-            self._pause = min(max(2 * self._pause, FIRST_PAUSE), LAST_PAUSE_AT_WORK)
-            self._wave_at = now
-        if failure.final is not None:
-            tries, since, patience = TRIES, now, 0.0
-        elif failure.killed:
-            tries, since, patience = self.failures, self._failing_since, KILLED_PATIENCE
-        else:
-            tries, since, patience = self._raises, self._raising_since, RAISED_PATIENCE
-        if tries >= TRIES and now - since >= patience:
+        self._failures.add(failure, now, at_work=self._at_work())
+        if self._failures.last(failure, now):
             self.trouble = failure.error(self.failures)
-            if not self._at_work() and now - max(since, self._alone_since) >= patience:
+            if not self._at_work() and self._failures.last(failure, now, self._alone_since):
                 self.error = self.trouble
 
     def news(self, failure: StartFailure, now: float) -> str:
         """What to tell a person who waits, once when failures last; else nothing."""
-        lasts = now - self._failing_since
-        if self.error or self._said or not self.failures or lasts < SAID_AFTER:
+        if self.error or not self._failures.are_news(now):
             return ""
-        self._said = True
         return (
-            f"no worker has started for {lasts:.0f} s, {self.failures} tries: {failure.who} "
-            f"ended before it was ready ({failure.reason}). Trying again"
+            f"no worker has started for {self._failures.lasted(now):.0f} s, {self.failures} tries: "
+            f"{failure.who} ended before it was ready ({failure.reason}). Trying again"
         )
 
     def _uncount(self, member: Member) -> None:

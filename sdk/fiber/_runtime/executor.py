@@ -29,7 +29,7 @@ from typing import Any, Protocol
 
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._engine.scheduler import Decisions, Scheduler
-from fiber._engine.worker_set import StartFailure
+from fiber._engine.start_failures import StartFailure
 from fiber._runtime.background import BackgroundThread
 from fiber._runtime.calls import CallQueue, Calls
 from fiber._runtime.functions import Function, FunctionCache

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from fiber._agent.interface import Cause, ChildHandle, ExitReport
 from fiber._engine.ledger import Worker
-from fiber._engine.worker_set import StartFailure
+from fiber._engine.start_failures import StartFailure
 from fiber._runtime.latch import Latch
 from fiber._runtime.shared_arguments import SharedArguments
 from fiber._transport.loop import Wakeup

@@ -1,0 +1,117 @@
+"""When to try again to start a process, and when to give up: for workers and for agents.
+
+Pure: ``now`` is an argument.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from fiber.errors import FiberError, StartError
+
+RAISED_PATIENCE = 1.0
+"""Seconds for which processes may fail to start by their own doing, as by an initializer that
+raises, before that is the answer."""
+
+KILLED_PATIENCE = 10.0
+"""The same for those that are killed, or refused by the system: spot nodes and OOM killers come in
+waves, and go."""
+
+TRIES = 3
+"""Starts that must have failed, however long it took."""
+
+FIRST_PAUSE, LAST_PAUSE = 0.05, 1.0
+"""Seconds from one wave of failures to the next try, doubled from wave to wave."""
+
+LAST_PAUSE_AT_WORK = 60.0
+"""The same, at most, while other processes are at work."""
+
+SAID_AFTER = 2.0
+"""Seconds of failures after which the user is told."""
+
+
+class StartFailure(NamedTuple):
+    """Why a process was gone before it was ready."""
+
+    who: str
+    reason: str
+    text: str = ""
+    """What it said."""
+    killed: bool = False
+    """By a signal, or the system had no room for it: it may have done nothing wrong."""
+    cause: BaseException | None = None
+    final: FiberError | None = None
+    """What keeps every process from starting: another try is of no use."""
+
+    def error(self, attempts: int) -> FiberError:
+        """What the user hears."""
+        if self.final is not None:
+            return self.final
+        error = StartError(self.who, self.reason, self.text, attempts)
+        error.__cause__ = self.cause
+        return error
+
+
+class StartFailures:
+    """Starts that failed in a row, counted in time and in waves.
+
+    ``pause`` is above 0 while one start has to succeed before others follow.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.pause = 0.0
+        self._since = 0.0
+        self._raises = 0  # those of the failures that were the processes' own doing
+        self._raising_since = 0.0
+        self._wave_at = 0.0
+        self._said = False
+
+    def add(self, failure: StartFailure, now: float, *, at_work: bool) -> None:
+        """Note one more; ``at_work`` says whether other processes work."""
+        if not self.count:
+            self._since = now
+            self._raises = 0
+        self.count += 1
+        if not failure.killed:
+            self._raising_since = self._raising_since if self._raises else now
+            self._raises += 1
+        if not self.pause or now >= self.try_at(at_work=at_work):  # else it is of the same wave
+            self.hold(min(max(2 * self.pause, FIRST_PAUSE), LAST_PAUSE_AT_WORK), now)
+
+    def hold(self, pause: float, now: float) -> None:
+        """Start nothing for a while."""
+        self.pause = pause
+        self._wave_at = now
+
+    def try_at(self, *, at_work: bool) -> float:
+        """Return when the pause is over."""
+        last = LAST_PAUSE_AT_WORK if at_work else LAST_PAUSE
+        return self._wave_at + min(self.pause, last)
+
+    def forget(self) -> None:
+        """End the series: one has started.  The pause is the caller's to end."""
+        self.count = 0
+        self._said = False
+
+    def last(self, failure: StartFailure, now: float, begin: float = -math.inf) -> bool:
+        """Return whether failures have lasted too long with this one, counted from ``begin``."""
+        if failure.final is not None:
+            tries, since, patience = TRIES, now, 0.0
+        elif failure.killed:
+            tries, since, patience = self.count, self._since, KILLED_PATIENCE
+        else:
+            tries, since, patience = self._raises, self._raising_since, RAISED_PATIENCE
+        return tries >= TRIES and now - max(since, begin) >= patience
+
+    def are_news(self, now: float) -> bool:
+        """Return True once for each series of failures that lasts."""
+        if self._said or not self.count or self.lasted(now) < SAID_AFTER:
+            return False
+        self._said = True
+        return True
+
+    def lasted(self, now: float) -> float:
+        """Return the seconds since the first of the series."""
+        return now - self._since
