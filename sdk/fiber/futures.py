@@ -32,6 +32,7 @@ from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
 from fiber import cpu
+from fiber._exceptions import fresh
 from fiber._runtime import methods, options
 from fiber._runtime.call_future import CallFuture, WorkerDied, translated
 from fiber._runtime.calls import CallQueue
@@ -281,5 +282,5 @@ def _next(results: IMapIterator, engine: Engine, deadline: float | None) -> list
     except WaitedTooLong:
         raise TimeoutError("the next result of the map was not there in time") from None
     if type(outcome) is Failure:
-        raise translated(outcome.error, engine)
+        raise fresh(translated(outcome.error, engine))
     return [outcome]

@@ -133,9 +133,10 @@ def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
         mp_context.set_spawning_popen(popen)
         return dumps(process, before_retry=popen.forget), fds
     except (*REFUSALS, AttributeError) as error:
-        culprit = _blame_process(process, error)
-        fds.clear()
-        raise culprit from error
+        try:
+            raise _blame_process(process, error) from error
+        finally:
+            fds.clear()
     except BaseException:
         fds.clear()  # now: the traceback, which holds them, may be kept for long
         raise

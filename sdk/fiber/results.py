@@ -16,6 +16,7 @@ from functools import partial
 from multiprocessing import TimeoutError
 from typing import Any, Protocol
 
+from fiber._exceptions import fresh
 from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.latch import Latch, Waiters, acquire
@@ -86,7 +87,7 @@ class ApplyResult:
             raise _too_late(timeout)
         outcome = self._settled()
         if type(outcome) is Failure:
-            raise outcome.error
+            raise fresh(outcome.error)
         return outcome
 
     # What the executor says
@@ -123,7 +124,7 @@ class ApplyResult:
             failed = type(self._outcome) is Failure
             callback = self._error_callback if failed else self._callback
             if callback is not None:
-                callback(self._outcome.error if failed else self._outcome)
+                callback(fresh(self._outcome.error) if failed else self._outcome)
         finally:
             self._complete()
 
@@ -374,7 +375,7 @@ class IMapIterator:
         """The next result; TimeoutError if it takes longer than ``timeout`` seconds."""
         outcome = self._take(timeout)
         if type(outcome) is Failure:
-            raise outcome.error
+            raise fresh(outcome.error)
         return outcome
 
     __next__ = next

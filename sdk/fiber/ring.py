@@ -17,6 +17,7 @@ from functools import partial
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 from typing import Any, NamedTuple, NoReturn
 
+from fiber._exceptions import fresh
 from fiber._runtime import options
 from fiber.connection import Connection, Pipe, wait
 from fiber.errors import ConnectionClosed, FiberError, MemberLost, UnpicklableError
@@ -180,7 +181,7 @@ def _attend(channels: list[Connection]) -> list[Any]:
                 failure = failure or error
                 _tell(end, running, len(channels))
     if failure is not None:
-        raise failure
+        raise fresh(failure)
     return results
 
 

@@ -136,10 +136,13 @@ def test_a_hundred_objects_work_side_by_side(manager: Any) -> None:
 def test_errors_are_raised_where_the_result_is_asked_for(manager: Any) -> None:
     desk = manager.Desk()
     failed, refused, went = desk.fail(), desk.lock(), desk.add(1)
+    raised = []
     for _ in range(2):
         with pytest.raises(KeyError, match="on purpose") as caught:
             failed.get(PATIENCE)
         assert "in fail" in str(caught.value.__cause__)
+        raised.append(caught.value)
+    assert raised[0] is not raised[1]
     with pytest.raises(RemoteError, match="cannot pickle"):
         refused.get(PATIENCE)
     assert went.get(PATIENCE) == 1

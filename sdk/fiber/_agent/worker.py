@@ -229,7 +229,8 @@ class Worker:
                 self._interruptible = False
             except BaseException as error:
                 self._interruptible = False
-                self._failed(batch, error)
+                if self._failed(batch, error):
+                    raise
                 continue
             if type(value) in plain:
                 values.append(value)
@@ -249,7 +250,8 @@ class Worker:
                 self._interruptible = False
             except BaseException as error:
                 self._interruptible = False
-                self._failed(batch, error)
+                if self._failed(batch, error):
+                    raise
             else:
                 values.append(value)
             if time.perf_counter() - started > SPLIT_AFTER and not len(values) % head.unit:
@@ -287,8 +289,9 @@ class Worker:
                 self._interruptible = False
             except BaseException as error:
                 self._interruptible = False
-                if batch.started() > len(values):  # or else SIGINT came after the last of them
-                    self._failed(batch, error)
+                # Otherwise SIGINT came after the last of them.
+                if batch.started() > len(values) and self._failed(batch, error):
+                    raise
                 continue
             if len(values) == stop:
                 return True
@@ -297,15 +300,17 @@ class Worker:
             # ``extend`` takes a task's StopIteration for the end of all.
             batch.fail(StopIteration())
 
-    def _failed(self, batch: BatchResults, error: BaseException) -> None:
+    def _failed(self, batch: BatchResults, error: BaseException) -> bool:
+        """Take a task's error; return whether it ends this process, as in multiprocessing."""
         batch.fail(error)
-        if isinstance(error, SystemExit):
-            # It ends this process, as in multiprocessing; what was done before it counts.
-            self._watchdog.end()
-            if not batch.eager:
-                batch.encode_new()
-            batch.return_unstarted()
-            raise error
+        if not isinstance(error, SystemExit):
+            return False
+        # The results of earlier tasks count.
+        self._watchdog.end()
+        if not batch.eager:
+            batch.encode_new()
+        batch.return_unstarted()
+        return True
 
 
 def _spread(function: _Function) -> _Function:

@@ -18,6 +18,7 @@ import weakref
 from functools import partial
 from queue import Empty, SimpleQueue
 
+from fiber._exceptions import fresh
 from fiber._hub import protocol
 from fiber._hub.client import NoHub, Unreachable
 from fiber._hub.client_handler import ClientHandler
@@ -120,7 +121,7 @@ class Hub:
             except Empty:
                 continue
             if isinstance(answer, Exception):
-                raise answer
+                raise fresh(answer)
             return answer
         raise Unreachable(self.host, "the program that keeps it has ended")
 

@@ -20,6 +20,7 @@ from multiprocessing import managers as mp_managers
 from typing import Any
 
 from fiber import reduction
+from fiber._exceptions import fresh
 from fiber._hub.client import Unreachable
 from fiber._managers.client import Session, new_owner, proxy_of, session
 from fiber._managers.door import NUMBER
@@ -50,7 +51,7 @@ class AsyncProxyResult:
         kind, result = self._pipeline.understood(self)
         if kind == "#RETURN":
             return result
-        raise _mp.convert_to_error(kind, result)
+        raise fresh(_mp.convert_to_error(kind, result))
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the call has ended, at most ``timeout`` seconds."""

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from fiber import errors
+from fiber._exceptions import fresh
 from fiber._runtime.calls import CallQueue
 from fiber._runtime.executor import Executor
 from fiber._runtime.outcome import Failure, Pickled
@@ -59,6 +60,18 @@ class CallFuture(Future[_T]):
     def cancelled(self) -> bool:
         """As in concurrent.futures, without its lock: the loop asks."""
         return self._claimed is False or self._state in (CANCELLED, CANCELLED_AND_NOTIFIED)
+
+    def result(self, timeout: float | None = None) -> _T:
+        """As in concurrent.futures; each call raises an exception of its own."""
+        error = super().exception(timeout)
+        if error is not None:
+            raise fresh(error)
+        return super().result()
+
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        """As in concurrent.futures; each call returns an exception of its own."""
+        error = super().exception(timeout)
+        return error and fresh(error)
 
     def _decide(self) -> bool:
         try:

@@ -30,6 +30,7 @@ from typing import Any, Protocol
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import StartFailure
+from fiber._exceptions import fresh
 from fiber._runtime.background import BackgroundThread
 from fiber._runtime.calls import CallQueue, Calls
 from fiber._runtime.functions import Function, FunctionCache
@@ -210,7 +211,7 @@ class Executor:
         elif outcome is not ADOPTED:
             outcome = decode(outcome)
             if type(outcome) is Failure:
-                raise outcome.error
+                raise fresh(outcome.error)
             return outcome
         return future.get()
 
@@ -319,7 +320,7 @@ class Executor:
         """Refuse at once what can be seen from here to be of no use."""
         error = self._refusal()
         if error is not None:
-            raise error
+            raise fresh(error)
 
     def wait_until_up(self, timeout: float | None) -> bool:
         """Wait for the first workers; False after ``timeout`` seconds.  Raises why none come."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from fiber._agent import worker
+from fiber._exceptions import fresh
 from fiber._runtime.background import BackgroundThread
 from fiber._runtime.host import Loop, Timer
 from fiber._runtime.latch import Latch
@@ -65,7 +66,7 @@ class Launcher:
             looked_at.wait(timeout)
         for handle in handles:
             if handle.child is not None and handle.child.start_error is not None:
-                raise handle.child.start_error
+                raise fresh(handle.child.start_error)
 
     def _start(self, handle: WorkerHandle) -> None:
         handle.shared = self._arguments

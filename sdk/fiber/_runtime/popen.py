@@ -8,6 +8,7 @@ from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 
 from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
+from fiber._exceptions import fresh
 from fiber._runtime.latch import Latch
 from fiber._runtime.state import runtime
 from fiber._transport.loop import Wakeup
@@ -58,7 +59,7 @@ class Popen:
             )
         if self._pid is None and self.report is not None:
             if child.start_error is not None:
-                raise child.start_error
+                raise fresh(child.start_error)
             raise StartError(f"process {self._name!r}", self.report.reason)
 
     # What the agent says, on the loop's thread

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from fiber._exceptions import fresh
 from fiber._transport import address as addresses
 from fiber._transport import handshake, tls
 from fiber._transport.credentials import Credentials
@@ -187,7 +188,7 @@ class AgentDialer:
             raise self._stranger(error) from error
         mismatch = handshake.mismatch(self._identity, greeting.identity)
         if mismatch is not None:
-            raise mismatch
+            raise fresh(mismatch)
         if isinstance(greeting, Welcome):
             return greeting
         reason = greeting.reason if isinstance(greeting, Refusal) else "it is an agent itself"

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
 
+from fiber._exceptions import fresh
 from fiber._wire.descriptor import opened
 from fiber.errors import FiberError
 
@@ -139,7 +140,7 @@ class Loop:
         # Both sides note first and look then: one of both sees the other.
         self._dependents.add(dependent)
         if self._failure is not None:
-            raise self._failure
+            raise fresh(self._failure)
 
     @staticmethod
     def now() -> float:

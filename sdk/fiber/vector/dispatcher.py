@@ -10,6 +10,7 @@ from multiprocessing import TimeoutError as WaitedTooLong
 from typing import Any, NamedTuple
 
 from fiber import reduction
+from fiber._exceptions import fresh
 from fiber._transport.loop import DOZE
 from fiber.vector.arrays import Shape, SharedMemory, StepArrays
 from fiber.vector.failures import ATTEMPTS, Failure
@@ -183,7 +184,7 @@ class Dispatcher:
             groups = [_Group(*group) for group in by_name.values()]
         for group in groups:
             if group.worker.error is not None:
-                raise group.worker.error
+                raise fresh(group.worker.error)
         return groups
 
     def _tell(self, commands: Iterable[tuple[_Group, dict[int, Pending], bytes]]) -> None:
@@ -287,7 +288,7 @@ class Dispatcher:
                 for note in getattr(other, "__notes__", ()) or (str(other),):
                     error.add_note(f"failed, too: {note}")
             self._failures.clear()
-            raise error
+            raise fresh(error)
 
     # Ends
 

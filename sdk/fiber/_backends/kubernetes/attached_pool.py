@@ -11,6 +11,7 @@ from typing import Any
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.api_errors import Body, Forbidden, NotFound
 from fiber._backends.kubernetes.resources import LEASES, POOLS
+from fiber._exceptions import fresh
 from fiber.errors import FiberPoolError
 from fiber_api import names
 
@@ -138,7 +139,7 @@ class AttachedPool:
         except NotFound:
             found = None
         if loss := self.loss(found):
-            raise loss
+            raise fresh(loss)
 
     def _loss(self, reason: str, what: str, advice: str) -> FiberPoolError:
         """``advice`` is for a pool that somebody else keeps; its own is followed by another."""

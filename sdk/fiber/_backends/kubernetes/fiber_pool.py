@@ -18,6 +18,7 @@ from fiber._backends.kubernetes.problems import PoolName
 from fiber._backends.kubernetes.reporter import Reporter
 from fiber._backends.kubernetes.resources import PODS, POOLS
 from fiber._backends.kubernetes.scaling import Scaling
+from fiber._exceptions import fresh
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
 from fiber_api import names
@@ -225,7 +226,7 @@ class FiberPoolClient:
             "charts/fiber-operator -n fiber-system --create-namespace`",
         )
         if silent >= OPERATOR_ABSENT:
-            raise error
+            raise fresh(error)
         if silent < OPERATOR_SLOW:
             return OPERATOR_SLOW - silent
         self._reporter.warn("no operator", str(error))

@@ -93,7 +93,8 @@ class Scaling:
             self._write(pool, replicas, release)
             self._due, self._pause, self._refused = now + PATCH_INTERVAL, _PAUSE_MIN, None
         except (Conflict, Forbidden, Unauthorized, Transient) as error:
-            self._put_off(error)
+            if not self._put_off(error):
+                raise
         return self._due - now
 
     def _write(self, pool: AttachedPool, replicas: int, release: list[str]) -> None:
@@ -105,15 +106,17 @@ class Scaling:
             pool.check()  # another's by now, or deleted: that says more
             raise
 
-    def _put_off(self, error: ApiError) -> None:
+    def _put_off(self, error: ApiError) -> bool:
+        """Try again later; return False if the server has refused for too long."""
         now = self._now()
         if isinstance(error, Forbidden | Unauthorized):
             self._refused = now if self._refused is None else self._refused
             if now - self._refused >= REFUSED:
-                raise error
+                return False
         with self._lock:
             self._changed = True
         asked = error.retry_after if isinstance(error, Transient) else 0.0
         self._due = now + max(self._pause, asked)
         self._pause = min(2 * self._pause, _PAUSE_MAX)
         self._on_trouble(error)
+        return True
