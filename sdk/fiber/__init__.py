@@ -7,43 +7,155 @@ effect; the first process, pool, pipe or queue starts what it needs.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0.dev0"
 
+__all__ = [
+    "SUBDEBUG",
+    "SUBWARNING",
+    "AdoptionError",
+    "AgentLost",
+    "Array",
+    "AuthenticationError",
+    "Barrier",
+    "BaseManager",
+    "BoundedSemaphore",
+    "BufferTooShort",
+    "Condition",
+    "Config",
+    "ConfigError",
+    "ConnectionClosed",
+    "Event",
+    "Executor",
+    "FiberError",
+    "FiberPoolError",
+    "FileTooLarge",
+    "JoinableQueue",
+    "LinkError",
+    "Lock",
+    "Manager",
+    "MemberLost",
+    "Pipe",
+    "Pool",
+    "Process",
+    "ProcessError",
+    "ProgramTooLarge",
+    "Queue",
+    "RLock",
+    "RawArray",
+    "RawValue",
+    "Ring",
+    "Semaphore",
+    "SimpleQueue",
+    "StartError",
+    "TimeoutError",
+    "TooManyOpenFiles",
+    "UnpicklableError",
+    "Value",
+    "VersionMismatch",
+    "WorkerDied",
+    "active_children",
+    "adopt",
+    "allow_connection_pickling",
+    "cpu_count",
+    "current_process",
+    "freeze_support",
+    "get_all_start_methods",
+    "get_context",
+    "get_logger",
+    "get_start_method",
+    "init",
+    "log_to_stderr",
+    "meta",
+    "parent_process",
+    "reducer",
+    "set_executable",
+    "set_forkserver_preload",
+    "set_start_method",
+]
+
 if TYPE_CHECKING:
-    from fiber.adoption import adopt as adopt
-    from fiber.config import Config as Config
-    from fiber.config import init as init
-    from fiber.errors import AdoptionError as AdoptionError
-    from fiber.errors import AgentLost as AgentLost
-    from fiber.errors import AuthenticationError as AuthenticationError
-    from fiber.errors import BufferTooShort as BufferTooShort
-    from fiber.errors import ConfigError as ConfigError
-    from fiber.errors import ConnectionClosed as ConnectionClosed
-    from fiber.errors import FiberError as FiberError
-    from fiber.errors import FiberPoolError as FiberPoolError
-    from fiber.errors import FileTooLarge as FileTooLarge
-    from fiber.errors import LinkError as LinkError
-    from fiber.errors import MemberLost as MemberLost
-    from fiber.errors import ProcessError as ProcessError
-    from fiber.errors import ProgramTooLarge as ProgramTooLarge
-    from fiber.errors import StartError as StartError
-    from fiber.errors import TimeoutError as TimeoutError
-    from fiber.errors import TooManyOpenFiles as TooManyOpenFiles
-    from fiber.errors import UnpicklableError as UnpicklableError
-    from fiber.errors import VersionMismatch as VersionMismatch
-    from fiber.errors import WorkerDied as WorkerDied
-    from fiber.futures import Executor as Executor
-    from fiber.managers import BaseManager as BaseManager
-    from fiber.process import Process as Process
-    from fiber.process import active_children as active_children
-    from fiber.process import current_process as current_process
-    from fiber.process import parent_process as parent_process
-    from fiber.resources import meta as meta
-    from fiber.ring import Ring as Ring
-    from fiber.util import SUBDEBUG as SUBDEBUG
-    from fiber.util import SUBWARNING as SUBWARNING
+    from fiber import adoption as adoption
+    from fiber import config as config
+    from fiber import connection as connection
+    from fiber import context as context
+    from fiber import cpu as cpu
+    from fiber import dummy as dummy
+    from fiber import errors as errors
+    from fiber import futures as futures
+    from fiber import managers as managers
+    from fiber import pool as pool
+    from fiber import process as process
+    from fiber import queues as queues
+    from fiber import reduction as reducer
+    from fiber import reduction as reduction
+    from fiber import resource_tracker as resource_tracker
+    from fiber import resources as resources
+    from fiber import results as results
+    from fiber import ring as ring
+    from fiber import shared_memory as shared_memory
+    from fiber import sharedctypes as sharedctypes
+    from fiber import spawn as spawn
+    from fiber import synchronize as synchronize
+    from fiber import util as util
+    from fiber import vector as vector
+    from fiber.adoption import adopt
+    from fiber.config import Config, init
+    from fiber.errors import (
+        AdoptionError,
+        AgentLost,
+        AuthenticationError,
+        BufferTooShort,
+        ConfigError,
+        ConnectionClosed,
+        FiberError,
+        FiberPoolError,
+        FileTooLarge,
+        LinkError,
+        MemberLost,
+        ProcessError,
+        ProgramTooLarge,
+        StartError,
+        TimeoutError,
+        TooManyOpenFiles,
+        UnpicklableError,
+        VersionMismatch,
+        WorkerDied,
+    )
+    from fiber.futures import Executor
+    from fiber.managers import BaseManager
+    from fiber.process import Process, active_children, current_process, parent_process
+    from fiber.queues import JoinableQueue, Queue, SimpleQueue
+    from fiber.resources import meta
+    from fiber.ring import Ring
+    from fiber.util import SUBDEBUG, SUBWARNING
+
+    Array = context.default.Array
+    Barrier = context.default.Barrier
+    BoundedSemaphore = context.default.BoundedSemaphore
+    Condition = context.default.Condition
+    Event = context.default.Event
+    Lock = context.default.Lock
+    Manager = context.default.Manager
+    Pipe = context.default.Pipe
+    Pool = context.default.Pool
+    RLock = context.default.RLock
+    RawArray = context.default.RawArray
+    RawValue = context.default.RawValue
+    Semaphore = context.default.Semaphore
+    Value = context.default.Value
+    allow_connection_pickling = context.default.allow_connection_pickling
+    cpu_count = context.default.cpu_count
+    freeze_support = context.default.freeze_support
+    get_all_start_methods = context.default.get_all_start_methods
+    get_context = context.default.get_context
+    get_logger = context.default.get_logger
+    get_start_method = context.default.get_start_method
+    log_to_stderr = context.default.log_to_stderr
+    set_executable = context.default.set_executable
+    set_forkserver_preload = context.default.set_forkserver_preload
+    set_start_method = context.default.set_start_method
 
 _SUBMODULES = frozenset(
     {
@@ -70,40 +182,6 @@ _SUBMODULES = frozenset(
         "synchronize",
         "util",
         "vector",
-    }
-)
-
-_METHODS_OF_THE_DEFAULT_CONTEXT = frozenset(
-    {
-        "Array",
-        "Barrier",
-        "BoundedSemaphore",
-        "Condition",
-        "Event",
-        "JoinableQueue",
-        "Lock",
-        "Manager",
-        "Pipe",
-        "Pool",
-        "Queue",
-        "RLock",
-        "RawArray",
-        "RawValue",
-        "Semaphore",
-        "SimpleQueue",
-        "Value",
-        "allow_connection_pickling",
-        "cpu_count",
-        "freeze_support",
-        "get_all_start_methods",
-        "get_context",
-        "get_logger",
-        "get_start_method",
-        "log_to_stderr",
-        "reducer",
-        "set_executable",
-        "set_forkserver_preload",
-        "set_start_method",
     }
 )
 
@@ -142,21 +220,21 @@ _HOMES = {
     "parent_process": "process",
 }
 
-__all__ = sorted([*_METHODS_OF_THE_DEFAULT_CONTEXT, *_HOMES])  # noqa: PLE0605 - computed once
 
+if not TYPE_CHECKING:  # to a type checker any name would be one of ours
 
-def __getattr__(name: str) -> Any:
-    """Names are looked up when first used, so that importing Fiber costs nothing."""
-    if name in _METHODS_OF_THE_DEFAULT_CONTEXT:
-        value = getattr(importlib.import_module("fiber.context").default, name)
-    elif name in _HOMES:
-        value = getattr(importlib.import_module(f"fiber.{_HOMES[name]}"), name)
-    elif name in _SUBMODULES:
-        return importlib.import_module(f"fiber.{name}")
-    else:
-        raise AttributeError(f"module 'fiber' has no attribute {name!r}")
-    globals()[name] = value
-    return value
+    def __getattr__(name: str) -> object:
+        """Names are looked up when first used, so that importing Fiber costs nothing."""
+        if name in _HOMES:
+            value = getattr(importlib.import_module(f"fiber.{_HOMES[name]}"), name)
+        elif name in __all__:
+            value = getattr(importlib.import_module("fiber.context").default, name)
+        elif name in _SUBMODULES:
+            return importlib.import_module(f"fiber.{name}")
+        else:
+            raise AttributeError(f"module 'fiber' has no attribute {name!r}")
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

@@ -19,7 +19,7 @@ import pickle
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict, Unpack, get_args
 
 from fiber import inherited
 from fiber.errors import ConfigError
@@ -125,6 +125,10 @@ def _key(default: Any, rule: _Rule, *, fixed: bool = False) -> Any:
     return field(default=default, metadata={"rule": rule, "fixed": fixed})
 
 
+Backend = Literal["local", "loopback", "kubernetes", "auto"]
+LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
     """What can be configured; each key's type and default is in the signature.
@@ -174,7 +178,7 @@ class Config:
         None means `tempfile.gettempdir()`. Socket paths are short: so should this be.
     """
 
-    backend: str = _key("auto", _choice("local", "loopback", "kubernetes", "auto"), fixed=True)
+    backend: Backend = _key("auto", _choice(*get_args(Backend)), fixed=True)  # noqa: RUF009 - a field
     agents: int = _key(2, _whole(1), fixed=True)
     processes_per_agent: int = _key(0, _whole(0), fixed=True)
     namespace: str | None = _key(None, _word("the name of a namespace", _LABEL), fixed=True)
@@ -193,11 +197,38 @@ class Config:
     suspect_after: float = _key(5.0, _seconds(), fixed=True)
     lost_after: float = _key(15.0, _seconds(), fixed=True)
     retries: int = _key(3, _whole(0))
-    log_level: str = _key("WARNING", _choice("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"))
+    log_level: LogLevel = _key("WARNING", _choice(*get_args(LogLevel)))  # noqa: RUF009 - a field
     runtime_directory: str | None = _key(None, _directory(), fixed=True)
 
 
 _KEYS = {entry.name: entry for entry in fields(Config)}
+
+if TYPE_CHECKING:
+
+    class Settings(TypedDict, total=False):
+        """The keys of `Config`, as `init` takes them."""
+
+        backend: Backend
+        agents: int
+        processes_per_agent: int
+        namespace: str | None
+        context: str | None
+        image: str | None
+        template: str | os.PathLike[str] | Mapping[str, Any] | None
+        pool: str | None
+        processes_per_pod: int
+        max_pods: int
+        pod_timeout: float
+        idle_timeout: float
+        listen_host: str | None
+        listen_port: int
+        start_timeout: float
+        heartbeat_interval: float
+        suspect_after: float
+        lost_after: float
+        retries: int
+        log_level: LogLevel
+        runtime_directory: str | os.PathLike[str] | None
 
 
 # ---- the configuration in force -------------------------------------------------------------
@@ -232,7 +263,7 @@ def use() -> Config:
     return config
 
 
-def init(**settings: object) -> Config:
+def init(**settings: Unpack[Settings]) -> Config:
     """Set keys of `Config` for this program, and return the configuration that results.
 
     Each call starts anew from the other sources: keys of an earlier call are forgotten.

@@ -13,8 +13,8 @@ import pickle
 import weakref
 from multiprocessing import AuthenticationError
 from multiprocessing import connection as _mp
-from multiprocessing.connection import Client, Listener, answer_challenge, deliver_challenge, wait
-from typing import TYPE_CHECKING, Any
+from multiprocessing.connection import Client, Listener, answer_challenge, deliver_challenge
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias, overload
 
 from fiber import reduction
 from fiber._hub import handles
@@ -25,7 +25,21 @@ from fiber._wire.packet import BytesLike, Message
 from fiber.errors import BufferTooShort, ConnectionClosed
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from socket import socket
     from types import TracebackType
+
+    from typing_extensions import TypeVar
+
+    # What is sent and received, if an annotation says so: ``Connection[Task, Answer]``.
+    _Sent_contra = TypeVar("_Sent_contra", contravariant=True, default=Any)
+    _Received_co = TypeVar("_Received_co", covariant=True, default=Any)
+else:
+    from multiprocessing.connection import wait
+    from typing import TypeVar  # without a default before Python 3.13
+
+    _Sent_contra = TypeVar("_Sent_contra", contravariant=True)
+    _Received_co = TypeVar("_Received_co", covariant=True)
 
 __all__ = [
     "AuthenticationError",
@@ -39,10 +53,26 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in vars(_mp):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return vars(_mp)[name]
+if TYPE_CHECKING:
+    _Waitable: TypeAlias = "Connection[Any, Any] | _mp.Connection[Any, Any] | socket | int"
+
+    @overload
+    def wait(
+        object_list: Iterable[Connection[_Sent_contra, _Received_co]], timeout: float | None = None
+    ) -> list[Connection[_Sent_contra, _Received_co]]: ...
+
+    @overload
+    def wait(object_list: Iterable[_Waitable], timeout: float | None = None) -> list[_Waitable]: ...
+
+    def wait(object_list: Iterable[Any], timeout: float | None = None) -> list[Any]:
+        """multiprocessing's, whose own types know no connections but its own."""
+
+else:  # to a type checker any name would be one of ours
+
+    def __getattr__(name: str) -> object:
+        if name not in vars(_mp):
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return vars(_mp)[name]
 
 
 _LAST_MOMENT = 0.05
@@ -52,7 +82,7 @@ _NEWS = 2.0
 """Seconds that news of an end may take on a busy machine."""
 
 
-class Connection:
+class Connection(Generic[_Sent_contra, _Received_co]):
     """One end of a pipe.  EOFError when the last holder of the other end has closed it or died."""
 
     def __init__(self, channel: Channel, readable: bool = True, writable: bool = True) -> None:
@@ -69,7 +99,7 @@ class Connection:
 
     # Sending
 
-    def send(self, obj: Any) -> None:
+    def send(self, obj: _Sent_contra) -> None:
         """Send a picklable object."""
         channel = self._channel
         if channel is None or not self._writable:
@@ -96,13 +126,14 @@ class Connection:
 
     # Receiving
 
-    def recv(self) -> Any:
+    def recv(self) -> _Received_co:
         """The next object."""
         channel = self._channel
         if channel is None or not self._readable:
             raise self._misuse("write-only")
         try:
-            return channel.recv_object()
+            received: _Received_co = channel.recv_object()
+            return received
         except ConnectionClosed as error:
             raise self._explained(error) from None
 
@@ -196,7 +227,7 @@ class Connection:
         """Whether it can send."""
         return self._writable
 
-    def __enter__(self) -> Connection:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

@@ -18,29 +18,45 @@ from multiprocessing.context import (
     get_spawning_popen,
     set_spawning_popen,
 )
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, overload
 
 from fiber import config, cpu
+from fiber import process as _process
 from fiber._runtime import early, methods
 from fiber.process import ForkProcess, ForkServerProcess, Process, SpawnProcess
 
 if TYPE_CHECKING:
+    import ctypes
     import logging
+    from _ctypes import _CData
+    from ctypes import _SimpleCData, c_char
+    from types import ModuleType
 
     from fiber.connection import Connection
     from fiber.managers import SyncManager
     from fiber.pool import Pool
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
+    from fiber.sharedctypes import (
+        Locked,
+        Size,
+        Synchronized,
+        SynchronizedArray,
+        SynchronizedBase,
+        SynchronizedString,
+    )
     from fiber.synchronize import (
         Barrier,
         BoundedSemaphore,
         Condition,
         Event,
         Lock,
+        LockLike,
         RLock,
         Semaphore,
-        SemLock,
     )
+
+    _CT = TypeVar("_CT", bound=_CData)
+_T = TypeVar("_T")
 
 __all__ = [
     "BaseContext",
@@ -64,7 +80,7 @@ class BaseContext:
     BufferTooShort = BufferTooShort
     TimeoutError = TimeoutError
     AuthenticationError = AuthenticationError
-    Process: type[Process] = Process
+    Process: ClassVar[type[_process.Process]] = Process
 
     current_process = staticmethod(_mp_process.current_process)
     parent_process = staticmethod(_mp_process.parent_process)
@@ -79,28 +95,28 @@ class BaseContext:
 
     # Communication
 
-    def Pipe(self, duplex: bool = True) -> tuple[Connection, Connection]:
+    def Pipe(self, duplex: bool = True) -> tuple[Connection[Any, Any], Connection[Any, Any]]:
         """Two connected ends of a pipe."""
         from fiber.connection import Pipe
 
         config.use()
         return Pipe(duplex)
 
-    def Queue(self, maxsize: int = 0) -> Queue:
+    def Queue(self, maxsize: int = 0) -> Queue[Any]:
         """A queue for any number of processes."""
         from fiber.queues import Queue
 
         config.use()
         return Queue(maxsize)
 
-    def JoinableQueue(self, maxsize: int = 0) -> JoinableQueue:
+    def JoinableQueue(self, maxsize: int = 0) -> JoinableQueue[Any]:
         """A queue whose items are accounted for by ``task_done`` and ``join``."""
         from fiber.queues import JoinableQueue
 
         config.use()
         return JoinableQueue(maxsize)
 
-    def SimpleQueue(self) -> SimpleQueue:
+    def SimpleQueue(self) -> SimpleQueue[Any]:
         """A queue without a feeder thread."""
         from fiber.queues import SimpleQueue
 
@@ -130,7 +146,7 @@ class BaseContext:
         config.use()
         return Event()
 
-    def Condition(self, lock: SemLock | None = None) -> Condition:
+    def Condition(self, lock: LockLike | None = None) -> Condition:
         """A lock, and those who wait until others notify them."""
         from fiber.synchronize import Condition
 
@@ -165,6 +181,29 @@ class BaseContext:
 
     # Shared memory
 
+    @overload
+    def Value(
+        self, typecode_or_type: type[_SimpleCData[_T]], *args: Any, lock: Locked = True
+    ) -> Synchronized[_T]: ...
+
+    @overload
+    def Value(self, typecode_or_type: type[_CT], *args: Any, lock: Literal[False]) -> _CT: ...
+
+    @overload
+    def Value(
+        self, typecode_or_type: type[_CT], *args: Any, lock: Locked = True
+    ) -> SynchronizedBase[_CT]: ...
+
+    @overload
+    def Value(
+        self, typecode_or_type: str, *args: Any, lock: Locked = True
+    ) -> Synchronized[Any]: ...
+
+    @overload
+    def Value(
+        self, typecode_or_type: str | type[_CData], *args: Any, lock: Locked | bool = True
+    ) -> Any: ...
+
     def Value(self, typecode_or_type: Any, *args: Any, lock: Any = True) -> Any:
         """A ctypes object in shared memory, with a lock."""
         from fiber.sharedctypes import Value
@@ -172,18 +211,51 @@ class BaseContext:
         config.use()
         return Value(typecode_or_type, *args, lock=lock)
 
+    @overload
+    def Array(
+        self, typecode_or_type: type[_CT], size_or_initializer: Size, *, lock: Literal[False]
+    ) -> ctypes.Array[_CT]: ...
+
+    @overload
+    def Array(
+        self, typecode_or_type: type[c_char], size_or_initializer: Size, *, lock: Locked = True
+    ) -> SynchronizedString: ...
+
+    @overload
     def Array(
         self,
-        typecode_or_type: Any,
-        size_or_initializer: int | Sequence[Any],
+        typecode_or_type: type[_SimpleCData[_T]],
+        size_or_initializer: Size,
         *,
-        lock: Any = True,
-    ) -> Any:
+        lock: Locked = True,
+    ) -> SynchronizedArray[_T]: ...
+
+    @overload
+    def Array(
+        self, typecode_or_type: str, size_or_initializer: Size, *, lock: Locked = True
+    ) -> SynchronizedArray[Any]: ...
+
+    @overload
+    def Array(
+        self,
+        typecode_or_type: str | type[_CData],
+        size_or_initializer: Size,
+        *,
+        lock: Locked | bool = True,
+    ) -> Any: ...
+
+    def Array(self, typecode_or_type: Any, size_or_initializer: Size, *, lock: Any = True) -> Any:
         """A ctypes array in shared memory, with a lock."""
         from fiber.sharedctypes import Array
 
         config.use()
         return Array(typecode_or_type, size_or_initializer, lock=lock)
+
+    @overload
+    def RawValue(self, typecode_or_type: type[_CT], *args: Any) -> _CT: ...
+
+    @overload
+    def RawValue(self, typecode_or_type: str, *args: Any) -> Any: ...
 
     def RawValue(self, typecode_or_type: Any, *args: Any) -> Any:
         """A ctypes object in shared memory."""
@@ -192,7 +264,15 @@ class BaseContext:
         config.use()
         return RawValue(typecode_or_type, *args)
 
-    def RawArray(self, typecode_or_type: Any, size_or_initializer: int | Sequence[Any]) -> Any:
+    @overload
+    def RawArray(
+        self, typecode_or_type: type[_CT], size_or_initializer: Size
+    ) -> ctypes.Array[_CT]: ...
+
+    @overload
+    def RawArray(self, typecode_or_type: str, size_or_initializer: Size) -> Any: ...
+
+    def RawArray(self, typecode_or_type: Any, size_or_initializer: Size) -> Any:
         """A ctypes array in shared memory."""
         from fiber.sharedctypes import RawArray
 
@@ -249,16 +329,45 @@ class BaseContext:
 
     # Settings
 
+    @overload
+    def get_context(self, method: None = None) -> DefaultContext: ...
+
+    @overload
+    def get_context(self, method: Literal["spawn"]) -> SpawnContext: ...
+
+    @overload
+    def get_context(self, method: Literal["fork"]) -> ForkContext: ...
+
+    @overload
+    def get_context(self, method: Literal["forkserver"]) -> ForkServerContext: ...
+
+    @overload
+    def get_context(self, method: str | None) -> BaseContext: ...
+
     def get_context(self, method: str | None = None) -> BaseContext:
-        """The context of a start method; this one if none is named."""
+        """The context of a start method; if none is named this one, or for ``fiber`` itself the one
+        in force.
+        """
         if method is None:
-            return self
+            return self._in_force()
         if method not in _contexts:
             raise ValueError(f"cannot find context for {method!r}")
         return _contexts[method]
 
+    def _in_force(self) -> BaseContext:
+        return self
+
+    @overload
+    def get_start_method(self, allow_none: Literal[False] = False) -> str: ...
+
+    @overload
+    def get_start_method(self, allow_none: bool) -> str | None: ...
+
     def get_start_method(self, allow_none: bool = False) -> str | None:
-        """The name of this context's start method."""
+        """The name of the start method; with ``allow_none`` None if nothing was set or used."""
+        return self._start_method(allow_none)
+
+    def _start_method(self, allow_none: bool) -> str | None:
         return self._method
 
     def set_start_method(self, method: str | None, force: bool = False) -> None:
@@ -294,7 +403,7 @@ class BaseContext:
         return util.log_to_stderr(level)
 
     @property
-    def reducer(self) -> Any:
+    def reducer(self) -> ModuleType:
         """How objects become bytes."""
         from fiber import reduction
 
@@ -304,7 +413,7 @@ class BaseContext:
 class ForkContext(BaseContext):
     """The context of the start method ``fork``."""
 
-    Process = ForkProcess
+    Process: ClassVar[type[ForkProcess]] = ForkProcess
 
     def __init__(self) -> None:
         super().__init__("fork")
@@ -313,7 +422,7 @@ class ForkContext(BaseContext):
 class ForkServerContext(BaseContext):
     """The context of the start method ``forkserver``."""
 
-    Process = ForkServerProcess
+    Process: ClassVar[type[ForkServerProcess]] = ForkServerProcess
 
     def __init__(self) -> None:
         super().__init__("forkserver")
@@ -322,7 +431,7 @@ class ForkServerContext(BaseContext):
 class SpawnContext(BaseContext):
     """The context of the start method ``spawn``."""
 
-    Process = SpawnProcess
+    Process: ClassVar[type[SpawnProcess]] = SpawnProcess
 
     def __init__(self) -> None:
         super().__init__("spawn")
@@ -331,12 +440,10 @@ class SpawnContext(BaseContext):
 class DefaultContext(BaseContext):
     """The context behind ``fiber`` itself: its start method can be set, once."""
 
-    def get_context(self, method: str | None = None) -> BaseContext:
-        """The context of a start method; the one in force if none is named."""
-        return super().get_context(method or methods.chosen or methods.START_METHODS[0])
+    def _in_force(self) -> BaseContext:
+        return _contexts[methods.chosen or methods.START_METHODS[0]]
 
-    def get_start_method(self, allow_none: bool = False) -> str | None:
-        """The start method in force; with ``allow_none`` None if nothing was set or used."""
+    def _start_method(self, allow_none: bool) -> str | None:
         return methods.chosen if allow_none else methods.settle()
 
     def set_start_method(self, method: str | None, force: bool = False) -> None:
@@ -355,4 +462,4 @@ _contexts: dict[str, BaseContext] = {
     "forkserver": ForkServerContext(),
     "spawn": SpawnContext(),
 }
-default = DefaultContext()
+default: DefaultContext = DefaultContext()

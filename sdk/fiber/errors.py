@@ -35,7 +35,7 @@ import resource
 import signal
 from collections.abc import Mapping, Sequence
 from multiprocessing import AuthenticationError, BufferTooShort, ProcessError, TimeoutError
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 __all__ = [
     "AdoptionError",
@@ -64,13 +64,15 @@ __all__ = [
 MaybeEncodingError: type[Exception]
 
 
-def __getattr__(name: str) -> Any:
-    # multiprocessing.pool is most of the import time that this module would have.
-    if name == "MaybeEncodingError":
-        from multiprocessing import pool
+if not TYPE_CHECKING:  # to a type checker any name would be one of ours
 
-        return vars(pool)[name]  # typeshed does not list it
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    def __getattr__(name: str) -> object:
+        # multiprocessing.pool is most of the import time that this module would have.
+        if name == "MaybeEncodingError":
+            from multiprocessing import pool
+
+            return vars(pool)[name]
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 class FiberError(ProcessError):

@@ -185,7 +185,7 @@ class Executor(concurrent.futures.Executor):
         ahead = options.buffersize(buffersize)
         unit = options.chunksize(chunksize)
         engine = self._group.executor_for(fn, self._wishes)
-        results = IMapIterator(self._group)
+        results: IMapIterator[Any] = IMapIterator(self._group)
         several = len(iterables) != 1
         try:
             item = WorkItem(
@@ -260,7 +260,7 @@ def _process(context: Any) -> Any:
 
 
 def _taken(
-    results: IMapIterator, engine: Engine, item: WorkItem | None, deadline: float | None
+    results: IMapIterator[Any], engine: Engine, item: WorkItem | None, deadline: float | None
 ) -> Iterator[Any]:
     """The results of a map, up to the first error."""
     try:
@@ -272,7 +272,7 @@ def _taken(
             engine.cancel(item)
 
 
-def _next(results: IMapIterator, engine: Engine, deadline: float | None) -> list[Any]:
+def _next(results: IMapIterator[Any], engine: Engine, deadline: float | None) -> list[Any]:
     """The next result of a map; none at its end."""
     left = None if deadline is None else deadline - time.monotonic()
     try:

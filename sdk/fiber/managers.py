@@ -25,7 +25,7 @@ from multiprocessing.managers import (
     ValueProxy,
 )
 from multiprocessing.util import Finalize
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from fiber._hub import client as hub_client
 from fiber._managers import SERIALIZER, client
@@ -38,6 +38,9 @@ from fiber.connection import Connection, Pipe
 from fiber.process import Process
 from fiber.resources import Resources, largest, merged, resources_of, with_resources
 from fiber.shared_memory import ShareableList, SharedMemory
+
+if TYPE_CHECKING:
+    from fiber.pool import Pool as _Pool
 
 __all__ = [
     "AcquirerProxy",
@@ -66,6 +69,7 @@ __all__ = [
     "ValueProxy",
 ]
 
+_T = TypeVar("_T", int, float, bool, str, bytes, None)
 _mp: Any = mp_managers  # typeshed has part of it
 AcquirerProxy = _mp.AcquirerProxy
 ArrayProxy = _mp.ArrayProxy
@@ -85,7 +89,7 @@ def _make_server(registry: Any, address: Any, authkey: bytes, serializer: str) -
     return kind(registry, address, authkey, serializer)
 
 
-class BaseManager(_mp.BaseManager):  # type: ignore[misc]
+class BaseManager(mp_managers.BaseManager):
     """multiprocessing's, whose server runs in a Fiber process: on a cluster, in a pod.
 
     Without an ``address`` any process of the program can use the manager and its proxies, and
@@ -97,6 +101,17 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
     """
 
     _Server = staticmethod(_make_server)
+
+    if TYPE_CHECKING:  # multiprocessing's, of which typeshed does not tell
+        _registry: dict[str, tuple[Callable[..., Any] | None, Any, Any, Any]]
+        _state: Any
+        _authkey: bytes
+        _serializer: str
+        _shutdown_timeout: float
+        _Client: Any
+        _process: Process
+        _run_server: Callable[..., None]
+        shutdown: Finalize
 
     def __init__(
         self,
@@ -196,15 +211,18 @@ class BaseManager(_mp.BaseManager):  # type: ignore[misc]
         self._hold_session()
 
     def _create(self, typeid: str, /, *args: Any, **kwds: Any) -> tuple[Token, Any]:
-        token, exposed = super()._create(typeid, *args, **kwds)
+        token, exposed = _mp.BaseManager._create(self, typeid, *args, **kwds)
         if self._serializer == SERIALIZER:
             token = client.TravellingToken(token.typeid, token.address, token.id)
         return token, exposed
 
-    def get_server(self) -> Any:
+    def get_server(self) -> mp_managers.Server:
         """The server, to be run in this process: it has ``serve_forever`` and ``address``."""
         self._check_initial()
-        return self._Server(self._registry, self._address, self._authkey, self._serializer)
+        server: mp_managers.Server = self._Server(
+            self._registry, self._address, self._authkey, self._serializer
+        )
+        return server
 
     def _check_initial(self) -> None:
         state = self._state.value
@@ -240,17 +258,17 @@ class SharedMemoryManager(BaseManager):
         names.append(memory.name)
         return memory
 
-    def ShareableList(self, sequence: Iterable[Any]) -> ShareableList:
+    def ShareableList(self, sequence: Iterable[_T] | None) -> ShareableList[_T]:
         """A new list; ValueError if the manager does not run."""
         names = self._names()
-        made = ShareableList(sequence)
+        made: ShareableList[_T] = ShareableList(sequence)
         names.append(made.shm.name)
         return made
 
     def _names(self) -> Any:
         if self._state.value != State.STARTED:
             raise ValueError("the manager does not run: start it, or use it in a with statement")
-        names: Any = self._memory_names()
+        names: Any = self._memory_names()  # type: ignore[attr-defined]  # registered below
         host = names.host()
         if host != hub_client.host():
             raise RuntimeError(
@@ -296,8 +314,11 @@ def _memory_names() -> _MemoryNames:
 SharedMemoryManager.register("_memory_names", _memory_names, exposed=("append", "host"))
 
 
-class SyncManager(BaseManager):
+class SyncManager(BaseManager, mp_managers.SyncManager):
     """A manager of lists, dicts, queues, locks and all else that multiprocessing registers."""
+
+    if TYPE_CHECKING:
+        Pool: ClassVar[type[_Pool]]  # type: ignore[assignment]  # it takes options of ours
 
 
 def _pool(*args: Any, **options: Any) -> Any:
@@ -323,19 +344,15 @@ class AsyncManager(BaseManager):
             )
 
     @classmethod
-    def register(cls, typeid: str, callable: Any = None, proxytype: Any = None, **how: Any) -> None:
+    def register(
+        cls, typeid: str, callable: Any = None, proxytype: Any = None, *args: Any, **options: Any
+    ) -> None:
         """As ``BaseManager.register``; ``proxytype`` is ``AsyncBaseProxy`` or a subclass."""
-        super().register(typeid, callable, proxytype or AsyncBaseProxy, **how)
+        super().register(typeid, callable, proxytype or AsyncBaseProxy, *args, **options)
 
 
-_OURS = {"Condition": condition, "Pool": _pool, "RLock": RLock}
+_OURS: dict[str, Callable[..., Any]] = {"Condition": condition, "Pool": _pool, "RLock": RLock}
 
-for _typeid, (_callable, _exposed, _typeids, _proxytype) in _mp.SyncManager._registry.items():
-    SyncManager.register(
-        _typeid,
-        _OURS.get(_typeid, _callable),
-        _proxytype,
-        _exposed,
-        _typeids,
-        create_method=hasattr(_mp.SyncManager, _typeid),
-    )
+for _typeid, _callable in _OURS.items():
+    _, _exposed, _typeids, _proxytype = _mp.SyncManager._registry[_typeid]
+    SyncManager.register(_typeid, _callable, _proxytype, _exposed, _typeids, create_method=False)

@@ -22,7 +22,7 @@ from multiprocessing.pool import (  # type: ignore[attr-defined]
     RemoteTraceback,
     ThreadPool,
 )
-from typing import Any
+from typing import Any, Self, TypeVar
 
 from fiber._engine.chunks import default_chunksize
 from fiber._runtime import methods, options
@@ -57,8 +57,9 @@ __all__ = [
     "WorkerInfo",
 ]
 
-_Function = Callable[..., Any]
-_Callback = Callable[[Any], object]
+_S = TypeVar("_S")
+_T = TypeVar("_T")
+_ErrorCallback = Callable[[BaseException], object]
 
 
 class Pool:
@@ -133,12 +134,12 @@ class Pool:
 
     def apply(
         self,
-        func: _Function,
+        func: Callable[..., _T],
         args: Iterable[Any] = (),
         kwds: Mapping[str, Any] = {},
         *,
         timeout: float | None = None,
-    ) -> Any:
+    ) -> _T:
         """Call ``func(*args, **kwds)`` in a worker and return its result.
 
         TimeoutError, and the worker is killed, if it runs for longer than ``timeout`` seconds; None
@@ -146,19 +147,21 @@ class Pool:
         """
         self._check_running(func)
         self._check_may_wait()
-        result = AsyncResult(self)
-        return self._executor.call_and_wait(result, func, args, kwds, self._limit(timeout))
+        result: AsyncResult[_T] = AsyncResult(self)
+        limit = self._limit(timeout)
+        value: _T = self._executor.call_and_wait(result, func, args, kwds, limit)
+        return value
 
     def apply_async(
         self,
-        func: _Function,
+        func: Callable[..., _T],
         args: Iterable[Any] = (),
         kwds: Mapping[str, Any] = {},
-        callback: _Callback | None = None,
-        error_callback: _Callback | None = None,
+        callback: Callable[[_T], object] | None = None,
+        error_callback: _ErrorCallback | None = None,
         *,
         timeout: float | None = None,
-    ) -> AsyncResult:
+    ) -> AsyncResult[_T]:
         """As ``apply``, but return at once with a result to wait for.
 
         In another thread ``callback`` is called with the result, or ``error_callback`` with what
@@ -169,14 +172,13 @@ class Pool:
         self._executor.call(result, func, args, kwds, self._limit(timeout))
         return result
 
-    def broadcast(self, func: _Function, *args: Any) -> list[Any]:
+    def broadcast(self, func: Callable[..., _T], *args: Any) -> list[_T]:
         """Call ``func(*args)`` once in every worker, and return the results of all."""
         self._check_running(func)
         self._check_may_wait()
-        result = MapResult(self)
+        result: MapResult[_T] = MapResult(self)
         self._executor.broadcast(result, func, args)
-        values: list[Any] = result.get()
-        return values
+        return result.get()
 
     # Workers
 
@@ -209,12 +211,12 @@ class Pool:
 
     def map(
         self,
-        func: _Function,
-        iterable: Iterable[Any],
+        func: Callable[[_S], _T],
+        iterable: Iterable[_S],
         chunksize: int | None = None,
         *,
         timeout: float | None = None,
-    ) -> list[Any]:
+    ) -> list[_T]:
         """``[func(x) for x in iterable]``, the calls spread over the workers.
 
         ``chunksize`` consecutive items go to one worker together; left out, it adapts to how long
@@ -225,25 +227,25 @@ class Pool:
 
     def starmap(
         self,
-        func: _Function,
+        func: Callable[..., _T],
         iterable: Iterable[Iterable[Any]],
         chunksize: int | None = None,
         *,
         timeout: float | None = None,
-    ) -> list[Any]:
+    ) -> list[_T]:
         """``[func(*x) for x in iterable]``, otherwise as ``map``."""
         return self._map(work.STAR, func, iterable, chunksize, timeout)
 
     def map_async(
         self,
-        func: _Function,
-        iterable: Iterable[Any],
+        func: Callable[[_S], _T],
+        iterable: Iterable[_S],
         chunksize: int | None = None,
-        callback: _Callback | None = None,
-        error_callback: _Callback | None = None,
+        callback: Callable[[list[_T]], object] | None = None,
+        error_callback: _ErrorCallback | None = None,
         *,
         timeout: float | None = None,
-    ) -> MapResult:
+    ) -> MapResult[_T]:
         """As ``map``, but return at once with a result to wait for.  ``iterable`` is read first.
 
         ``callback`` gets the list of results, ``error_callback`` the first error, as in
@@ -255,14 +257,14 @@ class Pool:
 
     def starmap_async(
         self,
-        func: _Function,
+        func: Callable[..., _T],
         iterable: Iterable[Iterable[Any]],
         chunksize: int | None = None,
-        callback: _Callback | None = None,
-        error_callback: _Callback | None = None,
+        callback: Callable[[list[_T]], object] | None = None,
+        error_callback: _ErrorCallback | None = None,
         *,
         timeout: float | None = None,
-    ) -> MapResult:
+    ) -> MapResult[_T]:
         """As ``map_async``, for ``starmap``."""
         result = MapResult(self, callback, error_callback)
         self._map_async(work.STAR, func, iterable, chunksize, timeout, result)
@@ -270,31 +272,32 @@ class Pool:
 
     def imap(
         self,
-        func: _Function,
-        iterable: Iterable[Any],
+        func: Callable[[_S], _T],
+        iterable: Iterable[_S],
         chunksize: int = 1,
         *,
         timeout: float | None = None,
         buffersize: int | None = None,
-    ) -> IMapIterator:
+    ) -> IMapIterator[_T]:
         """An iterator over ``func(x) for x in iterable``, in order; ``timeout`` as in ``map``.
 
         ``iterable`` is read in another thread, little faster than it is worked off; with
         ``buffersize`` also at most so many items ahead of what the iterator has given out.
         """
-        return self._imap(IMapIterator(self), func, iterable, chunksize, timeout, buffersize)
+        iterator: IMapIterator[_T] = IMapIterator(self)
+        return self._imap(iterator, func, iterable, chunksize, timeout, buffersize)
 
     def imap_unordered(
         self,
-        func: _Function,
-        iterable: Iterable[Any],
+        func: Callable[[_S], _T],
+        iterable: Iterable[_S],
         chunksize: int = 1,
         *,
         timeout: float | None = None,
         buffersize: int | None = None,
-    ) -> IMapIterator:
+    ) -> IMapIterator[_T]:
         """As ``imap``, in the order in which the results come."""
-        iterator = IMapUnorderedIterator(self)
+        iterator: IMapIterator[_T] = IMapUnorderedIterator(self)
         return self._imap(iterator, func, iterable, chunksize, timeout, buffersize)
 
     # How they are done
@@ -302,13 +305,13 @@ class Pool:
     def _map(
         self,
         kind: int,
-        func: _Function,
+        func: Callable[..., _T],
         iterable: Iterable[Any],
         chunksize: int | None,
         timeout: float | None,
-    ) -> list[Any]:
+    ) -> list[_T]:
         self._check_may_wait()
-        result = MapResult(self)
+        result: MapResult[_T] = MapResult(self)
         item = self._item(kind, func, result, chunksize, timeout)
         if item is not None:
             try:
@@ -322,17 +325,16 @@ class Pool:
             except BaseException:  # Ctrl-C: whoever waits for it no longer does
                 self._executor.cancel(item)
                 raise
-        values: list[Any] = result.get()
-        return values
+        return result.get()
 
     def _map_async(
         self,
         kind: int,
-        func: _Function,
+        func: Callable[..., _T],
         iterable: Iterable[Any],
         chunksize: int | None,
         timeout: float | None,
-        result: MapResult,
+        result: MapResult[_T],
     ) -> None:
         item = self._item(kind, func, result, chunksize, timeout)
         if item is not None:
@@ -340,13 +342,13 @@ class Pool:
 
     def _imap(
         self,
-        iterator: IMapIterator,
-        func: _Function,
+        iterator: IMapIterator[_T],
+        func: Callable[..., _T],
         iterable: Iterable[Any],
         chunksize: int,
         timeout: float | None,
         buffersize: int | None,
-    ) -> IMapIterator:
+    ) -> IMapIterator[_T]:
         buffersize = options.buffersize(buffersize)
         chunksize = options.chunksize(chunksize)
         item = self._item(work.MAP, func, iterator._buffer, chunksize, timeout)
@@ -357,7 +359,7 @@ class Pool:
     def _item(
         self,
         kind: int,
-        func: _Function,
+        func: Callable[..., Any],
         future: Any,
         chunksize: int | None,
         timeout: float | None,
@@ -418,7 +420,7 @@ class Pool:
     def _repopulate_pool(self) -> None:
         """Nothing: workers are replaced as they go."""
 
-    def _check_running(self, func: _Function | None = None) -> None:
+    def _check_running(self, func: Callable[..., Any] | None = None) -> None:
         self._check_owner()
         if self._state != RUN:
             raise ValueError("Pool not running")
@@ -464,7 +466,7 @@ class Pool:
         self._executor.join()
         self._terminate.cancel()
 
-    def __enter__(self) -> Pool:
+    def __enter__(self) -> Self:
         self._check_running()
         return self
 

@@ -21,7 +21,7 @@ import time
 import types
 from multiprocessing import util
 from queue import Empty, Full
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from fiber import reduction
 from fiber._hub.dealer import Dealer, arrive
@@ -35,8 +35,10 @@ from fiber.synchronize import RECHECK
 
 __all__ = ["Empty", "Full", "JoinableQueue", "Queue", "SimpleQueue", "SimpleQueuePush"]
 
+_T = TypeVar("_T")
 
-class Queue:
+
+class Queue(Generic[_T]):
     """A first-in first-out queue for any number of processes and threads."""
 
     def __init__(self, maxsize: int = 0, *, ctx: Any = None) -> None:
@@ -70,7 +72,7 @@ class Queue:
             close=self._writer.close,
         )
 
-    def put(self, obj: Any, block: bool = True, timeout: float | None = None) -> None:
+    def put(self, obj: _T, block: bool = True, timeout: float | None = None) -> None:
         """Put an item; Full if no slot is free, nor within ``timeout`` seconds.
 
         An item that does not pickle is given to ``_on_queue_feeder_error``.
@@ -93,7 +95,7 @@ class Queue:
     def _send(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
         self._feeder.put(payload, buffers, taken)
 
-    def get(self, block: bool = True, timeout: float | None = None) -> Any:
+    def get(self, block: bool = True, timeout: float | None = None) -> _T:
         """The next item; Empty if there is none, nor within ``timeout`` seconds."""
         if self._closed:
             raise ValueError(f"Queue {self!r} is closed")
@@ -105,7 +107,8 @@ class Queue:
         finally:
             if message is not None:
                 self._slots.free()
-        return packet.loads(message)
+        item: _T = packet.loads(message)
+        return item
 
     def _receive_within(self, timeout: float) -> Message:
         deadline = time.monotonic() + timeout
@@ -115,11 +118,11 @@ class Queue:
                 raise Empty
         return message
 
-    def put_nowait(self, obj: Any) -> None:
+    def put_nowait(self, obj: _T) -> None:
         """Put an item; Full if no slot is free."""
         self.put(obj, False)
 
-    def get_nowait(self) -> Any:
+    def get_nowait(self) -> _T:
         """The next item; Empty if there is none."""
         return self.get(False)
 
@@ -172,7 +175,7 @@ def _encode(obj: Any) -> tuple[bytes, list[memoryview]] | Exception:
         return reduction.blame({"the item": obj}, error)
 
 
-class JoinableQueue(Queue):
+class JoinableQueue(Queue[_T]):
     """A queue that counts items until ``task_done`` was called for each."""
 
     def __init__(self, maxsize: int = 0, *, ctx: Any = None) -> None:
@@ -212,7 +215,7 @@ class JoinableQueue(Queue):
             self._bell.changed(rung, RECHECK)
 
 
-class SimpleQueue:
+class SimpleQueue(Generic[_T]):
     """A queue whose ``put`` waits until the item is in the pipe."""
 
     def __init__(self, *, ctx: Any = None) -> None:
@@ -220,13 +223,14 @@ class SimpleQueue:
         self._reader = Connection(inbox, writable=False)
         self._writer = Connection(outbox, readable=False)
 
-    def put(self, obj: Any) -> None:
+    def put(self, obj: _T) -> None:
         """Put an item."""
         self._writer.send(obj)
 
-    def get(self) -> Any:
+    def get(self) -> _T:
         """The next item."""
-        return self._reader.recv()
+        item: _T = self._reader.recv()
+        return item
 
     def empty(self) -> bool:
         """Whether ``get`` would wait."""
@@ -251,7 +255,7 @@ class SimpleQueue:
         return types.GenericAlias(cls, item)
 
 
-class SimpleQueuePush:
+class SimpleQueuePush(Generic[_T]):
     """A queue that deals its items round robin: each to the next reader in turn, before it asks.
 
     A process is a reader from its first ``get`` on, until it closes the queue or ends; an item for
@@ -271,13 +275,14 @@ class SimpleQueuePush:
         Dealer(inbox, arrivals).start()
         self.__setstate__((Connection(outbox, readable=False), door))
 
-    def put(self, obj: Any) -> None:
+    def put(self, obj: _T) -> None:
         """Put an item; waits for room while every reader has more than it can hold."""
         self._writer.send(obj)
 
-    def get(self) -> Any:
+    def get(self) -> _T:
         """The next of the items dealt to this process."""
-        return self._joined().recv()
+        item: _T = self._joined().recv()
+        return item
 
     def empty(self) -> bool:
         """Whether ``get`` would wait."""

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from multiprocessing import TimeoutError
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from fiber._exceptions import fresh
 from fiber._runtime.executor import Executor
@@ -28,7 +28,8 @@ __all__ = ["ApplyResult", "AsyncResult", "IMapIterator", "IMapUnorderedIterator"
 SLICEABLE = (tuple, range, str, bytes)
 """What is mapped as it is: nobody changes it, and parts of it are cheap."""
 
-_Callback = Callable[[Any], object]
+_T = TypeVar("_T")
+_ErrorCallback = Callable[[BaseException], object]
 
 
 class Keeper(Protocol):
@@ -45,14 +46,14 @@ class Owner(Keeper, Protocol):
         """Have a callback run; False if none runs any more."""
 
 
-class ApplyResult:
+class ApplyResult(Generic[_T]):
     """The result of one call, as ``apply_async`` returns it."""
 
     def __init__(
         self,
         pool: Owner,
-        callback: _Callback | None = None,
-        error_callback: _Callback | None = None,
+        callback: Callable[[_T], object] | None = None,
+        error_callback: _ErrorCallback | None = None,
     ) -> None:
         # Keeps the pool while there is something to wait for, as in multiprocessing.
         self._pool: Owner | None = pool
@@ -80,7 +81,7 @@ class ApplyResult:
             _check_may_wait(self._pool, timeout)
             self._done.wait(timeout)
 
-    def get(self, timeout: float | None = None) -> Any:
+    def get(self, timeout: float | None = None) -> _T:
         """The result, or the exception that the call raised; TimeoutError if there is neither."""
         self.wait(timeout)
         if not self.ready():
@@ -88,7 +89,8 @@ class ApplyResult:
         outcome = self._settled()
         if type(outcome) is Failure:
             raise fresh(outcome.error)
-        return outcome
+        value: _T = outcome
+        return value
 
     # What the executor says
 
@@ -144,7 +146,8 @@ class ApplyResult:
             self._outcome = decode(self._outcome)
             self._mixed = False
 
-    __class_getitem__: Any = classmethod(types.GenericAlias)
+    def __class_getitem__(cls, item: Any, /) -> types.GenericAlias:
+        return types.GenericAlias(cls, item)
 
 
 AsyncResult = ApplyResult
@@ -161,7 +164,7 @@ def _too_late(timeout: float | None) -> TimeoutError:
     )
 
 
-class MapResult(ApplyResult):
+class MapResult(ApplyResult[list[_T]]):
     """The results of a map, as ``map_async`` returns it.
 
     If tasks raised, it raises what the first of them, in time, did; once all are done.
@@ -170,8 +173,8 @@ class MapResult(ApplyResult):
     def __init__(
         self,
         pool: Owner,
-        callback: _Callback | None = None,
-        error_callback: _Callback | None = None,
+        callback: Callable[[list[_T]], object] | None = None,
+        error_callback: _ErrorCallback | None = None,
     ) -> None:
         super().__init__(pool, callback, error_callback)
         self._outcome = []
@@ -359,7 +362,7 @@ class _OrderedBuffer(_Buffer):
         self._early.clear()
 
 
-class IMapIterator:
+class IMapIterator(Iterator[_T]):
     """Iterator over the results of ``imap``, in order."""
 
     _buffer_type: type[_Buffer] = _OrderedBuffer
@@ -368,15 +371,16 @@ class IMapIterator:
     def __init__(self, pool: Keeper) -> None:
         self._buffer = self._buffer_type(pool)
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Self:
         return self
 
-    def next(self, timeout: float | None = None) -> Any:
+    def next(self, timeout: float | None = None) -> _T:
         """The next result; TimeoutError if it takes longer than ``timeout`` seconds."""
         outcome = self._take(timeout)
         if type(outcome) is Failure:
             raise fresh(outcome.error)
-        return outcome
+        value: _T = outcome
+        return value
 
     __next__ = next
 
@@ -421,7 +425,7 @@ class IMapIterator:
             buffer.stream = None
 
 
-class IMapUnorderedIterator(IMapIterator):
+class IMapUnorderedIterator(IMapIterator[_T]):
     """Iterator over the results of ``imap_unordered``, as they come."""
 
     _buffer_type = _Buffer

@@ -82,7 +82,7 @@ class Member:
         while not self._previous.poll():
             for rank, how in self.lost.items():
                 raise MemberLost(rank, how)
-            _wait([self._previous, self._news])
+            wait([self._previous, self._news])
         try:
             return self._previous.recv()
         except ConnectionClosed:
@@ -173,7 +173,7 @@ def _attend(channels: list[Connection]) -> list[Any]:
     results: list[Any] = [None] * len(channels)
     failure: BaseException | None = None
     while running:
-        ready = _wait(running.values())
+        ready = wait(running.values())
         for rank, channel in list(running.items()):
             if channel in ready:
                 del running[rank]
@@ -207,10 +207,6 @@ def _tell(end: _End, running: dict[int, Connection], size: int) -> None:
     for rank in running if end.lost else neighbours & running.keys():
         with contextlib.suppress(BrokenPipeError, ConnectionClosed):
             running[rank].send(end)
-
-
-def _wait(connections: Iterable[Any]) -> list[Any]:
-    return wait(connections)  # multiprocessing's, whose types know no other connections
 
 
 def _close(connections: list[Connection]) -> None:

@@ -11,10 +11,9 @@ import mmap
 import os
 import pickle
 import types
-from collections.abc import Iterable
 from multiprocessing import context as mp_context
 from multiprocessing import shared_memory as mp_shared_memory
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fiber._hub import client
 from fiber._hub.directory import forget_memory, note_memory
@@ -28,6 +27,8 @@ _INSTEAD = (
     "send the data through a Pipe or Queue"
 )
 
+
+_T = TypeVar("_T", int, float, bool, str, bytes, None)
 
 _mp: Any = mp_shared_memory
 
@@ -99,11 +100,13 @@ class SharedMemory(mp_shared_memory.SharedMemory):
         return _attach, (type(self), self.name, client.host())
 
 
-class ShareableList(mp_shared_memory.ShareableList[Any]):
+class ShareableList(mp_shared_memory.ShareableList[_T]):
     """A list of fixed length in a ``SharedMemory``, of numbers, strings, bytes and None."""
 
-    def __init__(self, sequence: Iterable[Any] | None = None, *, name: str | None = None) -> None:
-        _init_list(self, sequence, name=name)
+    if not TYPE_CHECKING:  # its types are those of the base
+
+        def __init__(self, sequence=None, *, name=None):
+            _init_list(self, sequence, name=name)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _attach_list, (type(self), self.shm)
@@ -132,5 +135,5 @@ def _attach(cls: type[SharedMemory], name: str, host: str) -> SharedMemory:
     return cls(name)
 
 
-def _attach_list(cls: type[ShareableList], memory: SharedMemory) -> ShareableList:
+def _attach_list(cls: type[ShareableList[Any]], memory: SharedMemory) -> ShareableList[Any]:
     return cls(name=memory.name)

@@ -18,11 +18,25 @@ from multiprocessing.sharedctypes import (
     SynchronizedBase,
     SynchronizedString,
 )
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
 
 from fiber import synchronize
 from fiber._hub import shared_buffer
 from fiber._hub.shared_buffer import SharedBuffer
+
+if TYPE_CHECKING:
+    from _ctypes import _CData
+    from ctypes import _SimpleCData, c_char
+
+    from fiber.synchronize import LockLike
+
+    Locked: TypeAlias = Literal[True] | LockLike
+    """What ``lock=`` is for an object that is to have a lock."""
+    Size: TypeAlias = int | Sequence[Any]
+    """How many elements an array has, or their values."""
+
+    _CT = TypeVar("_CT", bound=_CData)
+_T = TypeVar("_T")
 
 __all__ = [
     "Array",
@@ -41,6 +55,14 @@ __all__ = [
 typecode_to_type: dict[str, type] = mp_sharedctypes.typecode_to_type  # type: ignore[attr-defined]
 
 
+@overload
+def RawValue(typecode_or_type: type[_CT], *args: Any) -> _CT: ...
+
+
+@overload
+def RawValue(typecode_or_type: str, *args: Any) -> Any: ...
+
+
 def RawValue(typecode_or_type: Any, *args: Any) -> Any:
     """A ctypes object in shared memory, made as ``type(*args)``; nothing guards it."""
     value = _new(_type(typecode_or_type))
@@ -48,7 +70,15 @@ def RawValue(typecode_or_type: Any, *args: Any) -> Any:
     return value
 
 
-def RawArray(typecode_or_type: Any, size_or_initializer: int | Sequence[Any]) -> Any:
+@overload
+def RawArray(typecode_or_type: type[_CT], size_or_initializer: Size) -> ctypes.Array[_CT]: ...
+
+
+@overload
+def RawArray(typecode_or_type: str, size_or_initializer: Size) -> Any: ...
+
+
+def RawArray(typecode_or_type: Any, size_or_initializer: Size) -> Any:
     """A ctypes array in shared memory, of zeros or of the values given; nothing guards it."""
     element = _type(typecode_or_type)
     if isinstance(size_or_initializer, int):
@@ -56,6 +86,36 @@ def RawArray(typecode_or_type: Any, size_or_initializer: int | Sequence[Any]) ->
     array = _new(element * len(size_or_initializer))
     array.__init__(*size_or_initializer)
     return array
+
+
+@overload
+def Value(
+    typecode_or_type: type[_SimpleCData[_T]], *args: Any, lock: Locked = True, ctx: Any = None
+) -> Synchronized[_T]: ...
+
+
+@overload
+def Value(
+    typecode_or_type: type[_CT], *args: Any, lock: Literal[False], ctx: Any = None
+) -> _CT: ...
+
+
+@overload
+def Value(
+    typecode_or_type: type[_CT], *args: Any, lock: Locked = True, ctx: Any = None
+) -> SynchronizedBase[_CT]: ...
+
+
+@overload
+def Value(
+    typecode_or_type: str, *args: Any, lock: Locked = True, ctx: Any = None
+) -> Synchronized[Any]: ...
+
+
+@overload
+def Value(
+    typecode_or_type: str | type[_CData], *args: Any, lock: Locked | bool = True, ctx: Any = None
+) -> Any: ...
 
 
 def Value(typecode_or_type: Any, *args: Any, lock: Any = True, ctx: Any = None) -> Any:
@@ -66,9 +126,59 @@ def Value(typecode_or_type: Any, *args: Any, lock: Any = True, ctx: Any = None) 
     return _guarded(RawValue(typecode_or_type, *args), lock)
 
 
+@overload
+def Array(
+    typecode_or_type: type[_CT],
+    size_or_initializer: Size,
+    *,
+    lock: Literal[False],
+    ctx: Any = None,
+) -> ctypes.Array[_CT]: ...
+
+
+@overload
+def Array(
+    typecode_or_type: type[c_char],
+    size_or_initializer: Size,
+    *,
+    lock: Locked = True,
+    ctx: Any = None,
+) -> SynchronizedString: ...
+
+
+@overload
+def Array(
+    typecode_or_type: type[_SimpleCData[_T]],
+    size_or_initializer: Size,
+    *,
+    lock: Locked = True,
+    ctx: Any = None,
+) -> SynchronizedArray[_T]: ...
+
+
+@overload
+def Array(
+    typecode_or_type: str,
+    size_or_initializer: Size,
+    *,
+    lock: Locked = True,
+    ctx: Any = None,
+) -> SynchronizedArray[Any]: ...
+
+
+@overload
+def Array(
+    typecode_or_type: str | type[_CData],
+    size_or_initializer: Size,
+    *,
+    lock: Locked | bool = True,
+    ctx: Any = None,
+) -> Any: ...
+
+
 def Array(
     typecode_or_type: Any,
-    size_or_initializer: int | Sequence[Any],
+    size_or_initializer: Size,
     *,
     lock: Any = True,
     ctx: Any = None,
@@ -80,11 +190,35 @@ def Array(
     return _guarded(RawArray(typecode_or_type, size_or_initializer), lock)
 
 
-def copy(obj: Any) -> Any:
+def copy(obj: _CT) -> _CT:
     """A copy of a ctypes object, in shared memory."""
-    new = _new(type(obj))
+    new: _CT = _new(type(obj))
     ctypes.pointer(new)[0] = obj
     return new
+
+
+@overload
+def synchronized(
+    obj: _SimpleCData[_T], lock: LockLike | None = None, ctx: Any = None
+) -> Synchronized[_T]: ...
+
+
+@overload
+def synchronized(
+    obj: ctypes.Array[c_char], lock: LockLike | None = None, ctx: Any = None
+) -> SynchronizedString: ...
+
+
+@overload
+def synchronized(
+    obj: ctypes.Array[_SimpleCData[_T]], lock: LockLike | None = None, ctx: Any = None
+) -> SynchronizedArray[_T]: ...
+
+
+@overload
+def synchronized(
+    obj: _CT, lock: LockLike | None = None, ctx: Any = None
+) -> SynchronizedBase[_CT]: ...
 
 
 def synchronized(obj: Any, lock: Any = None, ctx: Any = None) -> Any:

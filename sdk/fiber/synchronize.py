@@ -15,7 +15,7 @@ import time
 import weakref
 from collections.abc import Callable
 from multiprocessing import current_process
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from fiber._hub import shared_semaphores, wait_lists
 from fiber._hub.local import LocalCounter
@@ -23,6 +23,7 @@ from fiber._sync.abandonment import Abandoned
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX
 
 if TYPE_CHECKING:
+    from multiprocessing import synchronize as mp_synchronize
     from types import TracebackType
 
     from fiber._hub.shared_semaphores import AnySemaphore
@@ -41,6 +42,8 @@ __all__ = [
     "Semaphore",
 ]
 
+_T = TypeVar("_T")
+
 RECHECK = 1.0
 """Seconds after which whoever waits for a bell looks for itself: its ringer may have died."""
 
@@ -56,7 +59,7 @@ class SemLock:
     def __init__(self, kind: int, value: int, maximum: int) -> None:
         self._semlock: AnySemaphore = shared_semaphores.create(kind, value, maximum)
 
-    def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
         """Take a token; False if there is none, nor within ``timeout`` seconds."""
         if timeout is not None and math.isnan(timeout):
             raise ValueError("timeout must be a number of seconds, not NaN")
@@ -66,7 +69,7 @@ class SemLock:
         """Give a token back; ValueError if there would be more than there can be."""
         self._semlock.release()
 
-    def __enter__(self) -> bool | Abandoned:
+    def __enter__(self) -> bool:
         return self._semlock.acquire()
 
     def __exit__(
@@ -160,17 +163,23 @@ class RLock(SemLock):
         return f"<{type(self).__name__}({owner}, {count})>"
 
 
+if TYPE_CHECKING:
+    LockLike: TypeAlias = SemLock | mp_synchronize.SemLock
+    """A lock: the types of ``Value`` are multiprocessing's, and so is that of its lock."""
+
+
 class Condition:
     """A lock, and threads of any process that wait until others, who have it, notify them.
 
     Who is killed while it waits is passed over; in multiprocessing ``notify`` waits for it.
     """
 
-    def __init__(self, lock: SemLock | None = None, *, ctx: Any = None) -> None:
-        self._lock = RLock() if lock is None else lock
+    def __init__(self, lock: LockLike | None = None, *, ctx: Any = None) -> None:
+        # A lock of multiprocessing's own has what is used here, too.
+        self._lock = RLock() if lock is None else cast(SemLock, lock)
         self._waiters: AnyWaitList = wait_lists.create()
 
-    def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
         """Acquire its lock."""
         return self._lock.acquire(block, timeout)
 
@@ -178,7 +187,7 @@ class Condition:
         """Release its lock."""
         self._lock.release()
 
-    def __enter__(self) -> bool | Abandoned:
+    def __enter__(self) -> bool:
         return self._lock.__enter__()
 
     def __exit__(
@@ -207,7 +216,7 @@ class Condition:
                 notified = waiters.leave(place)
         return bool(notified)
 
-    def wait_for(self, predicate: Callable[[], Any], timeout: float | None = None) -> Any:
+    def wait_for(self, predicate: Callable[[], _T], timeout: float | None = None) -> _T:
         """Wait until ``predicate`` is true; what it says when ``timeout`` seconds are over."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while not (result := predicate()):

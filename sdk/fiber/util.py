@@ -24,6 +24,7 @@ from multiprocessing.util import (
     sub_debug,
     sub_warning,
 )
+from typing import TYPE_CHECKING
 
 __all__ = [
     "DEBUG",
@@ -47,7 +48,9 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> object:
-    if name not in vars(_mp):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return vars(_mp)[name]
+if not TYPE_CHECKING:  # to a type checker any name would be one of ours
+
+    def __getattr__(name: str) -> object:
+        if name not in vars(_mp):
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return vars(_mp)[name]

@@ -54,7 +54,10 @@ class ShmemVecEnv:
             pipe.send((command, action))
         for pipe in self._pipes:
             pipe.recv()
-        views = [np.frombuffer(buffer.get_obj(), dtype=np.float32) for buffer in self._buffers]
+        arrays: list[Any] = [
+            buffer.get_obj() for buffer in self._buffers
+        ]  # buffers, by the protocol
+        views = [np.frombuffer(array, dtype=np.float32) for array in arrays]
         return np.stack([view.reshape(SHAPE) for view in views])
 
     def close(self) -> None:

@@ -279,7 +279,7 @@ def make_a_push_queue(connection: Any) -> None:
     """Send a queue with an item in it, and the same again when asked."""
     from fiber.queues import SimpleQueuePush
 
-    queue = SimpleQueuePush()
+    queue: SimpleQueuePush[int] = SimpleQueuePush()
     queue.put(1)
     connection.send(queue)
     connection.recv()

@@ -73,7 +73,7 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
     [
         (lambda: fiber.Pool(0), ValueError, "processes"),
         (lambda: fiber.Pool(-1), ValueError, "processes"),
-        (lambda: fiber.Pool(2, initializer=1), TypeError, "initializer"),
+        (lambda: fiber.Pool(2, initializer=cast(Any, 1)), TypeError, "initializer"),
         (lambda: fiber.Pool(2, maxtasksperchild=0), ValueError, "maxtasksperchild"),
         (lambda: fiber.Pool(2, retries=-1), ValueError, "retries"),
         (lambda: fiber.Pool(2, task_timeout=0), ValueError, "task_timeout"),
@@ -90,8 +90,8 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
         (lambda: fiber.Semaphore(-1), ValueError, "value"),
         (lambda: fiber.get_context("typo"), ValueError, "typo"),
         (lambda: fiber.set_start_method("typo", force=True), ValueError, "typo"),
-        (lambda: fiber.init(bakend="local"), fiber.ConfigError, "'bakend'.*'backend'"),
-        (lambda: fiber.init(backend="typo"), fiber.ConfigError, "'typo'.*'local'"),
+        (lambda: fiber.init(bakend="local"), fiber.ConfigError, "'bakend'.*'backend'"),  # type: ignore[call-arg]
+        (lambda: fiber.init(backend="typo"), fiber.ConfigError, "'typo'.*'local'"),  # type: ignore[arg-type]
         (lambda: fiber.Barrier(0), ValueError, "one party.*0"),
     ],
 )

@@ -82,7 +82,7 @@ def test_of_what_processes_share(soon: Callable[..., None], what: str, long: flo
         soon(event.set)
         assert event.wait(long)
     elif what == "queue":
-        queue = fiber.SimpleQueue()
+        queue: fiber.SimpleQueue[Any] = fiber.SimpleQueue()
         soon(queue.put, 1)
         assert queue._reader.poll(long)
     else:

@@ -54,7 +54,7 @@ def add(tally: Any) -> int:
 
 def test_a_manager_takes_a_slot_of_a_pod_of_its_shape(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"), Tallies() as manager, fiber.Pool(1) as pool:
-        tally = manager.Tally()
+        tally = manager.Tally()  # type: ignore[attr-defined]  # registered
         assert tally.add() == 1
         assert pool.map(add, [tally] * 4) == [2, 3, 4, 5]
         (pod,) = (pod for pod in cluster.objects("pods") if pod["metadata"]["name"] == tally.pod())
@@ -69,7 +69,7 @@ def add_for_ever(tally: Any) -> NoReturn:
 
 def test_a_deleted_pod_ends_every_call(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"), AsyncTallies() as manager:
-        tally = manager.Tally()
+        tally = manager.Tally()  # type: ignore[attr-defined]  # registered
         pod = tally.pod().get(PATIENCE)
         cluster.do(cluster.nodes.kill, pod)
         with pytest.raises(ConnectionClosed, match=r"manager 'AsyncTallies-\d+'.*is gone"):

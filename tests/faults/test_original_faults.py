@@ -111,7 +111,7 @@ def test_terminate_on_an_unused_pool_raises() -> None:
 
 
 def test_a_reader_that_dies_swallows_queued_items() -> None:
-    queue = fiber.Queue()
+    queue: fiber.Queue[Any] = fiber.Queue()
     ours, theirs = fiber.Pipe()
     for number in range(20):
         queue.put(number)

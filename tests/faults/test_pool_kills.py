@@ -17,7 +17,7 @@ import pytest
 import fiber
 from faults import pool_targets as tasks
 from faults.program import alive, stop_and_wait, wait_for
-from fiber.pool import Pool
+from fiber.pool import ApplyResult, Pool
 from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -113,7 +113,8 @@ def test_ten_thousand_queued_and_workers_dying_all_the_time() -> None:
         killer = threading.Thread(target=kill_now_and_then)
         killer.start()
         try:
-            results = [pool.map_async(abs, range(-5000, 0), chunksize=7)]
+            results: list[ApplyResult[Any]] = []
+            results += [pool.map_async(abs, range(-5000, 0), chunksize=7)]
             results += [pool.apply_async(abs, (-n,)) for n in range(5000)]
             seen = [result.get(PATIENCE) for result in results]
         finally:

@@ -15,7 +15,7 @@ import fiber
 from faults import pool_targets as tasks
 from faults.program import wait_for
 from fiber.errors import MaybeEncodingError, StartError, WorkerDied
-from fiber.pool import Pool
+from fiber.pool import ApplyResult, Pool
 from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -203,7 +203,8 @@ def test_terminate_is_prompt_with_much_queued_and_workers_blocked(tmp_path: Path
     wait_for(lambda: len(list(tmp_path.iterdir())) == 2)
     pool.terminate()
     pool.join()
-    for result in (*blocked, queued):
+    results: list[ApplyResult[Any]] = [*blocked, queued]
+    for result in results:
         assert not result.ready() or not result.successful()
     del lazy
 

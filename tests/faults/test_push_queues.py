@@ -11,7 +11,7 @@ import pytest
 import fiber
 from faults import targets
 from fiber.errors import ConnectionClosed
-from fiber.queues import SimpleQueuePush
+from fiber.queues import SimpleQueue, SimpleQueuePush
 from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("backend")
 class Reader:
     """A process that reads when it is told to."""
 
-    def __init__(self, queue: SimpleQueuePush) -> None:
+    def __init__(self, queue: SimpleQueuePush[Any]) -> None:
         self._orders, theirs = fiber.Pipe()
         self.process = fiber.Process(target=targets.read_as_told, args=(queue, theirs))
         self.process.start()
@@ -39,8 +39,8 @@ class Reader:
 
 
 @pytest.fixture
-def queue() -> Iterator[SimpleQueuePush]:
-    queue = SimpleQueuePush()
+def queue() -> Iterator[SimpleQueuePush[Any]]:
+    queue: SimpleQueuePush[Any] = SimpleQueuePush()
     yield queue
     queue.close()
     for thread in threading.enumerate():
@@ -49,14 +49,14 @@ def queue() -> Iterator[SimpleQueuePush]:
 
 
 @pytest.fixture
-def readers(queue: SimpleQueuePush) -> Iterator[list[Reader]]:
+def readers(queue: SimpleQueuePush[Any]) -> Iterator[list[Reader]]:
     readers = [Reader(queue) for _ in range(3)]
     yield readers
     for reader in readers:
         reader.end()
 
 
-def test_each_gets_the_next(queue: SimpleQueuePush, readers: list[Reader]) -> None:
+def test_each_gets_the_next(queue: SimpleQueuePush[Any], readers: list[Reader]) -> None:
     for item in range(9):
         queue.put(item)
     for place, reader in enumerate(readers):
@@ -64,7 +64,9 @@ def test_each_gets_the_next(queue: SimpleQueuePush, readers: list[Reader]) -> No
         assert reader.ask("empty") is True
 
 
-def test_what_is_dealt_is_not_waited_for(queue: SimpleQueuePush, readers: list[Reader]) -> None:
+def test_what_is_dealt_is_not_waited_for(
+    queue: SimpleQueuePush[Any], readers: list[Reader]
+) -> None:
     large = bytes(2_000_000)
     queue.put(large)
     queue.put("small")
@@ -72,17 +74,20 @@ def test_what_is_dealt_is_not_waited_for(queue: SimpleQueuePush, readers: list[R
     assert readers[0].ask("get") == large
 
 
-def test_items_wait_for_the_first_reader(queue: SimpleQueuePush) -> None:
+def test_items_wait_for_the_first_reader(queue: SimpleQueuePush[Any]) -> None:
     queue.put(1)
     queue.put(2)
-    reader = fiber.Process(target=targets.read_one, args=(queue, sent := fiber.SimpleQueue()))
+    sent: SimpleQueue[int] = fiber.SimpleQueue()
+    reader = fiber.Process(target=targets.read_one, args=(queue, sent))
     reader.start()
     assert sent.get() == 1
     reader.join(PATIENCE)
     reader.close()
 
 
-def test_the_others_go_on_without_a_dead_one(queue: SimpleQueuePush, readers: list[Reader]) -> None:
+def test_the_others_go_on_without_a_dead_one(
+    queue: SimpleQueuePush[Any], readers: list[Reader]
+) -> None:
     dead = readers.pop(1)
     dead.end()
     for item in range(20):
@@ -93,7 +98,7 @@ def test_the_others_go_on_without_a_dead_one(queue: SimpleQueuePush, readers: li
 
 
 def test_one_that_reads_nothing_is_passed_over(
-    queue: SimpleQueuePush, readers: list[Reader]
+    queue: SimpleQueuePush[Any], readers: list[Reader]
 ) -> None:
     idle, *_ = readers
     item = bytes(50_000)
@@ -104,7 +109,9 @@ def test_one_that_reads_nothing_is_passed_over(
                 assert reader.ask("get") == item
 
 
-def test_who_made_it_can_read_too_and_a_thread_is_no_second_reader(queue: SimpleQueuePush) -> None:
+def test_who_made_it_can_read_too_and_a_thread_is_no_second_reader(
+    queue: SimpleQueuePush[Any],
+) -> None:
     for item in range(4):
         queue.put(item)
     got: list[Any] = []

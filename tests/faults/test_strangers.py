@@ -179,7 +179,7 @@ def test_who_has_the_credentials_and_speaks_nonsense_is_refused_not_unpickled(
 @pytest.fixture(scope="module")
 def door() -> Iterator[str]:
     with running(backend="local") as runtime:
-        queue = fiber.Queue()
+        queue: fiber.Queue[Any] = fiber.Queue()
         queue.put(1)
         assert runtime.hub is not None
         yield runtime.hub.address.path

@@ -16,6 +16,7 @@ import select
 import threading
 import time
 import weakref
+from collections.abc import Callable
 from multiprocessing import managers as mp_managers
 from typing import Any
 
@@ -190,19 +191,21 @@ class _Ended(Exception):
     """There will be no more answers."""
 
 
-class AsyncBaseProxy(_mp.BaseProxy):  # type: ignore[misc]
+class AsyncBaseProxy(mp_managers.BaseProxy):
     """A proxy of which every method returns an ``AsyncProxyResult`` at once.
 
     Calls by one proxy are made one after the other, in their order, and those by different proxies
     side by side.
     """
 
+    _token: Any
+
     def __init__(self, *args: Any, exposed: Any = None, **options: Any) -> None:
-        super().__init__(*args, exposed=exposed, **options)
+        _mp.BaseProxy.__init__(self, *args, exposed=exposed, **options)
         self._exposed = tuple(exposed or ())
         self._calls: Pipeline | None = None
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Callable[..., AsyncProxyResult]:
         if name.startswith("_") or name not in self._exposed:
             raise AttributeError(f"{self!r} has no method {name!r}")
 
@@ -212,7 +215,9 @@ class AsyncBaseProxy(_mp.BaseProxy):  # type: ignore[misc]
         method.__name__ = name
         return method
 
-    def _callmethod(self, methodname: str, args: Any = (), kwds: Any = None) -> AsyncProxyResult:
+    def _callmethod(  # type: ignore[override]  # the base's waits for the result
+        self, methodname: str, args: Any = (), kwds: Any = None
+    ) -> AsyncProxyResult:
         """Begin a call of any exposed method, ``__getitem__`` for instance."""
         calls, token = self._calls, self._token
         if calls is None or calls.pid != os.getpid():  # else forked

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import TYPE_CHECKING, Any, Self, cast
+
+if TYPE_CHECKING:
+    # No class can inherit from bool, and `acquire` returns a bool to those who do not care.
+    _Bool = bool
+else:
+    _Bool = int
 
 
-class Abandoned(int):
+class Abandoned(_Bool):  # type: ignore[misc]  # bool is final
     """The result of an ``acquire`` that got what another process held when it ended.
 
     It is true and equal to True, so nobody has to know of it.  What the lock guards may be half
@@ -16,9 +22,9 @@ class Abandoned(int):
     """The process that ended."""
 
     def __new__(cls, holder: str) -> Self:
-        self = super().__new__(cls, 1)
+        self: Any = super().__new__(cls, 1)
         self.holder = holder
-        return self
+        return cast(Self, self)
 
     def __repr__(self) -> str:
         return f"Abandoned(holder={self.holder!r})"

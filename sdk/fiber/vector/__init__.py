@@ -6,7 +6,7 @@ Needs the extra ``rl``.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fiber.vector.registration import make_vec as make_vec
@@ -24,11 +24,13 @@ _HOMES = {
 __all__ = ["VecEnv", "VectorEnv", "make_vec", "register"]
 
 
-def __getattr__(name: str) -> Any:
-    # stable-baselines3, and with it torch, is imported by those who ask for VecEnv.
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+if not TYPE_CHECKING:  # to a type checker any name would be one of ours
+
+    def __getattr__(name: str) -> object:
+        # stable-baselines3, and with it torch, is imported by those who ask for VecEnv.
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

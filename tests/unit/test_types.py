@@ -1,0 +1,168 @@
+"""Types: `import fiber as mp` gives the types that multiprocessing gives."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+import fiber
+from fiber.config import Config
+
+ROOT = Path(__file__).resolve().parents[2]
+SDK = ROOT / "sdk" / "fiber"
+TYPED = Path(__file__).parent / "typed"
+
+UNTYPED_UPSTREAM = {
+    "fiber.joblib.FiberBackend",
+    "fiber.vector.vector_env.VectorEnv.action_space",
+    "fiber.vector.vector_env.VectorEnv.observation_space",
+    "fiber.vector.vector_env.VectorEnv.single_action_space",
+    "fiber.vector.vector_env.VectorEnv.single_observation_space",
+}
+"""joblib has no types, and gymnasium's spaces have a parameter that gymnasium itself leaves out."""
+
+
+class Finding(NamedTuple):
+    """What a checker says about a line: a type, or the rule that the line breaks."""
+
+    line: int
+    type: str = ""
+    rule: str = ""
+
+
+def findings(checker: str, folder: Path, name: str) -> list[Finding]:
+    found = mypy(folder, name) if checker == "mypy" else pyright(folder, name)
+    return sorted(found)
+
+
+def run(*arguments: str, folder: Path, **environment: str) -> str:
+    command = [sys.executable, "-m", *arguments]
+    environ = os.environ | environment
+    done = subprocess.run(
+        command, cwd=folder, env=environ, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode in (0, 1), f"{arguments}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+def mypy(folder: Path, name: str) -> Iterator[Finding]:
+    cache = ROOT / ".mypy_cache" / "of_a_user"
+    options = ("--strict", "--config-file=", f"--cache-dir={cache}")
+    for text in run("mypy", *options, name, folder=folder).splitlines():
+        if match := re.match(rf"{name}:(\d+): (note|error): (.*)", text):
+            if revealed := re.match(r'Revealed type is "(.*)"', match[3]):
+                yield Finding(int(match[1]), short(revealed[1]))
+            elif match[2] == "error":
+                yield Finding(int(match[1]), rule=match[3].rpartition("  ")[2])
+
+
+def pyright(folder: Path, name: str) -> Iterator[Finding]:
+    printed = run("pyright", "--pythonpath", sys.executable, "--outputjson", name, folder=folder)
+    for found in json.loads(printed)["generalDiagnostics"]:
+        line = found["range"]["start"]["line"] + 1
+        if found["severity"] == "information":
+            yield Finding(line, short(found["message"].partition(" is ")[2].strip('"')))
+        else:
+            yield Finding(line, rule=found["rule"])
+
+
+def short(type_: str) -> str:
+    """A type without the modules that its classes are in."""
+    return re.sub(r"\b[a-z_]\w*\.(?=[\w.]*[A-Za-z])", "", type_)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("checker", ["mypy", "pyright"])
+def test_a_users_program_has_the_types_that_it_has_with_multiprocessing(
+    checker: str, tmp_path: Path
+) -> None:
+    program = (TYPED / "program.py").read_text(encoding="utf-8")
+    (tmp_path / "ours.py").write_text(program, encoding="utf-8")
+    (tmp_path / "theirs.py").write_text(program.replace("fiber", "multiprocessing"), "utf-8")
+    ours = findings(checker, tmp_path, "ours.py")
+    assert ours == findings(checker, tmp_path, "theirs.py")
+    assert sum(bool(found.type) for found in ours) == program.count("reveal_type(")
+    assert sum(bool(found.rule) for found in ours) > 5
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("checker", ["mypy", "pyright"])
+def test_what_fiber_adds_has_types_and_mistakes_are_errors(checker: str, tmp_path: Path) -> None:
+    program = (TYPED / "additions.py").read_text(encoding="utf-8")
+    (tmp_path / "program.py").write_text(program, encoding="utf-8")
+    found = findings(checker, tmp_path, "program.py")
+    lines = enumerate(program.splitlines(), 1)
+    said = {number: match[1] for number, line in lines if (match := re.search(r"  # (.+)", line))}
+    types = {finding.line: finding.type for finding in found if finding.type}
+    assert types == {number: words for number, words in said.items() if words != "error"}
+    broken = {finding.line for finding in found if finding.rule}
+    assert broken == {number for number, words in said.items() if words == "error"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_every_public_name_has_a_type(tmp_path: Path) -> None:
+    """By pyright's standard, without what it could infer in another way than other checkers do."""
+    options = ("--verifytypes", "fiber", "--ignoreexternal", "--outputjson")
+    # It looks for the package where the first python of PATH does, and follows no .pth file.
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    printed = run("pyright", *options, folder=tmp_path, PATH=path, PYTHONPATH=str(SDK.parent))
+    symbols = json.loads(printed)["typeCompleteness"]["symbols"]
+    public = [symbol for symbol in symbols if symbol["isExported"]]
+    assert len(public) > 500
+    inferred = re.compile(r"could be inferred differently|Ambiguous base class|partially unknown")
+    assert {
+        symbol["name"]
+        for symbol in public
+        for said in symbol["diagnostics"]
+        if said["severity"] == "error" and not inferred.search(said["message"])
+    } == UNTYPED_UPSTREAM
+
+
+def test_names_for_type_checkers_are_those_at_run_time() -> None:
+    tree = ast.parse((SDK / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = (
+        node
+        for node in tree.body
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+    )
+    names: set[str] = set()
+    for statement in block.body:
+        if isinstance(statement, ast.ImportFrom):
+            names |= {alias.asname or alias.name for alias in statement.names}
+        else:
+            assert isinstance(statement, ast.Assign)
+            names |= {target.id for target in statement.targets if isinstance(target, ast.Name)}
+    assert names == {*fiber.__all__, *fiber._SUBMODULES}
+
+
+def test_init_has_a_typed_keyword_for_each_key() -> None:
+    tree = ast.parse((SDK / "config.py").read_text(encoding="utf-8"))
+    (settings,) = (
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef) and node.name == "Settings"
+    )
+    typed = {
+        entry.target.id: ast.unparse(entry.annotation)
+        for entry in settings.body
+        if isinstance(entry, ast.AnnAssign) and isinstance(entry.target, ast.Name)
+    }
+    # What is a path in the configuration may be given as a pathlib.Path.
+    narrowed = {key: text.replace("str | os.PathLike[str]", "str") for key, text in typed.items()}
+    narrowed["template"] = narrowed["template"].removesuffix(" | None")
+    expected = {entry.name: str(entry.type) for entry in fields(Config)}
+    expected["template"] = expected["template"].removesuffix(" | None")
+    assert narrowed == expected
