@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import os
 import pickle
 import signal
@@ -217,6 +218,42 @@ def test_agents_that_are_killed_while_they_start_cost_a_pool_nothing_but_time() 
         assert census.wait_until(kill_next, PATIENCE)
         assert pool.map(abs, range(3)) == [0, 1, 2]
         stop(start())
+
+
+def gate_second_agent(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """The second agent is started once the event is set."""
+    goes_on, popen, numbers = threading.Event(), subprocess.Popen, itertools.count()
+
+    def start_one(*args: Any, **options: Any) -> Any:
+        assert next(numbers) != 1 or goes_on.wait(PATIENCE)
+        return popen(*args, **options)
+
+    monkeypatch.setattr(agent_process.subprocess, "Popen", start_one)
+    return goes_on
+
+
+def loads(backend: loopback.LoopbackBackend) -> list[int]:
+    return sorted(backend.agents.placement.loads.values())
+
+
+def test_a_pool_that_starts_before_its_agents_is_spread_over_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    goes_on = gate_second_agent(monkeypatch)
+    with running(agents=2) as backend, fiber.Pool(4) as pool:
+        assert census.wait_until(lambda: loads(backend) == [2], PATIENCE)
+        goes_on.set()
+        pool.wait_until_workers_up(PATIENCE)
+        assert loads(backend) == [2, 2]
+
+
+def test_an_agent_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loopback, "_EXPECTED_FOR", 0.0)
+    goes_on = gate_second_agent(monkeypatch)
+    with running(agents=2) as backend, fiber.Pool(4) as pool:
+        pool.wait_until_workers_up(PATIENCE)
+        assert loads(backend) == [4]
+        goes_on.set()
 
 
 class Reluctant:

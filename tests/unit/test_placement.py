@@ -57,6 +57,30 @@ def test_spread_children_go_to_the_agent_with_the_fewest() -> None:
     assert placement.room == math.inf
 
 
+def take_all(placement: Placement[str, str], *children: str) -> list[tuple[str, str]]:
+    """Have these wait; all that are placed."""
+    for child in children:
+        placement.wait(child)
+    return list(iter(placement.place, None))
+
+
+def test_agents_that_are_expected_are_left_their_share() -> None:
+    placement = with_agents("a", slots=math.inf, spread=True)
+    placement.expected = 1
+    assert take_all(placement, *"1234") == [("1", "a"), ("2", "a")]
+    placement.add("b", now=1)
+    placement.expected = 0
+    assert take_all(placement) == [("3", "b"), ("4", "b")]
+
+
+def test_children_do_not_wait_for_an_agent_that_is_given_up() -> None:
+    placement = with_agents("a", slots=math.inf, spread=True)
+    placement.expected = 3
+    assert take_all(placement, *"1234") == [("1", "a")]
+    placement.expected = 0
+    assert take_all(placement) == [("2", "a"), ("3", "a"), ("4", "a")]
+
+
 def test_packed_children_leave_agents_idle_and_those_that_are_idle_longest_stay_so() -> None:
     placement = with_agents("a", "b", "c")
     assert put(placement, *"123") == ["c", "c", "b"]

@@ -89,6 +89,12 @@ class AgentSet:
         self._place()
         return agent
 
+    def expect(self, agents: int) -> None:
+        """So many are about to join."""
+        if agents != self.placement.expected:
+            self.placement.expected = agents
+            self._place()
+
     def fail(self, error: Exception) -> None:
         """No agent will come: if there is none, nobody has to wait."""
         self.error = error

@@ -32,6 +32,9 @@ from fiber.errors import StartError
 _REASONS = 3
 """Failed agents that an error lists."""
 
+_EXPECTED_FOR = 5.0
+"""Seconds from an agent's start for which the others leave it its share of the children."""
+
 _LOOPBACK = "127.0.0.1"
 
 _QUIT_TIMEOUT = 5.0
@@ -96,6 +99,7 @@ class LoopbackBackend:
         )
         for index in range(config.agents):
             self._launch(index)
+        loop.call_soon(self._expect)
 
     @property
     def sends_program(self) -> bool:
@@ -130,9 +134,10 @@ class LoopbackBackend:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
         process = AgentProcess(self._loop, partial(self._ended, name), self.elsewhere)
-        self._by_name[name] = slot = _Slot(index, name, process)
+        self._by_name[name] = slot = _Slot(index, name, process, self._loop.now())
         self._slots[index : index + 1] = [slot]
         self._launcher.launch(process, name, self._environment(name))
+        self._loop.call_later(_EXPECTED_FOR, self._expect)
 
     def _environment(self, name: str) -> dict[str, str]:
         environment = dict(os.environ)
@@ -217,6 +222,17 @@ class LoopbackBackend:
 
     def _fill_vacant(self) -> None:
         """Start the agents that are missing; after failures one, once the pause is over."""
+        self._start_some()
+        self._expect()
+
+    def _expect(self) -> None:
+        """Have children wait for agents that may join at any moment."""
+        due = self._loop.now() - _EXPECTED_FOR
+        late = [slot for slot in self._starting if slot.launched <= due]
+        expected = 0 if self._failures.count else len(self._starting) - len(late)
+        self.agents.expect(expected)
+
+    def _start_some(self) -> None:
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
@@ -226,20 +242,24 @@ class LoopbackBackend:
             vacant, self._vacant = self._vacant, []
             for slot in vacant:
                 self._launch(slot.position)
-        elif self._vacant and not self._are_starting():
+        elif self._vacant and not self._starting:
             try_at = self._failures.try_at(at_work=bool(self.agents.agents))
             if (pause := try_at - self._loop.now()) > 0:
                 self._retry = self._loop.call_later(pause, self._fill_vacant)
             else:
                 self._launch(self._vacant.pop(0).position)
 
-    def _are_starting(self) -> bool:
-        return len(self._slots) > len(self._vacant) + len(self.agents.agents)
+    @property
+    def _starting(self) -> list[_Slot]:
+        """Those whose agents have not joined and not failed."""
+        joined = self.agents.agents
+        return [slot for slot in self._by_name.values() if slot.name not in joined]
 
 
 class _Slot(NamedTuple):
-    """The place of an agent among the others, the agent's name, and the process that it is."""
+    """The place of an agent among the others, its name, its process, and the time of its start."""
 
     position: int
     name: str
     process: AgentProcess
+    launched: float

@@ -17,13 +17,16 @@ Child = TypeVar("Child", bound=Hashable)
 class Placement(Generic[Agent, Child]):
     """Agents with ``slots`` places each, and the children that wait for one, in order.
 
-    ``spread``: the agent with the fewest children takes the next one.  Otherwise the one with the
+    ``spread``: the agent with the fewest children takes the next one, and those that are
+    ``expected`` are left their share.  Otherwise the one with the
     most that has room, so that others become idle and can go; an idle one is taken only if no other
     has room, and then the one that has been idle for the shortest time.
     """
 
     def __init__(self, slots: float, *, spread: bool) -> None:
         self.slots = slots
+        self.expected = 0
+        """How many agents are about to join."""
         # From the front an ordinary dict passes over all that was ever deleted there.
         self.waiting: OrderedDict[Child, None] = OrderedDict()
         self.children = 0
@@ -88,9 +91,11 @@ class Placement(Generic[Agent, Child]):
         """The child that has waited longest, and its agent from now on; None if none has room."""
         if not self.waiting or not self._with_room:
             return None
+        agent = self._best()
+        if self.expected and self._spread and self.loads[agent] >= self._share():
+            return None
         child = next(iter(self.waiting))
         del self.waiting[child]
-        agent = self._best()
         self.idle.pop(agent, None)
         self._change(agent, 1)
         return child, agent
@@ -105,6 +110,11 @@ class Placement(Generic[Agent, Child]):
         load = min(self._with_room) if self._spread else max(self._with_room)
         agents = self._with_room[load]
         return next(iter(agents)) if load or self._spread else next(reversed(agents))
+
+    def _share(self) -> int:
+        """How many children each agent has once the expected ones are there."""
+        agents = len(self.loads) + self.expected
+        return -(-(self.children + len(self.waiting)) // agents)
 
     def _change(self, agent: Agent, by: int) -> None:
         self._unlist(agent)
