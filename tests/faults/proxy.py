@@ -28,6 +28,8 @@ class Proxy:
         self._wake_in, self._wake_out = socket.socketpair()
         self._over = False
         self.connections = 0
+        self.break_after: int | None = None
+        """Bytes after which all connections break, once; new ones are taken."""
         self._selector.register(self._door, selectors.EVENT_READ)
         self._selector.register(self._wake_out, selectors.EVENT_READ)
         self._thread = threading.Thread(target=self._run, name="proxy")
@@ -100,10 +102,18 @@ class Proxy:
                 return
             if data:
                 self._peers[source].sendall(data)
+                self._count(len(data))
                 return
         except OSError:
             pass  # one side broke: so does the other
         self._drop(source)
+
+    def _count(self, size: int) -> None:
+        if self.break_after is not None:
+            self.break_after -= size
+            if self.break_after <= 0:
+                self.break_after = None
+                self._hang_up()
 
     def _drop(self, source: socket.socket) -> None:
         for sock in (source, self._peers.pop(source)):

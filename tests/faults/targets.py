@@ -21,6 +21,10 @@ def nothing() -> None:
     pass
 
 
+def same(value: Any) -> Any:
+    return value
+
+
 def exit_by(way: str) -> None:
     """End this process in one of the ways that a person's code does."""
     if way == "return":
@@ -285,3 +289,8 @@ def make_a_push_queue(connection: Any) -> None:
     connection.recv()
     connection.send(queue)
     block()
+
+
+def echo_large(connection: Any, requests: Any, replies: Any) -> None:
+    connection.send_bytes(connection.recv_bytes())
+    replies.put(requests.get())

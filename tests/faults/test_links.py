@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -16,6 +17,9 @@ from faults.proxy import Proxy
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 from patience import PATIENCE
+
+LARGE = 1 << 25
+"""Bytes of a large message."""
 
 SHORT = 0.5
 """Seconds of a cut that must cost nothing."""
@@ -83,6 +87,19 @@ def test_a_short_cut_loses_nothing(wire: Wire, way: str) -> None:
     ours.close()
     child.join(PATIENCE)
     assert child.exitcode == 0
+
+
+def test_a_large_message_survives_the_end_of_its_connection(wire: Wire) -> None:
+    with fiber.Pool(1) as pool:
+        pool.apply(len, (b"",))
+        pid = pool.apply(os.getpid)
+        for _ in range(2):
+            wire.proxy.break_after = LARGE // 2
+            data = os.urandom(LARGE)
+            assert pool.apply(targets.same, (data,)) == data
+            assert wire.proxy.break_after is None
+        assert pool.apply(os.getpid) == pid, "the worker was started again"
+    assert wire.agents() == ["loopback-0"]
 
 
 @pytest.mark.parametrize("way", ["silence", "sever"])

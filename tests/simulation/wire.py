@@ -67,7 +67,10 @@ class Wire:
         if head.kind == work.STOP:
             return None
         if head.kind == work.CALLS:
-            calls = [pickle.loads(call)[1] for call, _ in work.unpack_calls(body, head.size)]
+            calls = [
+                pickle.loads(work.found(call, [])[0])[1]
+                for call, _ in work.unpack_calls(body, head.size)
+            ]
             if calls == [()]:
                 return Work(seq, [NO_OP], 1, 1, apart=True)
             if seq in self.pinned:

@@ -409,3 +409,15 @@ class Tattling:
     def __reduce__(self) -> tuple[Any, ...]:
         state["pickled"].append(self.n)
         return int, (self.n,)
+
+
+def twice(value: Any) -> Any:
+    return [value, value]
+
+
+def join(one: Any, other: Any) -> Any:
+    return one, other
+
+
+def large(_number: int) -> bytes:
+    return b"x" * ((1 << 16) + 1)

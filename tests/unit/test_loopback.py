@@ -447,7 +447,7 @@ class Silent:
     def attach(self, _observer: Any) -> None:
         pass
 
-    def send(self, frame: Any) -> None:
+    def send(self, frame: Any, **_: Any) -> None:
         self.sent.append(messages.decode(frame))
 
 

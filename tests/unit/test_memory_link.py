@@ -273,3 +273,34 @@ def test_keepalive_is_configurable(loop: SimulatedLoop) -> None:
     cable.cut()
     loop.run_for(6)
     assert [event[:4] for event in notes.events] == ["susp", "lost"]
+
+
+@pytest.mark.parametrize("breaks", [False, True])
+def test_small_frames_pass_a_large_one_also_over_connections_that_break(
+    loop: SimulatedLoop, breaks: bool
+) -> None:
+    cable = Cable(loop, delay=(0.01, 0.01))
+    notes = Notes(cable.master)
+    large = random.Random(1).randbytes(20_000_000)
+    cable.agent.send(large, lane="one")
+    for number in range(1, 10):
+        loop.run_for(0.02)
+        cable.agent.send(b"%d" % number, lane=number)
+        if breaks and number % 3 == 0:
+            cable.break_off()
+    loop.run_until(lambda: len(notes.frames) == 10, within=60)
+    assert notes.frames == [*(b"%d" % number for number in range(1, 10)), large]
+    assert not notes.events
+
+
+def test_a_peer_that_is_lost_leaves_nothing_of_a_large_frame(loop: SimulatedLoop) -> None:
+    cable = Cable(loop, delay=(0.01, 0.01))
+    notes = Notes(cable.master)
+    cable.agent.send(bytes(20_000_000), lane="one")
+    loop.run_until(lambda: cable.master.statistics().partial_bytes > 10_000_000, within=60)
+    cable.cut()
+    loop.run_for(30)
+    assert notes.frames == []
+    assert [event.partition(":")[0] for event in notes.events] == ["suspect", "lost"]
+    assert cable.master.statistics().partial_bytes == 0
+    assert cable.agent.statistics().queued_bytes == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 from collections.abc import Callable
 
 import pytest
@@ -20,6 +21,7 @@ from fiber._transport.stream import (
     Gap,
     ResumableStream,
 )
+from fiber._transport.turns import FIRST, LAST, SIZE
 from fiber._wire.messages import ProtocolError
 
 BUDGET_SMALL = 64
@@ -231,7 +233,7 @@ def test_a_large_piece_is_sent_from_where_it_is() -> None:
 
 def test_the_window_bounds_what_is_under_way_in_bytes() -> None:
     one, other = pair()
-    frame = bytes(2 * WINDOW_BYTES)
+    frame = bytes(2 * WINDOW_BYTES - BUDGET)
     one.send(frame)
     first = [joined(datagram) for datagram in one.outgoing(0)]
     assert WINDOW_BYTES <= one.statistics().unacknowledged_bytes <= WINDOW_BYTES + BUDGET
@@ -378,6 +380,13 @@ def test_statistics_count_bytes_and_frames() -> None:
     assert one.statistics().frames_sent == 1
 
 
+def entries(*pieces: tuple[int, bytes]) -> bytes:
+    """A first datagram with these marks and bytes."""
+    words = [marks | len(piece) for marks, piece in pieces]
+    head = struct.pack(f"<BxxxIQQ{len(words)}I", 1, len(words), 1, 0, *words)
+    return head + b"".join(piece for _, piece in pieces)
+
+
 def numbered(frames: int) -> bytes:
     one, _ = pair()
     for _ in range(frames):
@@ -390,14 +399,20 @@ def numbered(frames: int) -> bytes:
     [
         (b"", "0 bytes has no header"),
         (b"\x07" + bytes(23), "unknown kind 7"),
-        (numbered(3)[:-1], "does not hold the 3 frames"),
-        (numbered(3) + b"!", "does not hold the 3 frames"),
+        (numbered(3)[:-1], "does not hold the 3 entries"),
+        (numbered(3) + b"!", "does not hold the 3 entries"),
         (
             b"\x01\x00\x00\x00\xff\xff\xff\xff\x01" + bytes(15),
-            "does not hold the 4294967295 frames",
+            "does not hold the 4294967295 entries",
         ),
-        (b"\x01\x00\x00\x00\x00\x00\x00\x00\x01" + bytes(15), "does not hold the 0 frames"),
-        (b"\x01\x02" + numbered(1)[2:], "does not go on"),
+        (b"\x01\x00\x00\x00\x00\x00\x00\x00\x01" + bytes(15), "does not hold the 0 entries"),
+        (entries((0, b"more")), "a piece does not go on where slot 0 ended"),
+        (entries((FIRST, SIZE.pack(9)), (FIRST, SIZE.pack(9))), "where slot 0 ended"),
+        (entries((FIRST, b"1234567")), "cannot be put together: unpack_from requires"),
+        (entries((FIRST, SIZE.pack(2) + b"123")), "it has more than the 2 bytes that it announced"),
+        (entries((FIRST, SIZE.pack(9)), (LAST, b"1")), "it ends after 1 of 9 bytes"),
+        (entries((FIRST, SIZE.pack(2**60))), "cannot be put together"),
+        (entries((FIRST, SIZE.pack(2**64 - 1))), "cannot be put together"),
         (b"\x02" + bytes(15) + b"\x09" + bytes(7), "acknowledges datagram 9, but only 0 were sent"),
     ],
 )

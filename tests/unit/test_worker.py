@@ -9,8 +9,10 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 from fiber._agent import worker as worker_module
@@ -49,7 +51,8 @@ class Channel:
             assert offset == len(found), "results out of order"
             rest = iter(buffers)
             for position, kind, data, count in odd:
-                value = pickle.loads(data, buffers=[next(rest) for _ in range(count)])
+                pickled, beside = work.found(data, [next(rest) for _ in range(count)])
+                value = pickle.loads(pickled, buffers=beside)
                 values[position] = value if kind == work.VALUE else (kind, value)
             found += values
         return found
@@ -75,14 +78,20 @@ class Rig:
         identity: int = 1,
     ) -> int:
         """Have a batch run; returns its sequence number."""
-        data = pickle.dumps(function) if function is not None else b""
-        head = work.Head(kind, stride, unit, identity, len(data), 0)
-        body, buffers = packet.dumps(items)
-        return self._handle(work.pack_batch(head, data, body), buffers)
+        data, beside = b"", []
+        size = 0
+        if function is not None:
+            data, beside = work.beside((pickle.dumps(function), []))
+            size = len(data) or work.BESIDE
+        head = work.Head(kind, stride, unit, identity, size, len(beside))
+        body, buffers = work.beside(packet.dumps(items))
+        return self._handle(work.pack_batch(head, data, body), [*beside, *buffers])
 
     def call(self, *calls: tuple[Any, ...]) -> int:
         """Have calls (function, args, kwargs) run."""
-        return self._handle(work.pack_calls([packet.dumps(call) for call in calls]), [])
+        pickles = [work.beside(packet.dumps(call)) for call in calls]
+        buffers = [buffer for _, beside in pickles for buffer in beside]
+        return self._handle(work.pack_calls(pickles), buffers)
 
     def _handle(self, message: bytes, buffers: list[memoryview]) -> int:
         self._seq += 1
@@ -440,3 +449,35 @@ def test_a_function_and_calls_may_be_larger_than_4_gib() -> None:
     head = work.Head(work.MAP, 0, 1, 1, 5 << 30, 0)
     assert work.Head._make(work.HEAD.unpack(work.HEAD.pack(*head))) == head
     assert work.CALL.unpack(work.CALL.pack(5 << 30, 3)) == (5 << 30, 3)
+
+
+LARGE = packet.INLINE_LIMIT + 1
+
+
+@pytest.mark.parametrize("size", [1, LARGE, 4 * LARGE])
+def test_large_calls_functions_items_and_results(rig: Rig, size: int) -> None:
+    text, array = "x" * size, np.ones(size, np.uint8)
+    seq = rig.call((tasks.identity, (text,), {}), (tasks.twice, (array,), {}))
+    found, twice = rig.channel.results(seq)
+    assert found == text
+    assert all(np.array_equal(each, array) for each in twice)
+    assert rig.channel.results(rig.call((tasks.identity, (text,), {}))) == [text]
+    for stride in (0, 1, 7):
+        seq = rig.give(partial(tasks.join, text), [text, b"", "y"], stride=stride)
+        assert rig.channel.results(seq) == [(text, text), (text, b""), (text, "y")]
+
+
+def test_what_is_large_in_an_answer_lies_beside_it(rig: Rig) -> None:
+    for value in ("x" * LARGE, b"x" * LARGE, ("row", b"x" * LARGE), ["x" * LARGE]):
+        rig.channel.said.clear()
+        rig.channel.buffers.clear()
+        seq = rig.call((tasks.identity, (value,), {}))
+        assert len(pickle.dumps(rig.channel.said)) < 1000
+        assert rig.channel.results(seq) == [value]
+
+
+def test_more_large_results_than_a_packet_has_buffers(rig: Rig) -> None:
+    count = packet.MAX_BUFFERS + 10
+    seq = rig.give(tasks.large, range(count), stride=count)
+    assert rig.channel.results(seq) == [tasks.large(0)] * count
+    assert all(len(buffers) <= packet.MAX_BUFFERS for buffers in rig.channel.buffers)

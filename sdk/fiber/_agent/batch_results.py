@@ -19,6 +19,9 @@ from fiber._agent import by_reference
 from fiber._hub.remote import Taken, confirm
 from fiber._wire import packet, work
 
+_MANY_BUFFERS = packet.MAX_BUFFERS - work.BUFFERS - 1
+"""Buffers above which another value's may be too many for a message."""
+
 
 class Sender(Protocol):
     """The sending side of a channel."""
@@ -72,30 +75,30 @@ class BatchResults:
         self.values: list[Any] = []
         self._encoded_up_to = 0
         self._sent = 0
-        self._encoded: list[tuple[int, int, bytes, int]] = []
+        self._encoded: list[tuple[int, int, bytes | None, int]] = []
         self._buffers: list[memoryview] = []
         self._channel = channel
         self._lock = threading.Lock()
         self._last_sent = started
         self._retryable = retryable
 
-    def add(self, value: Any) -> None:
-        """Take the next task's value as it is now: a later task may change the object."""
-        kind = type(value)
-        if kind in work.PLAIN or (kind is tuple and work.PLAIN.issuperset(map(type, value))):
+    def add(self, value: Any) -> bool:
+        """Take the next task's value as it is now: a later task may change the object.
+
+        True: call ``flush`` before the next task, which may write to the value's own memory.
+        """
+        if work.is_plain_value(value):
             self.values.append(value)
-            return
+            return False
         self._pickle(len(self.values), value)
         self.values.append(None)
-        if self._buffers:
-            # They show the value's own memory, which the next task may write to.
-            self.flush()
+        return bool(self._buffers)
 
     def fail(self, error: BaseException) -> None:
         """Take the next task's error."""
         again = bool(self._retryable) and isinstance(error, self._retryable)
         kind = work.AGAIN if again else work.ERROR
-        self._encoded.append((len(self.values), kind, encode_error(error), 0))
+        self._enclose(len(self.values), kind, (encode_error(error), []))
         self.values.append(None)
 
     def encode_new(self) -> None:
@@ -103,9 +106,12 @@ class BatchResults:
         first, values = self._encoded_up_to, self.values
         if not work.is_plain(values[first:]):
             for at in range(first, len(values)):
-                if type(values[at]) not in work.PLAIN:
+                if not work.is_plain_value(values[at]):
                     self._pickle(at, values[at])
                     values[at] = None
+                if len(self._buffers) > _MANY_BUFFERS:
+                    self._encoded_up_to = at + 1
+                    self.flush()
         self._encoded_up_to = len(values)
         if self._buffers:
             self.flush()
@@ -119,12 +125,15 @@ class BatchResults:
             try:
                 data, buffers = _pickle_unusual(value)
             except BaseException:
-                self._encoded.append(
-                    (position, work.ERROR, encode_error(unsendable(error, value)), 0)
-                )
+                fault = encode_error(unsendable(error, value))
+                self._enclose(position, work.ERROR, (fault, []))
                 return
+        self._enclose(position, work.VALUE, (data, buffers))
+
+    def _enclose(self, position: int, kind: int, pickled: work.Pickle) -> None:
+        data, buffers = work.beside(pickled)
         self._buffers += buffers
-        self._encoded.append((position, work.VALUE, data, len(buffers)))
+        self._encoded.append((position, kind, data or None, len(buffers)))
 
     def started(self) -> int:
         """How many tasks have begun."""

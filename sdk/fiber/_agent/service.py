@@ -6,6 +6,7 @@ import pickle
 import signal
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from fiber import config
@@ -20,13 +21,14 @@ from fiber._transport.loop import Loop
 from fiber._transport.stream import Frame
 from fiber._transport.unix import naming_the_limit
 from fiber._wire import messages, packet
+from fiber._wire.assembly import pass_on
 from fiber._wire.descriptor import contents
 
 _KNOWN_HERE = ExitReport._fields.index("pod")
 """Fields of an exit report that an agent knows; the master adds the others."""
 
 _BACKLOG = 4 << 20
-"""Bytes waiting on the link above which no more output of children is read."""
+"""Bytes of output waiting on the link above which no more output of children is read."""
 
 
 class AgentService:
@@ -46,6 +48,8 @@ class AgentService:
         self._on_end = on_end
         self._blobs = BlobStore(config.current().runtime_directory)
         self._children: dict[int, _Observed] = {}
+        self._output = 0
+        """Bytes of output that wait for the link."""
         self._stopping = False
         self._reason = ""
         self._lost = False
@@ -56,11 +60,23 @@ class AgentService:
         self._transmit(message)
 
     def _transmit(self, message: messages.Message) -> None:
-        self._link.send(*messages.pieces(message))
+        self._link.send(*messages.pieces(message), lane=messages.lane(message))
+
+    def send_output(self, message: messages.Output) -> None:
+        """Tell the master what a child wrote."""
+        self._hub_link.flush()
+        frame = message.encode()
+        self._output += len(frame)
+        self._link.send(
+            frame, lane=messages.lane(message), on_left=partial(self._output_left, len(frame))
+        )
 
     def busy(self) -> bool:
-        """Whether the link is so far behind that output should wait."""
-        return self._link.statistics().queued_bytes > _BACKLOG
+        """Whether so much output waits for the link that no more should be read."""
+        return self._output > _BACKLOG
+
+    def _output_left(self, size: int) -> None:
+        self._output -= size
 
     # What comes over the link
 
@@ -189,6 +205,8 @@ class _Observed:
         if isinstance(message, messages.Deliver):
             self._delivered += 1
             buffers = [memoryview(buffer) for buffer in message.buffers]
+            for buffer in buffers:
+                pass_on(buffer)
             try:
                 child.deliver(message.seq, message.payload, buffers)
             except OSError as error:
@@ -222,4 +240,4 @@ class _Observed:
         self._service.forget(self._number)
 
     def _wrote(self, text: str) -> None:
-        self._service.send(messages.Output(self._number, text))
+        self._service.send_output(messages.Output(self._number, text))

@@ -117,11 +117,13 @@ class Worker:
             function = self._function(seq, head, body, buffers)
             if function is _REPLIED:
                 return
+            pickled = body if head.size == work.BESIDE else body[head.size :]
             try:
-                items, taken = loads(body[head.size :], buffers[head.buffers :])
+                items, taken = loads(*work.found(pickled or None, buffers[head.buffers :]))
             except BaseException as error:
                 self._reply(work.UNREADABLE, seq, encode_error(error))
                 return
+            buffers.clear()
         batch = self._start(seq, items, started, taken, eager=not head.stride)
         del items  # what is not kept is gone by the time that the last of them is done
         self._note(seq)
@@ -136,7 +138,10 @@ class Worker:
         taken: Taken = []
         try:
             self._interruptible = True
-            (function, args, kwargs), taken = loads(body[work.CALL.size :], buffers)
+            ((data, _),) = work.unpack_calls(body, 1)
+            (function, args, kwargs), taken = loads(*work.found(data, buffers))
+            del data
+            buffers.clear()  # what is not used is gone
             value = function(*args, **kwargs)
             self._interruptible = False
             del function, args, kwargs  # what is not kept is gone
@@ -154,6 +159,7 @@ class Worker:
         else:
             batch = self._start(seq, (), started, taken, eager=True)
             batch.add(value)
+            del value  # it may be large, and is pickled
             batch.flush()
 
     def _start(
@@ -183,8 +189,10 @@ class Worker:
         """The function of a batch, whatever it is: to call it may be the error; or _REPLIED."""
         functions = self._functions
         if head.size:
+            inline = None if head.size == work.BESIDE else body[: head.size]
+            data, beside = work.found(inline, buffers[: head.buffers])
             try:
-                function = pickle.loads(body[: head.size], buffers=buffers[: head.buffers])
+                function = pickle.loads(data, buffers=beside)
             except BaseException as error:
                 self._reply(work.BROKEN, seq, encode_error(error))
                 return _REPLIED
@@ -220,7 +228,7 @@ class Worker:
 
     def _run_eagerly(self, batch: BatchResults, function: _Function) -> None:
         """One task after the other: its place noted, its result kept as it is right after it."""
-        progress, values, plain = self._progress, batch.values, work.PLAIN
+        progress, values, numbers = self._progress, batch.values, work.NUMBERS
         for index, item in enumerate(batch.remaining):
             progress[1] = index
             try:
@@ -232,10 +240,11 @@ class Worker:
                 if self._failed(batch, error):
                     raise
                 continue
-            if type(value) in plain:
+            if type(value) in numbers:
                 values.append(value)
-            else:
-                batch.add(value)
+            elif batch.add(value):
+                value = None  # it may be large, and is pickled
+                batch.flush()
 
     def _run_singly(
         self, batch: BatchResults, function: _Function, head: work.Head, started: float
@@ -321,11 +330,12 @@ class _Caller:
     """Runs pickled calls, whose buffers lie one after the other in ``buffers``."""
 
     def __init__(self, buffers: list[memoryview], taken: Taken) -> None:
-        self._buffers = iter(buffers)
+        self._buffers = iter(list(buffers))
         self._taken = taken
 
-    def __call__(self, call: tuple[memoryview, int]) -> Any:
+    def __call__(self, call: tuple[memoryview | None, int]) -> Any:
         data, count = call
-        (function, args, kwargs), taken = loads(data, list(islice(self._buffers, count)))
+        pickled = work.found(data, list(islice(self._buffers, count)))
+        (function, args, kwargs), taken = loads(*pickled)
         self._taken += taken
         return function(*args, **kwargs)

@@ -112,7 +112,7 @@ class RemoteAgent:
         self._put(message)
 
     def _put(self, message: messages.Message) -> None:
-        self._link.send(*messages.pieces(message))
+        self._link.send(*messages.pieces(message), lane=messages.lane(message))
 
     def close(self) -> None:
         """End it and its children.  From anywhere."""

@@ -9,6 +9,7 @@ from typing import Any
 from fiber import reduction
 from fiber._engine.chunks import Pace
 from fiber._hub.handles import GrantSet
+from fiber._wire import work
 
 FUNCTIONS = 128
 """Functions that are recognized when they come again."""
@@ -61,7 +62,8 @@ class FunctionCache:
         known = self._known.get(data)
         if known is not None:
             return known
-        made = Function(next(self._ids), name_of(function), data, buffers, grants)
+        sent = work.beside((data, buffers))
+        made = Function(next(self._ids), name_of(function), *sent, grants)
         if not buffers and grants is None and len(data) <= FUNCTION_SIZE:
             if len(self._known) >= FUNCTIONS:
                 self._known.clear()  # in one step: several threads may be here

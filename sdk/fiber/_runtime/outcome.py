@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from fiber._wire import work
+from fiber._wire.packet import BytesLike
 
 
 class Failure:
@@ -27,7 +28,7 @@ class Pickled:
 
     __slots__ = ("buffers", "data", "kind")
 
-    def __init__(self, kind: int, data: bytes, buffers: Sequence[memoryview]) -> None:
+    def __init__(self, kind: int, data: BytesLike, buffers: Sequence[memoryview]) -> None:
         self.kind = kind
         self.data = data
         self.buffers = buffers
@@ -58,12 +59,12 @@ def decode(outcome: Any) -> Any:
 
 
 def outcomes(
-    values: list[Any], odd: list[tuple[int, int, bytes, int]], buffers: list[memoryview]
+    values: list[Any], odd: list[tuple[int, int, bytes | None, int]], buffers: list[memoryview]
 ) -> list[Any]:
     """A worker's answer with what is pickled in its place."""
     used = 0
     for position, kind, data, count in odd:
-        values[position] = Pickled(kind, data, buffers[used : used + count])
+        values[position] = Pickled(kind, *work.found(data, buffers[used : used + count]))
         used += count
     return values
 

@@ -80,7 +80,9 @@ class Call:
     def copy_buffers(self) -> None:
         """Keep what was passed as it is now: the caller goes on before it is sent."""
         if self.buffers:
-            self.buffers = [memoryview(bytes(buffer)) for buffer in self.buffers]
+            ours = 0 if self.data else 1  # the pickle itself
+            copies = [memoryview(bytes(buffer)) for buffer in self.buffers[ours:]]
+            self.buffers = [*self.buffers[:ours], *copies]
 
     def message(self) -> bytes:
         """It alone as a message, its buffers beside."""
@@ -160,7 +162,7 @@ def pickle_call(
     except Exception as error:
         reject(future, _blame_call(function, args, kwargs, error))
         return None
-    return Call(name_of(function), data, buffers, grants, future)
+    return Call(name_of(function), *work.beside((data, buffers)), grants, future)
 
 
 def _blame_call(
@@ -203,7 +205,7 @@ def pickles_without_user_code(item: WorkItem, batch: Batch) -> bool:
     return item.kind == work.CALLS or type(items) in (range, str, bytes) or work.is_plain(items)
 
 
-Encoded = tuple[bytes, Sequence[memoryview]]
+Encoded = work.Pickle
 """Pickled items, and the buffers beside them."""
 
 
@@ -216,13 +218,13 @@ def encode(item: WorkItem, batch: Batch, *, plain: bool) -> Encoded:
         buffers = list(chain.from_iterable(call.buffers for call in calls))
         return work.pack_calls([(call.data, call.buffers) for call in calls]), buffers
     if plain:
-        return pickle.dumps(batch.items, 5), []
+        return work.beside((pickle.dumps(batch.items, 5), []))
     data, buffers, grants = reduction.encode_reusable(batch.items)
     if grants is not None:
         item.grants.append(grants)
     if len(buffers) > work.BUFFERS:
-        return reduction.dumps(batch.items, 5), []
-    return data, buffers
+        data, buffers = reduction.dumps(batch.items, 5), []
+    return work.beside((data, buffers))
 
 
 def pack(item: WorkItem, batch: Batch, encoded: Encoded, known: dict[int, None]) -> Encoded:
@@ -237,7 +239,7 @@ def pack(item: WorkItem, batch: Batch, encoded: Encoded, known: dict[int, None])
         0 if item.exact else batch.stride,
         item.unit,
         function.id,
-        len(function.data) if carry else 0,
+        (len(function.data) or work.BESIDE) if carry else 0,
         len(function.buffers) if carry else 0,
     )
     if not carry:

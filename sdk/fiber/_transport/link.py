@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 from fiber._transport.handshake import Identity
 from fiber._transport.stream import HEARTBEAT, Datagram, Frame, Statistics
+from fiber._transport.turns import Lane
 from fiber._wire.messages import BytesLike
 
 
@@ -34,7 +35,7 @@ class LinkObserver(Protocol):
     """Hears what happens to a link.  Called on the loop's thread; must not block."""
 
     def on_frame(self, frame: Frame) -> None:
-        """The next frame.  A bytearray is the observer's to keep and to write into."""
+        """The next frame.  One that can be written to is the observer's to keep and to write to."""
 
     def on_suspect(self) -> None:
         """The peer has not been heard for a while; it may come back."""
@@ -54,10 +55,14 @@ class Link(Protocol):
     def attach(self, observer: LinkObserver) -> None:
         """Whom to tell.  What arrives before waits for it."""
 
-    def send(self, *frame: BytesLike) -> None:
+    def send(
+        self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
+    ) -> None:
         """Send a frame as soon as there is room; dropped if the link has ended.
 
         It may come in pieces.  Large ones are not copied, and must not change until they arrived.
+        Large frames of different lanes travel at the same time (``turns.py`` says in which order).
+        ``on_left`` is called on the loop's thread when the last of it was given to the connection.
         """
 
     def close(

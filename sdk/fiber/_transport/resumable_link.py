@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import enum
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from fiber._transport.handshake import Identity
 from fiber._transport.link import EventLoop, Keepalive, LinkObserver, Timer, Wire
 from fiber._transport.stream import Frame, Gap, ResumableStream, Statistics
+from fiber._transport.turns import Lane
 from fiber._wire.messages import BytesLike, ProtocolError
 
 _BYE, _BYE_HEARD = b"\x20", b"\x21"
@@ -82,9 +84,11 @@ class ResumableLink:
         self._observer = observer
         self._loop.call_soon(self._hand_over)
 
-    def send(self, *frame: BytesLike) -> None:
+    def send(
+        self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
+    ) -> None:
         """Send a frame as soon as there is room; dropped if the link has ended."""
-        self._loop.call_soon(self._send, *frame)
+        self._loop.call_soon(self._send, frame, lane, on_left)
 
     def close(
         self,
@@ -190,9 +194,12 @@ class ResumableLink:
             self._observer = None
             observer.on_lost(self._lost)
 
-    def _send(self, *frame: BytesLike) -> None:
+    def _send(
+        self, frame: Sequence[BytesLike], lane: Lane, on_left: Callable[[], None] | None
+    ) -> None:
         if self._state is not _State.ENDED:
-            self._stream.send(*frame)
+            told = None if on_left is None else partial(self._loop.call_soon, on_left)
+            self._stream.send(*frame, lane=lane, on_left=told)
             self._flush_soon()
 
     def _flush_soon(self) -> None:
@@ -292,6 +299,7 @@ class ResumableLink:
         self._stop()
         if self._wire is not None:
             self._unplug().close()
+        self._stream.end()
         self._on_end(self)
         self._finished()
 

@@ -16,20 +16,24 @@ caller tells it the time and carries its datagrams::
   connection that stands still, costs no more memory than that; what waits travels together.
 * Acknowledgements ride on what is sent anyway, within ACK_DELAY or a quarter of the window.
 
-Layout (little endian): kind:u8, flags:u8, pad:u16, count:u32, number:u64, acknowledged:u64, then
-length:u32 * count and the frames.  A frame larger than a datagram goes on in the next one.
+* Frames larger than a datagram take turns (``turns.py``).
+
+Layout (little endian): kind:u8, pad:u24, count:u32, number:u64, acknowledged:u64, then a word:u32
+for each of ``count`` entries, and their bytes.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
+from fiber._transport.turns import FIRST, LAST, LENGTH, SIZE, SLOT_SHIFT, SLOTS, WORD, Lane, Turns
+from fiber._wire.assembly import Assembly
 from fiber._wire.messages import BytesLike, ProtocolError
 
-Frame: TypeAlias = bytes | bytearray
+Frame: TypeAlias = bytes | bytearray | memoryview
 
 Datagram: TypeAlias = bytes | tuple[BytesLike, ...]
 """As it leaves: in one piece, or in several, which whoever sends it puts together."""
@@ -42,7 +46,7 @@ LARGE = 1 << 14
 """Bytes from which on a piece of a frame is not copied: it stays where it is until it arrived."""
 
 BUDGET = 512 * 1024
-"""Bytes of frames in a datagram: one is sealed while the one before it is sent."""
+"""Bytes of entries in a datagram: one is sealed while the one before it is sent."""
 
 ACK_DELAY = 0.02
 """Seconds that an acknowledgement may wait for something to ride on."""
@@ -52,13 +56,9 @@ HEARTBEAT = 3.0
 
 DATA, CONTROL = 1, 2
 
-_CONTINUES = 2
-_UNFINISHED = 4
+_HEADER = struct.Struct("<BxxxIQQ")
 
-_HEADER = struct.Struct("<BBxxIQQ")
-_LENGTH = 4
-
-LARGEST = _HEADER.size + BUDGET + _LENGTH
+LARGEST = _HEADER.size + BUDGET
 """Bytes of the longest datagram."""
 
 
@@ -102,13 +102,8 @@ class ResumableStream:
         self._tick = heartbeat / 3
         self._window = window
         self._window_bytes = window_bytes
-        self._budget = budget
         self._connected = False
-        self._queue: deque[Sequence[BytesLike]] = deque()
-        """Frames, each in its pieces."""
-        self._rest: Sequence[BytesLike] = ()
-        """What has not left of the frame before those."""
-        self._queued_bytes = 0
+        self._turns = Turns(budget)
         self._sent = 0
         self._acknowledged = 0
         self._unacknowledged: deque[Datagram] = deque()
@@ -116,8 +111,8 @@ class ResumableStream:
         self._unacknowledged_bytes = 0
         self._repeat = False
         self._received = 0
-        self._partial: bytearray | None = None
-        """What is there of a frame that goes on."""
+        self._assemblies: list[Assembly | None] = [None] * SLOTS
+        """Frames of which some pieces have arrived, by slot."""
         self._ack_due: float | None = None
         self._unanswered = self._unanswered_bytes = 0
         """What arrived since the last acknowledgement that we sent."""
@@ -129,7 +124,7 @@ class ResumableStream:
     @property
     def idle(self) -> bool:
         """Whether everything that was given to ``send`` is known to have arrived."""
-        return not self._queue and not self._rest and not self._unacknowledged
+        return not self._turns and not self._unacknowledged
 
     @property
     def arrived(self) -> int:
@@ -141,13 +136,15 @@ class ResumableStream:
         """Whether the peer has ever said anything."""
         return bool(self._counts["datagrams_received"])
 
-    def send(self, *frame: BytesLike) -> None:
+    def send(
+        self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
+    ) -> None:
         """Queue a frame, in pieces; the next ``outgoing`` takes it along if there is room.
 
-        No piece may change until it has left, nor one from LARGE bytes on until ``idle``.
+        ``on_left`` is called when the last of it goes out for the first time.  No piece may change
+        until it has left, nor one from LARGE bytes on until ``idle``.
         """
-        self._queue.append(frame)
-        self._queued_bytes += sum(map(len, frame))
+        self._turns.add(frame, lane, on_left)
         self._counts["frames_sent"] += 1
 
     def connected(self, arrived: int) -> None:
@@ -168,6 +165,13 @@ class ResumableStream:
         self._ack_due = None
         self._counts["breaks"] += 1
 
+    def end(self) -> None:
+        """Forget the frames that have not arrived, here or there: nothing more will."""
+        self._turns.clear()
+        self._unacknowledged.clear()
+        self._unacknowledged_bytes = 0
+        self._assemblies = [None] * SLOTS
+
     def outgoing(self, now: float) -> list[Datagram]:
         """What to put on the connection now."""
         if not self._connected:
@@ -183,7 +187,7 @@ class ResumableStream:
         if len(datagrams) > fresh:
             self._answered()
         elif self._must_speak(now):  # a repetition carries the acknowledgement of its day
-            datagrams.append(_HEADER.pack(CONTROL, 0, 0, self._sent, self._received))
+            datagrams.append(_HEADER.pack(CONTROL, 0, self._sent, self._received))
             self._answered()
         if datagrams:
             self._last_sent = now
@@ -202,7 +206,7 @@ class ResumableStream:
         ProtocolError if no stream can have sent it, ``Gap`` if one before it is missing.
         """
         try:
-            kind, flags, count, number, acknowledged = _HEADER.unpack_from(datagram)
+            kind, count, number, acknowledged = _HEADER.unpack_from(datagram)
         except struct.error:
             raise ProtocolError(f"a datagram of {len(datagram)} bytes has no header") from None
         if kind not in (DATA, CONTROL):
@@ -225,7 +229,7 @@ class ResumableStream:
             self._counts["repeated"] += 1
             self._ack_due = now
             return []
-        return self._take(datagram, flags, count, now)
+        return self._take(datagram, count, now)
 
     def tick(self, now: float) -> float:
         """Seconds without a word from the peer, leaving out the time when this process did not run.
@@ -249,17 +253,17 @@ class ResumableStream:
     def statistics(self) -> Statistics:
         """What it holds and has done."""
         return Statistics(
-            queued_frames=len(self._queue) + bool(self._rest),
-            queued_bytes=self._queued_bytes,
+            queued_frames=len(self._turns),
+            queued_bytes=self._turns.bytes,
             unacknowledged_datagrams=len(self._unacknowledged),
             unacknowledged_bytes=self._unacknowledged_bytes,
-            partial_bytes=len(self._partial or ()),
+            partial_bytes=sum(each.arrived for each in self._assemblies if each is not None),
             **self._counts,
         )
 
     def _may_send(self) -> bool:
         return (
-            bool(self._rest or self._queue)
+            bool(self._turns)
             and len(self._unacknowledged) < self._window
             and self._unacknowledged_bytes < self._window_bytes
         )
@@ -274,27 +278,14 @@ class ResumableStream:
         self._unanswered = self._unanswered_bytes = 0
 
     def _pack(self) -> Datagram:
-        """Number and wrap as many queued frames as fit."""
-        flags = _CONTINUES if self._rest else 0
-        pieces: list[BytesLike] = []
-        lengths: list[int] = []
-        room = self._budget
-        while (self._rest or self._queue) and room > 0:
-            taken, self._rest = _split(self._rest or self._queue.popleft(), room)
-            pieces += taken
-            lengths.append(sum(map(len, taken)))
-            room -= lengths[-1] + _LENGTH
-            if self._rest:
-                flags |= _UNFINISHED
-                break
-        self._queued_bytes -= sum(lengths)
-        return self._number(flags, lengths, pieces)
-
-    def _number(self, flags: int, lengths: list[int], pieces: list[BytesLike]) -> Datagram:
-        count = len(lengths)
+        """Number and wrap what goes next."""
+        entries = self._turns.take()
+        count = len(entries)
         self._sent += 1
-        head = _HEADER.pack(DATA, flags, count, self._sent, self._received)
-        whole = (head, struct.pack(f"<{count}I", *lengths), *pieces)
+        head = _HEADER.pack(DATA, count, self._sent, self._received)
+        words = struct.pack(f"<{count}I", *[entry.word for entry in entries])
+        pieces = [piece for entry in entries for piece in entry.pieces]
+        whole = (head, words, *pieces)
         datagram = whole if max(map(len, pieces), default=0) >= LARGE else b"".join(whole)
         self._unacknowledged.append(datagram)
         self._unacknowledged_bytes += _size(datagram)
@@ -305,8 +296,8 @@ class ResumableStream:
             self._acknowledged += 1
             self._unacknowledged_bytes -= _size(self._unacknowledged.popleft())
 
-    def _take(self, datagram: BytesLike, flags: int, count: int, now: float) -> list[Frame]:
-        frames = self._unpack(datagram, flags, count)
+    def _take(self, datagram: BytesLike, count: int, now: float) -> list[Frame]:
+        frames = self._unpack(datagram, count)
         self._received += 1
         self._counts["frames_received"] += len(frames)
         self._unanswered += 1
@@ -318,39 +309,44 @@ class ResumableStream:
             self._ack_due = now + ACK_DELAY
         return frames
 
-    def _unpack(self, datagram: BytesLike, flags: int, count: int) -> list[Frame]:
-        at = _HEADER.size + _LENGTH * count
+    def _unpack(self, datagram: BytesLike, count: int) -> list[Frame]:
+        at = _HEADER.size + WORD * count
         fits = count > 0 and at <= len(datagram)
-        lengths = struct.unpack_from(f"<{count}I", datagram, _HEADER.size) if fits else ()
-        if not fits or at + sum(lengths) != len(datagram):
+        words = struct.unpack_from(f"<{count}I", datagram, _HEADER.size) if fits else ()
+        if not fits or at + sum([word & LENGTH for word in words]) != len(datagram):
             raise ProtocolError(
-                f"a datagram of {len(datagram)} bytes does not hold the {count} frames it announces"
+                f"a datagram of {len(datagram)} bytes does not hold the {count} entries that it "
+                "announces"
             )
-        if bool(flags & _CONTINUES) != (self._partial is not None):
-            raise ProtocolError("a datagram does not go on where the one before it ended")
+        view = memoryview(datagram)
         frames: list[Frame] = []
-        for length in lengths:
-            frame = bytearray() if self._partial is None else self._partial
-            self._partial = None
-            frame += memoryview(datagram)[at : at + length]
-            frames.append(frame)
-            at += length
-        if flags & _UNFINISHED:
-            self._partial = frame
-            frames.pop()
+        for word in words:
+            end = at + (word & LENGTH)
+            if word >= FIRST | LAST:
+                frames.append(bytearray(view[at:end]))
+            else:
+                frames += self._assemble(word, view[at:end])
+            at = end
         return frames
 
-
-def _split(
-    frame: Sequence[BytesLike], room: int
-) -> tuple[Sequence[BytesLike], Sequence[BytesLike]]:
-    """As much of a frame as there is room for, and the rest."""
-    for index, piece in enumerate(frame):
-        if len(piece) > room:
-            view = memoryview(piece)
-            return (*frame[:index], view[:room]), (view[room:], *frame[index + 1 :])
-        room -= len(piece)
-    return frame, ()
+    def _assemble(self, word: int, piece: memoryview) -> list[Frame]:
+        """Take a piece of a frame; the frame if it is the last one."""
+        slot = (word >> SLOT_SHIFT) % SLOTS
+        assembly = self._assemblies[slot]
+        if bool(word & FIRST) != (assembly is None):
+            raise ProtocolError(f"a piece does not go on where slot {slot} ended")
+        try:
+            if assembly is None:
+                (size,) = SIZE.unpack_from(piece)
+                assembly = self._assemblies[slot] = Assembly(size)
+                piece = piece[SIZE.size :]
+            assembly.add(piece)
+            if not word & LAST:
+                return []
+            self._assemblies[slot] = None
+            return [assembly.frame()]
+        except (struct.error, ValueError, OverflowError, OSError) as error:
+            raise ProtocolError(f"a frame in pieces cannot be put together: {error}") from error
 
 
 def _size(datagram: Datagram) -> int:

@@ -4,20 +4,21 @@ Nothing here is unpickled: a frame is a few numbers and then opaque bytes, which
 that they are meant for opens.  What it carries for the user stays out of its repr, and so of logs.
 
 Layout (little endian): version:u8, kind:u8, then each kind's own numbers and the rest.  Packets are
-count:u32, buffer length:u64 * count, payload and buffers.
+count:u32, payload length:u64, buffer length:u64 * count, the payload, and each buffer at the next
+multiple of ALIGNMENT.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
-from fiber._wire.packet import INLINE_LIMIT
+from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
 from fiber.errors import FiberError
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Version of everything that master and agent say to each other; both must have the same."""
 
 DIGEST_BYTES = 32
@@ -110,8 +111,12 @@ class Deliver(NamedTuple):
 
     def encode(self) -> bytes:
         """The frame."""
+        return b"".join(self.pieces())
+
+    def pieces(self) -> Sequence[BytesLike]:
+        """The frame, of which the buffers and a large payload are not copied."""
         head = _DELIVERY.pack(PROTOCOL, _DELIVER, self.child, self.seq)
-        return _packet(head, self.payload, self.buffers)
+        return _pieces(head, self.payload, self.buffers)
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -287,7 +292,7 @@ OfHubs: TypeAlias = TunnelOpen | TunnelData | TunnelClose | Memory
 """What the hubs of both sides say to each other."""
 
 
-def decode(frame: bytes | bytearray) -> Message:
+def decode(frame: BytesLike) -> Message:
     """Read a frame; ProtocolError says what is wrong with one that cannot be read.
 
     Payloads and buffers are views of ``frame``: not copied, and writable if it is a bytearray.
@@ -322,47 +327,68 @@ _NUMBERS = struct.Struct("<BBQq")
 _DELIVERY = struct.Struct("<BBQQ")
 _GRACE = struct.Struct("<BBd")
 _BLOB_HEAD = struct.Struct(f"<BB{DIGEST_BYTES}s")
-_COUNT = struct.Struct("<I")
-_NO_BUFFERS = _COUNT.pack(0)
+_PACKET = struct.Struct("<IQ")
 
 
 def pieces(message: Message) -> Sequence[BytesLike]:
     """A message's frame, in pieces if it has large ones: these are not copied."""
-    if isinstance(message, FromChild | TunnelData):
+    if isinstance(message, Deliver | FromChild | TunnelData):
         return message.pieces()
     return (message.encode(),)
 
 
-def _packet(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> bytes:
-    return b"".join(_pieces(head, payload, buffers))
+def lane(message: Message) -> Hashable:
+    """The lane that the message travels in.
+
+    Messages about one child's tasks keep their order, and so do those of one tunnel.  A Signal is
+    in no lane: it does not wait for what a child was sent.
+    """
+    if isinstance(message, TunnelData | TunnelClose):
+        return (_TUNNEL_DATA, message.tunnel)
+    if isinstance(message, Deliver | FromChild | Recall | Recalled | Exited | Output):
+        return (_DELIVER, message.child)
+    return None
 
 
-def _pieces(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> tuple[BytesLike, ...]:
+def _pieces(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> Sequence[BytesLike]:
     views = [memoryview(buffer).cast("B") for buffer in buffers]
     sizes = [view.nbytes for view in views]
-    table = struct.pack(f"<I{len(sizes)}Q", len(sizes), *sizes) if sizes else _NO_BUFFERS
-    if memoryview(payload).nbytes > INLINE_LIMIT:
-        return (head + table, payload, *views)
-    return (b"".join((head, table, payload)), *views)  # a small payload may be borrowed
+    length = memoryview(payload).nbytes
+    head += _PACKET.pack(len(sizes), length) + struct.pack(f"<{len(sizes)}Q", *sizes)
+    # A small payload may be borrowed.
+    parts: list[BytesLike]
+    parts = [head, payload] if length > INLINE_LIMIT else [b"".join((head, payload))]
+    end = len(head) + length
+    for view in views:
+        start = _aligned(end)
+        parts += [_PADDING[: start - end], view]
+        end = start + view.nbytes
+    return parts
 
 
 def _read_packet(view: memoryview, at: int) -> tuple[memoryview, list[memoryview]]:
-    (count,) = _COUNT.unpack_from(view, at)
-    at += _COUNT.size
-    if not count:
-        return view[at:], []
+    count, length = _PACKET.unpack_from(view, at)
+    at += _PACKET.size
     if count > len(view) // 8:
         raise ValueError(f"it announces {count} buffers")
     sizes = struct.unpack_from(f"<{count}Q", view, at)
     at += 8 * count
-    start = len(view) - sum(sizes)
-    if start < at:
-        raise ValueError(f"it announces buffers of {sum(sizes)} bytes")
-    payload, buffers = view[at:start], []
+    end = at + length
+    payload, buffers = view[at:end], []
     for size in sizes:
-        buffers.append(view[start : start + size])
-        start += size
+        start = _aligned(end)
+        end = start + size
+        buffers.append(view[start:end])
+    if end != len(view):
+        raise ValueError(f"it announces a packet that ends after {end} bytes")
     return payload, buffers
+
+
+def _aligned(offset: int) -> int:
+    return -(-offset // ALIGNMENT) * ALIGNMENT
+
+
+_PADDING = bytes(ALIGNMENT)
 
 
 def _utf8(text: str) -> bytes:

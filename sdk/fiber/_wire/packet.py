@@ -9,6 +9,8 @@ Layout (little endian)::
     kind:u8 = PLAIN     payload
     kind:u8 = PARTS     count:u32, payload length:u64, buffer lengths:u64 * count,
                         then payload and buffers, here or (IN_MEMFD) in the first descriptor
+    kind:u8 = PASSED    the same, then where each of them lies in the first descriptor:u64 (0 for
+                        the payload: here); they came from another host, and lie where they arrived
 
 Buffers are pickle protocol 5's out-of-band buffers (PEP 574).
 """
@@ -27,6 +29,7 @@ from itertools import starmap
 from typing import Any, TypeAlias
 
 from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, in_place, release
+from fiber._wire.assembly import place_of
 from fiber._wire.descriptor import own
 from fiber.errors import ConnectionClosed, FileTooLarge, TooManyOpenFiles
 
@@ -54,12 +57,15 @@ MAX_BUFFERS = 1024
 PLAIN = b"\x00"
 PARTS = 1
 PARTS_IN_MEMFD = 2
+PASSED = 3
+
+ALIGNMENT = 64
+"""Of parts in a descriptor, for vector loads."""
 
 _PARTS = struct.Struct("<BIQ")
 _SIZE = struct.Struct("<Q")
 _FD = struct.Struct("i")
-_ALIGNMENT = 64
-_RECEIVE = INLINE_LIMIT + len(BALLAST) + 16384
+_RECEIVE = INLINE_LIMIT + len(BALLAST) + 32768
 _ANCILLARY = socket.CMSG_SPACE(_FD.size * (MAX_DESCRIPTORS + 1))
 _CLOEXEC = int(socket.MSG_CMSG_CLOEXEC)
 _DONTWAIT = int(socket.MSG_DONTWAIT) | _CLOEXEC
@@ -220,6 +226,8 @@ def _send_parts(
         head = _PARTS.pack(PARTS, len(sizes), size) + table
         _sendmsg(sock, [head, payload, *buffers], fds)
         return
+    if _pass_on(sock, payload, buffers, fds, [size, *sizes], ballast):
+        return
     offsets, total = _offsets([size, *sizes])
     head = _PARTS.pack(PARTS_IN_MEMFD, len(sizes), size) + table
     block = _arena.claim(total)
@@ -231,6 +239,32 @@ def _send_parts(
         raise
     # What else is raised may be a signal's handler's, after it was sent: the block is forgotten.
     _arena.settle(block, sent=True)
+
+
+def _pass_on(
+    sock: socket.socket,
+    payload: BytesLike,
+    buffers: Sequence[memoryview],
+    fds: Sequence[int],
+    sizes: list[int],
+    ballast: bytes,
+) -> bool:
+    """Send the descriptor of the memory in which the parts arrived; False if they lie elsewhere."""
+    inline = sizes[0] <= INLINE_LIMIT
+    offsets = [0] * inline
+    owner = None
+    for view in buffers if inline else [memoryview(payload), *buffers]:
+        place = place_of(view)
+        if place is None or owner not in (None, place[0]):
+            return False
+        owner = place[0]
+        offsets.append(place[1])
+    if owner is None:
+        return False
+    table = b"".join(map(_SIZE.pack, [*sizes[1:], *offsets]))
+    head = _PARTS.pack(PASSED, len(buffers), sizes[0]) + table
+    _sendmsg(sock, [head, payload if inline else b"", ballast], [owner.fileno(), *fds])
+    return True
 
 
 def _sendmsg(sock: socket.socket, parts: Sequence[BytesLike], fds: Sequence[int]) -> None:
@@ -245,7 +279,7 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
     """Where each part lies in a block, aligned for vector loads, and where the last one ends."""
     offsets, end = [], DATA_OFFSET
     for size in sizes:
-        start = -(-end // _ALIGNMENT) * _ALIGNMENT
+        start = -(-end // ALIGNMENT) * ALIGNMENT
         offsets.append(start)
         end = start + size
     return offsets, end
@@ -307,7 +341,7 @@ def _recvmsg(sock: socket.socket, data: bytearray, call: _Call) -> _Received:
             # the peer sent before; the next call delivers that, or the end.
             received.extend(starmap(sock.recvmsg_into, call))
         ancillary = received[0][1]
-        if ancillary and data[0] == PARTS_IN_MEMFD:
+        if ancillary and data[0] in (PARTS_IN_MEMFD, PASSED):
             received.extend(map(own, _rights(ancillary)[:1]))
         return received
     except BaseException:
@@ -343,6 +377,8 @@ def _receive_parts(buffer: _Buffer, received: _Received, *, passing: bool = Fals
             return _inline_parts(view[offset:size], sizes, lent)
         if not memory:
             raise ValueError("a large message without its memory")
+        if kind == PASSED:
+            return _passed_parts(view[offset:size], sizes, lent, memory[0].fileno())
         return _memory_parts(sizes, lent, memory[0].fileno(), passing=passing)
     except BaseException:
         lent.close_descriptors()
@@ -372,6 +408,23 @@ def _memory_parts(sizes: list[int], lent: Message, memory: int, *, passing: bool
     else:
         views = [_copy_out(memory, at, size) for at, size in zip(offsets, sizes, strict=True)]
         release(memory)
+    lent.release()
+    return Message(views[0], views[1:], lent.fds)
+
+
+def _passed_parts(rest: memoryview, sizes: list[int], lent: Message, memory: int) -> Message:
+    """Map the parts, which nobody else uses, or copy them if they are not large."""
+    table = _SIZE.size * len(sizes)
+    offsets = [offset for (offset,) in _SIZE.iter_unpack(rest[:table])]
+    places = list(zip(offsets, sizes, strict=True))
+    end = max(map(sum, places))
+    if end > RETAINED_LIMIT:
+        mapped = memoryview(mmap.mmap(memory, end))
+        views = [mapped[at : at + size] for at, size in places]
+    else:
+        views = [_copy_out(memory, at, size) if at else lent.payload for at, size in places]
+    if not offsets[0]:
+        views[0] = memoryview(bytes(rest[table : table + sizes[0]]))
     lent.release()
     return Message(views[0], views[1:], lent.fds)
 

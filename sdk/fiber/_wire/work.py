@@ -6,6 +6,9 @@ To a worker (behind the sequence number that its agent put in front)::
     CALLS       head, (size:u64, buffers:u32) * count, a pickled (function, args, kwargs) each
     STOP        head
 
+A large pickle is the first of its buffers instead, with BESIDE as its size.  Items have no size:
+nothing follows the function then.
+
 From a worker, pickled tuples of plain values, so that reading one never runs the user's code::
 
     (seq, offset, kept, seconds, values, odd)   results of batch seq, its tasks from offset on
@@ -17,7 +20,8 @@ From a worker, pickled tuples of plain values, so that reading one never runs th
 ``kept`` is how many tasks of the batch the worker keeps, None for all: it gives the others back.
 ``values`` holds plain values; what is not plain is None there and stands in ``odd`` as (position
 in values, VALUE | ERROR | AGAIN, pickle, number of buffers), AGAIN being an error after which the
-pool was told to run the task again.  ``error`` is such a pickle.
+pool was told to run the task again.  A large pickle is the first of its buffers, and None here.
+``error`` is such a pickle.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
-from fiber._wire.packet import BytesLike
+from fiber._wire.packet import INLINE_LIMIT, BytesLike
 
 MAP, STAR, CALLS, STOP = range(4)
 UNREADABLE, UNKNOWN, BROKEN, READY = "unreadable", "unknown", "broken", "ready"
@@ -38,7 +42,9 @@ SEQ = struct.Struct("<Q")
 HEAD = struct.Struct("<BHIQQI")
 CALL = struct.Struct("<QI")
 
-PLAIN = frozenset({int, float, complex, str, bytes, bool, type(None)})
+NUMBERS = frozenset({int, float, complex, bool, type(None)})
+_TEXTS = frozenset({str, bytes})
+PLAIN = NUMBERS | _TEXTS
 """Immutable, and pickled and unpickled without running anyone's code."""
 
 _ROWS = frozenset({tuple, list})
@@ -60,6 +66,9 @@ class Head(NamedTuple):
     """Buffers of the message that belong to the function."""
 
 
+BESIDE = (1 << 64) - 1
+"""In place of the size of a pickle that is the first of its buffers."""
+
 BODY = SEQ.size + HEAD.size
 """Where what follows the head begins."""
 
@@ -69,22 +78,46 @@ BUFFERS = 256
 STOP_MESSAGE = HEAD.pack(STOP, 0, 1, 0, 0, 0)
 
 
-def pack_calls(calls: Sequence[tuple[bytes, Sequence[memoryview]]]) -> bytes:
-    """A message of calls that are already pickled."""
+Pickle = tuple[bytes, Sequence[memoryview]]
+"""A pickle and the buffers beside it."""
+
+
+def beside(pickle: Pickle) -> Pickle:
+    """Move a large pickle to its buffers, so that nothing on its way has to copy it."""
+    data, buffers = pickle
+    if len(data) <= INLINE_LIMIT:
+        return pickle
+    return b"", [memoryview(data), *buffers]
+
+
+def found(data: BytesLike | None, buffers: list[memoryview]) -> tuple[BytesLike, list[memoryview]]:
+    """Return a pickle, which is the first of its buffers if ``data`` is None, and the others."""
+    return (buffers[0], buffers[1:]) if data is None else (data, buffers)
+
+
+def pack_calls(calls: Sequence[Pickle]) -> bytes:
+    """A message of calls that are already pickled, and went through ``beside``."""
     if len(calls) == 1:
         data, buffers = calls[0]
-        return HEAD.pack(CALLS, 0, 1, 0, 1, 0) + CALL.pack(len(data), len(buffers)) + data
-    table = b"".join([CALL.pack(len(data), len(buffers)) for data, buffers in calls])
+        return HEAD.pack(CALLS, 0, 1, 0, 1, 0) + _entry(data, buffers) + data
+    table = b"".join([_entry(data, buffers) for data, buffers in calls])
     body = b"".join([data for data, _ in calls])
     return HEAD.pack(CALLS, 0, 1, 0, len(calls), 0) + table + body
 
 
-def unpack_calls(body: memoryview, count: int) -> Iterable[tuple[memoryview, int]]:
-    """The pickles in a message of calls, each with its number of buffers."""
+def _entry(data: bytes, buffers: Sequence[memoryview]) -> bytes:
+    return CALL.pack(len(data) or BESIDE, len(buffers))
+
+
+def unpack_calls(body: memoryview, count: int) -> Iterable[tuple[memoryview | None, int]]:
+    """The pickles in a message of calls, each with its number of buffers; None for one beside."""
     start = CALL.size * count
     for size, buffers in CALL.iter_unpack(body[:start]):
-        yield body[start : start + size], buffers
-        start += size
+        if size == BESIDE:
+            yield None, buffers
+        else:
+            yield body[start : start + size], buffers
+            start += size
 
 
 def pack_batch(head: Head, function: bytes, items: BytesLike) -> bytes:
@@ -93,10 +126,27 @@ def pack_batch(head: Head, function: bytes, items: BytesLike) -> bytes:
 
 
 def is_plain(items: Sequence[Any]) -> bool:
-    """Whether pickling ``items`` runs none of the user's code: plain values, or rows of them."""
+    """Whether pickling ``items`` runs none of the user's code and takes no time: plain values that
+    are not large, or rows of them.
+    """
     if type(items) is range:
         return True
     kinds = set(map(type, items))
     if kinds <= PLAIN:
-        return True
-    return kinds <= _ROWS and PLAIN.issuperset(map(type, chain.from_iterable(items)))
+        return kinds <= NUMBERS or not _has_large(items)
+    if not kinds <= _ROWS:
+        return False
+    kinds = set(map(type, chain.from_iterable(items)))
+    return kinds <= PLAIN and (kinds <= NUMBERS or not _has_large(chain.from_iterable(items)))
+
+
+def is_plain_value(value: Any) -> bool:
+    """The same of one value: as it is now it can be kept, pickled later and unpickled anywhere."""
+    kind = type(value)
+    if kind is tuple:
+        return PLAIN.issuperset(map(type, value)) and not _has_large(value)
+    return kind in NUMBERS or (kind in _TEXTS and len(value) <= INLINE_LIMIT)
+
+
+def _has_large(values: Iterable[Any]) -> bool:
+    return any(len(value) > INLINE_LIMIT for value in values if type(value) in _TEXTS)
