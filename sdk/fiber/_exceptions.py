@@ -1,8 +1,9 @@
-"""Exceptions that are stored and raised later."""
+"""Exceptions that are stored and raised later, or that no caller catches."""
 
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
 from types import BuiltinFunctionType, GetSetDescriptorType, MemberDescriptorType
 from typing import Any, TypeVar
@@ -66,3 +67,18 @@ def _fields(kind: type[BaseException]) -> Iterator[Any]:
             is_field = isinstance(found, MemberDescriptorType | GetSetDescriptorType)
             if is_field and not name.startswith("__"):
                 yield found
+
+
+def report_uncaught() -> None:
+    """Pass the exception being handled to ``sys.excepthook``, on a thread that has to go on.
+
+    The hook is the program's.  If it raises, the interpreter's own hook shows both exceptions.  If
+    it calls ``sys.exit()``, that has no effect, as on every thread but the main one.
+    """
+    try:
+        sys.excepthook(*sys.exc_info())
+    except SystemExit:
+        pass
+    except BaseException:
+        with contextlib.suppress(BaseException):  # stderr may be closed
+            sys.__excepthook__(*sys.exc_info())

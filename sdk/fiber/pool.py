@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -25,6 +24,7 @@ from multiprocessing.pool import (  # type: ignore[attr-defined]
 from typing import Any, Self, TypeVar
 
 from fiber._engine.chunks import default_chunksize
+from fiber._exceptions import report_uncaught
 from fiber._runtime import methods, options
 from fiber._runtime.executor import Executor
 from fiber._runtime.options import PoolOptions
@@ -404,7 +404,7 @@ class Pool:
         try:
             return self._executor.callbacks.submit(action)
         except RuntimeError:
-            sys.excepthook(*sys.exc_info())  # nobody else would hear of it
+            report_uncaught()  # nobody else would hear of it
             return False
 
     def _check_may_wait(self) -> None:

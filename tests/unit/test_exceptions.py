@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +14,10 @@ import pytest
 
 import fiber
 from fiber._exceptions import fresh
+from fiber._runtime.background import BackgroundThread
+from fiber._transport.loop import Loop
 from fiber.errors import ConnectionClosed, WorkerDied
+from patience import PATIENCE
 
 SDK = Path(fiber.__file__).parent
 
@@ -130,6 +134,35 @@ def test_what_cannot_be_copied_is_raised_itself(monkeypatch: pytest.MonkeyPatch)
     assert fresh(error) is error
     not_an_exception: Any = "text"
     assert fresh(not_an_exception) == "text"
+
+
+# Exceptions that no caller catches
+
+
+@pytest.mark.parametrize("leaves_by", [SystemExit(1), KeyboardInterrupt(), RuntimeError("hook")])
+def test_a_hook_that_raises_ends_no_thread(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    loop: Loop,
+    leaves_by: BaseException,
+) -> None:
+    thread, events = BackgroundThread("test-background"), [threading.Event() for _ in range(2)]
+
+    def hook(*_: object) -> NoReturn:
+        raise leaves_by
+
+    def fail() -> NoReturn:
+        raise ValueError("the callback")
+
+    monkeypatch.setattr(sys, "excepthook", hook)
+    for submit, event in zip((thread.submit, loop.call_soon), events, strict=True):
+        submit(fail)
+        submit(event.set)
+        assert event.wait(PATIENCE)
+    thread.stop()
+    thread.join()
+    shown = capsys.readouterr().err
+    assert ("ValueError: the callback" in shown) == (not isinstance(leaves_by, SystemExit))
 
 
 # The rule

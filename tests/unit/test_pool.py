@@ -167,7 +167,9 @@ def test_a_second_get_gives_the_same_again(pool: Pool) -> None:
         failed.get(PATIENCE)
     with pytest.raises(ValueError, match="1") as second:
         failed.get(PATIENCE)
-    assert first.value is second.value
+    assert first.value.args == second.value.args
+    assert first.value.__cause__ is second.value.__cause__
+    assert first.value is not second.value  # its traceback would grow
 
 
 def test_results_can_be_asked_how_they_are(pool: Pool, tmp_path: Path) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import wait
 from queue import Empty, Full
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
+from fiber._hub.feeder import Feeder, ItemCount
 from patience import PATIENCE
 
 MORE_THAN_FITS = 3000
@@ -182,6 +185,31 @@ def test_the_hook_for_errors_can_be_overridden() -> None:
     ((error, obj),) = reported
     assert isinstance(error, AttributeError)
     assert obj is item
+
+
+def test_a_hook_that_raises_does_not_stop_the_feeder(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(sys, "excepthook", lambda kind, error, trace: shown.append(error.args))
+    posted: list[bytes] = []
+    failures = [OSError("no memory")]
+
+    def post(payload: bytes, buffers: list[memoryview]) -> None:
+        if failures:
+            raise failures.pop()
+        posted.append(payload)
+
+    def hook(error: Exception, obj: Any) -> None:
+        sys.exit("the hook")
+
+    queue: Any = fiber.Queue()
+    outbox: Any = SimpleNamespace(can_try_send=False, post=post)
+    feeder = Feeder(queue, outbox, ItemCount(), on_error=hook, close=lambda: None)
+    feeder.put(b"1", [], [])
+    feeder.put(b"2", [], [])
+    feeder.close()
+    feeder.join()
+    assert posted == [b"2"]
+    assert shown == [("the hook",)]
 
 
 def test_a_waiting_put_goes_on_when_there_is_room() -> None:

@@ -11,6 +11,7 @@ from multiprocessing import util
 from queue import SimpleQueue
 from typing import Any
 
+from fiber._exceptions import report_uncaught
 from fiber._hub.local import LocalCounter
 from fiber._transport.base import SharedChannel, SharedCounter
 
@@ -236,7 +237,10 @@ class Feeder:
         if util.is_exiting():
             util.info("error in queue thread: %s", error)
         else:
-            self._on_error(error, None)
+            try:
+                self._on_error(error, None)
+            except BaseException:  # The hook is the user's, and other items are to be sent.
+                report_uncaught()
 
 
 def _join(thread: weakref.ref[threading.Thread]) -> None:

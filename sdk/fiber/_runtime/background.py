@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import queue
-import sys
 import threading
 from collections.abc import Callable
 from typing import Any
+
+from fiber._exceptions import report_uncaught
 
 
 class BackgroundThread:
@@ -67,5 +68,5 @@ class BackgroundThread:
                 action(*args)
             except BaseException:
                 # Mostly a callback of the user's: it must be seen, and must not end the others.
-                sys.excepthook(*sys.exc_info())
+                report_uncaught()
             del entry, action, args

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from fiber import errors
-from fiber._exceptions import fresh
+from fiber._exceptions import fresh, report_uncaught
 from fiber._runtime.calls import CallQueue
 from fiber._runtime.executor import Executor
 from fiber._runtime.outcome import Failure, Pickled
@@ -161,7 +161,10 @@ class CallFuture(Future[_T]):
         with contextlib.suppress(RuntimeError):  # the system has no room for its thread
             if self._executor.callbacks.submit(action):
                 return
-        action()  # else nobody would hear of it
+        try:
+            action()  # else nobody would hear of it
+        except BaseException:  # of a callback that exits: the loop has to go on
+            report_uncaught()
 
 
 def translated(error: BaseException, executor: Executor) -> BaseException:

@@ -11,7 +11,6 @@ import heapq
 import itertools
 import os
 import select
-import sys
 import threading
 import time
 import weakref
@@ -20,7 +19,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
 
-from fiber._exceptions import fresh
+from fiber._exceptions import fresh, report_uncaught
 from fiber._wire.descriptor import opened
 from fiber.errors import FiberError
 
@@ -311,4 +310,4 @@ def _call(callback: Callable[..., object], *args: Any) -> None:
         callback(*args)
     except Exception:
         # One broken callback must not stop the others, nor go unseen.
-        sys.excepthook(*sys.exc_info())
+        report_uncaught()
