@@ -29,7 +29,7 @@ demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
 ## make test          every test: all parts run, and the last lines say which of them failed
-test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-testsuite
+test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV)/.with-testsuite
 	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
 	@failed=; \
 	for part in $(PARTS); do $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; done; \
@@ -129,6 +129,11 @@ $(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench: $(VENV)/.made pyproject.
 # Without torch, which it needs to learn and is larger than all else together.
 $(VENV)/.with-stable-baselines3: $(VENV)/.with-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
+	touch $@
+
+# What most often starts threads in a main module. Where it has no wheel, its tests are skipped.
+$(VENV)/.with-jax: $(VENV)/.with-dev
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: 'jax>=0.4'
 	touch $@
 
 # Beside which vector environments are measured. Without torch, as above; where one has no wheel the

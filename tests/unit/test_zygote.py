@@ -22,12 +22,15 @@ import pytest
 import census
 from fiber import reduction
 from fiber._agent import child, zygote, zygote_process
+from fiber._agent.preload import Imports
 from fiber._agent.progress import ProgressTable
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
 from fiber.process import Process
 from patience import PATIENCE
 from unit.agent_children import run_forever
+
+NOTHING = Imports((), dict(os.environb))
 
 
 class Master:
@@ -37,12 +40,13 @@ class Master:
         self,
         progress_table: ProgressTable,
         *,
-        preload: bool = False,
+        imports: Imports | None = NOTHING,
         cleanup_directory: str | None = None,
+        ancestors: tuple[int, ...] = (),
     ) -> None:
         self.process, self.sock = zygote_process.launch()
         self.sock.settimeout(PATIENCE)
-        setup = (zygote.SETUP, (os.getpid(),), preload, cleanup_directory, None)
+        setup = (zygote.SETUP, (os.getpid(), *ancestors), imports, cleanup_directory, None)
         packet.send(self.sock, pickle.dumps(setup), fds=[progress_table.fd])
 
     def start(self, number: int, **options: Any) -> None:
@@ -80,9 +84,9 @@ def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.
     process = Process(target=target, args=args)
     preparation = spawn.get_preparation_data(process.name)
     preparation |= {"authkey": b"key", "calls": [], "same_host": True}
-    preparation |= options.pop("preparation", {})
     for key in ("start_method", "init_main_from_name", "init_main_from_path"):
         preparation.pop(key, None)
+    preparation |= options.pop("preparation", {})
     return zygote.StartRequest(
         name=process.name,
         host="here",
@@ -254,14 +258,14 @@ def _run(script: str, expect: int, env: Mapping[str, str] = os.environ) -> str:
 def test_once_its_imports_made_forking_unsafe_it_forks_no_more(
     progress_table: ProgressTable, method: str
 ) -> None:
-    master = Master(progress_table, preload=True)
+    master = Master(progress_table, imports=None)
     threads = {"preload": ["unit.threads_at_import"]}
     master.started(1, method="spawn")
     for number in (2, 3):
         master.start(number, preparation=threads)
-        kind, who, reason = master.hear()
+        kind, who, safe = master.hear()
         assert (kind, who) == (zygote.FORK_UNSAFE, number)
-        assert "started at import" in reason
+        assert safe.modules == ()
     assert master.started(4, method="spawn") > 0, "a new interpreter is safe all the same"
     master.close()
 
@@ -272,7 +276,7 @@ def test_the_main_module_is_imported_once_for_all(
 ) -> None:
     main, log = tmp_path / "main_module.py", tmp_path / "log"
     main.write_text(f"import os\nwith open({str(log)!r}, 'a') as f:\n    f.write('imported\\n')\n")
-    master = Master(progress_table, preload=True)
+    master = Master(progress_table, imports=None)
     for number in range(3):
         preparation = {"preload": [], "sys_path": [str(tmp_path), *sys.path]}
         master.started(number, preparation={**preparation, "preload": ["main_module"]})
@@ -286,7 +290,7 @@ def test_an_import_that_fails_does_not_end_it(
     progress_table: ProgressTable, tmp_path: Path, code: str
 ) -> None:
     (tmp_path / "broken_module.py").write_text(code)
-    master = Master(progress_table, preload=True)
+    master = Master(progress_table, imports=None)
     preparation = {"preload": ["broken_module"], "sys_path": [str(tmp_path), *sys.path]}
     assert master.started(1, preparation=preparation) > 0
     master.close()
@@ -334,7 +338,7 @@ def inside(progress_table: ProgressTable) -> Iterator[tuple[zygote.Zygote, socke
     ours, theirs = socketpair("a test")
     ours.settimeout(PATIENCE)
     watched = os.pidfd_open(os.getpid())
-    made = zygote.Zygote(theirs, progress_table, [watched], preload=False)
+    made = zygote.Zygote(theirs, progress_table, [watched], imports=NOTHING)
     yield made, ours
     for fd in (watched, made._sigchld, made._sigchld_in):
         os.close(fd)

@@ -20,6 +20,7 @@ from fiber._agent import zygote
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
 from fiber._agent.memory_limit import MemoryLimit
+from fiber._agent.preload import Imports
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_link import ZygoteLink
 from fiber._hub import client as hub_client
@@ -97,8 +98,14 @@ class Agent:
             return hub_client.inherited_address()
         return self._hub.address_or_problem
 
-    def _zygote(self, program: Blob | None, *, instead_of: ZygoteLink | None = None) -> ZygoteLink:
-        """The one for ``program``'s children: what it has imported is that program's."""
+    def _zygote(
+        self,
+        program: Blob | None,
+        *,
+        instead_of: ZygoteLink | None = None,
+        imports: Imports | None = None,
+    ) -> ZygoteLink:
+        """Return the zygote of ``program``'s children; a new one makes ``imports``."""
         link = self._newest_zygote(program)
         if link is None or link is instead_of:
             link = ZygoteLink(
@@ -106,7 +113,7 @@ class Agent:
                 self.loop,
                 self.progress_table.fd,
                 self._cleanup_directory,
-                preload=link is None,
+                imports=imports,
                 program=program,
                 folder=None if program is None else self._new_folder(),
             )
@@ -154,7 +161,7 @@ class Agent:
         elif reply[0] == zygote.FAILED:
             self._refused(child, reply[2])
         elif reply[0] == zygote.FORK_UNSAFE:
-            self._restart_elsewhere(child)
+            self._restart_elsewhere(child, reply[2])
 
     def abandon(self, child: LocalChild) -> None:
         """It was killed before it was born, and its zygote may be busy for long: it is gone now."""
@@ -178,16 +185,16 @@ class Agent:
                 child, -signal.SIGKILL, "killed by SIGKILL, together with its zygote"
             )
 
-    def _restart_elsewhere(self, child: LocalChild) -> None:
-        """Its zygote must not be forked: one that imports nothing serves it and all after it.
+    def _restart_elsewhere(self, child: LocalChild, imports: Imports) -> None:
+        """Start a child whose zygote must not be forked in one that makes ``imports`` alone.
 
-        What the old one runs already lives on there.
+        The same zygote then serves all later children.  Those of the old one live on.
         """
         if self._closed:
             return  # and the end of its zygote is its own
         old = child.zygote
         try:
-            new = self._zygote(child.program, instead_of=old)
+            new = self._zygote(child.program, instead_of=old, imports=imports)
             child.fork_from(new, self._access())
         except Exception as error:
             self._refused(child, error)

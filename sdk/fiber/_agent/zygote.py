@@ -5,27 +5,26 @@ imports once what its children need, so that forking is cheap.  As their parent 
 sends them signals (a pid that only we can reap cannot be someone else's).  It ends, and they with
 it, when its agent's process does.
 
-Packets from the agent: ``(SETUP, ancestors, preload, cleanup directory, program's folder)``, first
+Packets from the agent: ``(SETUP, ancestors, imports, cleanup directory, program's folder)``, first
 and once, with the descriptors of the progress table and, if there is a folder, of what belongs in
 it; ``(START, child, start request)``, ``(SIGNAL, child, signum)``,
 ``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
 Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
-``(FORK_UNSAFE, child, reason)``: this zygote's imports made forking unsafe, start that child
-elsewhere.  ``(FAILED, None, text)``: the next child of those asked for; its request is lost.
+``(FORK_UNSAFE, child, imports)``: this zygote's imports made forking unsafe, start that child in a
+zygote that makes ``imports`` alone.  ``(FAILED, None, text)``: the next child of those asked for;
+its request is lost.
 """
 
 from __future__ import annotations
 
 import contextlib
-import gc
-import importlib
 import os
 import pickle
 import resource
 import select
 import signal
 import socket
-import threading
+import sys
 import time
 import warnings
 from typing import Any, NoReturn
@@ -33,6 +32,7 @@ from typing import Any, NoReturn
 from fiber._agent import child as child_module
 from fiber._agent import program_folder
 from fiber._agent.child import StartRequest
+from fiber._agent.preload import Imports, Unfit, preload
 from fiber._agent.progress import ProgressTable
 from fiber._wire import packet
 from fiber.errors import TooManyOpenFiles
@@ -51,6 +51,8 @@ class Zygote:
     """One loop over descriptors: the agent's requests, deaths of children, deaths of ancestors.
 
     ``ancestors``: pidfds of the agent's process, which comes first, and of those that started it.
+    ``imports``: modules to import before the first fork; None for the program's main module and
+    those that the first child names.
     """
 
     def __init__(
@@ -59,7 +61,7 @@ class Zygote:
         progress_table: ProgressTable,
         ancestors: list[int],
         *,
-        preload: bool,
+        imports: Imports | None,
         program: tuple[int, str] | None = None,
     ) -> None:
         self._program = program
@@ -67,8 +69,9 @@ class Zygote:
         self._control = control
         self._progress_table = progress_table
         self._ancestors = ancestors
-        self._preload = preload
-        self._fork_unsafe: str | None = None
+        self._imports = imports
+        self._is_to_import = imports is None or bool(imports.modules)
+        self._unfit: Unfit | None = None
         self._pid = os.getpid()
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
@@ -144,7 +147,7 @@ class Zygote:
             _close_all(fds)
             return
         if start.method == "fork" and not self._is_fork_safe(start):
-            self._reply(FORK_UNSAFE, child, self._fork_unsafe)
+            self._reply(FORK_UNSAFE, child, self._unfit and self._unfit.safe)
             _close_all(fds)
             return
         # Until the child has undone it, it ignores what we ignore: a signal sent to it right after
@@ -173,11 +176,14 @@ class Zygote:
 
     def _is_fork_safe(self, start: StartRequest) -> bool:
         """Whether this process may be forked, after it has imported what it shall."""
-        if self._preload:
-            self._preload = False
-            self._fork_unsafe = _preload(start)
+        if self._is_to_import:
+            self._is_to_import = False
+            self._unfit = preload(child_module.read_preparation(start), self._imports)
             self._listen_to_signals()  # an import may have set its own
-        return self._fork_unsafe is None
+            # Once for a program: a zygote of its children would only repeat it.
+            if self._unfit is not None and self._imports is None and len(self._ancestors) == 1:
+                print(f"fiber: {self._unfit.reason}", file=sys.stderr, flush=True)
+        return self._unfit is None
 
     def _run_child(self, start: StartRequest, fds: list[int]) -> NoReturn:
         """In the forked process: drop what is the zygote's and run the child."""
@@ -244,24 +250,6 @@ class Zygote:
                 self._reply(EXITED, child, os.waitstatus_to_exitcode(status))
 
 
-def _preload(start: StartRequest) -> str | None:
-    """Import the program's main module and what it names; say why forking is unsafe after it."""
-    data = child_module.read_preparation(start)
-    child_module.prepare_paths(data)
-    for name in data.get("preload", ()):
-        # Whatever an import raises, a child that needs it will meet, and report, itself.
-        with contextlib.suppress(BaseException):
-            importlib.import_module(name)
-    with contextlib.suppress(BaseException), child_module.inheriting():
-        child_module.prepare_main(data)
-    if threading.active_count() > 1:
-        names = ", ".join(t.name for t in threading.enumerate() if t is not threading.main_thread())
-        return f"importing the main module started threads ({names})"
-    gc.collect()
-    gc.freeze()
-    return None
-
-
 def _kill(pid: int, signum: int) -> None:
     # A child that runs a set-user-ID program by now is out of our reach, but not the others.
     with contextlib.suppress(PermissionError):
@@ -275,8 +263,11 @@ def _close_all(fds: list[int]) -> None:
 
 def main(control: int, agent: int) -> None:
     """Entry point of the zygote's process; ``agent`` is the pid of the one that started it."""
-    # Native threads of libraries such as OpenBLAS, which handle forks, are what this warns of.
+    # Python and JAX warn of any thread, and of any fork.  Ours come after a trial (preload.py).
     warnings.filterwarnings("ignore", message=".*multi-threaded.*fork", category=DeprecationWarning)
+    warnings.filterwarnings(
+        "ignore", r"os\.fork\(\) was called", RuntimeWarning, r"fiber\._agent\."
+    )
     os.set_inheritable(control, False)
     # A program that raised its limit after it started us may send more than ours.
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -301,7 +292,7 @@ def _run_zygote(
     sock: socket.socket,
     fds: list[int],
     ancestors: tuple[int, ...],
-    preload: bool,
+    imports: Imports | None,
     cleanup_directory: str | None,
     folder: str | None,
 ) -> None:
@@ -318,7 +309,7 @@ def _run_zygote(
             sock,
             ProgressTable(progress_table),
             watched,
-            preload=preload,
+            imports=imports,
             program=None if folder is None else (archive[0], folder),
         ).run()
     ours = folder if told_to else cleanup_directory

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from fiber._agent import zygote, zygote_process
 from fiber._agent.child import StartRequest, lineage
+from fiber._agent.preload import Imports
 from fiber._agent.zygote_process import is_standard_stream
 from fiber._transport.loop import Loop
 from fiber._transport.outbox import Outbox
@@ -42,11 +43,13 @@ class ZygoteLink:
         progress_table: int,
         cleanup_directory: Callable[[], str | None],
         *,
-        preload: bool,
+        imports: Imports | None,
         program: Blob | None = None,
         folder: str | None = None,
     ) -> None:
-        """``program``: the files that it is to unpack to ``folder``, for its children."""
+        """``imports``: as in ``zygote.Zygote``.  ``program``: files that the zygote unpacks to
+        ``folder``, for its children.
+        """
         self.program = program
         self.folder = folder
         self.retired = False
@@ -71,7 +74,7 @@ class ZygoteLink:
         self._sock.setblocking(False)
         self._outbox = Outbox(loop, self._sock)
         # Made at the last moment: from here on the zygote removes it, whoever is killed.
-        setup = (zygote.SETUP, lineage(), preload, cleanup_directory(), folder)
+        setup = (zygote.SETUP, lineage(), imports, cleanup_directory(), folder)
         self._outbox.send(pickle.dumps(setup), fds=fds)
         loop.register(self._sock.fileno(), self._receive)
 

@@ -1,0 +1,202 @@
+"""Imports that a zygote makes once for its children, and whether it may be forked after them.
+
+Only the thread that forks lives on in the child.  A lock that another thread held, or a pool of
+threads that a library counts on, then makes the child wait for ever.  Some libraries know that:
+the threads of OpenBLAS end before a fork and start again when they are needed.  Those of XLA (JAX)
+and of GNU's OpenMP do not.  A trial fork tells them apart: threads that are there after it count.
+"""
+
+from __future__ import annotations
+
+import builtins
+import contextlib
+import gc
+import importlib
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from fiber._agent import child
+
+_TRIAL_TIMEOUT = 10.0
+"""Seconds that the process of a trial fork has to end."""
+
+_SETTLING = 0.1
+"""Seconds until the kernel has forgotten a thread that was joined."""
+
+_MAIN = "__mp_main__"
+
+
+class Imports(NamedTuple):
+    """Modules to import, and the environment variables to do it with."""
+
+    modules: tuple[str, ...]
+    environ: dict[bytes, bytes]
+
+
+class Unfit(NamedTuple):
+    """Why a zygote must not be forked."""
+
+    reason: str
+    safe: Imports
+    """Imports for the next zygote: those of the program up to the one that starts threads."""
+
+
+def preload(data: dict[str, Any], only: Imports | None) -> Unfit | None:
+    """Import ``only``, or else what ``data`` names and the main module; None if forking is safe."""
+    if only is not None:
+        os.environb.clear()
+        os.environb.update(only.environ)
+    child.prepare_paths(data)
+    preloader = _Preloader()
+    for name in data.get("preload", ()) if only is None else only.modules:
+        preloader.load(name)
+    if only is None:
+        preloader.load_main(data)
+    gc.collect()
+    gc.freeze()
+    return preloader.verdict()
+
+
+class _Preloader:
+    """Imports modules, and looks after each of them for threads that a fork would break."""
+
+    def __init__(self) -> None:
+        self._threads = 1
+        if not self._is_fit():
+            # Threads of any interpreter here: the next zygote would have them as well.
+            self._threads = _count_threads()
+        self._culprit: str | None = None
+        self._names = ""
+        self._safe: list[str] = []
+        self._environ = dict(os.environb)
+        self._seconds = 0.0
+        """Duration of all imports but those in ``_safe``."""
+
+    def load(self, name: str) -> None:
+        """Import the module ``name``."""
+        begin = time.perf_counter()
+        # Whatever an import raises, a child that needs the module meets, and reports, itself.
+        with contextlib.suppress(BaseException):
+            importlib.import_module(name)
+        is_fit = self._check(name)
+        self._seconds += time.perf_counter() - begin
+        if is_fit:
+            self._keep((name,), begin)
+
+    def load_main(self, data: dict[str, Any]) -> None:
+        """Import the main module, as the children will."""
+        begin = time.perf_counter()
+        main = data.get("init_main_from_name") or data.get("init_main_from_path") or _MAIN
+        with contextlib.suppress(BaseException), child.inheriting(), self._checking_imports(main):
+            child.prepare_main(data)
+        self._seconds += time.perf_counter() - begin
+        self._check(main)
+
+    def verdict(self) -> Unfit | None:
+        """None if this process may be forked."""
+        if self._culprit is None:
+            return None
+        reason = (
+            f"importing {self._culprit} starts threads ({self._names}), and a process that has "
+            "threads cannot be forked safely. Each process makes that import for itself, which "
+            f"takes {self._seconds * 1000:.0f} ms. "
+            "Start the threads in a function to save that time."
+        )
+        return Unfit(reason, Imports(tuple(self._safe), self._environ))
+
+    @contextlib.contextmanager
+    def _checking_imports(self, main: str) -> Iterator[None]:
+        """Check before and after each import statement of the main module."""
+        original = builtins.__import__
+
+        def checked(
+            name: str,
+            globals: Mapping[str, object] | None = None,
+            locals: Mapping[str, object] | None = None,
+            fromlist: Sequence[str] | None = (),
+            level: int = 0,
+        ) -> ModuleType:
+            is_mains = globals is not None and globals.get("__name__") == _MAIN
+            is_fit = is_mains and self._check(main)
+            begin = time.perf_counter()
+            module = original(name, globals, locals, fromlist or (), level)
+            whole = module.__name__ if level else name
+            if is_fit and self._check(whole):
+                parts = [f"{whole}.{part}" for part in fromlist or ()]
+                self._keep((whole, *(part for part in parts if part in sys.modules)), begin)
+            return module
+
+        builtins.__import__ = checked
+        try:
+            yield
+        finally:
+            if builtins.__import__ is checked:
+                builtins.__import__ = original
+
+    def _check(self, culprit: str) -> bool:
+        """Whether a fork is safe up to here; if it no longer is, ``culprit`` is the reason."""
+        if self._culprit is None and not self._is_fit():
+            self._culprit, self._names = culprit, _names_of_threads()
+        return self._culprit is None
+
+    def _keep(self, modules: Sequence[str], begin: float) -> None:
+        """Let the next zygote import ``modules``, which were imported since ``begin``."""
+        self._safe += modules
+        self._environ = dict(os.environb)
+        self._seconds -= time.perf_counter() - begin
+
+    def _is_fit(self) -> bool:
+        """Whether no thread is there that a fork would break."""
+        return _count_threads() <= self._threads or (
+            _trial_fork_ends() and _comes_down_to(self._threads)
+        )
+
+
+def _count_threads() -> int:
+    return len(os.listdir("/proc/self/task"))
+
+
+def _comes_down_to(threads: int) -> bool:
+    end = time.monotonic() + _SETTLING
+    while _count_threads() > threads:
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.001)
+    return True
+
+
+def _trial_fork_ends() -> bool:
+    """Fork, which makes some libraries end their threads; whether the new process could end."""
+    try:
+        pid = os.fork()
+    except OSError:
+        return False
+    if pid == 0:
+        os._exit(0)
+    watched = os.pidfd_open(pid)
+    try:
+        poller = select.poll()
+        poller.register(watched, select.POLLIN)
+        if not poller.poll(_TRIAL_TIMEOUT * 1000):
+            os.kill(pid, signal.SIGKILL)
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    finally:
+        os.close(watched)
+
+
+def _names_of_threads() -> str:
+    """Names of all threads but the first, whose name those without one have too."""
+    names = {thread.name for thread in threading.enumerate()} - {threading.main_thread().name}
+    for task in os.listdir("/proc/self/task"):
+        with contextlib.suppress(OSError), open(f"/proc/self/task/{task}/comm") as comm:
+            names.add(comm.read().strip())
+    with open("/proc/self/comm") as comm:
+        names.discard(comm.read().strip())
+    return ", ".join(sorted(names)) or "without names"
