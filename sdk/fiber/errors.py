@@ -326,7 +326,7 @@ class WorkerDied(FiberError):
 _CRASHES = frozenset({signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE, signal.SIGABRT})
 
 
-_ADVICE_ON_PODS = {
+_ADVICE_BY_WORD = {
     "Deleted": "find out who deletes the pods; allow more attempts (retries) if that is as it is.",
     "Evicted": "its node ran short of what the pod used beyond its share, or is drained. Ask for "
     "what a task needs with @fiber.meta(memory=, cpu=), or allow more attempts (retries).",
@@ -335,14 +335,16 @@ _ADVICE_ON_PODS = {
     "hold less.",
     "Preempted": "pods of a higher priority took its place. Give these a priorityClassName in the "
     "template of fiber.init(), let tasks be shorter, or allow more attempts (retries).",
+    "WrongAnswer": "only Fiber itself writes to the channel of a worker. Look for code in the task "
+    "or its libraries that does so, or that writes to descriptors which are not its own.",
 }
-"""By Kubernetes' word for the end of a pod."""
+"""By the first word of the reason: Kubernetes' for the end of a pod, or Fiber's."""
 
 
 def _advice(exitcode: int | None, reason: str) -> str:
-    on_pod = _ADVICE_ON_PODS.get(reason.partition(":")[0])
-    if on_pod:
-        return on_pod
+    by_word = _ADVICE_BY_WORD.get(reason.partition(":")[0])
+    if by_word:
+        return by_word
     if exitcode is None:
         return "look at the host and its agent; how the worker itself ended is not known."
     if exitcode == -signal.SIGKILL:

@@ -146,9 +146,9 @@ class Audit:
         ref = self._names.ref(job, index, item)
         require(ref == (account.number, index), f"{ref} is taken for task {index}")
 
-    def _receive(self, seq: int, *args: Any, **options: Any) -> Receipt | None:
+    def _receive(self, worker: Worker, seq: int, *args: Any, **options: Any) -> Receipt | None:
         batch = self._ledger.batches.get(seq)
-        receipt: Receipt | None = self._real.receive(seq, *args, **options)
+        receipt: Receipt | None = self._real.receive(worker, seq, *args, **options)
         if batch is not None and seq not in self._ledger.batches and batch.worker in self._left:
             self._left[batch.worker] -= batch.units
         account = self._names.account(receipt.job) if receipt is not None else None

@@ -11,10 +11,10 @@ from typing import Any
 from fiber._agent.interface import ExitReport
 from fiber._engine import ledger as engine
 from fiber._engine.chunks import Pace
-from fiber._engine.ledger import Ledger
+from fiber._engine.ledger import Ledger, WrongAnswer
 from simulation.agents import Child
 from simulation.audit import Audit
-from simulation.oracle import Account, Violation
+from simulation.oracle import Account, Violation, require
 from simulation.schedule import Act, Famine, Schedule
 from simulation.workers import NO_OP, Ready, Ref, Results, Unreadable, Work, Worker
 from simulation.world import World
@@ -51,6 +51,7 @@ class Member:
         self.child: Child
         self.worker: engine.Worker | None = None
         self.leaving = False
+        self.convicted = False
         self._master = master
 
     def started(self, pid: int) -> None:
@@ -105,6 +106,7 @@ class LedgerMaster:
         self._audit = Audit(world, ledger, Names())
         self._rng = random.Random(f"{world.schedule.seed} master")
         self._members: dict[Child, Member] = {}
+        self._gone: dict[Child, engine.Worker] = {}
         self._terminated = False
         self._pace = Pace()
         self._recall_at: float | None = None
@@ -203,29 +205,42 @@ class LedgerMaster:
         if isinstance(said, Ready):
             self.ledger.starting -= 1
             member.worker = self.ledger.add(member, self._now, self.world.schedule.left)
-        elif isinstance(said, Results):
-            if member.worker is not None and self._direct.get(member.worker) == said.seq:
-                del self._direct[member.worker]  # its caller hears it
-            else:
-                self._take(said)
-        elif isinstance(said, Unreadable):
-            self._split(said.seq)
+        elif member.worker is not None and not member.convicted:
+            try:
+                self._hear(member.worker, said)
+            except WrongAnswer as error:
+                self.world.note("%s is convicted: %s", member.child.name, error)
+                member.convicted = member.leaving = True
+                self.ledger.retire(member.worker)
+                member.child.signal(signal.SIGKILL)
         self._settle()
+
+    def _hear(self, worker: engine.Worker, said: Any) -> None:
+        if isinstance(said, Unreadable):
+            if self.ledger.held(worker, said.seq) is not None:
+                self._split(said.seq)
+        elif self._direct.get(worker) == said.seq:
+            del self._direct[worker]  # its caller hears it
+        else:
+            self._take(worker, said)
 
     def heard_late(self, child: Child, said: Any) -> None:
         """A worker that was given up says something: it must count for nothing."""
-        if isinstance(said, Results):
-            _require_dropped(self._receive(said))
-        elif isinstance(said, Unreadable):
-            _require_dropped(self.ledger.split(said.seq, self._now))
+        worker = self._gone.get(child)
+        if worker is not None and isinstance(said, Results):
+            _require_dropped(self._receive(worker, said))
+        elif worker is not None and isinstance(said, Unreadable):
+            require(self.ledger.held(worker, said.seq) is None, "a lost worker has a batch")
         self._settle()
 
-    def _receive(self, said: Results) -> engine.Receipt | None:
+    def _receive(self, worker: engine.Worker, said: Results) -> engine.Receipt | None:
         seq, offset, tasks, seconds, kept = said
-        return self.ledger.receive(seq, offset, len(tasks), self._now, seconds=seconds, kept=kept)
+        return self.ledger.receive(
+            worker, seq, offset, len(tasks), self._now, seconds=seconds, kept=kept
+        )
 
-    def _take(self, said: Results) -> None:
-        receipt = self._receive(said)
+    def _take(self, worker: engine.Worker, said: Results) -> None:
+        receipt = self._receive(worker, said)
         if receipt is None:
             return
         indexes = range(receipt.start, receipt.start + receipt.size)
@@ -264,6 +279,7 @@ class LedgerMaster:
         if member.worker is None:
             self.ledger.starting -= 1
         else:
+            self._gone[member.child] = member.worker
             self._lose(member.worker, report)
         self._settle()
 

@@ -166,6 +166,8 @@ class Oracle:
 
     @staticmethod
     def _is_suspect(worker: Worker, seq: int, offset: int) -> bool:
+        if worker.has_lied:
+            return True  # what it has truly done was not heard
         if worker.work is None or worker.work.seq != seq:
             return False  # never read, or answered in full
         if worker.board is None or worker.board[0] != seq:

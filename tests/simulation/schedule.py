@@ -123,6 +123,14 @@ class Repeat:
 
 
 @dataclass(frozen=True, slots=True)
+class Lie:
+    """The ``message``-th message of a worker says something wrong in its place."""
+
+    worker: int
+    message: int
+
+
+@dataclass(frozen=True, slots=True)
 class Refusal:
     """The ``start``-th time that a worker is to be started the system says no."""
 
@@ -156,7 +164,18 @@ class Terminate:
 
 
 Fault: TypeAlias = (
-    Crash | Kill | StillBirth | Stop | Slow | Cut | Repeat | Refusal | Famine | Drain | Terminate
+    Crash
+    | Kill
+    | StillBirth
+    | Stop
+    | Slow
+    | Cut
+    | Repeat
+    | Lie
+    | Refusal
+    | Famine
+    | Drain
+    | Terminate
 )
 
 
@@ -199,6 +218,7 @@ class _Draw:
     def __init__(self, seed: int) -> None:
         self.seed = seed
         self.rng = random.Random(seed)
+        self.liars = random.Random(f"{seed} liars")
         self.horizon = 5e-3
         """Seconds within which most will have happened: the first workers start, and the work."""
 
@@ -288,6 +308,8 @@ class _Draw:
                 case "cut":
                     seconds = rng.choice((0.1, 5.0, 14.0, 16.0, 40.0, FOREVER))
                     yield Cut(rng.randint(1, remote), self.time(), seconds)
+        if self.liars.random() < 0.15:
+            yield Lie(self.liars.randrange(workers + 3), self.liars.randint(1, 10))
         if rng.random() < 0.05:
             yield Terminate(self.time())
         if rng.random() < 0.1:

@@ -177,9 +177,9 @@ def pickles_on_the_loop(patch: Patch) -> None:
 
 
 def unpickles_on_the_loop(patch: Patch) -> None:
-    def _unreadable(self: Receiver, kind: str, seq: int, error: Pickled) -> None:
+    def _unreadable(self: Receiver, kind: str, batch: Batch, error: Pickled) -> None:
         error.decode()
-        real(self, kind, seq, error)
+        real(self, kind, batch, error)
 
     real = Receiver._unreadable
     patch.setattr(Receiver, "_unreadable", _unreadable)

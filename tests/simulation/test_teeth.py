@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
+from fiber._engine.ledger import Batch, Job, Ledger, Loss, Receipt, Worker, WrongAnswer
 from simulation.explore import Failure, Suite, examine, first_failure, run
 from simulation.ledger_master import LedgerMaster, for_ledger
 from simulation.schedule import draw
@@ -39,9 +39,22 @@ class KeepsLostBatches(Ledger):
 
 
 class TakesResultsTwice(Ledger):
-    def receive(self, seq: int, offset: int, count: int, now: float, **rest: Any) -> Receipt | None:
+    def receive(self, worker: Worker, seq: int, offset: int, *rest: Any, **more: Any) -> Any:
         batch = self.batches.get(seq)
-        return super().receive(seq, batch.received if batch else offset, count, now, **rest)
+        return super().receive(worker, seq, batch.received if batch else offset, *rest, **more)
+
+
+class BelievesAnyone(Ledger):
+    def held(self, worker: Worker, seq: int) -> Batch | None:
+        return self.batches.get(seq)
+
+
+class IgnoresWrongAnswers(Ledger):
+    def receive(self, *args: Any, **options: Any) -> Receipt | None:
+        try:
+            return super().receive(*args, **options)
+        except WrongAnswer:
+            return None
 
 
 class ChargesUnread(Ledger):
@@ -94,8 +107,8 @@ class DropsWhatIsTakenBack(Ledger):
 
 
 class IgnoresWhatIsKept(Ledger):
-    def receive(self, seq: int, offset: int, count: int, now: float, **rest: Any) -> Receipt | None:
-        return super().receive(seq, offset, count, now, **{**rest, "kept": None})
+    def receive(self, *args: Any, **options: Any) -> Receipt | None:
+        return super().receive(*args, **{**options, "kept": None})
 
 
 class NeverRecalls(Ledger):
@@ -157,6 +170,8 @@ BROKEN = [
     ForgetsLostBatches,
     KeepsLostBatches,
     TakesResultsTwice,
+    BelievesAnyone,
+    IgnoresWrongAnswers,
     ChargesUnread,
     ChargesAllThatWasRead,
     ChargesNobody,
@@ -242,6 +257,9 @@ TELLING = {
         "is cancelled",
         "leaves",
         "in None",
+        "which another worker has",
+        "which it never had",
+        "tasks and",
     ),
     "executor": (
         "a map",

@@ -13,7 +13,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fiber._agent.watchdog import SPLIT_EAGER_AFTER
-from simulation.schedule import Act, Crash, Repeat, Slow, StillBirth, Task
+from fiber._engine.chunks import LIMIT
+from simulation.schedule import Act, Crash, Lie, Repeat, Slow, StillBirth, Task
 
 if TYPE_CHECKING:
     from simulation.agents import Child
@@ -105,6 +106,8 @@ class Worker:
         faults = world.faults_of(number)
         self._crashes = {fault.step for fault in faults if isinstance(fault, Crash)}
         self._repeats = {fault.message for fault in faults if isinstance(fault, Repeat)}
+        self._lies = {fault.message for fault in faults if isinstance(fault, Lie)}
+        self.has_lied = False
         self._slowness = max((f.factor for f in faults if isinstance(f, Slow)), default=1.0)
         self._still_born = any(isinstance(fault, StillBirth) for fault in faults)
 
@@ -261,8 +264,26 @@ class Worker:
         self._awake = True
         self.wake()
 
+    def _lie(self, truth: Any) -> Any:
+        """Something that its master can tell from the truth."""
+        self.has_lied = True
+        seqs = [
+            other.work.seq
+            for other in self._world.workers
+            if other is not self and other.work is not None and not other.dead
+        ]
+        seq = self._rng.choice([*seqs, truth.seq + 1000])
+        lie: Any = self._rng.choice((Unreadable(seq), Results(seq, 0, [], 0.0, None)))
+        if isinstance(truth, Results):
+            gap, surplus = truth.offset + 1, [*truth.tasks, *[(NO_OP, Act.FINE)] * LIMIT]
+            lie = self._rng.choice((lie, truth._replace(offset=gap), truth._replace(tasks=surplus)))
+        self._world.note("%s lies: %s", self.name, lie)
+        return lie
+
     def _say(self, message: Any) -> None:
         self._messages += 1
+        if self._messages in self._lies and not isinstance(message, Ready):
+            message = self._lie(message)
         self._child.say(message)
         if self._messages in self._repeats and not isinstance(message, Ready | Unknown | Broken):
             self._child.say(message)

@@ -24,6 +24,7 @@ from simulation.schedule import (
     Famine,
     Fault,
     Kill,
+    Lie,
     Repeat,
     Schedule,
     Slow,
@@ -185,7 +186,7 @@ class World:
         self._calls = 0
         self._faults: dict[int, list[Fault]] = {}
         for fault in plans.faults:
-            if isinstance(fault, Crash | StillBirth | Slow | Repeat):
+            if isinstance(fault, Crash | StillBirth | Slow | Repeat | Lie):
                 self._faults.setdefault(fault.worker, []).append(fault)
         self._master = make_master(self)
         self.language = self._master.language

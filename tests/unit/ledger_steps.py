@@ -37,7 +37,9 @@ def assign_all(ledger: Ledger, now: float = 0.0) -> list[Batch]:
 def answer(ledger: Ledger, batch: Batch, now: float = 0.0) -> list[int]:
     """The whole batch is done; returns the tasks whose results counted."""
     size = len(batch.items) - batch.received
-    receipt = ledger.receive(batch.seq, batch.received, size, now, seconds=1e-3 * size)
+    receipt = ledger.receive(
+        batch.worker, batch.seq, batch.received, size, now, seconds=1e-3 * size
+    )
     return list(range(receipt.start, receipt.start + receipt.size)) if receipt else []
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from fiber._engine.chunks import SLOW
+from fiber._engine.ledger import WrongAnswer
 from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, run_to_end
 
 # Giving
@@ -298,33 +299,63 @@ def test_results_may_come_in_pieces() -> None:
     ledger, _ = ledger_with(1)
     job = job_of(ledger, range(10), pace=known(1e-6))
     (batch,) = assign_all(ledger)
-    first = ledger.receive(batch.seq, 0, 4, 0.0)
-    rest = ledger.receive(batch.seq, 4, 6, 0.0)
+    first = ledger.receive(batch.worker, batch.seq, 0, 4, 0.0)
+    rest = ledger.receive(batch.worker, batch.seq, 4, 6, 0.0)
     assert first is not None
     assert rest is not None
     assert [(first.start, first.size), (rest.start, rest.size)] == [(0, 4), (4, 6)]
     assert job.finished
 
 
-def test_duplicate_late_and_foreign_results_do_not_count() -> None:
+def test_repeated_and_late_results_do_not_count() -> None:
     ledger, (worker,) = ledger_with(1)
     job = job_of(ledger, range(10), pace=known(1e-6))
     (batch,) = assign_all(ledger)
-    assert ledger.receive(batch.seq, 0, 4, 0.0)
-    assert ledger.receive(batch.seq, 0, 4, 0.0) is None, "a duplicate counted"
-    assert ledger.receive(batch.seq, 5, 1, 0.0) is None, "results with a gap counted"
-    assert ledger.receive(batch.seq, 4, 7, 0.0) is None, "more results than tasks counted"
-    assert ledger.receive(batch.seq + 1, 0, 1, 0.0) is None, "an unknown batch counted"
+    assert ledger.receive(worker, batch.seq, 0, 4, 0.0)
+    assert ledger.receive(worker, batch.seq, 0, 4, 0.0) is None, "a repeated result counted"
+    ledger.put_back(worker, [batch.seq], 0.0)
+    (again,) = assign_all(ledger)
+    assert ledger.receive(worker, batch.seq, 4, 6, 0.0) is None, "a result of before counted"
     ledger.lose(worker, (), None)
-    assert ledger.receive(batch.seq, 4, 6, 0.0) is None, "a late result counted"
+    assert ledger.receive(worker, again.seq, 0, 6, 0.0) is None, "a late result counted"
     assert job.done == 4
+
+
+@pytest.mark.parametrize(
+    ("seq", "offset", "count", "kept", "words"),
+    [
+        (1, 0, 1, None, "which another worker has"),
+        (3, 0, 1, None, "which it never had"),
+        (2, 3, 1, None, "results 3 to 4 of batch 2, which has 5 tasks and 2 results"),
+        (2, 0, 1, None, "results 0 to 1 of batch 2"),
+        (2, 2, 4, None, "results 2 to 6 of batch 2"),
+        (2, 2, 1, 2, "it kept 2 of 5 tasks"),
+        (2, 2, 1, 6, "it kept 6 of 5 tasks"),
+    ],
+)
+def test_a_worker_answers_for_nothing_but_its_own_next_tasks(
+    seq: int, offset: int, count: int, kept: int | None, words: str
+) -> None:
+    ledger, _ = ledger_with(2)
+    job = job_of(ledger, range(10), unit=5)
+    others, own = sorted(assign_all(ledger), key=lambda batch: batch.seq)
+    assert (others.seq, own.seq) == (1, 2)
+    assert ledger.receive(own.worker, 2, 0, 2, 0.0)
+    with pytest.raises(WrongAnswer, match=words):
+        ledger.receive(own.worker, seq, offset, count, 0.0, kept=kept)
+    assert job.done == 2
+    ledger.retire(own.worker)
+    ledger.lose(own.worker, (), (2, 2))
+    assert job.attempts == {7: 1}, "the task that it ran is not charged, as for a death"
+    assert sorted([5, 6, *run_to_end(ledger)]) == list(range(10))
+    assert job.finished
 
 
 def test_a_worker_gives_back_what_it_has_not_begun() -> None:
     ledger, (worker,) = ledger_with(1)
     job = job_of(ledger, range(10), pace=known(1e-6))
     (batch,) = assign_all(ledger)
-    ledger.receive(batch.seq, 0, 2, 0.0, kept=3)
+    ledger.receive(batch.worker, batch.seq, 0, 2, 0.0, kept=3)
     assert len(worker.queue) == 1
     assert len(job.waiting) == 7
     other = ledger.add("other", 0.0)
@@ -338,7 +369,7 @@ def test_giving_back_without_results() -> None:
     ledger, _ = ledger_with(1)
     job = job_of(ledger, range(10), pace=known(1e-6))
     (batch,) = assign_all(ledger)
-    receipt = ledger.receive(batch.seq, 0, 0, 0.0, kept=1)
+    receipt = ledger.receive(batch.worker, batch.seq, 0, 0, 0.0, kept=1)
     assert receipt is not None
     assert receipt.size == 0
     assert len(job.waiting) == 9
@@ -350,7 +381,7 @@ def test_retry_runs_a_task_again_until_it_had_its_tries() -> None:
     for attempt in range(3):
         (batch,) = assign_all(ledger)
         assert "b" in batch.items
-        receipt = ledger.receive(batch.seq, 0, len(batch.items), 0.0)
+        receipt = ledger.receive(batch.worker, batch.seq, 0, len(batch.items), 0.0)
         assert receipt is not None
         assert ledger.retry(receipt, 1) == (attempt < 2)
     assert job.finished
@@ -360,7 +391,7 @@ def test_retry_of_a_cancelled_job_is_refused() -> None:
     ledger, _ = ledger_with(1)
     job = job_of(ledger, range(2))
     batch = assign_all(ledger)[0]
-    receipt = ledger.receive(batch.seq, 0, 1, 0.0)
+    receipt = ledger.receive(batch.worker, batch.seq, 0, 1, 0.0)
     assert receipt is not None
     ledger.cancel(job)
     assert not ledger.retry(receipt, 0)

@@ -167,7 +167,7 @@ def test_only_the_running_task_is_charged() -> None:
     job = job_of(ledger, range(10), pace=known(1e-4), exact=True)
     batch, *unread = assign_all(ledger)
     assert len(batch.items) > 4
-    ledger.receive(batch.seq, 0, 2, 0.0)
+    ledger.receive(batch.worker, batch.seq, 0, 2, 0.0)
     ledger.lose(worker, [other.seq for other in unread], (batch.seq, 3))
     assert job.attempts == {3: 1}
     ledger.add("next", 0.0)
@@ -195,7 +195,7 @@ def test_results_that_came_clear_of_suspicion() -> None:
     ledger, (worker,) = ledger_with(1)
     job = job_of(ledger, range(10), pace=known(1e-4), exact=True)
     batch = assign_all(ledger)[0]
-    ledger.receive(batch.seq, 0, 2, 0.0)
+    ledger.receive(batch.worker, batch.seq, 0, 2, 0.0)
     ledger.lose(worker, (), (batch.seq, 0))
     assert job.attempts == {}
 

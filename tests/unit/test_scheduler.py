@@ -309,7 +309,7 @@ def test_a_worker_that_is_returned_while_it_runs_a_call() -> None:
     scheduler.ledger.close(job)
     assert scheduler.lent == 0
     assert not scheduler.lend(worker)
-    receipt = scheduler.ledger.receive(seq, 0, 1, 0.0)
+    receipt = scheduler.ledger.receive(worker, seq, 0, 1, 0.0)
     assert receipt is not None
     assert (receipt.job, receipt.item(0), job.finished) == (job, "call", True)
     assert scheduler.lend(worker)
@@ -324,7 +324,7 @@ def test_what_a_returned_worker_runs_for_nobody_holds_it_up_and_no_more() -> Non
     assert not scheduler.lend(worker)
     scheduler.close()
     assert scheduler.decide(0.0).dismiss == []
-    assert scheduler.ledger.receive(seq, 0, 1, 0.0) is None
+    assert scheduler.ledger.receive(worker, seq, 0, 1, 0.0) is None
     assert scheduler.decide(0.0).dismiss == members
 
 

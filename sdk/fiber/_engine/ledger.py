@@ -10,8 +10,8 @@
 * A **task** is one call, known by its job and its index in it.  At every moment it waits, is in
   exactly one batch, or is done.
 * A **batch** is a contiguous slice of one job's tasks, sent to one worker in one message and known
-  by its sequence number.  Results count only while the ledger knows the number and only from
-  where the last ones ended, so late, duplicate and foreign ones fall off.
+  by its sequence number.  Results count only if they come from the worker that has the batch, and
+  only from where the last ones ended.  Late and repeated ones are ignored, others are WrongAnswers.
 * A **worker** has at most one batch that it runs and one that it has not read yet.
 
 No clock and no I/O: ``now`` is an argument, the caller sends what ``assign`` returns.  Not
@@ -23,17 +23,20 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from operator import attrgetter
 from typing import Any
 
 from fiber._engine.chunks import Pace
 from fiber._engine.load import PATIENCE, WorkersByLoad
 from fiber._engine.spans import Span, Waiting
-from fiber._engine.tasks import Batch, Job, Loss, Receipt, Worker
+from fiber._engine.tasks import Batch, Job, Loss, Receipt, Worker, WrongAnswer
 
 LOOKAHEAD = 4
 """Jobs whose turn it is that may be passed over for one whose tasks may queue."""
 
-__all__ = ["PATIENCE", "Batch", "Job", "Ledger", "Loss", "Receipt", "Span", "Worker"]
+_by_seq = attrgetter("seq")
+
+__all__ = ["PATIENCE", "Batch", "Job", "Ledger", "Loss", "Receipt", "Span", "Worker", "WrongAnswer"]
 
 
 class Ledger:
@@ -182,7 +185,7 @@ class Ledger:
         """Give ``worker`` nothing more.  False, and nothing changed, if it is busy."""
         if worker.queue or worker.pinned:
             return False
-        self._retire(worker)
+        self.retire(worker)
         self._load.spent.pop(worker, None)
         return True
 
@@ -192,11 +195,11 @@ class Ledger:
             return []
         spent, self._load.spent = list(self._load.spent), {}
         for worker in spent:
-            self._retire(worker)
+            self.retire(worker)
         return spent
 
-    def _retire(self, worker: Worker) -> None:
-        """It is about to go: what only it was to run is for one that comes after it."""
+    def retire(self, worker: Worker) -> None:
+        """Give it nothing more, since it is about to go; a later one gets what is pinned to it."""
         worker.leaving = True
         self._unassigned_pins += worker.pinned
         worker.pinned.clear()
@@ -338,6 +341,10 @@ class Ledger:
         self._load.sort(worker)
         return True
 
+    def expect_late(self, worker: Worker, seq: int) -> None:
+        """Let a worker answer a call that its caller has given up."""
+        worker.had.append(seq)
+
     def return_idle(self, worker: Worker, now: float) -> None:
         """A lent worker is back, and has nothing to do."""
         worker.lent = False
@@ -361,8 +368,22 @@ class Ledger:
 
     # Taking
 
+    def held(self, worker: Worker, seq: int) -> Batch | None:
+        """Return the batch that ``worker`` speaks of, or None if that is over.
+
+        Raises WrongAnswer if the worker never had it.
+        """
+        batch = self.batches.get(seq)
+        if batch is not None and batch.worker is worker:
+            return batch
+        if worker not in self.workers or (batch is None and seq in worker.had):
+            return None
+        whose = "which it never had" if batch is None else "which another worker has"
+        raise WrongAnswer(f"it answered for batch {seq}, {whose}")
+
     def receive(
         self,
+        worker: Worker,
         seq: int,
         offset: int,
         count: int,
@@ -373,19 +394,18 @@ class Ledger:
     ) -> Receipt | None:
         """``count`` results of batch ``seq``, its tasks from ``offset`` on; None: they don't count.
 
-        ``seconds`` is what they took.  ``kept``: the worker keeps only that many tasks of the
-        batch, with or without a result, and gives the rest back.
+        Raises WrongAnswer if ``worker`` cannot have them.  They took ``seconds``.  ``kept``: the
+        worker keeps only that many tasks of the batch, and gives the rest back.
         """
-        batch = self.batches.get(seq)
-        if batch is None or offset != batch.received or offset + count > len(batch.items):
+        batch = self.held(worker, seq)
+        if batch is None or not batch.take(offset, count, kept):
             return None
-        job = batch.job
-        batch.received = received = offset + count
+        job, received = batch.job, batch.received
         if job is not None:
             self._did(job, count)
             job.pace.observe(count, seconds)
         if kept is not None:
-            self._cut_short(batch, max(kept, received))
+            self._cut_short(batch, kept)
         if received == len(batch.items):
             self._close_batch(batch, now)
         if job is None:
@@ -394,12 +414,10 @@ class Ledger:
         return Receipt(job, batch.start + offset, count, batch)
 
     def _cut_short(self, batch: Batch, kept: int) -> None:
-        at, stop = batch.start + kept, batch.stop
-        if at >= stop:
+        if kept == len(batch.items):
             return
         units = batch.units
-        rest = batch.part(at, stop)
-        batch.items = batch.items[:kept]
+        rest = batch.cut(kept)
         if batch.worker.left is not None:
             batch.worker.left += units - batch.units
         if batch.job is not None:
@@ -417,6 +435,7 @@ class Ledger:
 
     def _drop(self, batch: Batch) -> None:
         del self.batches[batch.seq]
+        batch.worker.had.append(batch.seq)
         self._cancelled.discard(batch)
         if batch.job is not None:
             batch.job.batches.pop(batch, None)
@@ -426,7 +445,7 @@ class Ledger:
         job = receipt.job
         if job not in self.jobs and not job.finished:
             return False  # cancelled
-        if not self._charge(job, index):
+        if not job.charge(index):
             return False
         if job not in self.jobs:  # what was its last task is not done after all
             self.jobs.add(job)
@@ -472,7 +491,7 @@ class Ledger:
         if batch is None:
             return None
         if len(batch.items) == 1:
-            return self.receive(seq, 0, 1, now)
+            return self.receive(batch.worker, seq, 0, 1, now)
         self._withdraw(batch, now)
         if batch.job is not None:
             for span in reversed(batch.rest().singly()):
@@ -487,7 +506,7 @@ class Ledger:
         batch = self.batches.get(seq)
         if batch is None:
             return None
-        self._retire(batch.worker)
+        self.retire(batch.worker)
         job, batch.job = batch.job, None
         if job is None:
             return None
@@ -530,14 +549,14 @@ class Ledger:
                 suspects = batch.suspects(running) if batch is guilty else range(0)
                 losses += self._lose_batch(batch.job, batch.rest(), suspects)
         worker.queue.clear()
-        self._retire(worker)
+        self.retire(worker)
         self._load.spent.pop(worker, None)
         return losses[::-1]
 
     def _lose_batch(self, job: Job, rest: Span, suspects: range) -> list[Loss]:
         losses = []
         for span in reversed(rest.around(suspects)):
-            if span.start in suspects and not self._charge(job, span.start):
+            if span.start in suspects and not job.charge(span.start):
                 losses.append(Loss(job, span.start, job.attempts.pop(span.start), span.items[0]))
                 self._did(job, 1)
             elif span.pin:
@@ -563,11 +582,6 @@ class Ledger:
             batch.worker.left += batch.units
         self._close_batch(batch, now)
 
-    def _charge(self, job: Job, index: int) -> bool:
-        """Count one more run that came to nothing; False if that was the last one allowed."""
-        job.attempts[index] = attempts = job.attempts.get(index, 0) + 1
-        return attempts <= job.retries
-
     def _return(self, job: Job, span: Span) -> None:
         job.waiting.appendleft(span)
         self._list(job)
@@ -582,7 +596,3 @@ class Ledger:
             self.jobs.discard(job)
             self._paused.discard(job)
         return job.finished
-
-
-def _by_seq(batch: Batch) -> int:
-    return batch.seq

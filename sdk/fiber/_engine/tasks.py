@@ -8,6 +8,13 @@ from typing import Any, NamedTuple
 from fiber._engine.chunks import PROMPT, TARGET, Pace
 from fiber._engine.spans import Span, Waiting
 
+HAD = 16
+"""Batches that a worker had last and that it may still answer for."""
+
+
+class WrongAnswer(Exception):
+    """An answer that its worker cannot have given in good faith; the text says why."""
+
 
 class Job:
     """The tasks of one call."""
@@ -72,15 +79,22 @@ class Job:
         """No task will come any more, and all that came are done."""
         return self.closed and self.done == self.fed
 
+    def charge(self, index: int) -> bool:
+        """Count one more run that came to nothing; False if that was the last one allowed."""
+        self.attempts[index] = attempts = self.attempts.get(index, 0) + 1
+        return attempts <= self.retries
+
 
 class Batch:
     """A slice of a job's tasks in one message.
 
-    ``job`` is None once nobody wants its results; ``received`` counts those that came, ``stride``
-    is the number of tasks between two notes of the worker's progress.
+    ``job`` is None once nobody wants its results; ``received`` counts those that came, the last of
+    them from ``_received_from`` on; ``stride`` is the number of tasks between two notes of the
+    worker's progress.
     """
 
     __slots__ = (
+        "_received_from",
         "alone",
         "items",
         "job",
@@ -104,6 +118,25 @@ class Batch:
         self.stride = 1 if job is None or job.exact else job.pace.stride()
         self.unit = 1 if job is None else job.unit
         self.received = 0
+        self._received_from = 0
+
+    def take(self, offset: int, count: int, kept: int | None) -> bool:
+        """Take ``count`` results from ``offset`` on; False if they are the last ones once more.
+
+        Raises WrongAnswer for results that cannot come next.
+        """
+        stop, size = offset + count, len(self.items)
+        if count and offset == self._received_from and stop == self.received:
+            return False
+        if offset != self.received or stop > size:
+            raise WrongAnswer(
+                f"it sent results {offset} to {stop} of batch {self.seq}, which has {size} tasks "
+                f"and {self.received} results"
+            )
+        if kept is not None and not stop <= kept <= size:
+            raise WrongAnswer(f"it kept {kept} of {size} tasks of batch {self.seq}, {stop} done")
+        self._received_from, self.received = offset, stop
+        return True
 
     @property
     def stop(self) -> int:
@@ -123,6 +156,12 @@ class Batch:
         """The tasks from index ``first`` to before ``stop``."""
         return Span(self.start, self.items, self.alone, self.pin).part(first, stop)
 
+    def cut(self, kept: int) -> Span:
+        """Keep only the first ``kept`` tasks; return the others."""
+        rest = self.part(self.start + kept, self.stop)
+        self.items = self.items[:kept]
+        return rest
+
     def suspects(self, running: tuple[int, int] | None) -> range:
         """Tasks one of which was running: all without a result, if nothing else is known."""
         first, stop = self.start + self.received, self.stop
@@ -135,12 +174,13 @@ class Batch:
 class Worker:
     """What one worker holds.  ``left``: units that it may still be given (maxtasksperchild)."""
 
-    __slots__ = ("key", "leaving", "left", "lent", "pinned", "queue", "recalled", "since")
+    __slots__ = ("had", "key", "leaving", "left", "lent", "pinned", "queue", "recalled", "since")
 
     def __init__(self, key: Any, left: int | None) -> None:
         self.key = key
         self.left = left
         self.queue: deque[Batch] = deque()
+        self.had: deque[int] = deque(maxlen=HAD)  # batches that are over
         self.pinned: deque[tuple[Job, Span]] = deque()
         self.since = 0.0  # when it began what it does now
         self.recalled = False

@@ -70,3 +70,8 @@ class BackgroundThread:
                 # Mostly a callback of the user's: it must be seen, and must not end the others.
                 report_uncaught()
             del entry, action, args
+
+
+def say(news: str) -> None:
+    """Print it.  On a background thread: a slow terminal must not hold up the loop."""
+    print(f"fiber: {news}", file=sys.stderr, flush=True)

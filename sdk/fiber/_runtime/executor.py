@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol
@@ -31,7 +30,7 @@ from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import StartFailure
 from fiber._exceptions import fresh
-from fiber._runtime.background import BackgroundThread
+from fiber._runtime.background import BackgroundThread, say
 from fiber._runtime.calls import CallQueue, Calls
 from fiber._runtime.functions import Function, FunctionCache
 from fiber._runtime.host import TICK, Host, Loop, Timer
@@ -548,7 +547,7 @@ class Executor:
             self._jobs.put_losses(losses, handle.name, handle.pid, report)
         if failure is not None and (news := self._scheduler.workers.news(failure, now)):
             with contextlib.suppress(RuntimeError):  # the system has no room for its thread
-                self._background.submit(_say, news)
+                self._background.submit(say, news)
 
     # The end
 
@@ -591,8 +590,3 @@ class Executor:
         self._ended_by = None
         self.workers.end()
         self.ended.set()
-
-
-def _say(news: str) -> None:
-    """On the background thread: a slow terminal must not hold up the loop."""
-    print(f"fiber: {news}", file=sys.stderr, flush=True)

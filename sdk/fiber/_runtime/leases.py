@@ -25,12 +25,14 @@ from collections.abc import Callable
 from typing import Any
 
 from fiber._agent.interface import DirectChannel
+from fiber._engine.ledger import WrongAnswer
 from fiber._engine.scheduler import Scheduler
+from fiber._runtime.answers import Results, read
 from fiber._runtime.host import Loop, Timer
-from fiber._runtime.outcome import outcomes
 from fiber._runtime.work_items import Call
 from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
+from fiber._wire.packet import Message
 
 ATTENTION = 5e-3
 """Seconds that a caller waits for a worker itself before it leaves the answer to the loop."""
@@ -56,13 +58,15 @@ ADOPTED = Pending()
 class Lease:
     """An idle worker for direct use."""
 
-    __slots__ = ("__weakref__", "channel", "handle", "used")
+    __slots__ = ("__weakref__", "channel", "handle", "surprise", "used")
 
     def __init__(self, handle: WorkerHandle, channel: DirectChannel) -> None:
         self.handle = handle
         self.channel = channel
         self.used = True
         """Since somebody looked last."""
+        self.surprise: Message | None = None
+        """Message of its worker that is not the answer; the loop judges it."""
 
 
 class Leases:
@@ -109,13 +113,11 @@ class Leases:
             self._loop.call_soon(self._abandon, lease)
             raise
         self._put_back(lease)
-        if answer is UNAVAILABLE:
-            return UNAVAILABLE
-        (*_, values, odd), buffers = answer
-        return outcomes(values, odd, buffers)[0] if odd else values[0]
+        return answer
 
     def _exchange(self, lease: Lease, seq: int, call: Call) -> Any:
         handle, channel = lease.handle, lease.channel
+        handle.asked = seq
         try:
             channel.send(seq, call.message(), call.buffers)
         except OSError:  # whoever sends it in our place will see why
@@ -129,11 +131,20 @@ class Leases:
                 return ADOPTED
             if message is None:
                 return ADOPTED
-            words, buffers = pickle.loads(message.payload), message.buffers
-            message.release()
-            if words[0] == seq:
-                handle.tasks += 1
-                return words, buffers
+            try:
+                answer = read(message)
+            except WrongAnswer:
+                answer = ()
+            if isinstance(answer, Results):
+                if answer.is_single(seq):
+                    message.release()
+                    handle.tasks += 1
+                    return answer.values[0]
+                if answer.seq < seq and answer.seq not in self._scheduler.ledger.batches:
+                    message.release()  # it answers a call that was given up
+                    continue
+            lease.surprise = message
+            return ADOPTED
 
     def _put_back(self, lease: Lease) -> None:
         self._idle.append(lease)
@@ -208,7 +219,10 @@ class Leases:
     def _adopt(self, lease: Lease, seq: int, call: Call) -> None:
         # First what the answer is to: it may be there already.
         self._on_adopted(lease.handle, seq, call)
-        self._on_back(self._end(lease))
+        handle = self._end(lease)
+        if lease.surprise is not None:
+            handle.received(lease.surprise)
+        self._on_back(handle)
 
     def _abandon(self, lease: Lease) -> None:
         if weakref.ref(lease) in self._lent:  # else it was adopted
@@ -225,6 +239,7 @@ class Leases:
         """It may be running something that nobody wants any more."""
         assert handle.worker is not None
         assert handle.child is not None
+        self._scheduler.ledger.expect_late(handle.worker, handle.asked)
         seq = self._scheduler.ledger.next_seq()
         self._scheduler.return_busy(handle.worker, seq, None, None, self._loop.now())
         handle.child.deliver(seq, NO_OP_MESSAGE)

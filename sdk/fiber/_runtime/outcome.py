@@ -61,9 +61,13 @@ def decode(outcome: Any) -> Any:
 def outcomes(
     values: list[Any], odd: list[tuple[int, int, bytes | None, int]], buffers: list[memoryview]
 ) -> list[Any]:
-    """A worker's answer with what is pickled in its place."""
+    """A worker's answer with what is pickled in its place; ValueError if it does not fit."""
     used = 0
     for position, kind, data, count in odd:
+        if not (0 <= position < len(values) and 0 <= count <= len(buffers) - used):
+            raise ValueError("a pickled value has no place, or not its buffers")
+        if not (type(data) is bytes or (data is None and count)):
+            raise ValueError("a pickled value is not there")
         values[position] = Pickled(kind, *work.found(data, buffers[used : used + count]))
         used += count
     return values

@@ -5,22 +5,24 @@ On the loop's thread, but for ``_unpickle_fault``, which may run the user's code
 
 from __future__ import annotations
 
-import pickle
+import contextlib
 from collections.abc import Callable
-from typing import Any
 
-from fiber._engine.ledger import Batch
+from fiber._engine.ledger import Batch, WrongAnswer
 from fiber._engine.scheduler import Scheduler
-from fiber._runtime.background import BackgroundThread
+from fiber._runtime.answers import Results, Words, read
+from fiber._runtime.background import BackgroundThread, say
 from fiber._runtime.host import Loop
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.leases import Leases
-from fiber._runtime.outcome import Pickled, outcomes
+from fiber._runtime.outcome import Pickled
 from fiber._runtime.sender import Sender
 from fiber._runtime.work_items import WorkItem
 from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
 from fiber._wire.packet import Message
+
+_NOT_READY = "it answered for batch {} before it was ready"
 
 
 class Receiver:
@@ -48,35 +50,63 @@ class Receiver:
         self._leases = leases
         self._advance = advance
         self._on_ready = on_ready
-        self._last_words: dict[WorkerHandle, tuple[Any, list[memoryview], int]] = {}
+        self._last_words: dict[WorkerHandle, Results] = {}
         """Of workers that callers use, whose agents heard them first since they died."""
         self._taken_back: dict[WorkerHandle, list[int]] = {}
         """From workers that callers use: calls of theirs, which are no batches yet."""
 
     def take(self, handle: WorkerHandle, message: Message) -> None:
         """A packet from a worker."""
-        words = pickle.loads(message.payload)
-        buffers = message.buffers
-        size = len(message.payload) + sum([buffer.nbytes for buffer in buffers])
-        message.release()
-        kind = words[0]
-        if type(kind) is int and handle.worker is not None and handle.worker.lent:
-            self._last_words[handle] = words, buffers, size
-        elif type(kind) is int:
-            self._answered(handle, words, buffers, size)
-        elif kind == work.READY:
+        try:
+            if not handle.fault:  # else it was killed
+                self._take(handle, read(message))
+        except WrongAnswer as error:
+            self._convict(handle, str(error))
+        finally:
+            message.release()
+
+    def _take(self, handle: WorkerHandle, words: Results | Words) -> None:
+        if isinstance(words, Results):
+            if handle.worker is not None and handle.worker.lent:
+                self._last_words[handle] = words
+            else:
+                self._answered(handle, words)
+        elif words[0] == work.READY:
             self._on_ready(handle)
-        elif kind == work.INIT_FAILED:
+        elif words[0] == work.INIT_FAILED:
             handle.complaint = words[1]
-        elif kind == work.UNKNOWN:
+        elif words[0] == work.UNKNOWN:
+            self._held(handle, words[1])
             self.recalled(handle, [words[1]])
         else:
-            self._unreadable(kind, words[1], Pickled(work.ERROR, words[2], ()))
+            kind, seq, error = words
+            batch = self._held(handle, seq)
+            if batch is not None:
+                self._unreadable(kind, batch, Pickled(work.ERROR, error, ()))
+
+    def _held(self, handle: WorkerHandle, seq: int) -> Batch | None:
+        """Return the batch that a worker speaks of, or None if that is over."""
+        if handle.worker is None:
+            raise WrongAnswer(_NOT_READY.format(seq))
+        return self._ledger.held(handle.worker, seq)
+
+    def _convict(self, handle: WorkerHandle, reason: str) -> None:
+        """Kill a worker that sent what it cannot send; its tasks run elsewhere once it is gone."""
+        handle.fault = reason
+        if handle.worker is not None:
+            self._ledger.retire(handle.worker)
+        handle.kill()
+        with contextlib.suppress(RuntimeError):  # the system has no room for its thread
+            self._background.submit(say, f"pool worker {handle.name!r} is killed: {reason}")
+        self._advance()
 
     def replay(self, handle: WorkerHandle) -> None:
         """A worker is not lent any more: what was heard of it meanwhile counts now."""
         if handle in self._last_words:
-            self._answered(handle, *self._last_words.pop(handle))
+            try:
+                self._answered(handle, self._last_words.pop(handle))
+            except WrongAnswer as error:
+                self._convict(handle, str(error))
         if handle in self._taken_back:
             self.recalled(handle, self._taken_back.pop(handle))
 
@@ -85,15 +115,14 @@ class Receiver:
         self._last_words.pop(handle, None)
         self._taken_back.pop(handle, None)
 
-    def _answered(
-        self, handle: WorkerHandle, words: tuple[Any, ...], buffers: list[memoryview], size: int
-    ) -> None:
-        seq, offset, kept, seconds, values, odd = words
-        handle.tasks += len(values)
-        results = outcomes(values, odd, buffers) if odd else values
+    def _answered(self, handle: WorkerHandle, results: Results) -> None:
+        seq, offset, kept, seconds, values, mixed, size = results
+        if handle.worker is None:
+            raise WrongAnswer(_NOT_READY.format(seq))
         receipt = self._ledger.receive(
-            seq, offset, len(results), self._loop.now(), seconds=seconds, kept=kept
+            handle.worker, seq, offset, len(values), self._loop.now(), seconds=seconds, kept=kept
         )
+        handle.tasks += len(values)
         self._scheduler.workers.did_something()
         self._sender.settled(seq)
         if receipt is not None:
@@ -101,16 +130,15 @@ class Receiver:
             if item.future is None and receipt.size and receipt.item(receipt.start).blocking:
                 # First: who waited for it may call again at once.
                 self._leases.offer(receipt.batch.worker.key)
-            self._jobs.put(receipt, results, mixed=bool(odd), size=size)
+            self._jobs.put(receipt, values, mixed=mixed, size=size)
         self._advance()
 
-    def _unreadable(self, kind: str, seq: int, error: Pickled) -> None:
+    def _unreadable(self, kind: str, batch: Batch, error: Pickled) -> None:
         """A worker cannot unpickle a batch, or its function: then no task of its job can run."""
-        batch = self._ledger.batches.get(seq)
-        self._sender.settled(seq)
+        self._sender.settled(batch.seq)
         if kind == work.UNREADABLE:
-            self._sender.split(seq, error)
-        elif batch is not None:
+            self._sender.split(batch.seq, error)
+        else:
             self._sender.dropped(batch)
             try:
                 self._background.submit(self._unpickle_fault, batch, error)
@@ -144,9 +172,11 @@ class Receiver:
         if seqs and handle.worker.lent:  # a recall that was on its way as it was lent took them
             self._taken_back.setdefault(handle, []).extend(seqs)
         for seq in seqs:
-            self._sender.settled(seq)
             batch = self._ledger.batches.get(seq)
-            if batch is not None and batch.job is not None:
+            if batch is None or batch.worker is not handle.worker:
+                continue
+            self._sender.settled(seq)
+            if batch.job is not None:
                 function = batch.job.owner.function
                 if function is not None:
                     handle.known.pop(function.id, None)

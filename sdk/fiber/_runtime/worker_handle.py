@@ -51,6 +51,10 @@ class WorkerHandle:
         """Functions that it was sent."""
         self.complaint = ""
         """What its initializer, or its birth, failed with."""
+        self.fault = ""
+        """Wrong answer for which the pool has killed it."""
+        self.asked = 0
+        """The last call that a caller sent it directly."""
         self.leaving = False
         """It was told to go, or will be at once."""
         self.unwanted = False
@@ -104,6 +108,8 @@ class WorkerHandle:
 
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
+        if self.fault and report.cause == Cause.CHILD:
+            report = report._replace(reason=f"WrongAnswer: {self.fault}, and Fiber killed it")
         self.returncode = report.exitcode
         self._exited.set()
         self._born.set()
