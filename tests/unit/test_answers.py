@@ -70,7 +70,7 @@ def test_a_wrong_answer_ends_its_worker_and_nothing_else(
     rig: Rig, lie: Callable[[Rig, WorkerHandle, WorkerHandle], None]
 ) -> None:
     first, second = rig.call(), rig.call()
-    other, liar = sorted(rig.busy, key=lambda handle: handle.worker.queue[0].seq)  # type: ignore
+    other, liar = (batch.worker.key for batch in rig.ledger.batches.values())
     lie(rig, liar, other)
     assert rig.child(liar).signals == [signal.SIGKILL]
     assert rig.child(other).signals == []
