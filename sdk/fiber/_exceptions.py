@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import BuiltinFunctionType, GetSetDescriptorType, MemberDescriptorType
 from typing import Any, TypeVar
 
@@ -26,17 +26,14 @@ def fresh(error: _E) -> _E:
         return error
 
 
+def add_note(error: BaseException, note: str) -> None:
+    """Add a note, also to a frozen dataclass, whose ``add_note`` raises."""
+    vars(error)["__notes__"] = [*(getattr(error, "__notes__", None) or ()), note]
+
+
 def _copy(error: _E) -> _E:
-    kind = type(error)
-    # A group is made with what it holds; other fields can be set later.
-    group = (error.message, error.exceptions) if isinstance(error, BaseExceptionGroup) else ()
-    copy: _E = _constructor(kind)(kind, *group)
-    for field in _fields(kind):
-        value = _value(field, error)
-        # A native field that was never set reads as None, but setting it to None counts.
-        if value is not _value(field, copy):
-            with contextlib.suppress(AttributeError):  # read-only
-                field.__set__(copy, value)
+    copy = make(type(error), group_of(error))
+    set_fields(copy, fields_of(error))
     attributes = dict(vars(error))
     if isinstance(notes := attributes.get("__notes__"), list):
         attributes["__notes__"] = list(notes)  # Notes that a caller adds are for that caller.
@@ -44,6 +41,39 @@ def _copy(error: _E) -> _E:
     for name in ("args", "__cause__", "__context__", "__suppress_context__", "__traceback__"):
         object.__setattr__(copy, name, getattr(error, name))
     return copy
+
+
+def make(kind: type[_E], group: tuple[Any, ...]) -> _E:
+    """Make an exception that has neither arguments nor fields, without running code of its class.
+
+    ``group`` is what ``group_of`` returned.
+    """
+    made: _E = _constructor(kind)(kind, *group)
+    return made
+
+
+def group_of(error: BaseException) -> tuple[Any, ...]:
+    """Return what a group is made with: other fields can be set later."""
+    return (error.message, error.exceptions) if isinstance(error, BaseExceptionGroup) else ()
+
+
+def fields_of(error: BaseException) -> dict[str, Any]:
+    """Return what is not in the instance's dictionary: slots, and what native code keeps."""
+    found: dict[str, Any] = {}
+    for field in _fields(type(error)):
+        value = _value(field, error)
+        if value is not field:
+            found.setdefault(field.__name__, value)
+    return found
+
+
+def set_fields(error: BaseException, values: Mapping[str, Any]) -> None:
+    """Give an exception that was just made its fields."""
+    for field in _fields(type(error)):
+        # A native field that was never set reads as None, but setting it to None counts.
+        if field.__name__ in values and values[field.__name__] is not _value(field, error):
+            with contextlib.suppress(AttributeError):  # read-only
+                field.__set__(error, values[field.__name__])
 
 
 def _constructor(kind: type[BaseException]) -> Callable[..., Any]:

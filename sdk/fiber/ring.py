@@ -14,13 +14,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable
 from functools import partial
-from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 from typing import Any, NamedTuple, NoReturn
 
-from fiber._exceptions import fresh
+from fiber._agent.travelling import Travelling
+from fiber._exceptions import add_note, fresh
 from fiber._runtime import options
 from fiber.connection import Connection, Pipe, wait
-from fiber.errors import ConnectionClosed, FiberError, MemberLost, UnpicklableError
+from fiber.errors import ConnectionClosed, MemberLost
 from fiber.process import Process
 from fiber.resources import resources_of, with_resources
 
@@ -193,10 +193,10 @@ def _outcome(rank: int, channel: Connection) -> tuple[_End, Any, BaseException |
         how = closed.reason or "its process ended"
         return _End(rank, True, how), None, MemberLost(rank, how)
     except Exception as unreadable:  # what it is of cannot be imported here, for instance
-        unreadable.add_note(f"what member {rank} of the ring returned cannot be unpickled")
+        add_note(unreadable, f"what member {rank} of the ring returned cannot be unpickled")
         return _End(rank, True, "what it returned cannot be unpickled"), None, unreadable
     if error is not None:
-        error.add_note(f"raised by member {rank} of the ring")
+        add_note(error, f"raised by member {rank} of the ring")
         return _End(rank, True, f"it raised {type(error).__name__}: {error}"), None, error
     return _End(rank, False, "it has returned"), result, None
 
@@ -229,11 +229,4 @@ def _run(
         member._news.send((func(member.rank, member.size), None))
     except Exception as error:  # also of a result that does not pickle
         with contextlib.suppress(BrokenPipeError, ConnectionClosed):  # the program is gone
-            _send_error(member._news, error)
-
-
-def _send_error(news: Connection, error: Exception) -> None:
-    try:
-        news.send((None, ExceptionWithTraceback(error, error.__traceback__)))
-    except UnpicklableError:
-        news.send((None, FiberError(f"{type(error).__name__}: {error}")))
+            member._news.send((None, Travelling(error)))

@@ -12,15 +12,10 @@ from typing import Any, NoReturn
 
 
 class Unpicklable(Exception):
-    def __reduce__(self) -> Any:
-        raise TypeError("this does not pickle")
+    """Nothing makes it again."""
 
-
-class Ununpicklable(Exception):
-    """Pickles; its class cannot be called with what it keeps."""
-
-    def __init__(self, one: int, two: int) -> None:
-        super().__init__("only this is kept")
+    def __setstate__(self, state: Any) -> None:
+        raise TypeError("this does not unpickle")
 
 
 def fail(number: int) -> NoReturn:
@@ -34,11 +29,9 @@ def fail_if_odd(number: int) -> int:
 
 
 def raise_unpicklable(_number: int) -> NoReturn:
-    raise Unpicklable("cannot travel")
-
-
-def raise_ununpicklable(_number: int) -> NoReturn:
-    raise Ununpicklable(1, 2)
+    error = Unpicklable("cannot travel")
+    error.add_note("it has a state")
+    raise error
 
 
 def return_lock(_number: int) -> Any:

@@ -65,8 +65,7 @@ def test_every_kind_of_call_raises_it(pool: Pool) -> None:
     ("function", "error", "words"),
     [
         (tasks.return_lock, MaybeEncodingError, "lock"),
-        (tasks.raise_unpicklable, MaybeEncodingError, "does not pickle"),
-        (tasks.raise_ununpicklable, MaybeEncodingError, "Ununpicklable"),
+        (tasks.raise_unpicklable, MaybeEncodingError, "does not unpickle"),
     ],
 )
 def test_what_does_not_travel_back_is_an_error_that_shows_it(

@@ -6,7 +6,6 @@ import os
 import pickle
 import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -260,10 +259,14 @@ class ExitingInMaster:
 
 
 class _ExitsIn(Exception):
-    def __init__(self, pid: int) -> None:
-        super().__init__(pid)
-        if os.getpid() == pid:
-            raise SystemExit("no")
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _exit_in, self.args
+
+
+def _exit_in(pid: int) -> _ExitsIn:
+    if os.getpid() == pid:
+        raise SystemExit("no")
+    return _ExitsIn(pid)
 
 
 def _raise_exiting(pid: int) -> NoReturn:
@@ -307,32 +310,8 @@ class UnreadableResult:
         return _refuse_in_parent, (os.getpid(),)
 
 
-class BadError(Exception):
-    """An exception that pickles but does not unpickle, as many do."""
-
-    def __init__(self, message: str, code: int) -> None:
-        super().__init__(message)
-        self.code = code
-
-
-class HeldError(Exception):
-    """An exception that does not pickle."""
-
-    def __init__(self) -> None:
-        super().__init__("holds a lock")
-        self.lock = threading.Lock()
-
-
 class Exotic(BaseException):
     """Not an Exception."""
-
-
-def raise_bad_error(_: object = None) -> NoReturn:
-    raise BadError("disk full", 28)
-
-
-def raise_held_error(_: object = None) -> NoReturn:
-    raise HeldError
 
 
 def raise_exotic(_: object = None) -> NoReturn:

@@ -49,21 +49,6 @@ def test_errors_stay_with_their_tasks(pool: Pool, chunksize: int | None) -> None
         pool.map(tasks.raise_if_odd, range(40), chunksize)
 
 
-def test_an_exception_that_does_not_unpickle_says_what_it_was(pool: Pool) -> None:
-    with pytest.raises(MaybeEncodingError) as caught:
-        pool.apply(tasks.raise_bad_error)
-    text = str(caught.value)
-    assert "BadError" in text
-    assert "disk full" in text
-    assert 'raise BadError("disk full", 28)' in str(caught.value.__cause__)
-
-
-def test_an_exception_that_does_not_pickle_says_what_it_was(pool: Pool) -> None:
-    with pytest.raises(MaybeEncodingError, match="holds a lock") as caught:
-        pool.map(tasks.raise_held_error, range(3))
-    assert "raise HeldError" in str(caught.value.__cause__)
-
-
 def test_what_is_not_an_exception_reaches_the_caller(pool: Pool) -> None:
     with pytest.raises(tasks.Exotic, match="strange"):
         pool.apply(tasks.raise_exotic)

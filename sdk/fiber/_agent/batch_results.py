@@ -16,6 +16,7 @@ from operator import length_hint
 from typing import Any, Protocol
 
 from fiber._agent import by_reference
+from fiber._agent.travelling import encode_error, unsendable
 from fiber._hub.remote import Taken, confirm
 from fiber._wire import packet, work
 
@@ -121,10 +122,10 @@ class BatchResults:
             data, buffers = packet.dumps(value)
             if len(buffers) > work.BUFFERS:
                 data, buffers = pickle.dumps(value, 5), []
-        except BaseException as error:
+        except BaseException:
             try:
                 data, buffers = _pickle_unusual(value)
-            except BaseException:
+            except BaseException as error:
                 fault = encode_error(unsendable(error, value))
                 self._enclose(position, work.ERROR, (fault, []))
                 return
@@ -185,43 +186,3 @@ def _pickle_unusual(value: Any) -> tuple[bytes, list[memoryview]]:
     except BaseException:
         data, buffers = packet.dumps(value, by_reference.dumps)
         return (data, buffers) if len(buffers) <= work.BUFFERS else (by_reference.dumps(value), [])
-
-
-def encode_error(error: BaseException) -> bytes:
-    """Pickle an error, with its traceback as text, so that it surely unpickles."""
-    from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
-
-    wrapped = ExceptionWithTraceback(error, error.__traceback__)
-    refusals = []
-    for dumps in (pickle.dumps, by_reference.dumps):
-        try:
-            data = dumps(wrapped)
-            pickle.loads(data)
-            return data
-        except BaseException as reason:
-            refusals.append(reason)
-    # An error that cannot be sent still has to say what happened, and where.
-    substitute = ExceptionWithTraceback(unsendable(refusals[0], error), None)
-    substitute.tb = wrapped.tb
-    return pickle.dumps(substitute)
-
-
-def unsendable(reason: BaseException, value: Any) -> Exception:
-    """multiprocessing's error for a value that does not pickle."""
-    from multiprocessing.pool import MaybeEncodingError  # type: ignore[attr-defined]
-
-    error: Exception = MaybeEncodingError(_Words(reason), _Words(value))
-    return error
-
-
-class _Words:
-    """Stands for a value whose own repr may raise."""
-
-    def __init__(self, value: Any) -> None:
-        self._value = value
-
-    def __repr__(self) -> str:
-        try:
-            return repr(self._value)
-        except BaseException:  # whatever it is, an error message must not fail for it
-            return object.__repr__(self._value)

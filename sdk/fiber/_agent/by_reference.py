@@ -14,9 +14,10 @@ import pickle
 import sys
 from collections import ChainMap
 from collections.abc import Callable
+from functools import lru_cache
 from multiprocessing.reduction import ForkingPickler
 from types import FunctionType
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 
 def dumps(
@@ -26,7 +27,8 @@ def dumps(
 ) -> bytes:
     """Pickle ``obj`` for the program whose ``__main__`` came here by value."""
     file = io.BytesIO()
-    _pickler()(file, protocol or pickle.DEFAULT_PROTOCOL, buffer_callback=buffer_callback).dump(obj)
+    protocol = protocol or pickle.DEFAULT_PROTOCOL
+    _by_reference()(file, protocol, buffer_callback=buffer_callback).dump(obj)
     return file.getvalue()
 
 
@@ -47,13 +49,30 @@ def find(name: str, tracker_id: str | None) -> Any:
         ) from None
 
 
-def _pickler() -> Any:
+def pickler(file: io.BytesIO, reducers: dict[type, Any]) -> pickle.Pickler:
+    """Make a pickler as ``dumps`` has it, with reducers that go before its others."""
+    made: pickle.Pickler = _by_reference()(file, pickle.HIGHEST_PROTOCOL, reducers)
+    return made
+
+
+@lru_cache(maxsize=1)
+def _by_reference() -> Any:
     import cloudpickle
 
     class ByReference(cloudpickle.Pickler):  # type: ignore[misc]
-        dispatch_table: ClassVar[Any] = ChainMap(
-            cast("Any", ForkingPickler)._extra_reducers, cloudpickle.Pickler.dispatch_table
-        )
+        def __init__(
+            self,
+            file: io.BytesIO,
+            protocol: int,
+            reducers: dict[type, Any] | None = None,
+            buffer_callback: Callable[[pickle.PickleBuffer], Any] | None = None,
+        ) -> None:
+            own = (
+                {} if reducers is None else reducers,
+                cast("Any", ForkingPickler)._extra_reducers,
+            )
+            self.dispatch_table = ChainMap(*own, cloudpickle.Pickler.dispatch_table)
+            super().__init__(file, protocol, buffer_callback)  # which reads the table once
 
         def reducer_override(self, obj: Any) -> Any:
             if isinstance(obj, type | FunctionType) and obj.__module__ == "__main__":

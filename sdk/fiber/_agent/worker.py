@@ -17,7 +17,8 @@ from itertools import islice, starmap
 from typing import Any
 
 from fiber._agent import child
-from fiber._agent.batch_results import BatchResults, Sender, encode_error
+from fiber._agent.batch_results import BatchResults, Sender
+from fiber._agent.travelling import encode_error
 from fiber._agent.watchdog import SPLIT_AFTER, Watchdog
 from fiber._hub.remote import Taken, confirm, loads
 from fiber._wire import work

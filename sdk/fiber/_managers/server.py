@@ -8,17 +8,16 @@ is gone.
 from __future__ import annotations
 
 import itertools
-import pickle
 import sys
 import threading
 from contextlib import suppress
 from multiprocessing import managers as mp_managers
 from multiprocessing.managers import Token
-from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 from traceback import format_exc
 from typing import Any
 
 from fiber import reduction
+from fiber._agent.travelling import Travelling
 from fiber._managers.client import TravellingToken
 from fiber._managers.door import NUMBER, TAKE_BACK, received
 from fiber._managers.holdings import CONTENDED, Client, ClientThread, Holdings
@@ -239,15 +238,10 @@ def _start(target: Any, *args: Any) -> None:
     threading.Thread(target=target, args=args, daemon=True).start()
 
 
-def _error(error: Exception) -> _Answer:
+def _error(error: BaseException) -> _Answer:
     """An error of the object's own, which is raised as it is where that can be."""
-    wrapped = ExceptionWithTraceback(error, error.__traceback__)
-    error.__traceback__ = None  # its frames hold the object, which is to go with its last proxy
-    try:
-        pickle.loads(reduction.dumps(wrapped))
-    except Exception:
-        return "#TRACEBACK", wrapped.tb
-    return "#ERROR", wrapped
+    travelling = Travelling(error)
+    return ("#ERROR", travelling) if travelling.whole else ("#TRACEBACK", travelling.text)
 
 
 def _reply(line: Channel, number: int, answer: _Answer) -> Any:

@@ -10,7 +10,7 @@ from multiprocessing import TimeoutError as WaitedTooLong
 from typing import Any, NamedTuple
 
 from fiber import reduction
-from fiber._exceptions import fresh
+from fiber._exceptions import add_note, fresh
 from fiber._transport.loop import DOZE
 from fiber.vector.arrays import Shape, SharedMemory, StepArrays
 from fiber.vector.failures import ATTEMPTS, Failure
@@ -269,7 +269,7 @@ class Dispatcher:
     def _blame(self, worker: WorkerProcess, error: Exception) -> None:
         """An answer is here and cannot be unpickled: nobody knows of which environments it was."""
         whose = f"{worker.whose()}, of worker {worker.name!r},"
-        error.add_note(f"an answer of {whose} cannot be unpickled")
+        add_note(error, f"an answer of {whose} cannot be unpickled")
         if worker.hello is None:
             self._lose(worker, error)
             return
@@ -286,7 +286,7 @@ class Dispatcher:
             (_, error), *others = sorted(self._failures, key=lambda failure: failure[0])
             for _, other in others:
                 for note in getattr(other, "__notes__", ()) or (str(other),):
-                    error.add_note(f"failed, too: {note}")
+                    add_note(error, f"failed, too: {note}")
             self._failures.clear()
             raise fresh(error)
 

@@ -1,0 +1,300 @@
+"""How an exception travels: as its own class with its attributes, its traceback as text.
+
+pickle rebuilds an exception by calling its class with ``args``.  That fails, or changes the
+message, where ``__init__`` takes other arguments than those it passes on.  Such an exception is
+made here by its native base alone, and gets its arguments and attributes afterwards.  A
+``__reduce__`` in Python, or one registered with copyreg, is used where it makes the exception
+again.
+"""
+
+from __future__ import annotations
+
+import copyreg
+import io
+import pickle
+from collections import ChainMap
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from multiprocessing.reduction import ForkingPickler
+from types import BuiltinFunctionType, MethodDescriptorType, WrapperDescriptorType
+from typing import Any, cast
+
+from fiber._agent import by_reference
+from fiber._exceptions import add_note, fields_of, group_of, make, set_fields
+
+LINKS = 8
+"""Causes and contexts that travel with an exception."""
+
+_NATIVE = (BuiltinFunctionType, MethodDescriptorType, WrapperDescriptorType)
+
+_Reduced = tuple[Any, ...] | str
+
+_MakePickler = Callable[[io.BytesIO, dict[type, Any]], pickle.Pickler]
+
+
+def encode_error(error: BaseException) -> bytes:
+    """Pickle an error, with its traceback as text, so that it surely unpickles."""
+    return pickle.dumps(Travelling(error))
+
+
+class Travelling:
+    """Stands for an exception in a pickle: unpickling gives the exception itself.
+
+    Its ``__cause__`` is then multiprocessing's RemoteTraceback; causes and contexts are the
+    ``__context__`` of that.
+    """
+
+    def __init__(self, error: BaseException) -> None:
+        import traceback  # rarely needed, and long to import
+
+        self.text = "".join(traceback.format_exception(error))
+        error.with_traceback(None)  # its frames keep alive what the task had
+        self._shown = _shown(error)
+        notes = getattr(error, "__notes__", None)
+        self._notes = [str(note) for note in notes] if isinstance(notes, list) else []
+        self._data, self._reason = _pickled(error)
+        self._links: list[tuple[str, bytes]] = []
+        for name, link in _links(error):
+            data, _ = _pickled(link)
+            if data is None:
+                break
+            self._links.append((name, data))
+
+    @property
+    def whole(self) -> bool:
+        """False if the exception itself cannot be sent, but an error that shows it."""
+        return self._data is not None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        parts = (self._data, self._reason, self._shown, self.text, self._notes, self._links)
+        return _received, parts
+
+
+def unsendable(reason: object, value: object) -> Exception:
+    """multiprocessing's error for a value that does not pickle."""
+    from multiprocessing.pool import MaybeEncodingError  # type: ignore[attr-defined]
+
+    error: Exception = MaybeEncodingError(_Text(_shown(reason)), _Text(_shown(value)))
+    return error
+
+
+def _received(
+    data: bytes | None,
+    reason: str,
+    shown: str,
+    text: str,
+    notes: list[str],
+    links: list[tuple[str, bytes]],
+) -> BaseException:
+    from multiprocessing.pool import RemoteTraceback  # type: ignore[attr-defined]
+
+    trace = RemoteTraceback(f'\n"""\n{text}"""')
+    if data is None:
+        error: BaseException = unsendable(_Text(reason), _Text(shown))
+    else:
+        try:
+            error = _exception(pickle.loads(data))
+        except Exception as refusal:
+            error = unsendable(refusal, _Text(shown))
+    if not getattr(error, "__notes__", None):
+        for note in notes:
+            add_note(error, note)
+    last = trace
+    with suppress(Exception):  # the text has them in any case
+        for name, link in links:
+            linked = _exception(pickle.loads(link))
+            object.__setattr__(last, "__context__" if last is trace else name, linked)
+            last = linked
+    trace.__suppress_context__ = True  # the text shows them
+    # A frozen dataclass refuses the assignment.
+    object.__setattr__(error, "__cause__", trace)
+    return error
+
+
+def _exception(obj: Any) -> BaseException:
+    if isinstance(obj, BaseException):
+        return obj
+    raise TypeError(f"an exception was pickled, and unpickling gives a {type(obj).__qualname__}")
+
+
+def _links(error: BaseException) -> Iterator[tuple[str, BaseException]]:
+    """What led to ``error``: each with the attribute of the one before it that holds it."""
+    seen = {id(error)}
+    while len(seen) <= LINKS:
+        name, link = "__cause__", error.__cause__
+        if link is None and not error.__suppress_context__:
+            name, link = "__context__", error.__context__
+        if link is None or id(link) in seen:
+            return
+        yield name, link
+        seen.add(id(link))
+        error = link
+
+
+def _pickled(error: BaseException) -> tuple[bytes | None, str]:
+    """A pickle that was seen to unpickle; or None, and why there is none."""
+    reason = ""
+    for pickler, incomplete in (
+        (_by_name, False),
+        (by_reference.pickler, False),
+        (by_reference.pickler, True),
+    ):
+        try:
+            return _Pickling(pickler, incomplete=incomplete).checked(error), ""
+        except BaseException as refusal:  # which would keep this frame, and the error's
+            reason = _shown(refusal)
+    return None, reason
+
+
+def _by_name(file: io.BytesIO, reducers: dict[type, Any]) -> pickle.Pickler:
+    pickler: Any = ForkingPickler(file, pickle.HIGHEST_PROTOCOL)
+    pickler.dispatch_table = ChainMap(reducers, pickler.dispatch_table)
+    made: pickle.Pickler = pickler
+    return made
+
+
+class _Pickling:
+    """Pickles exceptions, and what has exceptions in it.
+
+    With ``incomplete``, an exception travels without those of its parts that cannot, and has a note
+    that says so.
+    """
+
+    def __init__(self, pickler: _MakePickler, *, incomplete: bool = False) -> None:
+        self._pickler = pickler
+        self._incomplete = incomplete
+        self._by_own_reduce: dict[int, BaseException] = {}
+        self._open: set[int] = set()
+
+    def checked(self, obj: Any) -> bytes:
+        """Pickle ``obj``, and unpickle it as a check."""
+        file = io.BytesIO()
+        self._pickler(file, _Exceptions(self._reduce)).dump(obj)
+        data = file.getvalue()
+        copy = pickle.loads(data)
+        if isinstance(obj, BaseException):
+            _exception(copy)
+        return data
+
+    def _reduce(self, error: BaseException) -> _Reduced:
+        kind = type(error)
+        if id(error) in self._by_own_reduce or not (self._incomplete or _needs_rebuilding(error)):
+            return _own_reduced(error)
+        if _has_own_reduce(kind):
+            self._by_own_reduce[id(error)] = error
+            if not self._refusal(error):
+                return _own_reduced(error)
+            del self._by_own_reduce[id(error)]
+        args, attributes, fields = error.args, dict(vars(error)), _fields(error)
+        if self._incomplete and id(error) not in self._open:
+            self._open.add(id(error))
+            try:
+                args = self._without_refused(args, attributes, fields)
+            finally:
+                self._open.remove(id(error))
+        state = args, attributes, fields
+        return make, (kind, group_of(error)), state, None, None, _set_state
+
+    def _without_refused(
+        self, args: tuple[Any, ...], attributes: dict[str, Any], fields: dict[str, Any]
+    ) -> tuple[Any, ...]:
+        """Drop the attributes that do not travel, and note them; such arguments become text."""
+        notes = []
+        for values in (attributes, fields):
+            for name, value in [*values.items()]:
+                if refusal := self._refusal(value):
+                    del values[name]
+                    notes.append(f"attribute {name!r} did not come along: {refusal}")
+        kept = []
+        for index, value in enumerate(args):
+            refusal = self._refusal(value)
+            kept.append(_shown(value) if refusal else value)
+            if refusal:
+                notes.append(f"argument {index} came as text: {refusal}")
+        attributes["__notes__"] = [*(attributes.get("__notes__") or ()), *notes]
+        return tuple(kept)
+
+    def _refusal(self, value: Any) -> str:
+        try:
+            self.checked(value)
+        except BaseException as error:
+            return _shown(error)
+        return ""
+
+
+class _Exceptions(dict[type, Callable[[Any], _Reduced]]):
+    """The part of a dispatch table that has every class of exceptions."""
+
+    def __init__(self, reduce: Callable[[Any], _Reduced]) -> None:
+        self._reduce = reduce
+
+    def __missing__(self, kind: type) -> Callable[[Any], _Reduced]:
+        if issubclass(kind, BaseException):
+            return self._reduce
+        raise KeyError(kind)
+
+
+def _set_state(
+    error: BaseException, state: tuple[tuple[Any, ...], dict[str, Any], dict[str, Any]]
+) -> None:
+    args, attributes, fields = state
+    set_fields(error, fields)
+    if isinstance(type(error).__setstate__, _NATIVE):
+        vars(error).update(attributes)
+    else:
+        error.__setstate__(attributes)
+    object.__setattr__(error, "args", args)
+
+
+def _needs_rebuilding(error: BaseException) -> bool:
+    """Whether pickle's own way may run code in Python, or lose a member."""
+    kind = type(error)
+    methods = (kind.__new__, kind.__init__, kind.__reduce__)
+    return (
+        not all(isinstance(method, _NATIVE) for method in methods)
+        or _has_own_reduce(kind)
+        or bool(_fields(error))
+    )
+
+
+def _has_own_reduce(kind: type[BaseException]) -> bool:
+    reduce: Any = kind.__reduce__
+    return (
+        kind in _registered
+        or kind.__reduce_ex__ is not object.__reduce_ex__
+        or not isinstance(reduce, _NATIVE)
+        or getattr(reduce, "__objclass__", kind).__module__ != "builtins"
+    )
+
+
+def _own_reduced(error: BaseException) -> _Reduced:
+    registered = _registered.get(type(error))
+    return registered(error) if registered else error.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+
+
+_registered: Mapping[type, Callable[[Any], _Reduced]] = ChainMap(
+    cast("Any", ForkingPickler)._extra_reducers, cast("Any", copyreg.dispatch_table)
+)
+
+
+def _fields(error: BaseException) -> dict[str, Any]:
+    fields = fields_of(error)
+    # Where an attribute was looked for: pickle leaves it out, too.
+    return {name: value for name, value in fields.items() if name not in ("args", "obj")}
+
+
+def _shown(value: object) -> str:
+    try:
+        return repr(value)
+    except BaseException:  # an error message must not fail for it
+        return object.__repr__(value)
+
+
+class _Text:
+    """Has a text for its repr."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __repr__(self) -> str:
+        return self._text

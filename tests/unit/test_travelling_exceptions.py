@@ -1,0 +1,185 @@
+"""Exceptions of users travel as what they are."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import weakref
+from multiprocessing.pool import MaybeEncodingError, RemoteTraceback  # type: ignore[attr-defined]
+from typing import Any
+
+import pytest
+
+from fiber._agent.travelling import LINKS, encode_error
+from unit import exception_kinds as kinds
+
+
+def travelled(error: BaseException) -> Any:
+    """The exception as it arrives that a task has raised."""
+    try:
+        raise error
+    except BaseException as raised:
+        return pickle.loads(encode_error(raised))
+
+
+@pytest.mark.parametrize(
+    ("error", "attributes"),
+    [
+        (kinds.Diverged(3, loss=0.5), ("step", "loss")),
+        (kinds.Rewords(3), ("code",)),
+        (kinds.Slotted(3, 4), ("step",)),
+        (kinds.Made(step=3), ("step",)),
+        (kinds.Data(3, loss=0.5), ("step", "loss")),
+        (kinds.Data(step=3), ("step", "loss")),
+        (kinds.Frozen(3), ("step",)),
+        (kinds.NoDevice("gpu"), ("device", "errno", "strerror", "filename")),
+        (kinds.NoText(3), ("line", "encoding", "object", "start", "end", "reason")),
+        (kinds.Stop(value=3), ("value",)),
+        (kinds.NoModule("module", why="none"), ("name", "path", "msg")),
+        (kinds.NoSyntax(3), ("lineno", "offset", "text", "end_offset", "filename")),
+        (kinds.Two("key", name="name"), ("name",)),
+        (kinds.BadlyReduced(3, 0.5), ("step", "loss")),
+        (kinds.Refusing(3), ()),
+        (AttributeError("none", name="name"), ("name",)),
+        (FileNotFoundError(2, "none", "path"), ("errno", "filename")),
+        (SystemExit(3), ("code",)),
+        (ValueError("plain"), ()),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_its_class_its_arguments_and_its_attributes(
+    error: BaseException, attributes: tuple[str, ...]
+) -> None:
+    vars(error)["__notes__"] = ["on the device"]
+    found = travelled(error)
+    assert type(found) is type(error)
+    assert (found.args, str(found)) == (error.args, str(error))
+    for name in attributes:
+        assert getattr(found, name) == getattr(error, name), name
+    assert found.__notes__ == ["on the device"]
+    assert isinstance(found.__cause__, RemoteTraceback)
+    assert "in travelled" in str(found.__cause__)
+
+
+def test_slots() -> None:
+    found = travelled(kinds.Slotted(3, 4))
+    assert found.hidden() == 4
+    assert not hasattr(found, "never_set")
+
+
+@pytest.mark.parametrize("kind", [kinds.Reduced, kinds.Registered])
+def test_a_reduce_that_works_is_used(kind: Any) -> None:
+    error = kind(3, "secret")
+    error.add_note("on the device")
+    found = travelled(error)
+    assert (type(found), found.args, found.secret) == (kind, (3, "left out"), "left out")
+    assert found.__notes__ == ["on the device"]
+
+
+def test_a_setstate_is_used() -> None:
+    assert travelled(kinds.WithState(3, 0.5)).step == 4
+
+
+def test_groups_with_groups() -> None:
+    inner = kinds.Several([kinds.Diverged(1, loss=0.5)], step=2)
+    found = travelled(ExceptionGroup("outer", [ValueError("plain"), inner]))
+    assert [type(error) for error in found.exceptions] == [ValueError, kinds.Several]
+    (diverged,) = found.exceptions[1].exceptions
+    assert (found.exceptions[1].step, diverged.step, diverged.loss) == (2, 1, 0.5)
+
+
+def test_one_that_has_another_and_itself() -> None:
+    found = travelled(kinds.Wraps(kinds.BadlyReduced(3, 0.5), step=2))
+    assert (type(found.inner), found.inner.step, found.step) == (kinds.BadlyReduced, 3, 2)
+    assert found.inner.outer is found
+
+
+def test_one_whose_class_is_local_to_a_function() -> None:
+    found = travelled(kinds.local(3))
+    assert (type(found).__name__, found.args, found.step) == ("Local", ("local",), 3)
+
+
+def test_what_cannot_travel_is_left_out_with_a_note() -> None:
+    error = kinds.Wraps(kinds.Holding(3), step=2)
+    error.add_note("on the device")
+    found = travelled(error)
+    assert (type(found), type(found.inner), found.inner.step) == (kinds.Wraps, kinds.Holding, 3)
+    assert not hasattr(found.inner, "lock")
+    first, second = found.inner.args
+    assert (first, "lock object" in second) == ("holds", True)
+    refusal = "TypeError(\"cannot pickle '_thread.lock' object\")"
+    lost, shown = found.inner.__notes__
+    assert lost == f"attribute 'lock' did not come along: {refusal}"
+    assert shown == f"argument 1 came as text: {refusal}"
+    assert found.__notes__[0] == "on the device"
+
+
+def test_what_cannot_be_made_again_says_why() -> None:
+    error = kinds.Hopeless("no hope")
+    error.step = 3  # type: ignore[attr-defined]
+    found = travelled(error)
+    assert type(found) is MaybeEncodingError
+    assert "Hopeless('no hope')" in str(found)
+    assert "its state cannot be set" in str(found)
+    assert "Hopeless: no hope" in str(found.__cause__)
+
+
+def test_what_only_its_receiver_cannot_unpickle_says_so_and_where_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = encode_error(kinds.Diverged(3, loss=0.5))
+    monkeypatch.delattr(kinds, "Diverged")
+    found = pickle.loads(data)
+    assert type(found) is MaybeEncodingError
+    assert "Diverged('loss 0.5 at step 3')" in str(found)
+    assert "has no attribute" in str(found) or "Can't get attribute" in str(found)
+    assert "Diverged: loss 0.5 at step 3" in str(found.__cause__)
+
+
+def test_causes_and_contexts_come_behind_the_traceback() -> None:
+    try:
+        try:
+            try:
+                raise kinds.BadlyReduced(1, 0.5)
+            except Exception as error:
+                raise kinds.Diverged(2, loss=0.5) from error
+        except Exception:
+            raise KeyError("first")  # noqa: B904  # its context is the point
+    except KeyError as error:
+        found = pickle.loads(encode_error(error))
+    trace = found.__cause__
+    diverged = trace.__context__
+    assert trace.__suppress_context__, "it would be printed twice"
+    assert (type(diverged), diverged.step) == (kinds.Diverged, 2)
+    assert (type(diverged.__cause__), diverged.__cause__.step) == (kinds.BadlyReduced, 1)
+
+
+def test_what_its_frames_hold_goes_at_once() -> None:
+    def fail(held: object) -> bytes:
+        try:
+            raise kinds.Holding(3)
+        except Exception as error:
+            return encode_error(error)
+
+    held = kinds.Refusing()
+    reference = weakref.ref(held)
+    gc.disable()
+    try:
+        fail(held)
+        del held
+        assert reference() is None
+    finally:
+        gc.enable()
+
+
+def test_a_long_chain_is_cut() -> None:
+    error: BaseException = ValueError(0)
+    for number in range(3000):
+        later = ValueError(number)
+        later.__context__ = error
+        error = later
+    found = pickle.loads(encode_error(error)).__cause__.__context__
+    length = 0
+    while found is not None:
+        length, found = length + 1, found.__context__
+    assert length == LINKS
