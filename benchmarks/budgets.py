@@ -9,6 +9,7 @@ from typing import Any
 from benchmarks import (
     agents,
     coldstart,
+    endings,
     executors,
     kubernetes_start,
     latency,
@@ -120,9 +121,10 @@ def _pool() -> Iterator[Budget]:
     for case, bound in (("map, chunksize 1", 50), ("map, default chunks", 1.1)):
         what = f"no-op tasks, {case.removeprefix('map, ')}"
         yield Budget(what, "throughput", case, rate, bound, at_least=True)
-    for metric in (latency.P50, latency.P95):
-        what = f"latency of one apply, {metric.label}"
-        yield Budget(what, "latency", latency.NAME, metric.name, 0.5)
+    for case in (latency.NAME, latency.OF_MAIN):
+        for metric in (latency.P50, latency.P95):
+            what = f"latency of one {case}, {metric.label}"
+            yield Budget(what, "latency", case, metric.name, 0.5)
     yield from _overhead()
     for case in throughput.ARRAY_KINDS:
         yield Budget(case, "throughput", case, throughput.TIME.name, 0.25)
@@ -256,11 +258,13 @@ def _remote() -> Iterator[Budget]:
             against=against,
         )
 
-    what = "latency of one apply, p50"
-    yield budget(what, "latency", latency.NAME, latency.P50, 2)
-    yield budget(f"{what}, to Ray's", "latency", latency.NAME, latency.P50, 0.25, against="ray")
+    for case in (latency.NAME, latency.OF_MAIN):
+        yield budget(f"latency of one {case}, p50", "latency", case, latency.P50, 2)
+    what = "latency of one apply, p50, to Ray's"
+    yield budget(what, "latency", latency.NAME, latency.P50, 0.25, against="ray")
     rate = throughput.RATE
-    yield budget("apply_async no-ops", "throughput", "apply_async", rate, 1, at_least=True)
+    for case in ("apply_async", f"apply_async, {throughput.OF_MAIN}"):
+        yield budget(f"no-ops: {case}", "throughput", case, rate, 1, at_least=True)
     what = "no-op tasks, chunksize 1"
     yield budget(what, "throughput", "map, chunksize 1", rate, 20, at_least=True)
     for case in throughput.ARRAY_KINDS:
@@ -268,6 +272,21 @@ def _remote() -> Iterator[Budget]:
     for chunks in overhead.CHUNKS:
         case = overhead.case_name(0.001, chunks)
         yield budget(case, "overhead", case, overhead.TIME, 1.02)
+
+
+def _endings() -> Iterator[Budget]:
+    """The bounds are promises to users; a test would fail for them on a busy machine."""
+    bounds = {
+        endings.TERMINATE: 1.0,
+        endings.KILLED_PROCESS: 0.5,
+        endings.OVER_LIMIT: 1.0,
+        endings.INTERRUPT: 2.0,
+        endings.KILLED_PROGRAM: 2.0,
+    }
+    for contender, where in (("fiber", ""), ("fiber-loopback", "loopback: ")):
+        for case, bound in bounds.items():
+            what, time = f"{where}{case}, time to end", endings.TIME.name
+            yield Budget(what, "endings", case, time, bound, contender=contender, unit="s")
 
 
 def _many() -> Iterator[Budget]:
@@ -319,5 +338,6 @@ BUDGETS = (
     *_start(),
     *_remote(),
     *_many(),
+    *_endings(),
 )
 ON_PODS = tuple(_on_pods())

@@ -20,8 +20,15 @@ from benchmarks import peers
 from benchmarks.tasks import no_op
 
 
+def give_back(item: Any) -> Any:
+    """Do what `no_op` does, as a function that the main module defines."""
+    return item
+
+
 class Bench:
     """What a measure is run with."""
+
+    of_main = staticmethod(give_back)
 
     def __init__(self, contender: str, *, light: bool) -> None:
         self.contender = contender

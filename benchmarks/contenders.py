@@ -11,7 +11,8 @@ _POOL = frozenset({"map", "stream", "stream in chunks", "submit", "apply"})
 _CLIENT = frozenset({"map", "stream", "submit", "apply"})
 EXECUTOR = frozenset({"executor", "executor in chunks"})
 _PARALLEL = frozenset({"parallel"})
-_PROCESSES = frozenset({"pipes", "sharing", "start", "cold start"})
+_PROCESSES = frozenset({"pipes", "sharing", "start", "cold start", "endings"})
+_GUARDED = frozenset({"guarded endings"})
 VECTOR = frozenset({"vector steps", "cart poles"})
 FIRST_READY = frozenset({"first ready"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
@@ -64,7 +65,7 @@ ALL = (
         "fiber",
         "Fiber",
         ("fiber",),
-        _POOL | _PROCESSES | _AGAINST_BASELINE | VECTOR | FIRST_READY | {"fake workers"},
+        _POOL | _PROCESSES | _GUARDED | _AGAINST_BASELINE | VECTOR | FIRST_READY | {"fake workers"},
         "#0072B2",
         "o",
         environment={"FIBER_BACKEND": "local"},
@@ -73,7 +74,7 @@ ALL = (
         "fiber-loopback",
         "Fiber, loopback agents",
         ("fiber",),
-        _POOL | _PROCESSES | VECTOR | FIRST_READY,
+        _POOL | _PROCESSES | _GUARDED | VECTOR | FIRST_READY,
         "#56B4E9",
         "s",
         environment={"FIBER_BACKEND": "loopback"},

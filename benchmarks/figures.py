@@ -13,6 +13,7 @@ mpl.use("Agg")
 from benchmarks import (
     agents,
     coldstart,
+    endings,
     executors,
     latency,
     overhead,
@@ -202,6 +203,13 @@ def _workers(run: Run, path: Path) -> None:
     _finish(figure, path)
 
 
+def _endings(run: Run, path: Path) -> None:
+    figure, panel = plt.subplots(figsize=(9, 4))
+    _rows(panel, run, [case.name for case in endings.cases(run.about["size"])], endings.TIME)
+    panel.set(title="Further left is better", xlabel="time to end")
+    _finish(figure, path)
+
+
 def _agents(run: Run, path: Path) -> None:
     figure, panels = plt.subplots(1, 3, figsize=(14, 5))
     points = [(float(count), agents.agents(count)) for count in agents.AGENTS]
@@ -229,6 +237,7 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "coldstart": _coldstart,
     "workers": _workers,
     "agents": _agents,
+    "endings": _endings,
 }
 
 

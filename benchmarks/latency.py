@@ -15,28 +15,34 @@ if TYPE_CHECKING:
 TITLE = "Latency"
 ABOUT = f"""\
 Time of one `apply` of a no-op to an idle pool of {WORKERS} workers: up to 2,000 calls, one
-after the other, or as many as fit in 2 s. p50 is the time that half of the calls stay below,
+after the other, or as many as fit in 2 s. The function is one of an importable module, or of the
+main module, as in most scripts. p50 is the time that half of the calls stay below,
 p95 the time that 95 % stay below. Where a library has no such call, the nearest is taken:
 submit and wait for the result; for Spark a job of one task."""
 
 P50 = Metric("p50", "p50", "s")
 P95 = Metric("p95", "p95", "s")
 NAME = "apply"
+OF_MAIN = "apply, function of __main__"
 
 
 def cases(size: float) -> list[Case]:
     """The full measure at size 1; below, fewer calls."""
     params = {"calls": max(20, round(2000 * size)), "seconds": 2.0 * size}
-    return [Case("latency", NAME, "one call", "apply", params, (P50, P95))]
+    return [
+        Case("latency", name, "one call", "apply", {**params, "of_main": of_main}, (P50, P95))
+        for name, of_main in ((NAME, False), (OF_MAIN, True))
+    ]
 
 
-def run(bench: Bench, calls: int, seconds: float) -> dict[str, float]:
+def run(bench: Bench, calls: int, seconds: float, of_main: bool = False) -> dict[str, float]:
     """The percentiles of up to `calls` calls, or of as many as fit in `seconds`."""
+    function = bench.of_main if of_main else no_op
     for _ in range(max(5, calls // 20)):
-        bench.pool.apply(no_op, 0)
+        bench.pool.apply(function, 0)
     clock, times, end = time.perf_counter, list[float](), time.perf_counter() + seconds
     while len(times) < calls and (not times or clock() < end):
         begin = clock()
-        bench.pool.apply(no_op, 0)
+        bench.pool.apply(function, 0)
         times.append(clock() - begin)
     return {P50.name: percentile(times, 50), P95.name: percentile(times, 95)}

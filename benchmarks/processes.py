@@ -37,6 +37,12 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
+def runs(pid: int) -> bool:
+    """Return whether the process is there and is no zombie."""
+    stat = _read(f"/proc/{pid}/stat")
+    return bool(stat) and stat.rpartition(")")[2].split()[0] != "Z"
+
+
 def memory(pid: int) -> int:
     """Bytes held by `pid` and all below it: PSS, where a page shared by n counts 1/n for each."""
     return sum(pss(each) for each in (pid, *descendants(pid)))

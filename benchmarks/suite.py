@@ -7,6 +7,7 @@ from types import ModuleType
 from benchmarks import (
     agents,
     coldstart,
+    endings,
     executors,
     latency,
     overhead,
@@ -32,4 +33,5 @@ MEASURES: dict[str, ModuleType] = {
     "coldstart": coldstart,
     "workers": workers,
     "agents": agents,
+    "endings": endings,
 }

@@ -15,9 +15,11 @@ if TYPE_CHECKING:
 
 TITLE = "Throughput"
 ABOUT = f"""\
-{WORKERS} workers. No-op tasks give their argument, an int, back. Contenders with servers of
-their own (Dask, ipyparallel, Ray, Spark) get a tenth of the no-op tasks, so that a round ends
-in bearable time. The batches of arrays are 100 different ones of 1 MB, sent with chunksize 1.
+{WORKERS} workers. No-op tasks give their argument, an int, back. Their function is one of an
+importable module or, where the case says so, of the main module, as in most scripts. Contenders
+with servers of their own (Dask, ipyparallel, Ray, Spark) get a tenth of the no-op tasks, so that
+a round ends in bearable time. The batches of arrays are 100 different ones of 1 MB, sent with
+chunksize 1.
 The long task stands in the middle of its batch, which is sent in default chunks: the time
 shows whether short tasks wait behind the long one, and whether the long one waited for its
 turn. Each other value of a round is the median of up to five batches in a row."""
@@ -28,6 +30,7 @@ NO_OPS = "no-op tasks"
 ARRAYS = "arrays of 1 MB"
 LONG = "one long task"
 MEGABYTE = 1 << 20
+OF_MAIN = "function of __main__"
 
 # Name, what it needs, method, chunk size, tasks.
 _NO_OPS: tuple[tuple[str, str, str, int | None, int], ...] = (
@@ -36,6 +39,8 @@ _NO_OPS: tuple[tuple[str, str, str, int | None, int], ...] = (
     ("imap_unordered, chunksize 1", "stream", "stream", 1, 10_000),
     ("imap_unordered, chunksize 100", "stream in chunks", "stream", 100, 100_000),
     ("apply_async", "submit", "submit", None, 10_000),
+    (f"map, chunksize 1, {OF_MAIN}", "map", "map", 1, 10_000),
+    (f"apply_async, {OF_MAIN}", "submit", "submit", None, 10_000),
 )
 ARRAY_KINDS = {
     "1 MB arguments": "arguments",
@@ -61,6 +66,7 @@ def cases(size: float) -> list[Case]:
                 kind=method,
                 tasks=max(100, round(tasks * size)),
                 chunksize=chunksize,
+                of_main=name.endswith(OF_MAIN),
             )
             for name, needs, method, chunksize, tasks in _NO_OPS
         ),
@@ -74,24 +80,30 @@ def cases(size: float) -> list[Case]:
     ]
 
 
-def run(bench: Bench, kind: str, tasks: int, chunksize: int | None) -> dict[str, float]:
+def run(
+    bench: Bench, kind: str, tasks: int, chunksize: int | None, *, of_main: bool = False
+) -> dict[str, float]:
     """Tasks a second for no-ops; for the others the seconds of the batch."""
     if kind == "long":
         return _long(bench, tasks)
     if kind in ARRAY_KINDS.values():
         return _arrays(bench, kind, tasks)
-    return _no_ops(bench, kind, tasks if bench.light else max(100, tasks // 10), chunksize)
+    function = bench.of_main if of_main else no_op
+    tasks = tasks if bench.light else max(100, tasks // 10)
+    return _no_ops(bench, kind, function, tasks, chunksize)
 
 
-def _no_ops(bench: Bench, method: str, tasks: int, chunksize: int | None) -> dict[str, float]:
+def _no_ops(
+    bench: Bench, method: str, function: Callable[[int], int], tasks: int, chunksize: int | None
+) -> dict[str, float]:
     pool = bench.pool
 
     def batch(items: Sequence[int]) -> Iterable[Any]:
         if method == "map":
-            return pool.map(no_op, items, chunksize)
+            return pool.map(function, items, chunksize)
         if method == "stream":
-            return pool.stream(no_op, items, chunksize or 1)
-        return pool.submit(no_op, items)
+            return pool.stream(function, items, chunksize or 1)
+        return pool.submit(function, items)
 
     sum(batch(range(WORKERS)))
     return {RATE.name: rate(lambda count: batch(range(count)), tasks)}
