@@ -7,6 +7,7 @@ effect; the first process, pool, pipe or queue starts what it needs.
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING
 
 __version__ = "0.1.0.dev0"
@@ -185,6 +186,8 @@ _SUBMODULES = frozenset(
     }
 )
 
+_OTHER_FILES = frozenset({"agent", "inherited", "joblib"})
+
 _HOMES = {
     "AdoptionError": "errors",
     "AgentLost": "errors",
@@ -239,3 +242,19 @@ if not TYPE_CHECKING:  # to a type checker any name would be one of ours
 
 def __dir__() -> list[str]:
     return sorted({*__all__, *_SUBMODULES, "__version__"})
+
+
+def _find_foreign_files() -> None:
+    """Warn if another distribution has installed its modules among these."""
+    try:
+        names = os.listdir(__path__[0])
+    except OSError:  # an archive
+        return
+    modules = {name[:-3] for name in names if name.endswith(".py") and not name.startswith("_")}
+    if foreign := modules - _SUBMODULES - _OTHER_FILES:
+        from fiber import _installation
+
+        _installation.warn_of_foreign_files(__path__[0], [f"{name}.py" for name in foreign])
+
+
+_find_foreign_files()

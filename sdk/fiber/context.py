@@ -89,6 +89,9 @@ class BaseContext:
     def __init__(self, method: str | None = None) -> None:
         self._method = method
 
+    def __repr__(self) -> str:  # part of that of fiber.Pool, a bound method
+        return f"fiber.get_context({self._method!r})" if self._method else "fiber"
+
     def cpu_count(self) -> int:
         """Processors that this process may use: its affinity and its cgroup's quota are heeded."""
         return cpu.cpu_count()

@@ -24,18 +24,21 @@ from concurrent.futures import Future
 from inspect import signature
 from typing import Any
 
-from joblib import register_parallel_backend
-from joblib.parallel import (
-    AutoBatchingMixin,
-    FallbackToBackend,
-    ParallelBackendBase,
-    SequentialBackend,
-)
-
 from fiber import cpu
-from fiber._memmapping import MemmappedArguments
+from fiber._installation import explained_if_missing
 from fiber._runtime.state import runtime
 from fiber.futures import Executor
+
+with explained_if_missing("fiber.joblib"):
+    from joblib import register_parallel_backend
+    from joblib.parallel import (
+        AutoBatchingMixin,
+        FallbackToBackend,
+        ParallelBackendBase,
+        SequentialBackend,
+    )
+
+    from fiber._memmapping import MemmappedArguments
 
 __all__ = ["FiberBackend"]
 

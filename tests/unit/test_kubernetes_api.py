@@ -111,9 +111,12 @@ def test_a_kubeconfig_that_is_none(
         Api.connect()
 
 
-def test_without_the_package_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "kubernetes", None)
-    with pytest.raises(ConfigError, match=r"pip install 'fiberpool\[kubernetes\]'"):
+@pytest.mark.parametrize("package", ["kubernetes", "pathspec"])
+def test_without_a_package_it_says_how_to_install_it(
+    package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ConfigError, match=rf"{package}.*pip install 'fiberpool\[kubernetes\]'"):
         Api.connect()
 
 

@@ -1,12 +1,14 @@
 """Vector environments on Fiber's processes: for Gymnasium and for stable-baselines3.
 
-Needs the extra ``rl``.
+Needs the extra ``vector``.
 """
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING
+
+from fiber._installation import explained_if_missing
 
 if TYPE_CHECKING:
     from fiber.vector.registration import make_vec as make_vec
@@ -30,7 +32,8 @@ if not TYPE_CHECKING:  # to a type checker any name would be one of ours
         # stable-baselines3, and with it torch, is imported by those who ask for VecEnv.
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+        with explained_if_missing(f"{__name__}.{name}"):
+            return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

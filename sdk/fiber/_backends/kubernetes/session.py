@@ -7,6 +7,7 @@ knows how to log in: kubeconfigs with their plugins, accounts of pods, tokens th
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import ssl
 import tempfile
@@ -222,6 +223,9 @@ def _account_namespace() -> str:
 def _package() -> Any:
     try:
         import kubernetes
+
+        if importlib.util.find_spec("pathspec") is None:  # needed once the program is sent
+            raise ModuleNotFoundError("No module named 'pathspec'")
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"the backend kubernetes needs a package that is not installed ({error}): "
