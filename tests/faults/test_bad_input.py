@@ -52,7 +52,10 @@ def test_an_unguarded_main_is_told_so_and_starts_no_avalanche(
     program = launch(script.replace("{method}", method))
     assert program.rest() == "1\n"
     assert program.wait() == 0
-    assert 'if __name__ == "__main__"' in program.stderr
+    assert program.stderr.count('if __name__ == "__main__"') == 1
+    assert f"did not start: {program.script}, line " in program.stderr
+    assert "Traceback" not in program.stderr
+    assert "threads" not in program.stderr
     assert program.stderr.count("main is imported") <= 3  # itself, its zygote, the child
     assert program.left() == []
 
@@ -62,7 +65,9 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
 ) -> None:
     program = launch(UNGUARDED_POOL)
     assert program.wait() == 1
-    assert 'if __name__ == "__main__"' in program.stderr
+    assert program.stderr.count('if __name__ == "__main__"') == 1
+    assert program.stderr.count("Traceback") == 1, "the program's own"
+    assert f"{program.script}, line 4, starts a process" in program.stderr
     assert "StartError" in program.stderr
     assert program.stderr.count("main is imported") <= 20
     assert program.left() == []

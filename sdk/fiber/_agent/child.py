@@ -39,6 +39,10 @@ host = ""
 """The host that this process belongs to; empty in a program that Fiber did not start."""
 
 
+class UnguardedMainError(RuntimeError):
+    """The main module starts a process each time it is imported."""
+
+
 class StartRequest(NamedTuple):
     """What a zygote is told of one child, and the child of itself; descriptors come beside it."""
 
@@ -145,11 +149,14 @@ def _run(start: StartRequest, fds: list[int], progress_table: ProgressTable, age
 def _load_and_run(start: StartRequest, agent: int, arguments: Descriptor | None) -> int:
     try:
         process = _load(start, arguments)
+    except UnguardedMainError as error:
+        is_worker = _task_channel is not None
+        _tell(f"{'' if is_worker else f'fiber: process {start.name!r} did not start: '}{error}\n")
+        return 1
     except BaseException:
         import traceback  # rarely needed, and long to import
 
-        traceback.print_exc()
-        _report_init_failure()
+        _tell(traceback.format_exc())
         return 1
     return int(process._bootstrap(parent_sentinel=agent))
 
@@ -244,14 +251,15 @@ def _adopt_stdio(fds: list[int], *, captured: bool) -> None:
             )
 
 
-def _report_init_failure() -> None:
+def _tell(problem: str) -> None:
+    """Tell the pool of this worker, which raises it; without a pool, write it to stderr."""
     if _task_channel is not None:
-        import traceback
-
         from fiber._wire import work
 
         with contextlib.suppress(OSError):
-            _task_channel.send(pickle.dumps((work.INIT_FAILED, traceback.format_exc())))
+            _task_channel.send(pickle.dumps((work.INIT_FAILED, problem)))
+            return
+    sys.stderr.write(problem)
 
 
 def _exec(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> None:

@@ -44,6 +44,7 @@ class Unfit(NamedTuple):
     """Why a zygote must not be forked."""
 
     reason: str
+    """For the user; empty where importing the main module fails, as each child will report."""
     safe: Imports
     """Imports for the next zygote: those of the program up to the one that starts threads."""
 
@@ -74,6 +75,7 @@ class _Preloader:
             self._threads = _count_threads()
         self._culprit: str | None = None
         self._names = ""
+        self._has_failed = False
         self._safe: list[str] = []
         self._environ = dict(os.environb)
         self._seconds = 0.0
@@ -94,8 +96,11 @@ class _Preloader:
         """Import the main module, as the children will."""
         begin = time.perf_counter()
         main = data.get("init_main_from_name") or data.get("init_main_from_path") or _MAIN
-        with contextlib.suppress(BaseException), child.inheriting(), self._checking_imports(main):
-            child.prepare_main(data)
+        try:
+            with child.inheriting(), self._checking_imports(main):
+                child.prepare_main(data)
+        except BaseException:  # a child meets, and reports, it
+            self._has_failed = True
         self._seconds += time.perf_counter() - begin
         self._check(main)
 
@@ -109,6 +114,7 @@ class _Preloader:
             f"takes {self._seconds * 1000:.0f} ms. "
             "Start the threads in a function to save that time."
         )
+        reason = "" if self._has_failed else reason
         return Unfit(reason, Imports(tuple(self._safe), self._environ))
 
     @contextlib.contextmanager

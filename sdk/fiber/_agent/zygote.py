@@ -181,7 +181,8 @@ class Zygote:
             self._unfit = preload(child_module.read_preparation(start), self._imports)
             self._listen_to_signals()  # an import may have set its own
             # Once for a program: a zygote of its children would only repeat it.
-            if self._unfit is not None and self._imports is None and len(self._ancestors) == 1:
+            is_first = self._imports is None and len(self._ancestors) == 1
+            if is_first and self._unfit is not None and self._unfit.reason:
                 print(f"fiber: {self._unfit.reason}", file=sys.stderr, flush=True)
         return self._unfit is None
 

@@ -5,7 +5,10 @@ A child starts with its parent's.
 
 from __future__ import annotations
 
+import sys
 from multiprocessing.process import current_process
+
+from fiber._agent.child import UnguardedMainError
 
 START_METHODS = ("forkserver", "spawn", "fork")
 """``forkserver`` and ``fork`` both fork from Fiber's zygote; the default comes first."""
@@ -41,17 +44,14 @@ def zygote_method(method: str | None) -> str:
 
 
 def check_main() -> None:
-    """RuntimeError if this process is still importing its parent's main module."""
-    if getattr(current_process(), "_inheriting", False):
-        raise RuntimeError(_UNGUARDED_MAIN)
-
-
-_UNGUARDED_MAIN = """\
-a process was started while its own parent's main module was being imported.
-
-The program starts processes at the top level of its main module, and each of them imports that
-module first. Put what starts processes under
-
-    if __name__ == "__main__":
-        ...
-"""
+    """Raise UnguardedMainError if this process is still importing its parent's main module."""
+    if not getattr(current_process(), "_inheriting", False):
+        return
+    frame = sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__") != "__mp_main__":
+        frame = frame.f_back
+    raise UnguardedMainError(
+        f"{frame.f_code.co_filename}, line {frame.f_lineno}, starts a process each time it is "
+        "imported. A new process imports the main module first, so processes would start without "
+        'end. Put the lines that start processes under: if __name__ == "__main__":'
+    )
