@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from fiber.managers import BaseManager
+from fiber.managers import AsyncManager, BaseManager
 
 
 class Diverged(Exception):
@@ -27,15 +27,41 @@ def diverge_as_member(rank: int, size: int) -> NoReturn:
 
 
 class Model:
+    def __init__(self, kind: type[BaseException] | None = None) -> None:
+        if kind is not None:
+            raise kind("in the making")
+
     def diverge(self, step: int) -> NoReturn:
         diverge(step)
+
+    def end_by(self, kind: type[BaseException]) -> NoReturn:
+        raise kind("no display")
+
+    def unpicklable(self, kind: type[BaseException]) -> RaisesWhenPickled:
+        return RaisesWhenPickled(kind)
+
+    def double(self, value: int) -> int:
+        return 2 * value
+
+
+class RaisesWhenPickled:
+    def __init__(self, kind: type[BaseException]) -> None:
+        self._kind = kind
+
+    def __reduce__(self) -> NoReturn:
+        raise self._kind("while it is pickled")
 
 
 class ModelManager(BaseManager):
     pass
 
 
+class AsyncModelManager(AsyncManager):
+    pass
+
+
 ModelManager.register("Model", Model)
+AsyncModelManager.register("Model", Model)
 
 
 class DivergingEnv(gymnasium.Env[Any, Any]):

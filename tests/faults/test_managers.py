@@ -15,7 +15,9 @@ import pytest
 import fiber
 from faults import targets
 from faults.program import wait_for
+from faults.raising import AsyncModelManager, ModelManager
 from fiber.errors import ConnectionClosed
+from fiber.managers import RemoteError
 from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -48,6 +50,36 @@ def tell(orders: Any, process: Any, method: str, *args: Any) -> Any:
         return process.name
     orders.put((method, args))
     return None
+
+
+# Calls that raise what ends a thread
+
+
+ENDS = (SystemExit, KeyboardInterrupt, GeneratorExit)
+
+
+@pytest.mark.parametrize("kind", ENDS)
+def test_what_would_end_a_thread_is_its_callers_error(kind: type[BaseException]) -> None:
+    with ModelManager() as manager:
+        model = manager.Model()  # type: ignore[attr-defined]
+        with pytest.raises(kind, match="no display") as caught:
+            model.end_by(kind)
+        assert "in end_by" in str(caught.value.__cause__)
+        with pytest.raises(RemoteError, match="while it is pickled"):
+            model.unpicklable(kind)
+        with pytest.raises(RemoteError, match="in the making"):
+            manager.Model(kind)  # type: ignore[attr-defined]
+        assert model.double(2) == 4
+
+
+@pytest.mark.parametrize("kind", ENDS)
+def test_calls_behind_it_are_made(kind: type[BaseException]) -> None:
+    with AsyncModelManager() as manager:
+        model = manager.Model()  # type: ignore[attr-defined]
+        before, ended, after = model.double(1), model.end_by(kind), model.double(2)
+        assert (before.get(PATIENCE), after.get(PATIENCE)) == (2, 4)
+        with pytest.raises(kind, match="no display"):
+            ended.get(PATIENCE)
 
 
 # The manager's process

@@ -126,7 +126,7 @@ class Server(_mp.Server):  # type: ignore[misc]
                 answer = "#RETURN", None
             else:
                 answer = self._own(client, method, args, kwds)
-        except Exception:
+        except BaseException:
             answer = "#TRACEBACK", format_exc()
         try:
             return _reply(line, number, answer)
@@ -158,7 +158,7 @@ class Server(_mp.Server):  # type: ignore[misc]
             if isinstance(obj, CONTENDED):
                 return thread.call(obj, method, function, args, kwds)
             result = function(*args, **kwds)
-        except Exception as error:
+        except BaseException as error:  # SystemExit too: the caller waits for an answer
             return _error(error)
         if typeids and method in typeids:
             return "#PROXY", self._made(client, typeids[method], result)
@@ -251,7 +251,7 @@ def _reply(line: Channel, number: int, answer: _Answer) -> Any:
         line.send(payload, buffers)
     except BrokenPipeError:
         raise
-    except Exception:  # it does not pickle, or there is no memory for it
+    except BaseException:  # it does not pickle, or there is no memory for it
         payload, buffers = reduction.encode((number, "#UNSERIALIZABLE", format_exc()))
         line.send(payload, buffers)
     return answer[1] if _PROXY in payload else None
