@@ -7,8 +7,9 @@ from unittest import mock
 
 import pytest
 
-from fiber._agent.service import AgentService
+from fiber._agent.service import AgentService, _Observed
 from fiber._wire import messages
+from fiber._wire.packet import Message
 from memory_link import SimulatedLoop
 
 
@@ -42,3 +43,29 @@ def test_a_link_that_is_lost_after_the_master_ended_is_not_the_reason(service: A
     served.on_frame(messages.Shutdown(0).encode())
     served.on_lost("it closed the link")
     assert ends == [("the master ended", False)]
+
+
+def test_a_child_with_a_large_result_on_its_way_is_not_heard_until_that_has_left() -> None:
+    link, child, nothing = mock.Mock(), mock.Mock(), mock.MagicMock()
+    loop: Any = SimulatedLoop()
+    service = AgentService(loop, link, nothing, nothing, nothing)
+    observed = _Observed(service, 1)
+    observed._child = child
+    observed.received(Message(memoryview(b"small"), [], []))
+    assert not child.mock_calls
+    observed.received(Message(memoryview(b"large"), [memoryview(bytes(8 << 20))], []))
+    assert child.mock_calls == [mock.call.pause()]
+    link.send.call_args.kwargs["on_left"]()
+    assert child.mock_calls == [mock.call.pause(), mock.call.resume()]
+
+
+def test_output_waits_for_output_and_not_for_large_messages() -> None:
+    link, nothing = mock.Mock(), mock.MagicMock()
+    loop: Any = SimulatedLoop()
+    service = AgentService(loop, link, nothing, nothing, nothing)
+    service.send(messages.FromChild(1, b"", [bytes(8 << 20)]))
+    assert not service.busy()
+    service.send_output(messages.Output(1, "x" * (8 << 20)))
+    assert service.busy()
+    link.send.call_args.kwargs["on_left"]()
+    assert not service.busy()

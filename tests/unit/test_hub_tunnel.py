@@ -16,10 +16,10 @@ from census import wait_until
 from fiber._hub.client import Unreachable
 from fiber._hub.remote import RemoteChannel
 from fiber._hub.streams import NullHandler
-from fiber._hub.tunnel import PIECE, WINDOW, Frame, Tunnels, TunnelStream
+from fiber._hub.tunnel import WINDOW, Frame, Tunnels, TunnelStream
 from fiber._wire import messages
 from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
-from fiber._wire.packet import INLINE_LIMIT, Message
+from fiber._wire.packet import Message
 from hosts import Hosts
 from patience import PATIENCE
 
@@ -80,14 +80,10 @@ def parts_of(*sizes: int) -> list[memoryview]:
     return [memoryview(bytes([n % 251]) * size) for n, size in enumerate(sizes)]
 
 
-def test_a_piece_holds_every_message_that_may_be_borrowed() -> None:
-    assert PIECE > INLINE_LIMIT
-
-
 @given(
     st.lists(
         st.lists(
-            st.sampled_from([0, 1, 5, PIECE - 1, PIECE, PIECE + 1, 3 * PIECE]),
+            st.sampled_from([0, 1, 5, WINDOW - 1, WINDOW, WINDOW + 1, 3 * WINDOW]),
             min_size=1,
             max_size=4,
         ),
@@ -125,17 +121,16 @@ def test_no_more_than_the_window_is_under_way() -> None:
     ours, theirs, listener = pair.open()
     ours.handler = sender = Listener()
     theirs.pause()
-    total = 5 * WINDOW
-    for _ in range(total // PIECE):
-        ours.send(bytes(PIECE - 1))
+    size = WINDOW // 2
+    for _ in range(10):
+        ours.send(bytes(size - 1))
     assert ours.congested
     pair.run()
     assert listener.messages == []
-    under_way = sum(len(message.payload) for message in theirs._early)
-    assert WINDOW - PIECE <= under_way <= WINDOW + PIECE
+    assert [len(message.payload) for message in theirs._early] == [size - 1] * 2
     theirs.resume()
     pair.run()
-    assert len(listener.messages) == total // PIECE
+    assert len(listener.messages) == 10
     assert not ours.congested
     assert sender.room == 1
 
@@ -149,11 +144,29 @@ def test_a_message_larger_than_the_window_passes() -> None:
     assert (len(payload), len(buffer)) == (4 * WINDOW, 3 * WINDOW)
 
 
+def test_no_more_than_one_large_message_is_under_way() -> None:
+    pair = Pair()
+    ours, theirs, listener = pair.open()
+    ours.handler = sender = Listener()
+    theirs.pause()
+    for _ in range(3):
+        ours.send(b"", parts_of(3 * WINDOW))
+        assert ours.congested
+    pair.run()
+    assert len(theirs._early) == 1
+    theirs.resume()
+    pair.run()
+    assert len(listener.messages) == 3
+    assert sender.room == 1
+    assert not ours.congested
+
+
 def test_other_tunnels_go_on_beside_a_congested_one() -> None:
     pair = Pair()
     ours, theirs, _ = pair.open()
     theirs.pause()
-    ours.send(bytes(4 * WINDOW))
+    for _ in range(2):
+        ours.send(bytes(4 * WINDOW))
     quick, _, listener = pair.open()
     quick.send(b"through")
     pair.run()
@@ -210,8 +223,8 @@ def test_a_lost_link_ends_all_its_tunnels() -> None:
     [
         TunnelData(1, b""),
         TunnelData(1, b"\x07"),
-        TunnelData(1, b"\x02", [b"a piece of nothing"]),
-        TunnelData(1, b"\x01" + (5).to_bytes(8, "little"), [b"too long"]),
+        TunnelData(1, b"\x02", [b"nothing that is known"]),
+        TunnelData(1, b"\x01" + (5).to_bytes(9, "little")),
         TunnelData(1, b"\x01\x05", [b"x"]),
         TunnelData(1, b"\x01"),
         TunnelData(1, b"\x03"),

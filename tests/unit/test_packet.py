@@ -286,3 +286,27 @@ def test_junk_raises_and_leaves_no_buffer_lent(pair: Pair, junk: bytes) -> None:
     assert len(packet._buffers.free) >= free
     packet.send(one, b"next")
     assert packet.receive(other).tobytes() == b"next"
+
+
+# What is large
+
+
+def test_large_bytes_in_a_call_are_not_copied_into_its_pickle() -> None:
+    large, small = os.urandom(packet.OUT_OF_BAND_MIN), b"small"
+    call = (max, (large, small, large), {"key": len})
+    data, buffers = packet.dumps(call)
+    assert len(data) < 1000
+    assert [buffer.obj for buffer in buffers] == [large]
+    assert buffers[0].obj is large
+    function, (one, other, same), keywords = pickle.loads(data, buffers=map(bytearray, buffers))
+    assert (function, one, other, keywords) == (max, large, small, {"key": len})
+    assert same is one
+    assert type(one) is bytes
+
+
+def test_what_its_owner_may_change_is_kept_by_a_copy() -> None:
+    fixed, open_ = bytes(10), bytearray(10)
+    views = packet.kept([memoryview(fixed), memoryview(open_)])
+    open_[0] = 1
+    assert views == [fixed, fixed]
+    assert views[0].obj is fixed

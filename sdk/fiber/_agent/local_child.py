@@ -175,6 +175,15 @@ class LocalChild:
     def reclaim(self) -> None:
         """Hear what it says again."""
         self._lent = False
+        self.resume()
+
+    def pause(self) -> None:
+        """Hear nothing that it says until ``resume``: it waits before it sends more."""
+        if self._ours is not None and self._ours.fileno() >= 0:
+            self._loop.pause(self._ours.fileno())
+
+    def resume(self) -> None:
+        """Hear what it says again."""
         if self._ours is not None and self._ours.fileno() >= 0:
             self._loop.resume(self._ours.fileno())
 

@@ -28,7 +28,9 @@ _KNOWN_HERE = ExitReport._fields.index("pod")
 """Fields of an exit report that an agent knows; the master adds the others."""
 
 _BACKLOG = 4 << 20
-"""Bytes of output waiting on the link above which no more output of children is read."""
+"""Bytes waiting on the link above which no more is read: of output of all children, of messages of
+one.
+"""
 
 
 class AgentService:
@@ -49,27 +51,26 @@ class AgentService:
         self._blobs = BlobStore(config.current().runtime_directory)
         self._children: dict[int, _Observed] = {}
         self._output = 0
-        """Bytes of output that wait for the link."""
+        """Characters of output that wait for the link."""
         self._stopping = False
         self._reason = ""
         self._lost = False
 
-    def send(self, message: messages.Message) -> None:
-        """Tell the master."""
+    def send(self, message: messages.Message, on_left: Callable[[], None] | None = None) -> None:
+        """Tell the master; ``on_left`` is called once that is on its way."""
         self._hub_link.flush()
-        self._transmit(message)
+        self._transmit(message, on_left)
 
-    def _transmit(self, message: messages.Message) -> None:
-        self._link.send(*messages.pieces(message), lane=messages.lane(message))
+    def _transmit(
+        self, message: messages.Message, on_left: Callable[[], None] | None = None
+    ) -> None:
+        lane = messages.lane(message)
+        self._link.send(*messages.pieces(message), lane=lane, on_left=on_left)
 
     def send_output(self, message: messages.Output) -> None:
         """Tell the master what a child wrote."""
-        self._hub_link.flush()
-        frame = message.encode()
-        self._output += len(frame)
-        self._link.send(
-            frame, lane=messages.lane(message), on_left=partial(self._output_left, len(frame))
-        )
+        self._output += len(message.text)
+        self.send(message, partial(self._output_left, len(message.text)))
 
     def busy(self) -> bool:
         """Whether so much output waits for the link that no more should be read."""
@@ -224,7 +225,14 @@ class _Observed:
 
     def received(self, message: packet.Message) -> None:
         """Pass a packet on."""
-        self._service.send(messages.FromChild(self._number, message.payload, message.buffers))
+        size = sum([buffer.nbytes for buffer in message.buffers])
+        on_left = None
+        if size > _BACKLOG and self._child is not None:
+            # Its next results stay with it, instead of filling the memory of this host.
+            self._child.pause()
+            on_left = self._child.resume
+        said = messages.FromChild(self._number, message.payload, message.buffers)
+        self._service.send(said, on_left)
         message.release()
 
     def recalled(self, seqs: list[int]) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from fiber._exceptions import report_uncaught
 from fiber._hub.local import LocalCounter
 from fiber._transport.base import SharedChannel, SharedCounter
+from fiber._wire import packet
 
 _MOVE = 1e-4
 """Seconds to wait while an item moves: its thread may have to wait for a processor."""
@@ -139,7 +140,7 @@ class Feeder:
             taken.clear()
             return
         # The arrays behind the buffers are their owner's to change once ``put`` has returned.
-        taken[:] = None, (payload, [memoryview(bytearray(view)) for view in buffers])
+        taken[:] = None, (payload, packet.kept(buffers))
         self._unsent.extend(iter(taken.pop, None))  # from there to here, with no handler in between
         self._wake.put(True)
         if self._vacancy:

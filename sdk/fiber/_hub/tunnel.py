@@ -5,14 +5,12 @@
     process ── unix stream ── its hub ══ link ══ master ══ link ══ another hub
                                 │ splice              │ splice         │ handler
 
-Many tunnels share a link with everything else that travels there.  So a message goes in pieces of
-at most PIECE bytes, and a tunnel has at most WINDOW bytes under way: the receiver gives credit as
-it passes them on.  A frame carries, the kind first in the payload and bytes in the buffers::
+Many tunnels share a link with everything else that travels there; the link sees to it that large
+messages take turns.  A tunnel has at most WINDOW bytes and a message under way: the receiver gives
+credit as it passes messages on.  A frame carries, the kind first in the payload::
 
-    WHOLE   a small message: its payload follows the kind, its buffers are the buffers
-    FIRST   a large one: the sizes of payload and buffers follow; the first piece is the buffer
-    MORE    the next piece
-    CREDIT  how many more bytes may come
+    MESSAGE  its payload follows the kind, its buffers are the buffers
+    CREDIT   how many more bytes may come
 """
 
 from __future__ import annotations
@@ -20,22 +18,19 @@ from __future__ import annotations
 import itertools
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from fiber._hub.streams import Handler, NullHandler, Stream, splice
 from fiber._wire import messages
+from fiber._wire.assembly import pass_on
 from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
 from fiber._wire.packet import BytesLike, Message
 
-PIECE = 1 << 20
-"""More than packet.INLINE_LIMIT.  What is not larger arrives in one piece, and is not put together
-from several.
-"""
+WINDOW = 1 << 21
+"""Bytes that one tunnel may have under way before another message."""
 
-WINDOW = 2 * PIECE
-
-_WHOLE, _FIRST, _MORE, _CREDIT = range(4)
-_KINDS = [bytes([kind]) for kind in range(4)]
+_MESSAGE, _CREDIT = range(2)
+_KINDS = [bytes([kind]) for kind in range(2)]
 _SIZE = struct.Struct("<Q")
 
 Frame = TunnelOpen | TunnelData | TunnelClose
@@ -57,14 +52,13 @@ class TunnelStream:
         self._owed = 0
         self._paused = False
         self._early: deque[Message] = deque()
-        self._assembly: _Assembly | None = None
         self._finishing: str | None = None
         self._closed = False
 
     @property
     def congested(self) -> bool:
         """Whether the other side takes less than comes."""
-        return bool(self._waiting)
+        return self._credit <= 0
 
     def send(
         self,
@@ -76,13 +70,14 @@ class TunnelStream:
         assert not fds, "a descriptor cannot leave its host"
         if self._closed or self._finishing is not None:
             return
-        for header, piece, size in _pieces(payload, buffers):
-            frame = TunnelData(self._number, header, piece)
-            if self._waiting or self._credit <= 0:
-                self._waiting.append((frame, size))
-            else:
-                self._credit -= size
-                self._send_frame(frame)
+        # The payload may be borrowed; the buffers are their message's own.
+        frame = TunnelData(self._number, _KINDS[_MESSAGE] + payload, buffers)
+        size = _size(frame.payload, buffers)
+        if self._waiting or self._credit <= 0:
+            self._waiting.append((frame, size))
+        else:
+            self._credit -= size
+            self._send_frame(frame)
 
     def pause(self) -> None:
         """Give no more credit, and keep what still comes."""
@@ -110,23 +105,18 @@ class TunnelStream:
         """A frame of this tunnel."""
         kind = header[0]
         if kind == _CREDIT:
+            was_congested = self.congested
             self._credit += _SIZE.unpack(header[1:])[0]
             self._pump()
+            if was_congested and not self.congested:
+                self.handler.on_room()
             return
-        if kind == _WHOLE:
-            self._arrived(Message(header[1:], buffers, []))
-            self._owe(len(header) + sum(view.nbytes for view in buffers))
-            return
-        (piece,) = buffers
-        if kind == _FIRST:
-            self._assembly = _Assembly(header[1:])
-        if self._assembly is None:
-            raise ValueError("a piece of no message")
-        self._assembly.add(piece)
-        if self._assembly.complete:
-            message, self._assembly = self._assembly.message(), None
-            self._arrived(message)
-        self._owe(piece.nbytes)
+        if kind != _MESSAGE:
+            raise ValueError(f"a frame of unknown kind {kind}")
+        for buffer in buffers:
+            pass_on(buffer)
+        self._arrived(Message(header[1:], buffers, []))
+        self._owe(_size(header, buffers))
 
     def on_close(self, reason: str) -> None:
         """The other side ended it, or the link is lost."""
@@ -155,17 +145,11 @@ class TunnelStream:
             self._send_frame(TunnelData(self._number, _KINDS[_CREDIT] + _SIZE.pack(credit)))
 
     def _pump(self) -> None:
-        if not self._waiting:
-            return
         while self._waiting and self._credit > 0:
             frame, size = self._waiting.popleft()
             self._credit -= size
             self._send_frame(frame)
-        if self._waiting:
-            return
-        if self._finishing is None:
-            self.handler.on_room()
-        else:
+        if self._finishing is not None and not self._waiting:
             self._end()
 
     def _end(self) -> None:
@@ -265,59 +249,5 @@ class Router:
         splice(stream, tunnels.open(host))
 
 
-class _Assembly:
-    """A message of which the pieces come one by one."""
-
-    def __init__(self, table: memoryview) -> None:
-        sizes = [size for (size,) in _SIZE.iter_unpack(table)]
-        self._parts = [memoryview(bytearray(size)) for size in sizes]
-        self._index = self._offset = 0
-
-    def add(self, piece: memoryview) -> None:
-        """The next piece: it may end one part and begin others."""
-        while piece.nbytes:
-            part = self._parts[self._index]
-            taken = min(part.nbytes - self._offset, piece.nbytes)
-            part[self._offset : self._offset + taken] = piece[:taken]
-            piece = piece[taken:]
-            self._offset += taken
-            self._skip_full()
-
-    def _skip_full(self) -> None:
-        while self._index < len(self._parts) and self._offset == self._parts[self._index].nbytes:
-            self._index += 1
-            self._offset = 0
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is missing."""
-        return self._index == len(self._parts)
-
-    def message(self) -> Message:
-        """The message."""
-        return Message(self._parts[0], self._parts[1:], [])
-
-
-def _pieces(
-    payload: BytesLike, buffers: Sequence[memoryview]
-) -> Iterator[tuple[bytes, Sequence[memoryview], int]]:
-    """Header, buffers and size of each frame that a message takes.
-
-    They may be kept: only the payload of a small message is ever borrowed, and it is copied.
-    """
-    parts = [memoryview(payload).cast("B"), *(view.cast("B") for view in buffers)]
-    total = sum(part.nbytes for part in parts)
-    if total <= PIECE:
-        yield _KINDS[_WHOLE] + bytes(parts[0]), parts[1:], total + 1
-        return
-    table = b"".join(_SIZE.pack(part.nbytes) for part in parts)
-    header = _KINDS[_FIRST] + table
-    for piece in _cut(parts):
-        yield header, [piece], piece.nbytes
-        header = _KINDS[_MORE]
-
-
-def _cut(parts: Sequence[memoryview]) -> Iterator[memoryview]:
-    for part in parts:
-        for start in range(0, part.nbytes, PIECE):
-            yield part[start : start + PIECE]
+def _size(payload: BytesLike, buffers: Sequence[memoryview]) -> int:
+    return len(payload) + sum(view.nbytes for view in buffers)

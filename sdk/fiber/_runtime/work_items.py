@@ -16,7 +16,7 @@ from fiber._engine.ledger import Batch, Job
 from fiber._hub.handles import GrantSet
 from fiber._runtime.functions import Function, name_of
 from fiber._runtime.input_stream import InputStream
-from fiber._wire import work
+from fiber._wire import packet, work
 
 
 class Future(Protocol):
@@ -80,9 +80,7 @@ class Call:
     def copy_buffers(self) -> None:
         """Keep what was passed as it is now: the caller goes on before it is sent."""
         if self.buffers:
-            ours = 0 if self.data else 1  # the pickle itself
-            copies = [memoryview(bytes(buffer)) for buffer in self.buffers[ours:]]
-            self.buffers = [*self.buffers[:ours], *copies]
+            self.buffers = packet.kept(self.buffers)
 
     def message(self) -> bytes:
         """It alone as a message, its buffers beside."""
@@ -219,7 +217,8 @@ def encode(item: WorkItem, batch: Batch, *, plain: bool) -> Encoded:
         return work.pack_calls([(call.data, call.buffers) for call in calls]), buffers
     if plain:
         return work.beside((pickle.dumps(batch.items, 5), []))
-    data, buffers, grants = reduction.encode_reusable(batch.items)
+    items = tuple(batch.items) if type(batch.items) is list else batch.items
+    data, buffers, grants = reduction.encode_reusable(items)
     if grants is not None:
         item.grants.append(grants)
     if len(buffers) > work.BUFFERS:

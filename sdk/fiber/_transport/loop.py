@@ -101,6 +101,7 @@ class Loop:
         self._asleep = False
         self._readers: dict[int, Callback] = {wakeup.fd: partial(os.eventfd_read, wakeup.fd)}
         self._writers: dict[int, Callback] = {}
+        self._paused: set[int] = set()
         self._ready: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._timers: list[tuple[float, int, Timer]] = []
         self._sequence = itertools.count()
@@ -172,20 +173,24 @@ class Loop:
     def unregister(self, fd: int) -> None:
         """Forget ``fd``; do it before the descriptor is closed."""
         self._writers.pop(fd, None)
+        self._paused.discard(fd)
         if self._readers.pop(fd, None) is not None and not self._closed:
             self._epoll.unregister(fd)
 
     def pause(self, fd: int) -> None:
-        """Let another thread read the registered ``fd`` without waking this one, until resumed."""
-        self._epoll.modify(fd, 0)
+        """Do not call back for what can be read from the registered ``fd``, until resumed."""
+        self._paused.add(fd)
+        self._epoll.modify(fd, self._interest(fd))
 
     def resume(self, fd: int) -> None:
         """Watch ``fd`` again."""
+        self._paused.discard(fd)
         if fd in self._readers:
             self._epoll.modify(fd, self._interest(fd))
 
     def _interest(self, fd: int) -> int:
-        return select.EPOLLIN | (select.EPOLLOUT if fd in self._writers else 0)
+        reads = 0 if fd in self._paused else select.EPOLLIN
+        return reads | (select.EPOLLOUT if fd in self._writers else 0)
 
     def want_write(self, fd: int, callback: Callback | None) -> None:
         """Also call back when the registered ``fd`` is writable; None ends it."""

@@ -26,6 +26,7 @@ import struct
 import threading
 from collections.abc import Callable, Sequence
 from itertools import starmap
+from operator import is_not
 from typing import Any, TypeAlias
 
 from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, in_place, release
@@ -141,7 +142,7 @@ class Message:
 
 def dumps(obj: Any, dump: Callable[..., bytes] = pickle.dumps) -> tuple[bytes, list[memoryview]]:
     """Pickle ``obj``; large contiguous buffers in it (NumPy arrays) are returned beside the
-    pickle.
+    pickle, and so are large bytes that it is or that it has as an argument or element.
     """
     buffers: list[memoryview] = []
 
@@ -152,7 +153,35 @@ def dumps(obj: Any, dump: Callable[..., bytes] = pickle.dumps) -> tuple[bytes, l
         buffers.append(raw)
         return False
 
-    return dump(obj, protocol=5, buffer_callback=keep_in_band), buffers
+    return dump(_light(obj, {}), protocol=5, buffer_callback=keep_in_band), buffers
+
+
+def kept(buffers: Sequence[memoryview]) -> list[memoryview]:
+    """Copy those buffers that their owner may change."""
+    return [view if type(view.obj) is bytes else memoryview(bytes(view)) for view in buffers]
+
+
+class _Large:
+    """Stands for bytes that no pickle has to copy."""
+
+    __slots__ = ("_data",)
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def __reduce__(self) -> tuple[type[bytes], tuple[pickle.PickleBuffer]]:
+        return bytes, (pickle.PickleBuffer(self._data),)
+
+
+def _light(obj: Any, known: dict[int, _Large], depth: int = 2) -> Any:
+    """Replace large bytes: ``obj`` itself, and those in tuples, of which calls consist."""
+    kind = type(obj)
+    if kind is bytes and len(obj) >= OUT_OF_BAND_MIN:
+        return known.setdefault(id(obj), _Large(obj))
+    if kind is tuple and depth and len(obj) <= MAX_BUFFERS:
+        light = [_light(each, known, depth - 1) for each in obj]
+        return tuple(light) if any(map(is_not, light, obj)) else obj
+    return obj
 
 
 def loads(message: Message) -> Any:
