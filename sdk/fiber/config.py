@@ -17,11 +17,13 @@ import math
 import os
 import pickle
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict, Unpack, get_args
 
-from fiber import inherited
+from fiber import _original, inherited
 from fiber.errors import ConfigError
 
 __all__ = ["Config", "current", "guard", "init", "install", "load", "use"]
@@ -278,6 +280,18 @@ def init(**settings: Unpack[Settings]) -> Config:
     return config
 
 
+def assign(key: str, value: object) -> None:
+    """Set one key and keep the others: `fiber.config.retries = 5`, as in the original Fiber."""
+    global _current
+    old = current()
+    changed: dict[str, Any] = {key: _checked(_Setting(key, value, "fiber.config"))}
+    new = replace(old, **changed)
+    _check_patience(new, {key: "fiber.config"})
+    if _used or _in_use():
+        _refuse_late_change(old, new)
+    _current = {"config": new}
+
+
 def install(config: Config) -> None:
     """Put a configuration in force as it is."""
     global _current, _used
@@ -325,6 +339,8 @@ def load(
     The environment and the directory to start from are the process's own unless given.
     """
     environ = os.environ if environ is None else environ
+    if message := _original.file_error(directory or os.curdir):
+        raise ConfigError(message)
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for setting in (
@@ -341,7 +357,7 @@ def load(
 
 def _checked(setting: _Setting) -> object:
     if setting.key not in _KEYS:
-        raise ConfigError(_unknown(setting))
+        raise ConfigError(_of_the_original(setting) or _unknown(setting))
     entry = _KEYS[setting.key]
     if setting.value is None and entry.default is None:
         return None
@@ -356,6 +372,14 @@ def _checked(setting: _Setting) -> object:
             f"bad value {setting.value!r} for {setting.key!r} in {setting.source}: "
             f"expected {rule.expects}"
         ) from None
+
+
+def _of_the_original(setting: _Setting) -> str | None:
+    advice = _original.replacement(setting.key, setting.spelling)
+    if advice is None:
+        return None
+    written = setting.spelling(setting.key)
+    return f"{written!r} in {setting.source} is a key of the original Fiber alone. {advice}."
 
 
 def _unknown(setting: _Setting) -> str:
@@ -467,3 +491,26 @@ def _read_toml(path: str) -> dict[str, Any]:
             return tomllib.load(file)
     except (OSError, ValueError) as error:
         raise ConfigError(f"cannot read {path} for [tool.fiber]: {error}") from error
+
+
+# ---- keys as attributes of this module ------------------------------------------------------
+
+
+class _Module(ModuleType):
+    """This module, whose attributes with the names of keys are the configuration in force."""
+
+    def __getattr__(self, name: str) -> object:
+        if name in _KEYS:
+            return getattr(current(), name)
+        advice = _original.replacement(name)
+        hint = f": it is a key of the original Fiber alone. {advice}." if advice else ""
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in _KEYS or name in _original.REPLACEMENTS:
+            assign(name, value)
+        else:
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Module

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fiber import config, inherited
+from fiber import _original, config, inherited
 from fiber._agent import main as agent
 from fiber.config import Config, load
 from fiber.errors import ConfigError, FiberError
@@ -481,3 +481,82 @@ class TestConfig:
     def test_every_default_passes_its_own_rule(self, entry: dataclasses.Field[object]) -> None:
         if entry.default is not None:
             assert load({entry.name: entry.default}) == Config()
+
+
+class TestKeysOfTheOriginal:
+    """Users of uber's Fiber hear what to write in place of what they have."""
+
+    def test_its_file(self, tmp_path: Path) -> None:
+        text = "[default]\nbackend=kubernetes\nlog_file=stdout\nkubernetes_namespace=rl\n"
+        (tmp_path / ".fiberconfig").write_text(text)
+        with pytest.raises(ConfigError) as caught:
+            load()
+        first, *lines = str(caught.value).splitlines()
+        assert f"{tmp_path}/.fiberconfig is a file of the original Fiber" in first
+        assert "[tool.fiber] of pyproject.toml" in first
+        assert lines[0] == "backend: Set backend to 'kubernetes'."
+        assert lines[1].startswith("log_file: Give the logger 'fiber'")
+        assert lines[2] == "kubernetes_namespace: Set namespace."
+
+    @pytest.mark.parametrize("text", ["no section", "[other]\nbackend=local", "\0"])
+    def test_its_file_with_a_fault(self, text: str, tmp_path: Path) -> None:
+        (tmp_path / ".fiberconfig").write_text(text)
+        with pytest.raises(ConfigError, match="They cannot be read"):
+            load()
+
+    @pytest.mark.parametrize("key", sorted(_original.REPLACEMENTS))
+    def test_its_keys_have_a_replacement_in_each_source(
+        self, key: str, pyproject: Callable[[str], Path]
+    ) -> None:
+        variable = f"FIBER_{key.upper()}"
+        with pytest.raises(ConfigError, match=f"{variable!r} in .* of the original Fiber") as env:
+            load(environ={variable: "1"})
+        assert "Did you mean" not in str(env.value)
+        with pytest.raises(ConfigError, match=rf"{key!r} in fiber.init\(\) is a key of the orig"):
+            config.init(**{key: 1})
+        pyproject(f"[tool.fiber]\n{key} = 1")
+        with pytest.raises(ConfigError, match=f"{key!r} in .*pyproject.toml is a key of the orig"):
+            load()
+
+    def test_advice_spells_keys_as_its_source_does(self) -> None:
+        with pytest.raises(ConfigError, match=r"Set FIBER_LOG_LEVEL to 'DEBUG'\.$"):
+            load(environ={"FIBER_DEBUG": "1"})
+        with pytest.raises(ConfigError, match=r"Set log_level to 'DEBUG'\.$"):
+            load({"debug": True})
+
+    def test_keys_are_set_as_attributes_of_the_module(self) -> None:
+        config.init(agents=3)
+        vars_before = set(vars(config))
+        setattr(config, "backend", "loopback")  # noqa: B010 - mypy
+        setattr(config, "retries", 7)  # noqa: B010
+        assert set(vars(config)) == vars_before
+        assert config.current() == dataclasses.replace(
+            Config(), agents=3, backend="loopback", retries=7
+        )
+        assert getattr(config, "backend") == "loopback"  # noqa: B009
+
+    @pytest.mark.parametrize(
+        ("key", "value", "words"),
+        [
+            ("backend", "docker", "bad value 'docker' for 'backend' in fiber.config"),
+            ("cpu_per_job", 2, r"'cpu_per_job' in fiber.config is .*fiber\.meta\(cpu=…\)"),
+            ("lost_after", 1.0, "lost_after must be longer"),
+        ],
+    )
+    def test_a_bad_attribute_changes_nothing(self, key: str, value: object, words: str) -> None:
+        with pytest.raises(ConfigError, match=words):
+            setattr(config, key, value)
+        assert config.current() == Config()
+
+    def test_an_attribute_that_comes_too_late(self) -> None:
+        config.use()
+        with pytest.raises(ConfigError, match="too late for backend='loopback'"):
+            setattr(config, "backend", "loopback")  # noqa: B010
+        setattr(config, "retries", 7)  # noqa: B010
+        assert config.current().retries == 7
+
+    def test_a_key_that_is_read_says_what_replaces_it(self) -> None:
+        with pytest.raises(AttributeError, match=r"original Fiber alone\. Set backend"):
+            getattr(config, "default_backend")  # noqa: B009
+        with pytest.raises(AttributeError, match=r"no attribute 'no_such_key'$"):
+            getattr(config, "no_such_key")  # noqa: B009
