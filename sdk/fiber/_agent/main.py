@@ -49,6 +49,10 @@ class Main:
         self._lost_grace = _seconds(_LOST_GRACE)
         self._waits_until = _seconds(_WAITS_UNTIL)
         self._parent = _pid(_PARENT)
+        if self._parent is not None:
+            # The kernel hangs up on a stopped process whose parent dies, and lets it go on.  What
+            # the parent left has to be removed then.
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
         self._loop = Loop()
         self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
         self._agent = Agent(self._loop, self._name, self._hub)
