@@ -402,13 +402,17 @@ class Pool:
     def _call_back(self, action: Callable[[], None]) -> bool:
         """Have a callback run; False if none runs any more, or the system has no thread for it."""
         try:
-            return self._executor.callbacks.submit(action)
+            return self._executor.threads.callbacks.submit(action)
         except RuntimeError:
             report_uncaught()  # nobody else would hear of it
             return False
 
+    def _calls_back_here(self) -> bool:
+        """Return whether the caller is a callback."""
+        return self._executor.threads.callbacks.runs_here()
+
     def _check_may_wait(self) -> None:
-        self._executor.check_may_wait()
+        self._executor.threads.check_may_wait()
 
     # The pool itself
 
@@ -488,7 +492,7 @@ class Pool:
 
 def _end(executor: Executor) -> None:
     executor.terminate(_terminated())
-    if not (executor.on_loop() or executor.pickles_here()):
+    if not (executor.on_loop() or executor.threads.pickling.runs_here()):
         executor.ended.wait()
 
 

@@ -42,6 +42,9 @@ class Keeper(Protocol):
 class Owner(Keeper, Protocol):
     """What a result needs of it."""
 
+    def _calls_back_here(self) -> bool:
+        """Return whether the caller is a callback, on the thread of all callbacks."""
+
     def _call_back(self, action: Callable[[], None]) -> bool:
         """Have a callback run; False if none runs any more."""
 
@@ -62,12 +65,16 @@ class ApplyResult(Generic[_T]):
         self._outcome: Any = None
         self._mixed = False
         self._done = Latch()
+        """The outcome is there, and the callback has run."""
+        calls_back = callback is not None or error_callback is not None
+        self._arrived = Latch() if calls_back else self._done
+        """The outcome is there."""
         # Reentrant: unpickling runs the user's code, which may ask for this very result.
         self._settling = threading.RLock()
 
     def ready(self) -> bool:
         """Whether the call has completed."""
-        return self._done.is_set()
+        return self._awaited().is_set()
 
     def successful(self) -> bool:
         """Whether it completed without raising; ValueError if it has not completed."""
@@ -77,9 +84,10 @@ class ApplyResult(Generic[_T]):
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the result is there or ``timeout`` seconds are over."""
-        if not self._done.is_set():
+        awaited = self._awaited()
+        if not awaited.is_set():
             _check_may_wait(self._pool, timeout)
-            self._done.wait(timeout)
+            awaited.wait(timeout)
 
     def get(self, timeout: float | None = None) -> _T:
         """The result, or the exception that the call raised; TimeoutError if there is neither."""
@@ -109,9 +117,12 @@ class ApplyResult(Generic[_T]):
 
     def set_done(self) -> None:
         """All outcomes are there: call back, then let those go on who wait."""
-        wanted = self._callback is not None or self._error_callback is not None
         pool = self._pool
-        if not wanted or pool is None or not pool._call_back(self._run_callback):
+        if self._arrived is self._done or pool is None:
+            self._complete()
+            return
+        self._arrived.set()
+        if not pool._call_back(self._run_callback):
             self._complete()
 
     def set_exception(self, error: BaseException) -> None:
@@ -129,6 +140,17 @@ class ApplyResult(Generic[_T]):
                 callback(fresh(self._outcome.error) if failed else self._outcome)
         finally:
             self._complete()
+
+    def _awaited(self) -> Latch:
+        """Return what the calling thread waits for.
+
+        Callbacks run one after the other: one that waits for a result cannot wait for the callback
+        of that result, too.
+        """
+        pool = self._pool
+        if self._arrived is self._done or pool is None or not pool._calls_back_here():
+            return self._done
+        return self._arrived
 
     def _complete(self) -> None:
         self._pool = None

@@ -98,8 +98,12 @@ class ManualThread:
             self.submitted.append((action, args))
         return not self.stopped
 
-    def stop(self) -> None:
+    def runs_here(self) -> bool:
+        return False
+
+    def stop(self, then: Callable[[], object] = lambda: None) -> None:
         self.stopped = True
+        then()
 
     def join(self) -> None:
         pass

@@ -81,6 +81,16 @@ def test_after_stop_what_was_submitted_is_done_and_no_more_is_taken() -> None:
     assert seen == [1]
 
 
+@pytest.mark.parametrize("needed", [True, False])
+def test_what_follows_its_end_is_called_last(needed: bool) -> None:
+    thread, seen = BackgroundThread("test-background"), []
+    if needed:
+        thread.submit(seen.append, 1)
+    thread.stop(then=lambda: seen.append(2))
+    thread.join()
+    assert seen == [1, 2] if needed else [2]
+
+
 @pytest.mark.parametrize("kind", [ValueError, SystemExit, KeyboardInterrupt])
 def test_what_raises_is_shown_and_stops_nothing(
     thread: BackgroundThread, monkeypatch: pytest.MonkeyPatch, kind: type[BaseException]

@@ -249,7 +249,7 @@ def test_without_a_thread_for_its_callback_a_result_is_there_and_that_is_seen(
     refusal = RuntimeError("can't start new thread")
     shown: list[BaseException] = []
     monkeypatch.setattr(sys, "excepthook", lambda _kind, error, _traceback: shown.append(error))
-    monkeypatch.setattr(pool._executor.callbacks, "submit", mock.Mock(side_effect=refusal))
+    monkeypatch.setattr(pool._executor.threads.callbacks, "submit", mock.Mock(side_effect=refusal))
     called: list[int] = []
     assert pool.apply_async(tasks.square, (3,), callback=called.append).get(PATIENCE) == 9
     assert (called, shown) == ([], [refusal])

@@ -16,7 +16,8 @@ class BackgroundThread:
 
     As ``ThreadPoolExecutor(1)``, with two differences: the thread is a daemon, so that what hangs
     in it cannot keep the program from ending, and ``stop`` does not wait.  ``submit`` and ``stop``
-    are for the loop's thread only, so nothing here needs a lock.
+    are for the loop's thread, so nothing here needs a lock.  Other threads may ``submit`` once the
+    thread has been started.
     """
 
     def __init__(self, name: str) -> None:
@@ -51,9 +52,13 @@ class BackgroundThread:
         """Whether it runs the caller, who then must not wait for what it would do next."""
         return threading.current_thread() is self._thread
 
-    def stop(self) -> None:
-        """End once everything submitted is done."""
+    def stop(self, then: Callable[[], object] | None = None) -> None:
+        """End once everything submitted is done, and call ``then`` at the end."""
         self._stopped = True
+        if then is not None and self._thread is None:
+            then()
+        elif then is not None:
+            self._queue.put((then, ()))
         self._queue.put(None)
 
     def join(self) -> None:
@@ -76,3 +81,46 @@ class BackgroundThread:
 def say(news: str) -> None:
     """Print it.  On a background thread: a slow terminal must not hold up the loop."""
     print(f"fiber: {news}", file=sys.stderr, flush=True)
+
+
+class UserThreads:
+    """The threads of one pool that run the user's code, by the kind of that code.
+
+    None of them waits for another one: a callback may wait for a result that is to be unpickled.
+    """
+
+    def __init__(self, thread: Callable[[str], BackgroundThread]) -> None:
+        self.pickling = thread("fiber-pool")
+        """Pickles tasks, and starts workers."""
+        self.unpickling = thread("fiber-pool-results")
+        """Unpickles results that are not unpickled where they are asked for."""
+        self.callbacks = thread("fiber-pool-callbacks")
+        """Runs the callbacks of results."""
+
+    def start(self) -> None:
+        """Start all of them now."""
+        for thread in (self.pickling, self.unpickling, self.callbacks):
+            thread.start()
+
+    def stop(self) -> None:
+        """End all of them once everything submitted is done."""
+        self.pickling.stop()
+        self.unpickling.stop(then=self.callbacks.stop)  # unpickled results have callbacks
+
+    def join(self) -> None:
+        """Wait until all of them have ended."""
+        for thread in (self.pickling, self.unpickling, self.callbacks):
+            thread.join()
+
+    def check_may_wait(self) -> None:
+        """Raise RuntimeError where a result would wait for the calling thread."""
+        if self.pickling.runs_here():
+            raise RuntimeError(
+                "what a pool pickles for its workers cannot wait for the same pool, which would "
+                "wait for the pickle: get the result before the map, or in the task"
+            )
+        if self.unpickling.runs_here():
+            raise RuntimeError(
+                "what unpickles a result cannot wait for another result of the same executor, "
+                "which would be unpickled later: get that result where this one is used"
+            )

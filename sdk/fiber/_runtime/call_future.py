@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 from fiber import errors
 from fiber._exceptions import fresh, report_uncaught
+from fiber._runtime.background import BackgroundThread
 from fiber._runtime.calls import CallQueue
 from fiber._runtime.executor import Executor
 from fiber._runtime.outcome import Failure, Pickled
@@ -38,6 +39,7 @@ class CallFuture(Future[_T]):
     def __init__(self, executor: Executor, queue: CallQueue) -> None:
         super().__init__()
         self._executor = executor
+        self._threads = executor.threads
         self._queue = queue
         self._undecided = bytearray(1)  # which the collector has no work with
         """Whoever takes it out decides: to give the call to a worker, or to cancel it."""
@@ -63,6 +65,7 @@ class CallFuture(Future[_T]):
 
     def result(self, timeout: float | None = None) -> _T:
         """As in concurrent.futures; each call raises an exception of its own."""
+        self._check_may_wait(timeout)
         error = super().exception(timeout)
         if error is not None:
             raise fresh(error)
@@ -70,8 +73,13 @@ class CallFuture(Future[_T]):
 
     def exception(self, timeout: float | None = None) -> BaseException | None:
         """As in concurrent.futures; each call returns an exception of its own."""
+        self._check_may_wait(timeout)
         error = super().exception(timeout)
         return error and fresh(error)
+
+    def _check_may_wait(self, timeout: float | None) -> None:
+        if (timeout is None or timeout > 0) and not self.done():
+            self._threads.check_may_wait()
 
     def _decide(self) -> bool:
         try:
@@ -100,7 +108,7 @@ class CallFuture(Future[_T]):
         """Take the outcome."""
         outcome = outcomes[0]
         if type(outcome) is Pickled:
-            self._elsewhere(partial(self._unpickle, outcome))
+            self._submit(self._threads.unpickling, partial(self._unpickle, outcome))
         else:
             self._settle(outcome)
         return False
@@ -148,18 +156,19 @@ class CallFuture(Future[_T]):
             finally:
                 self._condition.release()
         else:
-            self._elsewhere(action)
+            self._submit(self._threads.unpickling, action)
 
     def _invoke_callbacks(self) -> None:
         call = super()._invoke_callbacks  # type: ignore[misc]
-        if self._done_callbacks and self._executor.on_loop():  # type: ignore[attr-defined]
-            self._elsewhere(call)
+        here = self._executor.on_loop() or self._threads.unpickling.runs_here()
+        if self._done_callbacks and here:  # type: ignore[attr-defined]
+            self._submit(self._threads.callbacks, call)
         else:
             call()
 
-    def _elsewhere(self, action: Callable[[], object]) -> None:
+    def _submit(self, thread: BackgroundThread, action: Callable[[], object]) -> None:
         with contextlib.suppress(RuntimeError):  # the system has no room for its thread
-            if self._executor.callbacks.submit(action):
+            if thread.submit(action):
                 return
         try:
             action()  # else nobody would hear of it

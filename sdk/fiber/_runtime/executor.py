@@ -30,7 +30,7 @@ from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import StartFailure
 from fiber._exceptions import fresh
-from fiber._runtime.background import BackgroundThread, say
+from fiber._runtime.background import BackgroundThread, UserThreads, say
 from fiber._runtime.calls import CallQueue, Calls
 from fiber._runtime.functions import Function, FunctionCache
 from fiber._runtime.host import TICK, Host, Loop, Timer
@@ -70,14 +70,13 @@ class Executor:
         thread: Callable[[str], BackgroundThread] = BackgroundThread,
     ) -> None:
         self.options = options
-        self.callbacks = thread("fiber-pool-callbacks")
-        """Runs the callbacks of results."""
+        self.threads = UserThreads(thread)
         self.ended = Latch()
         """Nobody is left."""
         self._host = host
         self._elastic = host.elastic
         self._loop: Loop = host.loop
-        self._background = thread("fiber-pool")
+        self._background = self.threads.pickling
         self._scheduler = Scheduler(
             options.minimum,
             options.maximum,
@@ -143,8 +142,7 @@ class Executor:
         """
         try:
             if self.options.calls_back_at_end:  # when no thread could be started any more
-                self._background.start()
-                self.callbacks.start()
+                self.threads.start()
             self._loop.depend(self)
         except BaseException:
             self._end()
@@ -291,24 +289,11 @@ class Executor:
         """Wait until all workers and threads are gone; after ``close`` or ``terminate``."""
         self._loop.call_soon(self._lift_limits)
         self.ended.wait()
-        self._background.join()
-        self.callbacks.join()
+        self.threads.join()
 
     def on_loop(self) -> bool:
         """Whether this is the loop's thread, which must not wait."""
         return self._loop.on_thread()
-
-    def pickles_here(self) -> bool:
-        """Whether this is the thread that pickles its tasks, which must not wait for it."""
-        return self._background.runs_here()
-
-    def check_may_wait(self) -> None:
-        """RuntimeError on that thread."""
-        if self.pickles_here():
-            raise RuntimeError(
-                "what a pool pickles for its workers cannot wait for the same pool, which would "
-                "wait for the pickle: get the result before the map, or in the task"
-            )
 
     @property
     def error(self) -> BaseException | None:
@@ -560,7 +545,7 @@ class Executor:
         self.calls.take_all()
         self._ended_by = error
         if not self.options.calls_back_at_end:
-            self.callbacks.stop()
+            self.threads.callbacks.stop()
         for job in list(self._ledger.jobs):
             self._jobs.fail(job, error)
         self._launcher.end(self._scheduler.terminate())
@@ -584,8 +569,7 @@ class Executor:
         self._launcher.close()
         self._sender.close()
         self._leases.close()
-        self._background.stop()
-        self.callbacks.stop()
+        self.threads.stop()
         # Its traceback may hold the pool, whose finalizer holds this.
         self._ended_by = None
         self.workers.end()

@@ -110,7 +110,7 @@ class ExecutorGroup:
 
     def _check_may_wait(self) -> None:
         for executor in self.executors():
-            executor.check_may_wait()
+            executor.threads.check_may_wait()
 
 
 def _close_all(executors: dict[Resources, Executor]) -> None:
