@@ -19,7 +19,7 @@ PARTS = test-prepare test-modules $(addprefix test-python-,$(OTHER_PYTHONS)) tes
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons e2e lint bench bench-operator bench-kubernetes conformance crds images cluster cluster-down clean
+.PHONY: help demo test test-fast test-pythons e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds images cluster cluster-down clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -88,6 +88,10 @@ conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
 	$(BIN)/python tests/conformance/run.py --backend $(BACKEND)
 	$(BIN)/python tests/conformance/executors.py --backend $(BACKEND)
 	$(BIN)/python -m pytest tests/conformance/test_joblib.py
+
+## make conformance-original CHECKOUT=…  the tests and examples of https://github.com/uber/fiber
+conformance-original: $(VENV)/.with-dev
+	$(BIN)/python tests/conformance/uber_fiber.py "$(CHECKOUT)" --timeout 120
 
 ## make crds          crds/fiberpools.yaml and the chart's copy, from the model
 crds: $(VENV)/.with-dev

@@ -1,0 +1,1 @@
+"""Stands in for the package requests in tests that only import it."""
