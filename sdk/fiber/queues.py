@@ -31,7 +31,7 @@ from fiber._transport.base import SharedCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
 from fiber.connection import Connection
-from fiber.connection import Pipe as Pipe  # the original Fiber has it here, too
+from fiber.connection import Pipe as Pipe  # noqa: PLC0414  # exported: the original has it here
 from fiber.synchronize import RECHECK
 
 __all__ = ["Empty", "Full", "JoinableQueue", "Queue", "SimpleQueue", "SimpleQueuePush"]
