@@ -175,7 +175,8 @@ class Config:
     lost_after*: seconds of silence after which an agent counts as lost, and its tasks run
         elsewhere.
     retries: how many times a task runs again after its worker died.
-    log_level: the least severe records of Fiber's logger that are shown.
+    log_level: the least severe records that are shown on stderr, in children too, as by
+        `fiber.log_to_stderr()`. "DEBUG" shows workers, processes, agents and links come and go.
     runtime_directory*: where Fiber makes its private directory for sockets and credentials;
         None means `tempfile.gettempdir()`. Socket paths are short: so should this be.
     """

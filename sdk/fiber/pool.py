@@ -23,6 +23,7 @@ from multiprocessing.pool import (  # type: ignore[attr-defined]
 )
 from typing import Any, Self, TypeVar
 
+from fiber import _logs
 from fiber._engine.chunks import default_chunksize
 from fiber._exceptions import report_uncaught
 from fiber._runtime import methods, options
@@ -128,6 +129,7 @@ class Pool:
         # First: whoever is interrupted while the workers start has forgotten the pool.
         self._terminate = util.Finalize(self, _abandon, args=(self._executor,), exitpriority=15)
         self._executor.start()
+        _logs.debug("opened a pool of %d to %d workers", minimum, maximum)
         self._state = RUN
 
     # Calls
@@ -441,7 +443,7 @@ class Pool:
     def close(self) -> None:
         """Take no more work.  The workers go once all that was asked for is done."""
         self._check_owner()
-        util.debug("closing pool")
+        _logs.debug("closing pool")
         if self._state == RUN:
             self._state = CLOSE
             self._executor.close()
@@ -450,7 +452,7 @@ class Pool:
         """End the workers at once.  Whoever waits for a result gets an error."""
         if os.getpid() != self._owner:
             return  # a copy that came here by a fork: nothing of the pool is here to end
-        util.debug("terminating pool")
+        _logs.debug("terminating pool")
         self._state = TERMINATE
         _end(self._executor)
         self._terminate.cancel()  # last: whoever is interrupted before it leaves that to do
@@ -461,7 +463,7 @@ class Pool:
         Results that nobody has taken from ``imap(buffersize=)`` no longer hold up what is left.
         """
         self._check_owner()
-        util.debug("joining pool")
+        _logs.debug("joining pool")
         if self._state == RUN:
             raise ValueError("Pool is still running")
         if self._state not in (CLOSE, TERMINATE):

@@ -16,6 +16,7 @@ from multiprocessing import process as mp_process
 from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
+from fiber import _logs
 from fiber._agent import program_folder
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
@@ -229,6 +230,7 @@ def _prepare_environment(data: dict[str, Any]) -> None:
         os.environb.update(environ)
     given: Any = {key: data[key] for key in _SPAWN_KEYS if key in data}
     multiprocessing.spawn.prepare(given)
+    _logs.debug("process %d on host %s", os.getpid(), host)
     for function, arguments in data["calls"]:
         function(*arguments)
     numpy_random = sys.modules.get("numpy.random")

@@ -8,9 +8,10 @@ import signal
 import socket
 import sys
 import time
+from multiprocessing import current_process
 from typing import NoReturn
 
-from fiber import config
+from fiber import _logs, config
 from fiber._agent.agent import Agent
 from fiber._agent.allocator import keep_memory
 from fiber._agent.service import AgentService
@@ -63,6 +64,9 @@ class Main:
 
     def run(self) -> int:
         """Serve until the end; the exit status."""
+        current_process().name = self._name  # which its records bear
+        _logs.show(config.current().log_level)
+        _logs.debug("agent with pid %d", os.getpid())
         self._dialer = self._dial()
         self._wake_by_signals()
         signal.signal(signal.SIGTERM, self._on_sigterm)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 
+from fiber import _logs
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
@@ -81,6 +82,7 @@ class AgentSet:
     def join(self, host: str, link: Link) -> RemoteAgent:
         """An agent has dialled in."""
         agent = RemoteAgent(host, link, self.loop, self._hub, self._output, self)
+        _logs.debug("agent %s has joined", host)
         self.agents[host] = agent
         self.joined += 1
         self.error = None
@@ -129,6 +131,7 @@ class AgentSet:
 
     def lost(self, agent: RemoteAgent, reason: str) -> None:
         """It is gone."""
+        _logs.debug("agent %s is lost: %s", agent.host, reason)
         del self.agents[agent.host]
         if agent in self.placement.loads:
             self.placement.remove(agent)
@@ -146,6 +149,7 @@ class AgentSet:
 
     def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
         """It gets no children while it is silent."""
+        _logs.debug("agent %s is %s", agent.host, "silent" if suspect else "heard again")
         self.withhold(agent, suspect, "silent")
 
     def withhold(self, agent: RemoteAgent, withheld: bool, why: str) -> None:

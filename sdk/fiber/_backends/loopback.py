@@ -149,6 +149,7 @@ class LoopbackBackend:
             "FIBER_AGENT_NAME": name,
             "FIBER_AGENT_PARENT": str(os.getpid()),
             "FIBER_AGENT_INHERITS": os.path.dirname(self._hub.address_or_problem.path),
+            "FIBER_LOG_LEVEL": self._config.log_level,
             "FIBER_START_TIMEOUT": str(self._config.start_timeout),
         }
 

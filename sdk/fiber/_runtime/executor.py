@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol
 
+from fiber import _logs
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import StartFailure
@@ -498,6 +499,7 @@ class Executor:
 
     def _ready(self, handle: WorkerHandle) -> None:
         """A worker is initialized."""
+        _logs.debug("worker %s is ready", handle.name)
         self._scheduler.ready(handle, self._loop.now())
         self.workers.changed()
         self._advance()

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from fiber import _logs
 from fiber._agent.interface import ExitReport
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
@@ -166,6 +167,7 @@ class Jobs:
                 pod=report.pod or None,
                 node=report.node or None,
             )
+            _logs.debug("%s is given up: %s", error.task, report.describe())
             if item.future is not None:
                 item.future.add_results(loss.task, [Failure(error)], True)
             else:

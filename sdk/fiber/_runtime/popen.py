@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 
+from fiber import _logs
 from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
 from fiber._exceptions import fresh
 from fiber._runtime.latch import Latch
@@ -73,6 +74,7 @@ class Popen:
 
     def started(self, pid: int) -> None:
         """It has a pid."""
+        _logs.debug("process %s has pid %d", self._name, pid)
         self._pid = pid
         self._born.set()
         self._answered.set()
@@ -86,6 +88,7 @@ class Popen:
 
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
+        _logs.debug("process %s ended: %s", self._name, report.describe())
         self.report = report
         at_exit = self._at_exit
         if at_exit is not None:

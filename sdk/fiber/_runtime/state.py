@@ -15,7 +15,7 @@ from multiprocessing import process as mp_process
 from multiprocessing import spawn, util
 from typing import TYPE_CHECKING, Any, Protocol
 
-from fiber import config, inherited, reduction
+from fiber import _logs, config, inherited, reduction
 from fiber._agent import child
 from fiber._agent.interface import ChildHandle, ChildObserver, ChildSpec, ExitReport
 from fiber._hub import client as hub_client
@@ -40,6 +40,7 @@ class Runtime:
 
     def __init__(self) -> None:
         self.config = config.current()
+        _logs.show(self.config.log_level)
         self.loop = Loop()
         self.host = child.host or "local"
         self.hub: Hub | None = None
@@ -52,6 +53,7 @@ class Runtime:
                 and not (self._shipping is not None and self._shipping.main_is_sent)
             )
             self.loop.start_thread("fiber-io")
+            _logs.debug("%s on host %s", type(self.backend).__name__, self.host)
         except BaseException:
             self._close_hub()
             self.loop.stop()
@@ -161,6 +163,7 @@ class Runtime:
 
     def close(self) -> None:
         """End every child, agent and thread.  Not on the loop's thread."""
+        _logs.debug("ending all processes and agents")
         self.backend.close()
         self.loop.stop()
         self._close_hub()

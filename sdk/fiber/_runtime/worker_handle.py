@@ -8,6 +8,7 @@ from multiprocessing import process as mp_process
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
 
+from fiber import _logs
 from fiber._agent.interface import Cause, ChildHandle, ExitReport
 from fiber._engine.ledger import Worker
 from fiber._engine.start_failures import StartFailure
@@ -77,8 +78,14 @@ class WorkerHandle:
         """The worker's name."""
         return self.child.name if self.child is not None else "?"
 
+    @property
+    def host(self) -> str:
+        """The name of its host, once that is known."""
+        return self.child.host if self.child is not None else "?"
+
     def launch(self, process: BaseProcess, method: str) -> None:
         """Start the process; returns before it exists."""
+        _logs.debug("starting worker %s", process.name)
         self._launched = process
         self._host.start(process, self, tasks=True, method=method, shared=self.shared)
 
@@ -95,6 +102,7 @@ class WorkerHandle:
 
     def started(self, pid: int) -> None:
         """It has a pid."""
+        _logs.debug("worker %s has pid %d on host %s", self.name, pid, self.host)
         self._pid = pid
         self._born.set()
 
@@ -110,6 +118,7 @@ class WorkerHandle:
         """It is gone."""
         if self.fault and report.cause == Cause.CHILD:
             report = report._replace(reason=f"WrongAnswer: {self.fault}, and Fiber killed it")
+        _logs.debug("worker %s ended: %s", self.name, report.describe())
         self.returncode = report.exitcode
         self._exited.set()
         self._born.set()

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from fiber import _logs
 from fiber._transport.handshake import Identity
 from fiber._transport.link import EventLoop, Keepalive, LinkObserver, Timer, Wire
 from fiber._transport.stream import Frame, Gap, ResumableStream, Statistics
@@ -119,6 +120,7 @@ class ResumableLink:
             wire.close()
             self._lose(str(error))
             return
+        _logs.debug("link with %s: connected", self.peer.name)
         self._wire = wire
         self._flush()
 
@@ -131,6 +133,7 @@ class ResumableLink:
         """``wire`` broke; one that was replaced before does not matter."""
         if wire is not self._wire:
             return
+        _logs.debug("link with %s: the connection ended", self.peer.name)
         self._unplug()
         if self._state is _State.LEAVING:
             self._end()

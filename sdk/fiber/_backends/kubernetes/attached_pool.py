@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from fiber import _logs
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.api_errors import Body, Forbidden, NotFound
 from fiber._backends.kubernetes.resources import LEASES, POOLS
@@ -91,6 +92,7 @@ class AttachedPool:
 
         Conflict if the pool is another by now, or not that of ``resource_version``.
         """
+        _logs.debug("FiberPool %s/%s: %d replicas wanted", self.namespace, self.name, replicas)
         metadata = {"name": self.name, "uid": self.uid}
         if resource_version is not None:
             metadata["resourceVersion"] = resource_version
