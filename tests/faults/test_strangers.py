@@ -8,6 +8,7 @@ import pickle
 import socket
 import ssl
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -187,6 +188,35 @@ def door() -> Iterator[str]:
 
 def test_the_door_is_in_a_directory_that_only_this_user_can_enter(door: str) -> None:
     assert os.stat(os.path.dirname(door)).st_mode & 0o077 == 0
+
+
+KNOCK = """
+import os, socket, sys
+os.setresgid(65534, 65534, 65534)
+os.setresuid(65534, 65534, 65534)
+stranger = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+try:
+    stranger.connect(sys.argv[1])
+    stranger.send(bytes(100))
+    print("heard", stranger.recv(100))
+except OSError as error:
+    print(type(error).__name__)
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_another_user_is_not_heard_at_the_door(door: str) -> None:
+    def knock() -> str:
+        # Isolated, and without site: the other user may not read this one's packages.
+        command = [sys.executable, "-I", "-S", "-c", KNOCK, door]
+        return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE).stdout
+
+    folder = os.path.dirname(door)
+    assert knock() == "PermissionError\n"
+    for opened in (os.path.dirname(folder), folder, door):  # as if somebody had opened the way
+        os.chmod(opened, os.stat(opened).st_mode | 0o007)
+    assert knock() in ("heard b''\n", "ConnectionResetError\n", "BrokenPipeError\n")
+    works()
 
 
 @pytest.mark.parametrize("data", [data for data in GARBAGE if data], ids=range(len(GARBAGE) - 1))

@@ -16,14 +16,13 @@ from typing import Any
 from fiber._hub import heap
 from fiber._hub.heap import Block
 from fiber._hub.hosted import HostedMemory
-from fiber._hub.protocol import KEY_BYTES, Extent, ObjectKind, Origin
+from fiber._hub.protocol import NO_SECRET, Extent, ObjectKind, Origin
 from fiber._hub.registry import Registry
 from fiber._hub.replicas import MemoryLink, Replicas
 from fiber._wire import messages
 from fiber._wire.messages import Memory
 
 MASTER = "master"
-KEY = bytes(KEY_BYTES)
 RACY = 24
 """Bytes at the end of the block that everybody writes."""
 
@@ -50,7 +49,7 @@ class Host:
     def __init__(self, name: str) -> None:
         self.name = name
         self.registry = Registry(lambda shared: HostedMemory(), _at_once)
-        self.replicas = Replicas(name, KEY, self.registry)
+        self.replicas = Replicas(name, self.registry)
         self.links: dict[str, MemoryLink] = {}
         self.wires: dict[str, deque[Memory | Passing]] = {}
 
@@ -132,10 +131,10 @@ class World:
         block = heap.allocate(self.size)
         block.give()
         extent = Extent(block.offset, block.size)
-        number, grant = maker.host.registry.register(
+        grant, identity = maker.host.registry.register(
             ObjectKind.MEMORY, block.segment.fileno(), extent, reusable=True
         )
-        self.origin = Origin(maker.host.name, block.segment.inode, *extent, number, grant, KEY)
+        self.origin = Origin(maker.host.name, identity, block.size, NO_SECRET, grant)
         maker.memory = block.view
         start = 0
         for size in sizes:
@@ -191,7 +190,7 @@ class World:
                 process.host.send(Passing(self.rng.choice(self.processes), token))
             process.tokens.clear()
             process.memory = None
-            process.host.replicas.leave(self.origin.identity, process)
+            process.host.replicas.leave(self.origin.block, process)
 
     def _deliver(self) -> None:
         wires = [(host, to, wire) for host in self.hosts for to, wire in host.wires.items() if wire]

@@ -21,7 +21,7 @@ from fiber import reduction
 from fiber._hub import client, handles, protocol
 from fiber._hub.client import HubStream, NoHub, Unreachable
 from fiber._hub.handles import collecting_grants
-from fiber._hub.protocol import TWO, HubAddress, Op
+from fiber._hub.protocol import NO_SECRET, SECRET, HubAddress, Op
 from fiber._wire import packet
 from fiber.connection import Connection
 from hosts import Hosts, objects_kept
@@ -244,7 +244,7 @@ class Bomb:
         b"\2" + bytes(20),
         packet.PLAIN + protocol.hello(bytes(32)),
         packet.PLAIN + protocol.hello(bytes(32))[:-1],
-        packet.PLAIN + TWO.pack(Op.FETCH, 1, 1, 2),
+        packet.PLAIN + SECRET.pack(Op.FETCH, 1, NO_SECRET),
     ],
 )
 def test_a_stranger_is_shown_out(hosts: Hosts, greeting: bytes) -> None:
@@ -257,7 +257,7 @@ def test_a_stranger_is_shown_out(hosts: Hosts, greeting: bytes) -> None:
         stranger.connect(hub.address.path)
         stranger.send(greeting)
         try:
-            packet.send(stranger, TWO.pack(Op.FETCH, 1, 1, 2))
+            packet.send(stranger, SECRET.pack(Op.FETCH, 1, NO_SECRET))
         except OSError:
             pass  # it was shown out already
         said = []
@@ -285,7 +285,7 @@ def test_a_wrong_key_is_refused_with_a_reason(hosts: Hosts) -> None:
     with hosts.child_at("a"):
         stream = HubStream(HubAddress("a", own.path, bytes(32)))
         with pytest.raises(Unreachable, match="another program"):
-            stream.ask(Op.FETCH, 1, 2, form=TWO)
+            stream.ask(Op.FETCH, NO_SECRET, form=SECRET)
         stream.close()
 
 

@@ -28,7 +28,7 @@ from fiber._hub import feeder, handles, hub, registry, remote
 from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.handles import GrantSet
 from fiber._hub.local import LocalChannel, QuietSocket
-from fiber._hub.protocol import ONE, Op
+from fiber._hub.protocol import NO_SECRET, ONE, SECRET, Op
 from fiber._runtime import state
 from fiber._sync import semaphore as shared_semaphore
 from fiber._transport import unix
@@ -192,7 +192,7 @@ def test_a_handler_at_any_line_of_sharing_may_wait_for_the_hub(hosts: Hosts) -> 
         stream = HubStream(hub.address)
 
         def ask() -> None:
-            stream.say(Op.RELEASE, 0, form=ONE)
+            stream.say(Op.RELEASE, NO_SECRET, form=SECRET)
             stream.ask(Op.SYNC, 0, form=ONE)
 
         def share() -> None:

@@ -13,7 +13,7 @@ import fiber
 from census import wait_until
 from fiber._hub.client import Unreachable
 from fiber._hub.heap import Block
-from fiber._hub.protocol import KEY_BYTES, Origin
+from fiber._hub.protocol import NO_SECRET, Origin
 from fiber._hub.replicas import Replicas
 from fiber._wire.messages import Memory, ProtocolError
 from hosts import Far, Hosts, Wire, objects_kept
@@ -190,42 +190,36 @@ def replicas(hosts: Hosts) -> Iterator[Replicas]:
 
 
 @pytest.mark.parametrize(
-    ("home", "key", "reason"),
-    [
-        ("a", bytes(KEY_BYTES), "key is not the hub's"),
-        ("a", None, "not there any more"),
-        ("c", None, "'c' cannot be reached"),
-    ],
+    ("home", "reason"), [("a", "not there any more"), ("c", "'c' cannot be reached")]
 )
-def test_who_may_not_have_it_is_told_why(
-    replicas: Replicas, hosts: Hosts, home: str, key: bytes | None, reason: str
-) -> None:
+def test_who_may_not_have_it_is_told_why(replicas: Replicas, home: str, reason: str) -> None:
     asker = Asker()
-    origin = Origin(home, 1, 0, 8, 1, 1, hosts["a"].key if key is None else key)
+    origin = Origin(home, NO_SECRET, 8, NO_SECRET, NO_SECRET)
     replicas.join(origin, asker, asker)
     assert reason in asker.reason
     assert not replicas._replicas
 
 
-def test_what_others_have_is_not_had_without_the_key(far: Far, hosts: Hosts) -> None:
+def test_what_others_have_is_not_had_without_its_secrets(far: Far, hosts: Hosts) -> None:
     with hosts.at("a"):
         array = fiber.RawArray("i", 3)
     other = far(array)
     for name in ("a", "b"):
         replicas, asker = hosts[name].replicas, Asker()
         (replica,) = replicas._replicas.values()
-        wrong = Origin(*replica.identity, replica.block.size, 0, 0, bytes(KEY_BYTES))
-        replicas.join(wrong, asker, asker)
-        assert "key is not the hub's" in asker.reason
+        wrong = Origin("a", NO_SECRET, replica.block.size, NO_SECRET, NO_SECRET)
+        hosts.on_loop(replicas.join, wrong, asker, asker)
+        assert wait_until(lambda told=asker: bool(told.reason), PATIENCE)
+        assert "not there any more" in asker.reason
     assert list(other) == [0, 0, 0]
 
 
 def test_a_block_is_had_as_a_whole_or_not_at_all(replicas: Replicas, hosts: Hosts) -> None:
     block = memory_of(fiber.RawArray("i", 4))
-    (home, extent, inode) = buffer_of_handle(block)
-    for wrong in ((0, 8), (extent.offset, 1 << 20)):
+    home, extent = buffer_of_handle(block)
+    for wrong in ((home.identity, 1 << 20), (NO_SECRET, extent.size)):
         asker = Asker()
-        replicas.join(Origin("a", inode, *wrong, home.number, home.grant, home.home.key), 1, asker)
+        replicas.join(Origin("a", *wrong, NO_SECRET, home.grant), 1, asker)
         assert "no such block" in asker.reason
 
 

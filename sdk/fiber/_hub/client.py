@@ -16,7 +16,7 @@ from typing import Protocol
 from fiber._hub import protocol
 from fiber._hub.doorbell import Doorbell
 from fiber._hub.local import QuietSocket, without_timeout
-from fiber._hub.protocol import HEAD, ONE, TWO, HubAddress, Op, Status
+from fiber._hub.protocol import HEAD, ONE, SECRETS, HubAddress, Op, Status
 from fiber._hub.registry import Registry
 from fiber._transport.unix import naming_the_limit, wait_readable
 from fiber._wire import packet
@@ -24,7 +24,7 @@ from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import ConnectionClosed, FiberError
 
-_FORMS = {form.size: form for form in (HEAD, ONE, TWO)}
+_FORMS = {form.size: form for form in (HEAD, ONE, SECRETS)}
 
 
 class NoHub(FiberError, OSError):
@@ -62,7 +62,7 @@ class LocalHub(Protocol):
     def dial(self) -> socket.socket:
         """A stream to it."""
 
-    def fetch(self, number: int, grant: int) -> Descriptor:
+    def fetch(self, grant: bytes) -> Descriptor:
         """A descriptor of an object that it keeps."""
 
     def on_loop(self) -> bool:
@@ -156,8 +156,7 @@ class Reply:
     __slots__ = ("fds", "number", "parts", "status", "values")
 
     def __init__(self, message: Message) -> None:
-        fields: tuple[int, ...] = _FORMS[len(message.payload)].unpack(message.payload)
-        self.number, self.values = fields[1], fields[2:]
+        _, self.number, *self.values = _FORMS[len(message.payload)].unpack(message.payload)
         self.status = Status(message.payload[0])
         self.parts = message.buffers
         self.fds, message.fds = message.fds, []
@@ -193,7 +192,7 @@ class HubStream:
     def ask(
         self,
         operation: Op,
-        *values: int,
+        *values: int | bytes,
         form: struct.Struct = HEAD,
         timeout: float | None = None,
         buffers: Sequence[memoryview] = (),
@@ -250,7 +249,7 @@ class HubStream:
         self._unsettled = None
         return (operation, late) if late is not None else None
 
-    def say(self, operation: Op, *values: int, form: struct.Struct = HEAD) -> None:
+    def say(self, operation: Op, *values: int | bytes, form: struct.Struct = HEAD) -> None:
         """Make a request that has no answer."""
         self._send(form.pack(operation, self._next(), *values))
 

@@ -17,8 +17,11 @@ from fiber._hub.hosted_semaphore import HostedSemaphore
 from fiber._hub.hosted_wait_list import HostedWaitList
 from fiber._hub.protocol import (
     FOUR,
+    GRANTING,
     HEAD,
     ONE,
+    SECRET,
+    SECRETS,
     TWO,
     Extent,
     GrantFlags,
@@ -27,8 +30,8 @@ from fiber._hub.protocol import (
     Origin,
     Status,
 )
-from fiber._hub.registry import Entry, NoSuchObject, Registry
-from fiber._hub.replicas import Replicas
+from fiber._hub.registry import Attachment, Hosted, NoSuchObject, Registry
+from fiber._hub.replicas import Identity, Replicas
 from fiber._hub.streams import NullHandler, Stream
 from fiber._wire.packet import Message
 
@@ -84,9 +87,9 @@ class ClientHandler:
         self.waiting: PendingRequest | None = None
         self._home = home
         self._admitted = False
-        self._entry: Entry | None = None
-        self._joined: tuple[str, int, int] | None = None
-        self._bound: set[int] = set()
+        self._attachment: Attachment | None = None
+        self._joined: Identity | None = None
+        self._bound: set[bytes] = set()
         self._holder: str | None = None
         """Whose token the stream keeps."""
         self._granted_last: int | None = None
@@ -133,11 +136,11 @@ class ClientHandler:
     def _leave(self) -> None:
         self._cancel()
         self._give_back()
-        entry, self._entry = self._entry, None
-        if entry is not None:
-            if isinstance(entry.hosted, HostedChannel):
-                entry.hosted.forget(self)
-            self._home.registry.detach(entry)
+        attachment, self._attachment = self._attachment, None
+        if attachment is not None:
+            if isinstance(attachment.shared.hosted, HostedChannel):
+                attachment.shared.hosted.forget(self)
+            self._home.registry.detach(attachment)
         joined, self._joined = self._joined, None
         if joined is not None:
             self._home.replicas.leave(joined, self)
@@ -148,8 +151,8 @@ class ClientHandler:
     def _cancel(self) -> PendingRequest | None:
         """Withdraw the request that waits."""
         request, self.waiting = self.waiting, None
-        if request is not None and self._entry is not None:
-            self._entry.hosted.withdraw(request)
+        if request is not None and self._hosted is not None:
+            self._hosted.withdraw(request)
         return request
 
     def _request(self, message: Message) -> PendingRequest:
@@ -190,40 +193,45 @@ class ClientHandler:
         """Host a descriptor."""
         _, number, kind, flags, *extent = FOUR.unpack(message.payload)
         (fd,) = message.fds
-        entry, grant = self._home.registry.register(
+        granted = self._home.registry.register(
             ObjectKind(kind), fd, Extent(*extent), reusable=bool(flags & GrantFlags.REUSABLE)
         )
-        self._granted(number, entry, grant, flags)
+        self._granted(number, flags, *granted)
 
     def grant(self, message: Message) -> None:
         """Give a grant for an object that the sender uses."""
-        _, number, entry, flags = TWO.unpack(message.payload)
-        grant = self._home.registry.grant(entry, reusable=bool(flags & GrantFlags.REUSABLE))
-        self._granted(number, entry, grant, flags)
+        _, number, flags, token = GRANTING.unpack(message.payload)
+        granted = self._home.registry.grant(token, reusable=bool(flags & GrantFlags.REUSABLE))
+        self._granted(number, flags, *granted)
 
-    def _granted(self, number: int, entry: int, grant: int, flags: int) -> None:
+    def _granted(self, number: int, flags: int, grant: bytes, identity: bytes) -> None:
         if flags & GrantFlags.ENDS_WITH_STREAM:
             self._bound.add(grant)
-        self.stream.send(TWO.pack(Status.OK, number, entry, grant))
+        self.stream.send(SECRETS.pack(Status.OK, number, grant, identity))
 
     def release(self, message: Message) -> None:
         """Take a grant back."""
-        self._home.registry.take_back([ONE.unpack(message.payload)[2]])
+        self._home.registry.take_back([SECRET.unpack(message.payload)[2]])
 
     def fetch(self, message: Message) -> None:
         """Hand over a descriptor."""
-        _, number, entry, grant = TWO.unpack(message.payload)
+        _, number, grant = SECRET.unpack(message.payload)
         if not self.stream.passes_descriptors:
             raise RequestRefused("a descriptor cannot be handed to another host")
-        fd = self._home.registry.fetch(entry, grant)
+        fd = self._home.registry.fetch(grant)
         self.stream.send(HEAD.pack(Status.OK, number), (), [fd])
 
     def attach(self, message: Message) -> None:
         """Begin to use an object."""
-        if self._entry is not None:
+        if self._attachment is not None:
             raise RequestRefused("a stream is for one object")
-        _, _, entry, grant = TWO.unpack(message.payload)
-        self._entry = self._home.registry.attach(entry, grant)
+        _, _, token, grant = SECRETS.unpack(message.payload)
+        self._attachment = self._home.registry.attach(token, grant)
+
+    @property
+    def _hosted(self) -> Hosted | None:
+        """What the stream is attached to."""
+        return None if self._attachment is None else self._attachment.shared.hosted
 
     def ring(self, message: Message) -> None:
         """Look again at shared memory that somebody here waits for."""
@@ -237,7 +245,7 @@ class ClientHandler:
         if self._joined is not None:
             raise RequestRefused("a stream is for one object")
         origin = Origin.decode(message.buffers[0])
-        self._joined = origin.identity
+        self._joined = origin.block
         self._home.replicas.join(origin, self, _Joining(self, number))
 
     def cancel(self, message: Message) -> None:
@@ -263,9 +271,10 @@ class ClientHandler:
     # A channel
 
     def _channel(self) -> HostedChannel:
-        if self._entry is None or not isinstance(self._entry.hosted, HostedChannel):
+        hosted = self._hosted
+        if not isinstance(hosted, HostedChannel):
             raise RequestRefused("the stream is not attached to a channel")
-        return self._entry.hosted
+        return hosted
 
     def send(self, message: Message) -> None:
         """Send a message."""
@@ -307,9 +316,10 @@ class ClientHandler:
     # A counter
 
     def _counter(self) -> HostedCounter:
-        if self._entry is None or not isinstance(self._entry.hosted, HostedCounter):
+        hosted = self._hosted
+        if not isinstance(hosted, HostedCounter):
             raise RequestRefused("the stream is not attached to a counter")
-        return self._entry.hosted
+        return hosted
 
     def add(self, message: Message) -> None:
         """Raise it."""
@@ -343,9 +353,10 @@ class ClientHandler:
     # A semaphore
 
     def _semaphore(self) -> HostedSemaphore:
-        if self._entry is None or not isinstance(self._entry.hosted, HostedSemaphore):
+        hosted = self._hosted
+        if not isinstance(hosted, HostedSemaphore):
             raise RequestRefused("the stream is not attached to a lock or semaphore")
-        return self._entry.hosted
+        return hosted
 
     def acquire(self, message: Message) -> None:
         """Take a token, which is the stream's."""
@@ -380,9 +391,10 @@ class ClientHandler:
     # A wait list
 
     def _wait_list(self) -> HostedWaitList:
-        if self._entry is None or not isinstance(self._entry.hosted, HostedWaitList):
+        hosted = self._hosted
+        if not isinstance(hosted, HostedWaitList):
             raise RequestRefused("the stream is not attached to a condition")
-        return self._entry.hosted
+        return hosted
 
     def enter(self, message: Message) -> None:
         """Take a place, which is the stream's."""

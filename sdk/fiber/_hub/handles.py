@@ -28,8 +28,8 @@ from fiber._hub.heap import Block, block_of
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.protocol import (
     FOUR,
-    ONE,
-    TWO,
+    GRANTING,
+    SECRET,
     WHOLE,
     Extent,
     GrantFlags,
@@ -55,8 +55,12 @@ class HubHandle(NamedTuple):
     """Stands for an object that a hub keeps."""
 
     home: HubAddress
-    number: int
-    grant: int
+    grant: bytes
+    identity: bytes
+    """Of shared memory: the same in all handles of it."""
+
+    def __repr__(self) -> str:
+        return f"HubHandle(home={self.home!r})"
 
     def here(self) -> bool:
         """Whether the hub is on this host."""
@@ -67,12 +71,12 @@ class HubHandle(NamedTuple):
         hub = client.local_hub()
         if hub is not None and hub.key == self.home.key:
             try:
-                return hub.fetch(self.number, self.grant)
+                return hub.fetch(self.grant)
             except NoSuchObject as error:
                 raise Unreachable(hub.host, str(error)) from None
         stream = HubStream(self.home)
         try:
-            reply = stream.ask(Op.FETCH, self.number, self.grant, form=TWO)
+            reply = stream.ask(Op.FETCH, self.grant, form=SECRET)
             (fd,) = reply.fds
             return own(fd)
         finally:
@@ -90,8 +94,6 @@ class BlockHandle(NamedTuple):
 
     segment: Handle
     extent: Extent
-    inode: int
-    """Of the segment, on its own host."""
 
     def elsewhere(self) -> HubHandle | None:
         """How to reach the hub of its host, if that is not this one."""
@@ -146,23 +148,22 @@ def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
     block.give()
     extent = Extent(block.offset, block.size)
     spawning = _spawning_here()
-    inode = block.segment.inode
     if spawning is None:
         segment = _grants().for_local(kind, block.segment.fileno(), extent)
-        return BlockHandle(segment, extent, inode)
+        return BlockHandle(segment, extent)
     inherit = getattr(spawning, "inherit_segment", None)
     if inherit is None:
         # multiprocessing's own Process takes each descriptor once, and closes it in the child.
         duplicate = opened(os.dup, block.segment.fileno())
         vars(spawning).setdefault("_fiber_duplicates", []).append(duplicate)  # until it started
         number = spawning.duplicate_for_child(duplicate.fileno())
-        return BlockHandle(spawning.DupFd(number), extent, inode)
-    return BlockHandle(inherit(block.segment), extent, inode)
+        return BlockHandle(spawning.DupFd(number), extent)
+    return BlockHandle(inherit(block.segment), extent)
 
 
-def handle_for_remote_block(end: RemoteObject, extent: Extent, inode: int) -> BlockHandle:
+def handle_for_remote_block(end: RemoteObject, extent: Extent) -> BlockHandle:
     """What to pickle in place of a block of another host."""
-    return BlockHandle(_grants().for_remote(end), extent, inode)
+    return BlockHandle(_grants().for_remote(end), extent)
 
 
 def _spawning_here() -> Any:
@@ -182,7 +183,7 @@ class GrantSet:
 
     def __init__(self, *, reusable: bool = True) -> None:
         self._reusable = reusable
-        self._direct: dict[Registry, list[int]] = {}
+        self._direct: dict[Registry, list[bytes]] = {}
         self._streams: dict[HubAddress, HubStream] = {}
         self._kept: list[object] = []
 
@@ -199,15 +200,15 @@ class GrantSet:
         home = client.hub_address()
         hub = client.local_hub()
         if hub is not None:
-            number, grant = hub.registry.register(kind, fd, extent, reusable=self._reusable)
-            self._direct.setdefault(hub.registry, []).append(grant)
-            return HubHandle(home, number, grant)
+            granted = hub.registry.register(kind, fd, extent, reusable=self._reusable)
+            self._direct.setdefault(hub.registry, []).append(granted[0])
+            return HubHandle(home, *granted)
         return _register(self._stream(home), home, kind, fd, extent, self._flags())
 
     def for_remote(self, end: RemoteObject) -> HubHandle:
         """A handle for an object of another host."""
-        stream = self._stream(end.home)
-        reply = stream.ask(Op.GRANT, end.number, self._flags(), form=TWO)
+        end.confirm()  # its hub must know that it is used before another stream says so
+        reply = self._stream(end.home).ask(Op.GRANT, self._flags(), end.token, form=GRANTING)
         return HubHandle(end.home, *reply.values)
 
     def release(self) -> None:
@@ -256,14 +257,14 @@ class _SingleUse:
             _undo_by(lambda: self._release(handle))
             return handle
         registry = hub.registry
-        number, grant = registry.register(kind, fd, extent, reusable=False)
-        _undo_by(lambda: registry.release([grant]))
-        return HubHandle(home, number, grant)
+        granted = registry.register(kind, fd, extent, reusable=False)
+        _undo_by(lambda: registry.release(granted[:1]))
+        return HubHandle(home, *granted)
 
     def for_remote(self, end: RemoteObject) -> HubHandle:
         """A handle for an object of another host."""
         with end.stream() as stream:
-            reply = stream.ask(Op.GRANT, end.number, GrantFlags(0), form=TWO)
+            reply = stream.ask(Op.GRANT, GrantFlags(0), end.token, form=GRANTING)
         handle = HubHandle(end.home, *reply.values)
         _undo_by(lambda: _release_remote(end, handle.grant))
         return handle
@@ -288,7 +289,7 @@ class _SingleUse:
 
     def _release(self, handle: HubHandle) -> None:
         with self.stream(handle.home) as stream:
-            stream.say(Op.RELEASE, handle.grant, form=ONE)
+            stream.say(Op.RELEASE, handle.grant, form=SECRET)
 
 
 def _register(
@@ -303,9 +304,9 @@ def _register(
     return HubHandle(home, *reply.values)
 
 
-def _release_remote(end: RemoteObject, grant: int) -> None:
+def _release_remote(end: RemoteObject, grant: bytes) -> None:
     with end.stream() as stream:
-        stream.say(Op.RELEASE, grant, form=ONE)
+        stream.say(Op.RELEASE, grant, form=SECRET)
 
 
 class Pickling:

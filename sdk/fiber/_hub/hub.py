@@ -2,7 +2,7 @@
 
 It lives in the agent of its host, on its loop.  A process of the same host asks it for descriptors
 and needs it no more; one on another host reaches it through a tunnel and uses its objects by
-request (``fiber._hub.remote``).  Who wants anything has to know the hub's key.
+request (``fiber._hub.remote``).  A client has to know the hub's key, and for each object a grant.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Hub:
         self._poller = Poller(loop)
         self.registry = Registry(self._host_object, loop.call_soon)
         self.doorbell = Doorbell(loop.call_soon)
-        self.replicas = Replicas(host, self.key, self.registry)
+        self.replicas = Replicas(host, self.registry)
         self._router = Router(host, self._accept)
         self._handlers: set[ClientHandler] = set()
         self._streams: weakref.WeakSet[SocketStream] = weakref.WeakSet()
@@ -109,12 +109,12 @@ class Hub:
         self._loop.call_soon(self._admit, theirs)
         return without_timeout(QuietSocket(fileno=ours.detach()))
 
-    def fetch(self, number: int, grant: int) -> Descriptor:
+    def fetch(self, grant: bytes) -> Descriptor:
         """A descriptor of an object, for this very process.  Any thread: it waits for the loop."""
         if self._loop.on_thread():
-            return own(self.registry.fetch(number, grant))
+            return own(self.registry.fetch(grant))
         answers: SimpleQueue[Descriptor | Exception] = SimpleQueue()
-        self._loop.call_soon(self._answer, number, grant, answers)
+        self._loop.call_soon(self._answer, grant, answers)
         while not self._closed and not self._loop.broken:
             try:
                 answer = answers.get(timeout=DOZE)
@@ -125,11 +125,9 @@ class Hub:
             return answer
         raise Unreachable(self.host, "the program that keeps it has ended")
 
-    def _answer(
-        self, number: int, grant: int, answers: SimpleQueue[Descriptor | Exception]
-    ) -> None:
+    def _answer(self, grant: bytes, answers: SimpleQueue[Descriptor | Exception]) -> None:
         try:
-            answers.put(own(self.registry.fetch(number, grant)))
+            answers.put(own(self.registry.fetch(grant)))
         except Exception as error:
             answers.put(error)
 

@@ -17,12 +17,18 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 1
+VERSION = 2
 KEY_BYTES = 32
+
+SECRET_BYTES = 16
+"""Length of grants, tokens and identities: 128 bits, which cannot be guessed."""
+
+NO_SECRET = bytes(SECRET_BYTES)
+"""Stands for none."""
 
 
 class HubAddress(NamedTuple):
-    """How to reach a hub.  The key opens everything that the hub hosts: never show it."""
+    """How to reach a hub.  The key lets in, and opens no object: that takes a grant."""
 
     host: str
     path: str
@@ -69,10 +75,10 @@ class Op(IntEnum):
 
     HELLO = 1  # version, key
     CONNECT = 2  # host
-    REGISTER = 3  # kind, flags, offset, size; a descriptor beside it -> object, grant
-    FETCH = 4  # object, grant -> a descriptor beside the reply
-    ATTACH = 5  # object, grant
-    GRANT = 6  # object, flags -> object, grant
+    REGISTER = 3  # kind, flags, offset, size; a descriptor beside it -> grant, identity
+    FETCH = 4  # grant -> a descriptor beside the reply
+    ATTACH = 5  # token, grant: the token is for more streams of the same user, without a grant
+    GRANT = 6  # flags, token -> grant, identity
     RELEASE = 7  # grant; silent
     CANCEL = 8  # answers the request of this number NO, if it is still waiting; otherwise silent
     SYNC = 9  # number of the request that is given up, or 0: takes back what it got -> nothing
@@ -119,25 +125,23 @@ class Status(IntEnum):
 
 
 class Origin(NamedTuple):
-    """A block of shared memory, and which object of its home's hub it is."""
+    """A block of shared memory, and what entitles a process to it."""
 
     home: str
     """The host where it was made."""
-    inode: int
-    offset: int
+    identity: bytes
+    """Secret that tells it from all other blocks: only its users know it."""
     size: int
-    entry: int
-    grant: int
-    key: bytes
-    """Of the home's hub."""
+    token: bytes
+    grant: bytes
 
     @property
-    def identity(self) -> tuple[str, int, int]:
-        """What tells it from all other blocks."""
-        return self.home, self.inode, self.offset
+    def block(self) -> tuple[str, bytes]:
+        """Name of the block on every host."""
+        return self.home, self.identity
 
     def __repr__(self) -> str:
-        return f"Origin(home={self.home!r}, inode={self.inode}, offset={self.offset})"
+        return f"Origin(home={self.home!r}, size={self.size})"
 
     def encode(self) -> bytes:
         """As it travels between hubs."""
@@ -149,13 +153,17 @@ class Origin(NamedTuple):
         return cls(str(data[_ORIGIN.size :], "utf-8"), *_ORIGIN.unpack_from(data))
 
 
-_ORIGIN = struct.Struct(f"<5Q{KEY_BYTES}s")
+_SECRET = f"{SECRET_BYTES}s"
+_ORIGIN = struct.Struct(f"<{_SECRET}Q{_SECRET}{_SECRET}")
 
 HEAD = struct.Struct("<BI")
 HELLO = struct.Struct(f"<BIB{KEY_BYTES}s")
 TWO = struct.Struct("<BIQQ")
 FOUR = struct.Struct("<BIQQQQ")
 ONE = struct.Struct("<BIQ")
+SECRET = struct.Struct(f"<BI{_SECRET}")
+SECRETS = struct.Struct(f"<BI{_SECRET}{_SECRET}")
+GRANTING = struct.Struct(f"<BIQ{_SECRET}")
 
 
 def hello(key: bytes) -> bytes:

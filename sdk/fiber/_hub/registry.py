@@ -1,24 +1,27 @@
 """Which objects of its host a hub keeps for others, and what keeps each of them there.
 
 An object stays as long as someone on another host is attached to it or a grant for it is out.  A
-grant is the permission that travels inside a pickled handle.  A plain one is used up by whoever
-takes it first; a reusable one lasts until it is released.
+grant is the permission that travels inside a pickled handle: 128 random bits.  A plain one is used
+up by whoever takes it first; a reusable one lasts until it is released.  A user that attaches by a
+grant brings a *token*, 128 random bits of its own choice.  While it is attached, the token lets it
+attach again and grant the object to others.
 """
 
 from __future__ import annotations
 
-import itertools
+import hmac
 import os
 import stat
+import struct
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory
 from fiber._hub.hosted_semaphore import HostedSemaphore
 from fiber._hub.hosted_wait_list import HostedWaitList
-from fiber._hub.protocol import WHOLE, Extent, ObjectKind
+from fiber._hub.protocol import NO_SECRET, SECRET_BYTES, WHOLE, Extent, ObjectKind
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.descriptor import Descriptor, opened
 
@@ -26,45 +29,58 @@ Hosted: TypeAlias = HostedChannel | HostedCounter | HostedMemory | HostedSemapho
 
 
 class NoSuchObject(LookupError):
-    """The grant was used up or released, or nobody holds the object any more."""
+    """The grant was used up or released, or the user is not attached."""
 
 
 class SharedObject:
     """A channel, counter or block of this host, while others may ask for it."""
 
-    __slots__ = ("__weakref__", "attached", "descriptor", "extent", "hosted", "kind")
+    __slots__ = (
+        "__weakref__",
+        "attached",
+        "descriptor",
+        "extent",
+        "identity",
+        "kind",
+        "server",
+    )
 
-    def __init__(self, kind: ObjectKind, descriptor: Descriptor, extent: Extent) -> None:
+    def __init__(
+        self, kind: ObjectKind, descriptor: Descriptor, extent: Extent, identity: bytes
+    ) -> None:
         self.kind = kind
         self.descriptor = descriptor
         self.extent = extent
+        self.identity = identity
+        """Of shared memory: the same in each handle of it, and known to its users alone."""
         self.attached = 0
-        self.hosted: Hosted | None = None
-        """What serves those who are attached."""
-
-    def end_service(self) -> None:
-        """Nobody is attached any more."""
-        hosted, self.hosted = self.hosted, None
-        if hosted is not None:
-            hosted.close()
-
-
-class Entry:
-    """An object as it was registered once, and its holders."""
-
-    __slots__ = ("attached", "grants", "number", "shared")
-
-    def __init__(self, number: int, shared: SharedObject) -> None:
-        self.number = number
-        self.shared = shared
-        self.attached = 0
-        self.grants: set[int] = set()
+        self.server: Hosted | None = None
 
     @property
     def hosted(self) -> Hosted:
-        """The object, for those who are attached."""
-        assert self.shared.hosted is not None
-        return self.shared.hosted
+        """Serves those who are attached."""
+        assert self.server is not None
+        return self.server
+
+    def end_service(self) -> None:
+        """Nobody is attached any more."""
+        server, self.server = self.server, None
+        if server is not None:
+            server.close()
+
+
+class Attachment(NamedTuple):
+    """One stream of a user of an object."""
+
+    shared: SharedObject
+    token: bytes
+
+
+class Grant(NamedTuple):
+    """A permission to use an object."""
+
+    shared: SharedObject
+    reusable: bool
 
 
 class Registry:
@@ -80,133 +96,131 @@ class Registry:
     ) -> None:
         self._host = host
         self._call_soon = call_soon
-        # Ids are unguessable only in so far as nobody without the hub's key gets to ask for one.
-        self._numbers = itertools.count(1)
-        self._registered: deque[tuple[Entry, int, bool]] = deque()
+        self._secret = os.urandom(SECRET_BYTES)
+        self._registered: deque[tuple[bytes, Grant]] = deque()
         # So that one descriptor does for an object, however often it is registered.  Of two threads
         # that share it for the first time each may keep one: as good, but one too many.
         self._objects: weakref.WeakValueDictionary[tuple[int, ...], SharedObject] = (
             weakref.WeakValueDictionary()
         )
-        self._entries: dict[int, Entry] = {}
-        self._grants: dict[int, Entry] = {}
-        self._reusable: set[int] = set()
+        self._grants: dict[bytes, Grant] = {}
+        self._users: dict[bytes, list[SharedObject]] = {}
+        """By their tokens; an entry for each stream."""
 
     def register(
         self, kind: ObjectKind, fd: int, extent: Extent = WHOLE, *, reusable: bool
-    ) -> tuple[int, int]:
-        """Keep what ``fd`` refers to, which stays the caller's; a number for it and a grant."""
-        identity = (kind, _identity(kind, fd), extent.offset)
-        shared = self._objects.get(identity)
+    ) -> tuple[bytes, bytes]:
+        """Keep what ``fd`` refers to, which stays the caller's; a grant and its identity."""
+        known = (kind, _identity(kind, fd), extent.offset)
+        shared = self._objects.get(known)
         if shared is None:
+            identity = NO_SECRET if kind in _WITHOUT_IDENTITY else self._identify(known)
             with naming_the_limit("sharing a pipe or queue with another process"):
-                shared = SharedObject(kind, opened(os.dup, fd), extent)
-            self._objects[identity] = shared
-        number, grant = next(self._numbers), next(self._numbers)
-        self._registered.append((Entry(number, shared), grant, reusable))
-        return number, grant
+                shared = SharedObject(kind, opened(os.dup, fd), extent, identity)
+            self._objects[known] = shared
+        grant = os.urandom(SECRET_BYTES)
+        self._registered.append((grant, Grant(shared, reusable)))
+        return grant, shared.identity
 
-    def release(self, grants: Iterable[int]) -> None:
+    def _identify(self, known: tuple[int, ...]) -> bytes:
+        """The same for each thread that shares it, and however often it is forgotten meanwhile."""
+        return hmac.digest(self._secret, struct.pack("<3Q", *known), "sha256")[:SECRET_BYTES]
+
+    def release(self, grants: Iterable[bytes]) -> None:
         """Nobody will use them any more.  It is done in a moment."""
         self._call_soon(self.take_back, grants)
 
-    def take_back(self, grants: Iterable[int]) -> None:
+    def take_back(self, grants: Iterable[bytes]) -> None:
         """The same, now."""
         self._settle()
         for grant in grants:
-            self._end(grant)
+            self._grants.pop(grant, None)
 
-    def grant(self, number: int, *, reusable: bool) -> int:
-        """One more grant for an object."""
-        self._settle()
-        entry, grant = self._find(number), next(self._numbers)
-        self._note(entry, grant, reusable)
-        return grant
+    def grant(self, token: bytes, *, reusable: bool) -> tuple[bytes, bytes]:
+        """One more grant for what the user with this token is attached to, and its identity."""
+        shared = self._used_by(token)
+        grant = os.urandom(SECRET_BYTES)
+        self._grants[grant] = Grant(shared, reusable)
+        return grant, shared.identity
 
-    def fetch(self, number: int, grant: int) -> int:
+    def fetch(self, grant: bytes) -> int:
         """A descriptor for someone on this host; uses up a plain grant."""
-        self._settle()
-        entry = self._find(number, grant)
+        shared = self._granted(grant)
         with naming_the_limit("receiving a pipe or queue from another process"):
-            fd = os.dup(entry.shared.descriptor.fileno())
+            fd = os.dup(shared.descriptor.fileno())
         self._use(grant)
         return fd
 
-    def attach(self, number: int, grant: int) -> Entry:
+    def attach(self, token: bytes, grant: bytes = NO_SECRET) -> Attachment:
         """Someone on another host uses it now; ``detach`` ends that.
 
-        Who is attached already may attach again with grant 0.
+        Who is attached already may attach again with the same token and no grant.
         """
-        self._settle()
-        entry = self._find(number, grant)
-        shared = entry.shared
-        if shared.hosted is None:
+        shared = self._used_by(token) if grant == NO_SECRET else self._granted(grant)
+        if self._users.get(token, [shared])[0] is not shared:
+            raise NoSuchObject("the token is already in use for something else")
+        if shared.server is None:
             with naming_the_limit("serving a pipe or queue to another host"):
-                shared.hosted = self._host(shared)
+                shared.server = self._host(shared)
         shared.attached += 1
-        entry.attached += 1
+        self._users.setdefault(token, []).append(shared)
         self._use(grant)
-        return entry
+        return Attachment(shared, token)
 
-    def look_up(self, number: int, grant: int) -> SharedObject:
+    def look_up(self, token: bytes, grant: bytes) -> SharedObject:
         """What somebody is attached to, or is about to be by this grant."""
-        self._settle()
-        entry = self._entries.get(number)
-        return self._find(number, grant if entry and grant in entry.grants else 0).shared
+        return self._used_by(token) if token in self._users else self._granted(grant)
 
-    def detach(self, entry: Entry) -> None:
-        """One user less."""
-        entry.attached -= 1
-        entry.shared.attached -= 1
-        if not entry.shared.attached:
-            entry.shared.end_service()
-        self._drop_if_unused(entry)
+    def detach(self, attachment: Attachment) -> None:
+        """One stream less."""
+        shared, token = attachment
+        streams = self._users[token]
+        streams.pop()
+        if not streams:
+            del self._users[token]
+        shared.attached -= 1
+        if not shared.attached:
+            shared.end_service()
 
     def close(self) -> None:
         """Let go of everything."""
         self._registered.clear()
-        for entry in self._entries.values():
-            entry.shared.end_service()
-        self._entries.clear()
+        for streams in self._users.values():
+            streams[0].end_service()
+        self._users.clear()
         self._grants.clear()
-        self._reusable.clear()
 
     def _settle(self) -> None:
         """Enter what was registered meanwhile."""
         while self._registered:
-            entry, grant, reusable = self._registered.popleft()
-            self._note(entry, grant, reusable)
-            self._entries[entry.number] = entry
+            grant, granted = self._registered.popleft()
+            self._grants[grant] = granted
 
-    def _find(self, number: int, grant: int = 0) -> Entry:
-        entry = self._entries.get(number)
-        if entry is None or (grant and grant not in entry.grants) or not (grant or entry.attached):
-            raise NoSuchObject(
-                "the pipe, queue or event that this handle stands for is not there any more: "
-                "the handle was used once already, or all of its holders have ended"
-            )
-        return entry
+    def _granted(self, grant: bytes) -> SharedObject:
+        self._settle()
+        granted = self._grants.get(grant)
+        if granted is None:
+            raise NoSuchObject(_NOT_THERE)
+        return granted.shared
 
-    def _note(self, entry: Entry, grant: int, reusable: bool) -> None:
-        if reusable:
-            self._reusable.add(grant)
-        entry.grants.add(grant)
-        self._grants[grant] = entry
+    def _used_by(self, token: bytes) -> SharedObject:
+        streams = self._users.get(token)
+        if streams is None:
+            raise NoSuchObject(_NOT_THERE)
+        return streams[0]
 
-    def _use(self, grant: int) -> None:
-        if grant not in self._reusable:
-            self._end(grant)
+    def _use(self, grant: bytes) -> None:
+        granted = self._grants.get(grant)
+        if granted is not None and not granted.reusable:
+            del self._grants[grant]
 
-    def _end(self, grant: int) -> None:
-        entry = self._grants.pop(grant, None)
-        if entry is not None:
-            self._reusable.discard(grant)
-            entry.grants.discard(grant)
-            self._drop_if_unused(entry)
 
-    def _drop_if_unused(self, entry: Entry) -> None:
-        if not entry.attached and not entry.grants:
-            self._entries.pop(entry.number, None)
+_WITHOUT_IDENTITY = (ObjectKind.CHANNEL, ObjectKind.COUNTER)
+
+_NOT_THERE = (
+    "the pipe, queue or event that this handle stands for is not there any more: "
+    "the handle was used once already, or all of its holders have ended"
+)
 
 
 def _identity(kind: ObjectKind, fd: int) -> int:

@@ -15,7 +15,15 @@ from contextlib import contextmanager, suppress
 from typing import Any, TypeAlias
 
 from fiber._hub.client import HubStream, Reply, Unreachable
-from fiber._hub.protocol import ONE, TWO, HubAddress, Op, Status
+from fiber._hub.protocol import (
+    NO_SECRET,
+    ONE,
+    SECRET_BYTES,
+    SECRETS,
+    HubAddress,
+    Op,
+    Status,
+)
 from fiber._transport.unix import wait_readable
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
@@ -57,9 +65,11 @@ class RemoteObject:
     hub keeps for us.
     """
 
-    def __init__(self, home: HubAddress, number: int, grant: int) -> None:
+    def __init__(self, home: HubAddress, grant: bytes, identity: bytes = NO_SECRET) -> None:
         self.home = home
-        self.number = number
+        self.identity = identity
+        self.token = os.urandom(SECRET_BYTES)
+        """Proves to the hub that it uses the object."""
         self._pid = os.getpid()
         self._closed = False
         self._streams: list[HubStream] = []
@@ -94,8 +104,8 @@ class RemoteObject:
         if hasattr(self, "_idle"):  # otherwise its first stream could not be opened
             self.close()
 
-    def _open(self, grant: int = 0) -> HubStream:
-        stream = HubStream(self.home, [TWO.pack(Op.ATTACH, 0, self.number, grant)])
+    def _open(self, grant: bytes = NO_SECRET) -> HubStream:
+        stream = HubStream(self.home, [SECRETS.pack(Op.ATTACH, 0, self.token, grant)])
         self._streams.append(stream)
         return stream
 
@@ -139,12 +149,12 @@ class RemoteChannel(RemoteObject):
 
     can_try_send = False
 
-    def __init__(self, home: HubAddress, number: int, grant: int) -> None:
+    def __init__(self, home: HubAddress, grant: bytes, identity: bytes = NO_SECRET) -> None:
         self._late: deque[Reply] = deque()
         # One; more once threads have asked for a descriptor at the same moment.
         self._watching: deque[HubStream] = deque()
         self._unconfirmed: deque[HubStream] = deque()
-        super().__init__(home, number, grant)
+        super().__init__(home, grant, identity)
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message; returns when it can be received."""
@@ -263,13 +273,13 @@ class RemoteCounter(RemoteObject):
     def clear(self) -> int:
         """Set the count to zero and say what it was."""
         with self.stream() as stream:
-            (count,) = stream.ask(Op.CLEAR).values
+            count: int = stream.ask(Op.CLEAR).values[0]
         return count
 
     def value(self) -> int:
         """The count now."""
         with self.stream() as stream:
-            (count,) = stream.ask(Op.VALUE).values
+            count: int = stream.ask(Op.VALUE).values[0]
         return count
 
     def wait(self, timeout: float | None) -> bool:

@@ -22,11 +22,8 @@ from fiber._sync.semaphore import RECURSIVE
 class RemoteSemaphore(RemoteObject):
     """With the methods of multiprocessing's ``SemLock``, as ``SharedSemaphore``."""
 
-    def __init__(
-        self, handle: HubHandle, extent: Extent, inode: int, kind: int, maximum: int
-    ) -> None:
+    def __init__(self, handle: HubHandle, extent: Extent, kind: int, maximum: int) -> None:
         self.extent = extent
-        self.inode = inode
         self.kind = kind
         self.maximum = maximum
         self._holding: list[HubStream] = []
@@ -93,7 +90,7 @@ class RemoteSemaphore(RemoteObject):
     def _get_value(self) -> int:
         """How often it can be acquired now."""
         with self.stream() as stream:
-            (value,) = stream.ask(Op.TOKENS).values
+            value: int = stream.ask(Op.TOKENS).values[0]
         return value
 
     def _is_zero(self) -> bool:

@@ -18,7 +18,6 @@ All of this is on the loop's thread.
 
 from __future__ import annotations
 
-import hmac
 import itertools
 import os
 import struct
@@ -34,7 +33,8 @@ from fiber._hub.registry import NoSuchObject, Registry
 from fiber._wire.descriptor import opened
 from fiber._wire.messages import Memory, ProtocolError
 
-Identity = tuple[str, int, int]
+Identity = tuple[str, bytes]
+"""Home of a block, and its secret identity there."""
 Send = Callable[[Memory], None]
 
 
@@ -63,9 +63,7 @@ class Replica:
     """A block that this host shares with others: its own, or a copy of another's."""
 
     def __init__(self, origin: Origin, block: Block) -> None:
-        self.identity = origin.identity
-        self.key = origin.key
-        """Of the home's hub: whoever wants the block has to know it."""
+        self.identity = origin.block
         self.block = block
         self.memory = block.view
         self.joiners: list[Joiner] = []
@@ -91,9 +89,8 @@ class _Share:
 class Replicas:
     """Of one hub."""
 
-    def __init__(self, host: str, key: bytes, registry: Registry) -> None:
+    def __init__(self, host: str, registry: Registry) -> None:
         self._host = host
-        self._key = key
         self._registry = registry
         self._replicas: dict[Identity, Replica] = {}
         self._links: dict[str | None, MemoryLink] = {}
@@ -110,10 +107,13 @@ class Replicas:
             link.lost(reason)
 
     def join(self, origin: Origin, user: object, joiner: Joiner) -> None:
-        """Have the block here for ``user``, until that leaves; tell ``joiner``."""
+        """Have the block here for ``user``, until that leaves; tell ``joiner``.
+
+        Elsewhere than at its home, only the users of a block know the identity of a replica.
+        """
         try:
-            replica = self._replicas.get(origin.identity) or self._new(origin)
-            _check_key(origin, replica.key)
+            own = self._own_block(origin) if origin.home == self._host else None
+            replica = self._replicas.get(origin.block) or self._new(origin, own)
         except (LookupError, OSError) as error:
             joiner.refused(str(error))
             return
@@ -150,36 +150,30 @@ class Replicas:
             else:
                 joiner.joined(replica.block)
 
-    def _new(self, origin: Origin) -> Replica:
-        if origin.home == self._host:
-            replica = Replica(origin, self._own_block(origin))
+    def _new(self, origin: Origin, own: Block | None) -> Replica:
+        if own is not None:
+            replica = Replica(origin, own)
         else:
             link = self._towards(origin.home)
             replica = Replica(origin, heap.allocate(origin.size))
             replica.block.give()
             replica.ready = False
             replica.upstream = link.join(replica, origin)
-        self._replicas[origin.identity] = replica
+        self._replicas[replica.identity] = replica
         return replica
 
     def _own_block(self, origin: Origin) -> Block:
-        _check_key(origin, self._key)
-        shared = self._registry.look_up(origin.entry, origin.grant)
-        extent = origin.offset, origin.size
-        if shared.kind is not ObjectKind.MEMORY or extent != shared.extent:
+        shared = self._registry.look_up(origin.token, origin.grant)
+        told = ObjectKind.MEMORY, origin.identity, origin.size
+        if told != (shared.kind, shared.identity, shared.extent.size):
             raise NoSuchObject("there is no such block of shared memory")
-        return block_of(opened(os.dup, shared.descriptor.fileno()), *extent)
+        return block_of(opened(os.dup, shared.descriptor.fileno()), *shared.extent)
 
     def _towards(self, host: str) -> MemoryLink:
         link = self._links.get(host, self._links.get(None))
         if link is None:
             raise NoSuchObject(f"host {host!r} cannot be reached: no agent of that name is there")
         return link
-
-
-def _check_key(origin: Origin, key: bytes) -> None:
-    if not hmac.compare_digest(origin.key, key):
-        raise NoSuchObject("the key is not the hub's: the handle belongs to another program")
 
 
 class MemoryLink:
@@ -239,7 +233,7 @@ class MemoryLink:
     # The other side
 
     def _accept(self, number: int, origin: Origin) -> None:
-        downstream = self._joining[number] = _Downstream(self, number, origin.identity)
+        downstream = self._joining[number] = _Downstream(self, number, origin.block)
         self._home.join(origin, downstream, downstream)
 
     def accepted(self, downstream: _Downstream) -> None:

@@ -37,23 +37,22 @@ class SharedBuffer:
 class ReplicaBuffer(SharedBuffer):
     """The same on another host than where it was made."""
 
-    __slots__ = ("_extent", "_inode", "_original", "_stream")
+    __slots__ = ("_extent", "_original", "_stream")
 
-    def __init__(self, home: HubHandle, extent: Extent, inode: int) -> None:
+    def __init__(self, home: HubHandle, extent: Extent) -> None:
         self._extent = extent
-        self._inode = inode
         # Keeps the original at its home.
-        self._original = RemoteObject(*home)
+        original = self._original = RemoteObject(*home)
         # Keeps the replica at this host's hub, until this object is forgotten.
         self._stream = HubStream(client.hub_address())
-        address, entry, grant = home
-        origin = Origin(address.host, inode, *extent, entry, grant, address.key)
+        address, grant, identity = home
+        origin = Origin(address.host, identity, extent.size, original.token, grant)
         reply = self._stream.ask(Op.REPLICATE, buffers=[memoryview(origin.encode())])
         (fd,), (offset,) = reply.fds, reply.values
         super().__init__(block_of(own(fd), offset, extent.size))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (handle_for_remote_block(self._original, self._extent, self._inode),)
+        return _rebuild, (handle_for_remote_block(self._original, self._extent),)
 
 
 def allocate(size: int) -> SharedBuffer:
@@ -65,4 +64,4 @@ def _rebuild(handle: BlockHandle) -> SharedBuffer:
     home = handle.elsewhere()
     if home is None:
         return SharedBuffer(handle.block())
-    return ReplicaBuffer(home, handle.extent, handle.inode)
+    return ReplicaBuffer(home, handle.extent)

@@ -15,7 +15,7 @@ from fiber._sync.semaphore import SIZE, SharedSemaphore
 AnySemaphore: TypeAlias = SharedSemaphore | RemoteSemaphore
 
 # One object for each in a process: only so a recursive one knows its thread again, however often it
-# was unpickled.  By the identity of its block, and the key of its hub if that is elsewhere.
+# was unpickled.  By the identity of its block, or by the one that its hub elsewhere gave it.
 _known: weakref.WeakValueDictionary[tuple[object, ...], AnySemaphore] = (
     weakref.WeakValueDictionary()
 )
@@ -31,8 +31,8 @@ def create(kind: int, value: int, maximum: int) -> SharedSemaphore:
 def _rebuild(handle: BlockHandle, kind: int, maximum: int) -> AnySemaphore:
     home = handle.elsewhere()
     if home is not None:
-        remote = RemoteSemaphore(home, handle.extent, handle.inode, kind, maximum)
-        return _known.setdefault((home.home.key, handle.inode, handle.extent.offset), remote)
+        remote = RemoteSemaphore(home, handle.extent, kind, maximum)
+        return _known.setdefault((home.identity,), remote)
     block = handle.block()
     known = _known.get(block.identity)
     if known is None:
@@ -47,7 +47,7 @@ def _reduce(semaphore: SharedSemaphore) -> tuple[Any, ...]:
 
 
 def _reduce_remote(remote: RemoteSemaphore) -> tuple[Any, ...]:
-    handle = handle_for_remote_block(remote, remote.extent, remote.inode)
+    handle = handle_for_remote_block(remote, remote.extent)
     return _rebuild, (handle, remote.kind, remote.maximum)
 
 

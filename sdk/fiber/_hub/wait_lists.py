@@ -23,9 +23,8 @@ from fiber._sync.wait_list import SIZE, WaitList
 class RemoteWaitList(RemoteObject):
     """Of another host; as ``WaitList``.  A place is a stream, so it ends with this process."""
 
-    def __init__(self, handle: HubHandle, extent: Extent, inode: int) -> None:
+    def __init__(self, handle: HubHandle, extent: Extent) -> None:
         self.extent = extent
-        self.inode = inode
         super().__init__(*handle)
 
     def enter(self) -> HubStream:
@@ -82,7 +81,7 @@ class RemoteWaitList(RemoteObject):
 
     def _ask(self, operation: Op, number: int) -> int:
         with self.stream() as stream:
-            (value,) = stream.ask(operation, number, form=ONE).values
+            value: int = stream.ask(operation, number, form=ONE).values[0]
         return value
 
 
@@ -97,7 +96,7 @@ def create() -> WaitList:
 def _rebuild(handle: BlockHandle) -> AnyWaitList:
     home = handle.elsewhere()
     if home is not None:
-        return RemoteWaitList(home, handle.extent, handle.inode)
+        return RemoteWaitList(home, handle.extent)
     return WaitList(handle.block(), ring)
 
 
@@ -107,7 +106,7 @@ def _reduce(waiters: WaitList) -> tuple[Any, ...]:
 
 
 def _reduce_remote(remote: RemoteWaitList) -> tuple[Any, ...]:
-    return _rebuild, (handle_for_remote_block(remote, remote.extent, remote.inode),)
+    return _rebuild, (handle_for_remote_block(remote, remote.extent),)
 
 
 copyreg.pickle(WaitList, _reduce)
