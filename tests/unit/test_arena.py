@@ -5,10 +5,12 @@ from __future__ import annotations
 import errno
 import os
 import threading
+import weakref
 from collections.abc import Iterator
 
 import pytest
 
+from census import wait_until
 from fiber._wire import arena
 from fiber._wire.arena import (
     DATA_OFFSET,
@@ -19,8 +21,11 @@ from fiber._wire.arena import (
     Block,
     fill,
     in_place,
+    mapping,
     release,
 )
+from fiber._wire.descriptor import opened, own
+from patience import PATIENCE
 
 
 @pytest.fixture
@@ -28,6 +33,10 @@ def blocks() -> Iterator[Arena]:
     made = Arena()
     yield made
     made._forget()
+
+
+def read_in_place(fd: int, size: int) -> memoryview | None:
+    return in_place(own(os.dup(fd)), size)
 
 
 def test_a_block_is_used_again_once_its_reader_released_it(blocks: Arena) -> None:
@@ -45,7 +54,7 @@ def test_a_block_read_in_place_is_its_senders_again_once_nobody_looks_at_it(bloc
     block = blocks.claim(1000)
     fill(block, [memoryview(b"content")], [DATA_OFFSET])
     blocks.settle(block, sent=True)
-    memory = in_place(block.fd, 1000)
+    memory = read_in_place(block.fd, 1000)
     assert memory is not None
     part = memory[DATA_OFFSET : DATA_OFFSET + 7]
     del memory
@@ -64,13 +73,13 @@ def test_a_block_read_in_place_is_its_senders_again_once_nobody_looks_at_it(bloc
 
 def test_only_so_many_blocks_are_read_in_place(blocks: Arena) -> None:
     block = blocks.claim(1000)
-    read = [in_place(block.fd, 1000) for _ in range(LENT_BLOCKS)]
+    read = [read_in_place(block.fd, 1000) for _ in range(LENT_BLOCKS)]
     assert all(memory is not None for memory in read)
-    assert in_place(block.fd, 1000) is None
+    assert read_in_place(block.fd, 1000) is None
     read.pop()
     with pytest.raises(ValueError, match="greater than file size"):
-        in_place(block.fd, 1 << 20)
-    read.append(in_place(block.fd, 1000))
+        read_in_place(block.fd, 1 << 20)
+    read.append(read_in_place(block.fd, 1000))
     assert read[-1] is not None
     read.clear()
     blocks.settle(block, sent=False)
@@ -86,8 +95,8 @@ def test_where_no_descriptor_is_left_a_block_is_copied(
     with monkeypatch.context() as full:
         full.setattr(arena, "_Lent", refuse)
         for _ in range(LENT_BLOCKS + 1):
-            assert in_place(block.fd, 1000) is None
-    assert in_place(block.fd, 1000) is not None, "none of those counts as read"
+            assert read_in_place(block.fd, 1000) is None
+    assert read_in_place(block.fd, 1000) is not None, "none of those counts as read"
     blocks.settle(block, sent=False)
 
 
@@ -98,10 +107,10 @@ def test_only_what_its_sender_cannot_cut_is_read_in_place(blocks: Arena) -> None
     blocks.settle(block, sent=False)
     fd = os.memfd_create("a sender's own")
     os.ftruncate(fd, 1000)
-    assert in_place(fd, 1000) is None
+    assert read_in_place(fd, 1000) is None
     os.close(fd)
     with open(os.path.abspath(__file__), "rb") as file:
-        assert in_place(file.fileno(), 1000) is None
+        assert read_in_place(file.fileno(), 1000) is None
 
 
 def test_a_message_that_did_not_go_out_frees_its_block(blocks: Arena) -> None:
@@ -194,3 +203,32 @@ def test_a_block_without_memory_leaves_no_descriptor(monkeypatch: pytest.MonkeyP
         with pytest.raises(OSError, match="no memory"):
             Block(1 << 16)
     assert os.listdir("/proc/self/fd") == before
+
+
+def test_much_memory_is_given_back_by_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arena, "SLOWLY", 1 << 16)
+    owner = opened(os.memfd_create, "message")
+    os.ftruncate(owner.fileno(), 1 << 16)
+    part = memoryview(mapping(owner, 1 << 16))[10:20]
+    part[:] = b"0123456789"
+    if (child := os.fork()) == 0:
+        del part
+        os._exit(0 if threading.active_count() == 1 else 1)
+    assert os.waitpid(child, 0)[1] == 0, "it belongs to the process that made it"
+    assert part == b"0123456789"
+    del part
+    assert wait_until(lambda: owner.closed, PATIENCE)
+
+
+def test_where_no_thread_can_be_started_memory_is_given_back_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(arena, "SLOWLY", 1 << 16)
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    owner = opened(os.memfd_create, "message")
+    os.ftruncate(owner.fileno(), 1 << 16)
+    kept = weakref.ref(mapping(owner, 1 << 16))
+    assert kept() is None

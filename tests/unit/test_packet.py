@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fiber._wire import packet
+from fiber._wire import packet, raw_memory
 from fiber._wire.arena import RETAINED_LIMIT
 from fiber._wire.packet import BULK, INLINE_LIMIT
 from fiber.errors import TooManyOpenFiles
@@ -310,3 +310,12 @@ def test_what_its_owner_may_change_is_kept_by_a_copy() -> None:
     open_[0] = 1
     assert views == [fixed, fixed]
     assert views[0].obj is fixed
+
+
+@pytest.mark.parametrize("size", [0, 1, packet.OUT_OF_BAND_MIN, 5_000_000])
+def test_a_copy_that_other_threads_can_run_beside_is_one(size: int) -> None:
+    source = bytearray(os.urandom(size))
+    made = raw_memory.copy(memoryview(source).toreadonly())
+    assert type(made) is bytes
+    assert made == source
+    assert hash(made) == hash(bytes(source))

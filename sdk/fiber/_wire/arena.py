@@ -12,10 +12,11 @@ import contextlib
 import fcntl
 import mmap
 import os
+import threading
 from collections import deque
 from collections.abc import Iterable
 
-from fiber._wire.descriptor import opened
+from fiber._wire.descriptor import Descriptor, opened
 
 RETAINED_LIMIT = 1 << 25
 """Bytes of memory kept for later messages, per process.
@@ -120,43 +121,75 @@ def release(fd: int) -> None:
         os.pwrite(fd, _CLEARED, 0)
 
 
-class _Lent(mmap.mmap):
-    """A sender's block as its reader has it: its sender's again once nobody looks at it."""
+SLOWLY = 1 << 27
+"""Bytes of memory from which on a thread gives it back: for a gigabyte that takes 0.2 s."""
 
-    reader = 0
-    """A process that the reader forks has no say."""
+_STEP = 1 << 24
+
+
+class Mapping(mmap.mmap):
+    """Memory of one message, and the owner of its descriptor."""
+
+    owner: Descriptor | None = None
+    process = 0
+    """Where it was made.  A process that this one forks has no say."""
 
     def __del__(self) -> None:
-        if self.reader == os.getpid():
+        if self.process == os.getpid() and len(self) >= SLOWLY:
+            with contextlib.suppress(RuntimeError):  # then it takes what it takes
+                threading.Thread(target=self._give_back, name="fiber-free", daemon=True).start()
+
+    def _give_back(self) -> None:
+        """Give the memory back while other threads of the interpreter run."""
+        for start in range(0, len(self), _STEP):
+            self.madvise(mmap.MADV_DONTNEED, start, min(_STEP, len(self) - start))
+        self.close()
+        if self.owner is not None:
+            self.owner.close()  # the last of it: the system frees the content, and we do not wait
+
+
+def mapping(memory: Descriptor, size: int) -> Mapping:
+    """Map a message."""
+    mapped = Mapping(memory.fileno(), size)
+    mapped.owner, mapped.process = memory, os.getpid()
+    return mapped
+
+
+class _Lent(Mapping):
+    """A sender's block as its reader has it: its sender's again once nobody looks at it."""
+
+    def __del__(self) -> None:
+        if self.process == os.getpid():
             self[0] = _FREE
             _leave_to_lend.append(None)
+        super().__del__()
 
 
 LENT_BLOCKS = 64
-"""Blocks of others that a process reads in place at a time; each holds a descriptor."""
+"""Blocks of others that a process reads in place at a time; each holds two descriptors."""
 
 _leave_to_lend = deque([None] * LENT_BLOCKS)
 
 
-def in_place(fd: int, size: int) -> memoryview | None:
+def in_place(memory: Descriptor, size: int) -> memoryview | None:
     """A sender's block, not copied; None if that has to be copied.
 
     That is so where the sender could make it shorter, since to read beyond the end of a file is the
     end of this process, and where LENT_BLOCKS are being read.
     """
     try:
-        if not fcntl.fcntl(fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
+        if not fcntl.fcntl(memory.fileno(), fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
             return None
         _leave_to_lend.pop()
     except (OSError, IndexError):  # no memfd at all, or enough of them
         return None
     try:
-        lent = _Lent(fd, size)
+        lent = _Lent(memory.fileno(), size)
     except OSError:  # no descriptor or mapping is left: to copy it takes none
         _leave_to_lend.append(None)
         return None
     except BaseException:
         _leave_to_lend.append(None)
         raise
-    lent.reader = os.getpid()
+    lent.owner, lent.process = memory, os.getpid()
     return memoryview(lent)

@@ -7,10 +7,9 @@ the frame on to a process of this host carries the memfd's descriptor and says w
 from __future__ import annotations
 
 import fcntl
-import mmap
 import os
 
-from fiber._wire.arena import DATA_OFFSET
+from fiber._wire.arena import DATA_OFFSET, Mapping
 from fiber._wire.descriptor import Descriptor, opened
 
 IN_FILE = 1 << 22
@@ -52,11 +51,13 @@ class Assembly:
         return self._small if self._memory is None else memoryview(self._memory)[DATA_OFFSET:]
 
 
-class Memory(mmap.mmap):
-    """Memory of one frame.  Its layout is that of an arena's block, which nobody uses again."""
+class Memory(Mapping):
+    """Memory of one frame, laid out as an arena's block, which nobody uses again.
 
-    owner: Descriptor | None = None
-    """None where the system had no descriptor for it, or lets this process write no files."""
+    It has no ``owner`` where the system had no descriptor for it, or lets this process write no
+    files.
+    """
+
     passes_on = False
 
 
@@ -74,7 +75,9 @@ def place_of(view: memoryview) -> tuple[Descriptor, int] | None:
     memory = view.obj
     if not isinstance(memory, Memory) or not memory.passes_on or memory.owner is None or not view:
         return None
-    return memory.owner, _address(view) - _address(memoryview(memory))
+    from fiber._wire.raw_memory import address  # few processes need it
+
+    return memory.owner, address(view) - address(memoryview(memory))
 
 
 def _memory(size: int) -> Memory:
@@ -88,7 +91,7 @@ def _memory(size: int) -> Memory:
         memory = Memory(owner.fileno(), total)
     except OSError:
         return Memory(-1, total)
-    memory.owner = owner
+    memory.owner, memory.process = owner, os.getpid()
     return memory
 
 
@@ -96,9 +99,3 @@ def _write(fd: int, piece: memoryview, offset: int) -> None:
     done = 0
     while done < len(piece):
         done += os.pwrite(fd, piece[done:], offset + done)
-
-
-def _address(view: memoryview) -> int:
-    import ctypes  # few processes need it
-
-    return ctypes.addressof(ctypes.c_char.from_buffer(view))

@@ -18,7 +18,6 @@ Buffers are pickle protocol 5's out-of-band buffers (PEP 574).
 from __future__ import annotations
 
 import errno
-import mmap
 import os
 import pickle
 import socket
@@ -29,9 +28,17 @@ from itertools import starmap
 from operator import is_not
 from typing import Any, TypeAlias
 
-from fiber._wire.arena import DATA_OFFSET, RETAINED_LIMIT, Arena, fill, in_place, release
+from fiber._wire.arena import (
+    DATA_OFFSET,
+    RETAINED_LIMIT,
+    Arena,
+    fill,
+    in_place,
+    mapping,
+    release,
+)
 from fiber._wire.assembly import place_of
-from fiber._wire.descriptor import own
+from fiber._wire.descriptor import Descriptor, own
 from fiber.errors import ConnectionClosed, FileTooLarge, TooManyOpenFiles
 
 BytesLike: TypeAlias = bytes | bytearray | memoryview
@@ -169,8 +176,17 @@ class _Large:
     def __init__(self, data: bytes) -> None:
         self._data = data
 
-    def __reduce__(self) -> tuple[type[bytes], tuple[pickle.PickleBuffer]]:
-        return bytes, (pickle.PickleBuffer(self._data),)
+    def __reduce__(self) -> tuple[Callable[..., bytes], tuple[pickle.PickleBuffer]]:
+        return large_bytes, (pickle.PickleBuffer(self._data),)
+
+
+def large_bytes(buffer: BytesLike) -> bytes:
+    """Return the bytes for which a ``_Large`` stood."""
+    if isinstance(buffer, bytes):  # they were pickled after all
+        return buffer
+    from fiber._wire.raw_memory import copy  # few processes need it
+
+    return copy(memoryview(buffer))
 
 
 def _light(obj: Any, known: dict[int, _Large], depth: int = 2) -> Any:
@@ -407,8 +423,8 @@ def _receive_parts(buffer: _Buffer, received: _Received, *, passing: bool = Fals
         if not memory:
             raise ValueError("a large message without its memory")
         if kind == PASSED:
-            return _passed_parts(view[offset:size], sizes, lent, memory[0].fileno())
-        return _memory_parts(sizes, lent, memory[0].fileno(), passing=passing)
+            return _passed_parts(view[offset:size], sizes, lent, memory[0])
+        return _memory_parts(sizes, lent, memory[0], passing=passing)
     except BaseException:
         lent.close_descriptors()
         lent.release()
@@ -424,34 +440,36 @@ def _inline_parts(body: memoryview, sizes: list[int], lent: Message) -> Message:
     return lent
 
 
-def _memory_parts(sizes: list[int], lent: Message, memory: int, *, passing: bool) -> Message:
+def _memory_parts(sizes: list[int], lent: Message, memory: Descriptor, *, passing: bool) -> Message:
     """Take the parts out of the sender's block: by a copy that frees it, or for good if it is
     large; or lend them, to who is ``passing`` them on.
     """
     offsets, total = _offsets(sizes)
     mapped = in_place(memory, total) if passing else None
     if total > RETAINED_LIMIT and mapped is None:
-        mapped = memoryview(mmap.mmap(memory, total))
+        mapped = memoryview(mapping(memory, total))
     if mapped is not None:
         views = [mapped[at : at + size] for at, size in zip(offsets, sizes, strict=True)]
     else:
-        views = [_copy_out(memory, at, size) for at, size in zip(offsets, sizes, strict=True)]
-        release(memory)
+        fd = memory.fileno()
+        views = [_copy_out(fd, at, size) for at, size in zip(offsets, sizes, strict=True)]
+        release(fd)
     lent.release()
     return Message(views[0], views[1:], lent.fds)
 
 
-def _passed_parts(rest: memoryview, sizes: list[int], lent: Message, memory: int) -> Message:
+def _passed_parts(rest: memoryview, sizes: list[int], lent: Message, memory: Descriptor) -> Message:
     """Map the parts, which nobody else uses, or copy them if they are not large."""
     table = _SIZE.size * len(sizes)
     offsets = [offset for (offset,) in _SIZE.iter_unpack(rest[:table])]
     places = list(zip(offsets, sizes, strict=True))
     end = max(map(sum, places))
     if end > RETAINED_LIMIT:
-        mapped = memoryview(mmap.mmap(memory, end))
+        mapped = memoryview(mapping(memory, end))
         views = [mapped[at : at + size] for at, size in places]
     else:
-        views = [_copy_out(memory, at, size) if at else lent.payload for at, size in places]
+        fd = memory.fileno()
+        views = [_copy_out(fd, at, size) if at else lent.payload for at, size in places]
     if not offsets[0]:
         views[0] = memoryview(bytes(rest[table : table + sizes[0]]))
     lent.release()
