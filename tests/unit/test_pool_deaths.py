@@ -17,6 +17,7 @@ from fiber.errors import StartError, WorkerDied
 from fiber.pool import Pool
 from patience import PATIENCE
 from unit import pool_tasks as tasks
+from unit.pool_programs import run_program
 
 
 @pytest.fixture
@@ -65,6 +66,27 @@ def test_sys_exit_ends_the_worker_and_is_not_tried_again(
     assert wait_until(lambda: not before <= {process.pid for process in pool._pool}, PATIENCE), (
         "its worker goes on"
     )
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+@pytest.mark.parametrize("call", ["pool.apply(leave, (7,))", "executor.submit(leave, 7).result()"])
+def test_a_program_that_a_tasks_sys_exit_ends_says_which_task(backend: str, call: str) -> None:
+    done = run_program(
+        f"""
+        import fiber
+        import sys
+
+        def leave(status):
+            sys.exit(status)
+
+        with fiber.Pool(1) as pool, fiber.Executor(1) as executor:
+            {call}
+        """,
+        {"FIBER_BACKEND": backend},
+    )
+    assert done.returncode == 7
+    assert "the task leave() (" in done.stderr
+    assert "called sys.exit(7)" in done.stderr
 
 
 @pytest.mark.parametrize("chunksize", [None, 1, 2])

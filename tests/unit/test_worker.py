@@ -6,6 +6,7 @@ import errno
 import pickle
 import random
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -272,20 +273,43 @@ def note(_: object) -> None:
 
 
 @MODES
-def test_what_was_done_before_sys_exit_is_sent(rig: Rig, mode: dict[str, int]) -> None:
+def test_what_was_done_before_sys_exit_is_sent(
+    rig: Rig, mode: dict[str, int], capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         rig.give(exit_at_three, range(10), **mode)
     *done, last = rig.channel.results(1)
     assert done == [0, 1, 2]
     assert isinstance(last[1], SystemExit)
     assert [words[2] for words in rig.channel.said if words[2] is not None] == [4]
+    assert_that_the_task_is_named(capsys)
 
 
-def test_a_call_that_exits_is_answered_first(rig: Rig) -> None:
+def test_a_call_that_exits_is_answered_first(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         rig.call((exit_at_three, (3,), {}))
     ((_, error),) = rig.channel.results(1)
     assert isinstance(error, SystemExit)
+    assert_that_the_task_is_named(capsys)
+
+
+def assert_that_the_task_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "the task exit_at_three() (" in line
+    assert "test_worker.py" in line
+    assert "called sys.exit(5)" in line
+
+
+def test_a_task_that_the_pool_ends_by_a_handler_is_not_named(
+    rig: Rig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    try:
+        with pytest.raises(SystemExit):
+            rig.call((signal.raise_signal, (signal.SIGTERM,), {}))
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    assert capsys.readouterr().err == ""
 
 
 def exit_at_three(x: int) -> int:

@@ -10,10 +10,12 @@ from __future__ import annotations
 import contextlib
 import pickle
 import signal
+import sys
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice, starmap
+from types import FrameType
 from typing import Any
 
 from fiber._agent import child
@@ -148,6 +150,8 @@ class Worker:
             del function, args, kwargs  # what is not kept is gone
         except BaseException as error:
             self._interruptible = False
+            if isinstance(error, SystemExit):
+                _report_exit(error)
             batch = self._start(seq, (), started, taken, eager=True)
             batch.fail(error)
             batch.flush()
@@ -312,6 +316,8 @@ class Worker:
 
     def _failed(self, batch: BatchResults, error: BaseException) -> bool:
         """Take a task's error; return whether it ends this process, as in multiprocessing."""
+        if isinstance(error, SystemExit):
+            _report_exit(error)  # first: the program may end as soon as it hears of it
         batch.fail(error)
         if not isinstance(error, SystemExit):
             return False
@@ -321,6 +327,33 @@ class Worker:
             batch.encode_new()
         batch.return_unstarted()
         return True
+
+
+def _report_exit(error: SystemExit) -> None:
+    """Name the task that ends this worker: its caller's program may end without a word."""
+    import traceback  # rarely needed, and long to import
+
+    frames = [frame for frame in traceback.walk_tb(error.__traceback__) if not _is_ours(frame[0])]
+    on_sigterm = getattr(signal.getsignal(signal.SIGTERM), "__code__", None)
+    if any(frame.f_code is on_sigterm for frame, _ in frames):
+        return  # The pool ends this worker.
+    task = "a task"
+    if frames:
+        (frame, line), *_ = frames
+        code = frame.f_code
+        task = f"the task {code.co_qualname}() ({code.co_filename}:{line})"
+    with contextlib.suppress(Exception):  # stderr is the program's
+        print(
+            f"fiber: {task} called sys.exit({error.code!r}). That ends its worker, and SystemExit "
+            "ends the program that asks for the result. Return from the task, or raise another "
+            "exception",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
+def _is_ours(frame: FrameType) -> bool:
+    return frame.f_code.co_filename == __file__
 
 
 def _spread(function: _Function) -> _Function:
