@@ -45,7 +45,7 @@ from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from fiber.process import PoolProcess, process_type
 from fiber.resources import Resources, merged, wished
-from fiber.results import IMapIterator
+from fiber.results import SLICEABLE, IMapIterator
 
 __all__ = [
     "ALL_COMPLETED",
@@ -184,9 +184,10 @@ class Executor(concurrent.futures.Executor):
         deadline = None if timeout is None else time.monotonic() + timeout
         ahead = options.buffersize(buffersize)
         unit = options.chunksize(chunksize)
+        several = len(iterables) != 1
+        source = zip(*iterables, strict=False) if several else _iterable(iterables[0])
         engine = self._group.executor_for(fn, self._wishes)
         results: IMapIterator[Any] = IMapIterator(self._group)
-        several = len(iterables) != 1
         try:
             item = WorkItem(
                 work.STAR if several else work.MAP,
@@ -200,7 +201,6 @@ class Executor(concurrent.futures.Executor):
         except Exception as error:  # it does not pickle
             engine.reject(results._buffer, error)
             return _taken(results, engine, None, deadline)
-        source = zip(*iterables, strict=False) if several else iterables[0]
         results._begin(engine, item, source, ahead)
         return _taken(results, engine, item, deadline)
 
@@ -257,6 +257,11 @@ def _process(context: Any) -> Any:
         raise TypeError(
             f"mp_context must be what fiber.get_context() returns, not {context!r}"
         ) from None
+
+
+def _iterable(given: Any) -> Iterable[Any]:
+    """Return what is taken whole as it is, and the iterator of all else, or raise TypeError."""
+    return given if isinstance(given, (*SLICEABLE, list)) else iter(given)
 
 
 def _taken(

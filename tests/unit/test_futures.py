@@ -9,6 +9,7 @@ import pickle
 import threading
 import weakref
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -273,6 +274,21 @@ def test_map_keeps_no_result(executor: fiber.Executor) -> None:
 def test_map_refuses(executor: fiber.Executor, wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=r"1\+"):
         executor.map(tasks.square, [1], **wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", [(5,), ([1], 5), (5, [1]), (None,)])
+def test_map_of_what_is_not_iterable_is_an_error_at_the_call(
+    executor: fiber.Executor, wrong: tuple[Any, ...]
+) -> None:
+    with ThreadPoolExecutor(1) as other:
+        for each in (other, executor):
+            with pytest.raises(TypeError, match="object is not iterable"):
+                each.map(tasks.add, *wrong)
+
+
+@pytest.mark.parametrize("kind", [list, tuple, iter, set, dict.fromkeys])
+def test_map_takes_any_iterable(executor: fiber.Executor, kind: Any) -> None:
+    assert list(executor.map(tasks.square, kind([0, 1, 2]))) == [0, 1, 4]
 
 
 # Deaths
