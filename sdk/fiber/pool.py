@@ -250,6 +250,9 @@ class Pool:
     ) -> MapResult[_T]:
         """As ``map``, but return at once with a result to wait for.  ``iterable`` is read first.
 
+        Its items are pickled later: change none of them, as an array in place, before the result is
+        there.
+
         ``callback`` gets the list of results, ``error_callback`` the first error, as in
         ``apply_async``.
         """
