@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from multiprocessing import util
 from typing import Any
@@ -14,13 +15,20 @@ USUAL = "WARNING"
 
 def debug(message: str, *args: object) -> None:
     """Log an event of Fiber's; free of cost where nobody has imported ``logging``."""
-    logging: Any = sys.modules.get("logging")
-    if logging is None:
+    # Another thread may be importing the module at this moment.
+    get_logger: Any = getattr(sys.modules.get("logging"), "getLogger", None)
+    if get_logger is None:
         return
-    logger = logging.getLogger("fiber")
+    logger = get_logger("fiber")
     if _mp._logger is not None:
         logger.parent = _mp._logger  # its level and handlers count from here on
-    logger.debug(message, *args)
+    try:
+        logger.debug(message, *args)
+    except Exception:  # of a handler of the user's: Fiber's own threads go on
+        import traceback
+
+        with contextlib.suppress(Exception):
+            traceback.print_exc()
 
 
 def show(level: str) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -121,6 +122,23 @@ def test_the_logger_has_handlers_of_its_users(records: list[str]) -> None:
     logging.getLogger("fiber").setLevel("INFO")
     _logs.debug("agent %s has joined", "b")
     assert records == ["agent a has joined"]
+
+
+def test_a_handler_that_raises_is_shown_and_harms_nobody(
+    records: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Faulty(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            raise RuntimeError("no room")
+
+    monkeypatch.setattr(logging.getLogger("fiber"), "handlers", [Faulty()])
+    _logs.debug("agent %s has joined", "a")
+    assert "RuntimeError: no room" in capsys.readouterr().err
+
+
+def test_a_module_that_is_being_imported_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "logging", ModuleType("logging"))
+    _logs.debug("agent %s has joined", "a")
 
 
 def test_a_program_without_logging_imports_none() -> None:
