@@ -288,6 +288,10 @@ def test_complaints_are_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> 
     for number in range(10):
         listener._acceptor.report(f"10.0.0.{number}", f"10.0.0.{number}:1", "nonsense")
     notes: Notes = master
-    notes.wait(lambda: len(notes.refusals) == 3)
+    notes.wait(lambda: len(notes.refusals) == 4)
+    assert "strangers come from many addresses" in notes.refusals[-1]
+    listener._acceptor.report("10.0.0.99", "10.0.0.99:1", "an agent's trouble", proven=True)
+    notes.wait(lambda: len(notes.refusals) == 5)
+    assert notes.refusals[-1] == "an agent's trouble (10.0.0.99:1)"
     site.on_loop(lambda: None)
-    assert len(notes.refusals) == 3
+    assert len(notes.refusals) == 5

@@ -2,22 +2,50 @@
 
 from __future__ import annotations
 
+import pytest
+
 from fiber._transport import refusals
 from fiber._transport.refusals import Refusals
 
 
-def test_the_same_is_told_once_and_again_after_some_minutes() -> None:
+@pytest.mark.parametrize("own", [False, True])
+def test_the_same_is_told_once_and_again_after_some_minutes(own: bool) -> None:
     told = Refusals()
-    assert told.is_news("here", "late", 0.0)
-    assert not told.is_news("here", "late", refusals._FORGET - 1)
-    assert told.is_news("there", "late", 1.0)
-    assert told.is_news("here", "late", refusals._FORGET)
-    assert not told.is_news("here", "late", refusals._FORGET + 1)
+    assert "late" in told.news("here", "here:1", "late", 0.0, own=own)
+    assert not told.news("here", "here:2", "late", refusals._FORGET - 1, own=own)
+    assert told.news("there", "there:1", "late", 1.0, own=own)
+    assert told.news("here", "here:3", "late", refusals._FORGET, own=own)
+    assert not told.news("here", "here:3", "late", refusals._FORGET + 1, own=own)
 
 
-def test_who_varies_his_fault_is_not_told_for_ever_and_keeps_nobody_else_out_for_ever() -> None:
+def many_strangers(told: Refusals, now: float, count: int) -> list[str]:
+    heard = [
+        told.news(f"host {number}", f"host {number}:1", "late", now) for number in range(count)
+    ]
+    return [news for news in heard if news]
+
+
+def test_strangers_from_many_addresses_are_summed_up() -> None:
     told = Refusals()
-    heard = [told.is_news("here", f"fault {number}", 0.0) for number in range(1000)]
-    assert sum(heard) == refusals._MOST
-    assert not told.is_news("there", "late", 1.0)
-    assert told.is_news("there", "late", refusals._FORGET)
+    assert len(many_strangers(told, 0.0, 1000)) == refusals._MOST + 1
+    assert not told.news("there", "there:1", "late", 1.0)
+    (summary,) = [
+        news
+        for number in range(refusals._MOST + 10)
+        if "more turned away" in (news := told.news(str(number), "x:1", "new", refusals._FORGET))
+    ]
+    assert f"{1000 - refusals._MOST - 1 + 2} more turned away" in summary
+    assert "x:1 (new)" in summary
+
+
+def test_own_agents_are_told_of_whatever_strangers_do() -> None:
+    told = Refusals()
+    many_strangers(told, 0.0, 1000)
+    news = told.news("node", "node:1", "'agent-1' has another version", 1.0, own=True)
+    assert news == "'agent-1' has another version (node:1)"
+
+
+def test_no_number_of_own_agents_keeps_one_out_or_takes_memory_without_end() -> None:
+    told = Refusals()
+    assert all(told.news("node", "node:1", f"agent {n}", 0.0, own=True) for n in range(1000))
+    assert len(told._own) == refusals._MOST

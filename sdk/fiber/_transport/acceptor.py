@@ -52,7 +52,7 @@ class Acceptor:
 
     ``on_hello`` is called on its thread with a connection that has proved itself, and its first
     words; ``on_refused`` with why one was turned away, once in some minutes for each address and
-    reason.
+    reason.  Strangers from many addresses are summed up.
     """
 
     def __init__(
@@ -94,10 +94,9 @@ class Acceptor:
 
     def report(self, host: str, origin: str, reason: str, *, proven: bool = False) -> None:
         """Somebody was turned away; ``proven``: one with the pool's credentials."""
-        if self._refusals.is_news(host, reason, self.loop.now()):
-            self._on_refused(
-                f"{reason} ({origin})" if proven else f"{origin} was turned away: {reason}"
-            )
+        news = self._refusals.news(host, origin, reason, self.loop.now(), own=proven)
+        if news:
+            self._on_refused(news)
 
     def forget(self, connection: PendingConnection) -> None:
         """It is gone, or in."""

@@ -1,30 +1,58 @@
-"""Which refusals are told: whoever varies his address or his fault must not fill the log."""
+"""Which refusals are told: strangers that vary their address or their fault must not fill the log,
+nor keep what concerns the program's own agents out of it.
+"""
 
 from __future__ import annotations
 
 _MOST = 256
-"""Refusals that are remembered; above that nothing new is told."""
+"""Refusals that are remembered of strangers, and of the program's own agents."""
 
 _FORGET = 300.0
-"""Seconds after which the same is told again."""
+"""Seconds after which the same is told again, and how often strangers are summed up."""
 
 
 class Refusals:
-    """Who was told of, and when.  Pure: the caller tells the time."""
+    """Refusals that were told, and when.  Pure: the caller tells the time.
+
+    An own agent is one that has proved to have the pool's credentials.
+    """
 
     def __init__(self) -> None:
-        self._told: dict[tuple[str, str], float] = {}
+        self._strangers: dict[tuple[str, str], float] = {}
+        self._own: dict[tuple[str, str], float] = {}
+        self._untold = 0
+        self._next_summary = 0.0
 
-    def is_news(self, address: str, reason: str, now: float) -> bool:
-        """Whether to tell that somebody from ``address`` is refused for ``reason``; asked once."""
-        self._forget(now)
-        if (address, reason) in self._told or len(self._told) >= _MOST:
-            return False
-        self._told[address, reason] = now
-        return True
+    def news(self, host: str, origin: str, reason: str, now: float, *, own: bool = False) -> str:
+        """Return what to tell of a refusal, which is nothing if it was told lately.
 
-    def _forget(self, now: float) -> None:
-        for refusal, told in list(self._told.items()):
-            if now - told < _FORGET:
-                return  # the others were told later
-            del self._told[refusal]
+        ``own``: of an agent of the program, which is told whatever strangers do.
+        """
+        told = self._own if own else self._strangers
+        _forget(told, now)
+        if (host, reason) in told:
+            return ""
+        if len(told) >= _MOST:
+            if not own:
+                return self._summary(origin, reason, now)
+            del told[next(iter(told))]
+        told[host, reason] = now
+        return f"{reason} ({origin})" if own else f"{origin} was turned away: {reason}"
+
+    def _summary(self, origin: str, reason: str, now: float) -> str:
+        self._untold += 1
+        if now < self._next_summary:
+            return ""
+        count, self._untold = self._untold, 0
+        self._next_summary = now + _FORGET
+        return (
+            f"strangers come from many addresses: {count} more turned away, the last was {origin} "
+            f"({reason}). The next line about them comes in {_FORGET / 60:.0f} minutes"
+        )
+
+
+def _forget(told: dict[tuple[str, str], float], now: float) -> None:
+    for refusal, when in list(told.items()):
+        if now - when < _FORGET:
+            return  # the others were told later
+        del told[refusal]
