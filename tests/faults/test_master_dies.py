@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
 import re
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from faults.program import LOOPBACK, Program, alive, stop_and_wait, wait_for
+
+PR_SET_CHILD_SUBREAPER = 36
 
 IDLE_AND_BUSY = """
     import fiber, time
@@ -96,6 +100,32 @@ def test_killed_while_others_of_it_are_stopped_it_leaves_nothing(
     for found in program.family():
         if spared is None or not re.search(spared, found.command):
             stop_and_wait(found.pid)
+    program.kill()
+    assert program.left() == []
+
+
+@pytest.fixture
+def adopting() -> Iterator[list[int]]:
+    """Adopt processes whose parents die, as a supervisor does; reap those that the test names."""
+    libc = ctypes.CDLL(None)
+    pids: list[int] = []
+    libc.prctl(PR_SET_CHILD_SUBREAPER, 1)
+    yield pids
+    libc.prctl(PR_SET_CHILD_SUBREAPER, 0)
+    for pid in pids:
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(pid, 0)
+
+
+def test_killed_while_all_of_it_is_stopped_it_leaves_nothing_to_a_supervisor(
+    adopting: list[int], launch_on: Callable[..., Program]
+) -> None:
+    # The kernel lets no group go on that has a parent in its session, as here.
+    program = launch_on(IDLE_AND_BUSY.format(method="forkserver"))
+    assert program.line() == "ready"
+    adopting += [found.pid for found in program.family()]
+    for pid in adopting:
+        stop_and_wait(pid)
     program.kill()
     assert program.left() == []
 

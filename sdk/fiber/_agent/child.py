@@ -114,6 +114,15 @@ def die_with_parent(parent: int) -> None:
         os._exit(1)
 
 
+def go_on_without_parent() -> None:
+    """Have the kernel let this process go on, if it is stopped, when its parent dies.
+
+    The kernel does so by itself only for process groups that were stopped before that moment.  A
+    stop that takes effect just after it would last for ever.
+    """
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
+
+
 def become_subreaper() -> None:
     """Have the kernel make this process the parent of what our children leave behind."""
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)

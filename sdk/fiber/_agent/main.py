@@ -14,6 +14,7 @@ from typing import NoReturn
 from fiber import _logs, config
 from fiber._agent.agent import Agent
 from fiber._agent.allocator import keep_memory
+from fiber._agent.child import go_on_without_parent
 from fiber._agent.service import AgentService
 from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
@@ -51,9 +52,10 @@ class Main:
         self._waits_until = _seconds(_WAITS_UNTIL)
         self._parent = _pid(_PARENT)
         if self._parent is not None:
-            # The kernel hangs up on a stopped process whose parent dies, and lets it go on.  What
-            # the parent left has to be removed then.
+            # What the parent leaves has to be removed when it dies.  If this process is stopped
+            # then, the kernel may hang up on it before it lets it go on.
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
+            go_on_without_parent()
         self._loop = Loop()
         self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
         self._agent = Agent(self._loop, self._name, self._hub)

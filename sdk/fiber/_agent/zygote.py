@@ -270,6 +270,7 @@ def main(control: int, agent: int) -> None:
         "ignore", r"os\.fork\(\) was called", RuntimeWarning, r"fiber\._agent\."
     )
     os.set_inheritable(control, False)
+    child_module.go_on_without_parent()
     # A program that raised its limit after it started us may send more than ours.
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
