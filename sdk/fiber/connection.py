@@ -17,7 +17,7 @@ from multiprocessing.connection import Client, Listener, answer_challenge, deliv
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias, overload
 
 from fiber import reduction
-from fiber._hub import handles
+from fiber._hub import handles, one_way
 from fiber._transport.base import Channel
 from fiber._transport.unix import UnixChannel
 from fiber._wire import packet
@@ -263,7 +263,7 @@ def _rebuild(handle: handles.Handle, readable: bool, writable: bool) -> Connecti
 
 def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
     """Two connected ends; without ``duplex`` the first only receives and the second only sends."""
-    one, other = UnixChannel.pair()
+    one, other = UnixChannel.pair() if duplex else one_way.pair()
     first = Connection(one, writable=duplex)
     second = Connection(other, readable=duplex)
     first._other_given_to, second._other_given_to = second._given_to, first._given_to

@@ -24,6 +24,7 @@ from queue import Empty, Full
 from typing import Any, Generic, TypeVar
 
 from fiber import reduction
+from fiber._hub import one_way
 from fiber._hub.dealer import Dealer, arrive
 from fiber._hub.feeder import Feeder, ItemCount, Slots
 from fiber._hub.local import LocalChannel, LocalCounter
@@ -220,7 +221,7 @@ class SimpleQueue(Generic[_T]):
     """A queue whose ``put`` waits until the item is in the pipe."""
 
     def __init__(self, *, ctx: Any = None) -> None:
-        inbox, outbox = LocalChannel.pair()
+        inbox, outbox = one_way.pair()
         self._reader = Connection(inbox, writable=False)
         self._writer = Connection(outbox, readable=False)
 
@@ -271,7 +272,7 @@ class SimpleQueuePush(Generic[_T]):
     _reader: Connection | None
 
     def __init__(self, *, ctx: Any = None) -> None:
-        inbox, outbox = LocalChannel.pair()
+        inbox, outbox = one_way.pair()
         arrivals, door = LocalChannel.pair()
         Dealer(inbox, arrivals).start()
         self.__setstate__((Connection(outbox, readable=False), door))

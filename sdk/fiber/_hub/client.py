@@ -62,8 +62,8 @@ class LocalHub(Protocol):
     def dial(self) -> socket.socket:
         """A stream to it."""
 
-    def fetch(self, grant: bytes) -> Descriptor:
-        """A descriptor of an object that it keeps."""
+    def fetch(self, grant: bytes) -> list[Descriptor]:
+        """The descriptors of an object that it keeps."""
 
     def on_loop(self) -> bool:
         """Whether the caller is the thread that serves it."""

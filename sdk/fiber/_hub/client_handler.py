@@ -192,9 +192,13 @@ class ClientHandler:
     def register(self, message: Message) -> None:
         """Host a descriptor."""
         _, number, kind, flags, *extent = FOUR.unpack(message.payload)
-        (fd,) = message.fds
+        fd, *beside = message.fds
         granted = self._home.registry.register(
-            ObjectKind(kind), fd, Extent(*extent), reusable=bool(flags & GrantFlags.REUSABLE)
+            ObjectKind(kind),
+            fd,
+            Extent(*extent),
+            beside=beside,
+            reusable=bool(flags & GrantFlags.REUSABLE),
         )
         self._granted(number, flags, *granted)
 
@@ -214,12 +218,12 @@ class ClientHandler:
         self._home.registry.take_back([SECRET.unpack(message.payload)[2]])
 
     def fetch(self, message: Message) -> None:
-        """Hand over a descriptor."""
+        """Hand over an object's descriptors."""
         _, number, grant = SECRET.unpack(message.payload)
         if not self.stream.passes_descriptors:
             raise RequestRefused("a descriptor cannot be handed to another host")
-        fd = self._home.registry.fetch(grant)
-        self.stream.send(HEAD.pack(Status.OK, number), (), [fd])
+        fds = self._home.registry.fetch(grant)
+        self.stream.send(HEAD.pack(Status.OK, number), (), fds)
 
     def attach(self, message: Message) -> None:
         """Begin to use an object."""

@@ -15,8 +15,10 @@ import select
 import threading
 from collections import deque
 
+from fiber._hub import one_way
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel
+from fiber._hub.one_way import Receiver, Sender
 from fiber._hub.remote import RemoteObject
 from fiber._transport.base import Channel
 from fiber._wire import packet
@@ -34,10 +36,10 @@ class Dealer:
     behind it in ``inbox``.
     """
 
-    def __init__(self, inbox: LocalChannel, arrivals: LocalChannel) -> None:
+    def __init__(self, inbox: Receiver, arrivals: LocalChannel) -> None:
         self._inbox = inbox
         self._arrivals = arrivals
-        self._readers: deque[LocalChannel] = deque()
+        self._readers: deque[Sender] = deque()
         self._item: Message | None = None
 
     def start(self) -> None:
@@ -68,7 +70,7 @@ class Dealer:
             poller.register(self._inbox.fileno(), select.POLLIN)
         else:
             for reader in self._readers:
-                poller.register(reader.fileno(), select.POLLOUT)
+                poller.register(reader.fileno(), reader.room_events)
         poller.poll()
 
     def _welcome(self) -> None:
@@ -79,7 +81,7 @@ class Dealer:
             answer: Channel = packet.loads(message)
         except Exception:  # the reader is gone already
             return
-        ours, theirs = LocalChannel.pair()
+        theirs, ours = one_way.pair()
         with collecting_grants(reusable=False) as grants:
             invitation = pickle.dumps(theirs)
         try:

@@ -18,14 +18,16 @@ import os
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import context as mp_context
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from fiber._hub import client
+from fiber._hub.backlog import Backlog
 from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.heap import Block, block_of
 from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.one_way import ENDS, OneWayEnd, Receiver, Sender
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,
@@ -66,8 +68,8 @@ class HubHandle(NamedTuple):
         """Whether the hub is on this host."""
         return self.home.host == client.host()
 
-    def fetch(self) -> Descriptor:
-        """On the hub's host: a descriptor."""
+    def fetch(self) -> list[Descriptor]:
+        """On the hub's host: its descriptors."""
         hub = client.local_hub()
         if hub is not None and hub.key == self.home.key:
             try:
@@ -77,8 +79,7 @@ class HubHandle(NamedTuple):
         stream = HubStream(self.home)
         try:
             reply = stream.ask(Op.FETCH, self.grant, form=SECRET)
-            (fd,) = reply.fds
-            return own(fd)
+            return list(map(own, reply.fds))
         finally:
             stream.close()
 
@@ -103,44 +104,94 @@ class BlockHandle(NamedTuple):
     def block(self) -> Block:
         """On its own host: the block."""
         segment = self.segment
-        owner = segment.fetch() if isinstance(segment, HubHandle) else own(segment.detach())
+        (owner,) = _descriptors(segment)
         return block_of(owner, *self.extent)
+
+
+class EndHandle(NamedTuple):
+    """Stands for an end of a one-way channel: a socket, and a block for its backlog."""
+
+    kind: ObjectKind
+    socket: Handle
+    segment: Handle | None
+    """None where the hub that keeps the socket keeps the segment beside it."""
+    extent: Extent
+
+    def end(self) -> SharedChannel:
+        """Where it was unpickled: the end."""
+        if isinstance(self.socket, HubHandle) and not self.socket.here():
+            return RemoteChannel(*self.socket)
+        socket, *beside = _descriptors(self.socket)
+        (segment,) = beside if self.segment is None else _descriptors(self.segment)
+        return ENDS[self.kind](socket, Backlog(block_of(segment, *self.extent)))
+
+
+def _descriptors(handle: Handle) -> list[Descriptor]:
+    """On its own host: what it stands for."""
+    return handle.fetch() if isinstance(handle, HubHandle) else [own(handle.detach())]
 
 
 # Unpickling
 
 
-def channel(handle: Handle) -> SharedChannel:
+def channel(handle: Handle | EndHandle) -> SharedChannel:
     """Where a handle was unpickled: the channel that it stands for."""
-    if not isinstance(handle, HubHandle):
-        return LocalChannel.from_fd(handle.detach())
-    if handle.here():
-        return LocalChannel(handle.fetch())
-    return RemoteChannel(*handle)
+    if isinstance(handle, EndHandle):
+        return handle.end()
+    if isinstance(handle, HubHandle) and not handle.here():
+        return RemoteChannel(*handle)
+    return LocalChannel(*_descriptors(handle))
 
 
 def counter(handle: Handle) -> SharedCounter:
     """Where a handle was unpickled: the counter that it stands for."""
-    if not isinstance(handle, HubHandle):
-        return LocalCounter.from_fd(handle.detach())
-    if handle.here():
-        return LocalCounter(handle.fetch())
-    return RemoteCounter(*handle)
+    if isinstance(handle, HubHandle) and not handle.here():
+        return RemoteCounter(*handle)
+    return LocalCounter(*_descriptors(handle))
 
 
 # Pickling
 
 
-def handle_for(end: Any) -> Handle:
+def handle_for(end: Any) -> Handle | EndHandle:
     """What to pickle in place of a channel or counter."""
     if isinstance(end, RemoteObject):
         return _grants().for_remote(end)
+    if isinstance(end, OneWayEnd):
+        return _handle_for_end(end)
     spawning = _spawning_here()
     if spawning is not None:
-        handle: InheritedDescriptor = spawning.DupFd(spawning.duplicate_for_child(end.fileno()))
-        return handle
+        return _inherited(spawning, end.fileno())
     kind = ObjectKind.CHANNEL if isinstance(end, UnixChannel) else ObjectKind.COUNTER
     return _grants().for_local(kind, end.fileno())
+
+
+def _handle_for_end(end: OneWayEnd) -> EndHandle:
+    block = end.backlog.block
+    block.give()
+    extent = Extent(block.offset, block.size)
+    spawning = _spawning_here()
+    if spawning is not None:
+        segment = _inherited_segment(spawning, block)
+        return EndHandle(end.kind, _inherited(spawning, end.fileno()), segment, extent)
+    kept = _grants().for_local(end.kind, end.fileno(), extent, beside=[block.segment.fileno()])
+    return EndHandle(end.kind, kept, None, extent)
+
+
+def _inherited(spawning: Any, fd: int) -> InheritedDescriptor:
+    handle: InheritedDescriptor = spawning.DupFd(spawning.duplicate_for_child(fd))
+    return handle
+
+
+def _inherited_segment(spawning: Any, block: Block) -> InheritedDescriptor:
+    inherit = getattr(spawning, "inherit_segment", None)
+    if inherit is not None:
+        segment: InheritedDescriptor = inherit(block.segment)
+        return segment
+    # multiprocessing's own Process takes each descriptor once, and closes it in the child.
+    duplicate = opened(os.dup, block.segment.fileno())
+    vars(spawning).setdefault("_fiber_duplicates", []).append(duplicate)  # until it started
+    return _inherited(spawning, duplicate.fileno())
 
 
 def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
@@ -151,14 +202,7 @@ def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
     if spawning is None:
         segment = _grants().for_local(kind, block.segment.fileno(), extent)
         return BlockHandle(segment, extent)
-    inherit = getattr(spawning, "inherit_segment", None)
-    if inherit is None:
-        # multiprocessing's own Process takes each descriptor once, and closes it in the child.
-        duplicate = opened(os.dup, block.segment.fileno())
-        vars(spawning).setdefault("_fiber_duplicates", []).append(duplicate)  # until it started
-        number = spawning.duplicate_for_child(duplicate.fileno())
-        return BlockHandle(spawning.DupFd(number), extent)
-    return BlockHandle(inherit(block.segment), extent)
+    return BlockHandle(_inherited_segment(spawning, block), extent)
 
 
 def handle_for_remote_block(end: RemoteObject, extent: Extent) -> BlockHandle:
@@ -195,15 +239,20 @@ class GrantSet:
         """Keep something alive that whoever unpickles the handles relies on."""
         self._kept.append(thing)
 
-    def for_local(self, kind: ObjectKind, fd: int, extent: Extent = WHOLE) -> HubHandle:
+    def for_local(
+        self, kind: ObjectKind, fd: int, extent: Extent = WHOLE, *, beside: Sequence[int] = ()
+    ) -> HubHandle:
         """A handle for an object of this host."""
         home = client.hub_address()
         hub = client.local_hub()
         if hub is not None:
-            granted = hub.registry.register(kind, fd, extent, reusable=self._reusable)
+            granted = hub.registry.register(
+                kind, fd, extent, beside=beside, reusable=self._reusable
+            )
             self._direct.setdefault(hub.registry, []).append(granted[0])
             return HubHandle(home, *granted)
-        return _register(self._stream(home), home, kind, fd, extent, self._flags())
+        fds = (fd, *beside)
+        return _register(self._stream(home), home, kind, fds, extent, self._flags())
 
     def for_remote(self, end: RemoteObject) -> HubHandle:
         """A handle for an object of another host."""
@@ -247,17 +296,19 @@ class _SingleUse:
         # Each is for whoever takes it out, which a finalizer in the middle of that may be, too.
         self._streams: deque[tuple[HubAddress, HubStream]] = deque()
 
-    def for_local(self, kind: ObjectKind, fd: int, extent: Extent = WHOLE) -> HubHandle:
+    def for_local(
+        self, kind: ObjectKind, fd: int, extent: Extent = WHOLE, *, beside: Sequence[int] = ()
+    ) -> HubHandle:
         """A handle for an object of this host."""
         home = client.hub_address()
         hub = client.local_hub()
         if hub is None:
             with self.stream(home) as stream:
-                handle = _register(stream, home, kind, fd, extent, GrantFlags(0))
+                handle = _register(stream, home, kind, (fd, *beside), extent, GrantFlags(0))
             _undo_by(lambda: self._release(handle))
             return handle
         registry = hub.registry
-        granted = registry.register(kind, fd, extent, reusable=False)
+        granted = registry.register(kind, fd, extent, beside=beside, reusable=False)
         _undo_by(lambda: registry.release(granted[:1]))
         return HubHandle(home, *granted)
 
@@ -296,11 +347,11 @@ def _register(
     stream: HubStream,
     home: HubAddress,
     kind: ObjectKind,
-    fd: int,
+    fds: Sequence[int],
     extent: Extent,
     flags: GrantFlags,
 ) -> HubHandle:
-    reply = stream.ask(Op.REGISTER, kind, flags, *extent, form=FOUR, fds=[fd])
+    reply = stream.ask(Op.REGISTER, kind, flags, *extent, form=FOUR, fds=fds)
     return HubHandle(home, *reply.values)
 
 
@@ -437,7 +488,7 @@ def _reduce_counter(end: Any) -> tuple[Any, ...]:
     return counter, (handle_for(end),)
 
 
-for _channel in (UnixChannel, LocalChannel, RemoteChannel):
+for _channel in (UnixChannel, LocalChannel, Receiver, Sender, RemoteChannel):
     copyreg.pickle(_channel, _reduce_channel)
 for _counter in (UnixCounter, LocalCounter, RemoteCounter):
     copyreg.pickle(_counter, _reduce_counter)

@@ -33,9 +33,9 @@ class Watcher(Protocol):
 class HostedChannel:
     """One end of a channel."""
 
-    def __init__(self, poller: Poller, fd: int) -> None:
+    def __init__(self, poller: Poller, channel: LocalChannel) -> None:
         self._poller = poller
-        self._channel = LocalChannel.from_fd(fd)
+        self._channel = channel
         self._senders: deque[tuple[Waiter, Sequence[memoryview]]] = deque()
         self._receivers: deque[Waiter] = deque()
         self._pollers: deque[Waiter] = deque()
@@ -106,11 +106,11 @@ class HostedChannel:
 
     def _watch(self) -> None:
         wanted = self._receivers or self._pollers or self._watchers
-        mask = (IN if wanted else 0) | (OUT if self._senders else 0)
+        mask = (IN if wanted else 0) | (self._channel.room_events if self._senders else 0)
         self._poller.watch(self._channel.fileno(), mask, self._event)
 
     def _event(self, events: int) -> None:
-        if events & ~IN:
+        if self._senders:
             self._serve_senders()
         if events & ~OUT:
             self._serve_receivers()
@@ -161,9 +161,9 @@ class HostedChannel:
 class HostedCounter:
     """A counter."""
 
-    def __init__(self, poller: Poller, fd: int) -> None:
+    def __init__(self, poller: Poller, counter: LocalCounter) -> None:
         self._poller = poller
-        self._counter = LocalCounter.from_fd(fd)
+        self._counter = counter
         self._takers: deque[Waiter] = deque()
         self._waiters: deque[Waiter] = deque()
         self._changes: dict[Waiter, int] = {}

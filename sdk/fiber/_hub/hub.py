@@ -20,6 +20,7 @@ from queue import Empty, SimpleQueue
 
 from fiber._exceptions import fresh
 from fiber._hub import protocol
+from fiber._hub.backlog import Backlog
 from fiber._hub.client import NoHub, Unreachable
 from fiber._hub.client_handler import ClientHandler
 from fiber._hub.directory import remove_directory
@@ -29,7 +30,8 @@ from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory
 from fiber._hub.hosted_semaphore import HostedSemaphore
 from fiber._hub.hosted_wait_list import HostedWaitList
 from fiber._hub.hub_link import HubLink, Send
-from fiber._hub.local import QuietSocket, without_timeout
+from fiber._hub.local import LocalChannel, LocalCounter, QuietSocket, without_timeout
+from fiber._hub.one_way import ENDS
 from fiber._hub.poller import Poller
 from fiber._hub.protocol import HubAddress, ObjectKind
 from fiber._hub.registry import Hosted, Registry, SharedObject
@@ -109,11 +111,11 @@ class Hub:
         self._loop.call_soon(self._admit, theirs)
         return without_timeout(QuietSocket(fileno=ours.detach()))
 
-    def fetch(self, grant: bytes) -> Descriptor:
-        """A descriptor of an object, for this very process.  Any thread: it waits for the loop."""
+    def fetch(self, grant: bytes) -> list[Descriptor]:
+        """An object's descriptors, for this very process.  Any thread: it waits for the loop."""
         if self._loop.on_thread():
-            return own(self.registry.fetch(grant))
-        answers: SimpleQueue[Descriptor | Exception] = SimpleQueue()
+            return list(map(own, self.registry.fetch(grant)))
+        answers: SimpleQueue[list[Descriptor] | Exception] = SimpleQueue()
         self._loop.call_soon(self._answer, grant, answers)
         while not self._closed and not self._loop.broken:
             try:
@@ -125,9 +127,9 @@ class Hub:
             return answer
         raise Unreachable(self.host, "the program that keeps it has ended")
 
-    def _answer(self, grant: bytes, answers: SimpleQueue[Descriptor | Exception]) -> None:
+    def _answer(self, grant: bytes, answers: SimpleQueue[list[Descriptor] | Exception]) -> None:
         try:
-            answers.put(own(self.registry.fetch(grant)))
+            answers.put(list(map(own, self.registry.fetch(grant))))
         except Exception as error:
             answers.put(error)
 
@@ -228,14 +230,18 @@ class Hub:
     def _host_object(self, shared: SharedObject) -> Hosted:
         if shared.kind is ObjectKind.MEMORY:
             return HostedMemory()
-        fd = os.dup(shared.descriptor.fileno())
+        fd, *beside = map(own, shared.duplicates())
         if shared.kind is ObjectKind.CHANNEL:
-            return HostedChannel(self._poller, fd)
+            return HostedChannel(self._poller, LocalChannel(fd))
+        if shared.kind in ENDS:
+            (segment,) = beside
+            end = ENDS[shared.kind](fd, Backlog(block_of(segment, *shared.extent)))
+            return HostedChannel(self._poller, end)
         if shared.kind is ObjectKind.SEMAPHORE:
-            return HostedSemaphore(self._loop, self.doorbell, block_of(own(fd), *shared.extent))
+            return HostedSemaphore(self._loop, self.doorbell, block_of(fd, *shared.extent))
         if shared.kind is ObjectKind.WAIT_LIST:
-            return HostedWaitList(self._loop, self.doorbell, block_of(own(fd), *shared.extent))
-        return HostedCounter(self._poller, fd)
+            return HostedWaitList(self._loop, self.doorbell, block_of(fd, *shared.extent))
+        return HostedCounter(self._poller, LocalCounter(fd))
 
 
 def _listen(parent: str | None) -> tuple[socket.socket, str]:

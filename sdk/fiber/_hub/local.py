@@ -5,18 +5,15 @@ from __future__ import annotations
 import select
 import socket
 import time
-from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from typing import TypeVar
 
 from fiber._transport.loop import LONGEST_POLL
-from fiber._transport.unix import BorrowedSocket, UnixChannel, UnixCounter
+from fiber._transport.unix import UnixChannel, UnixCounter, grow
 from fiber._wire import packet
-from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike
 
 _Socket = TypeVar("_Socket", bound=socket.socket)
-
-_DONTWAIT = int(socket.MSG_DONTWAIT)  # the enum member is slow to combine
 
 
 class QuietSocket(socket.socket):
@@ -32,30 +29,6 @@ class QuietSocket(socket.socket):
         self._real_close()  # type: ignore[attr-defined]  # ``close`` needs a finished ``__init__``
 
 
-class NonWaitingSocket(BorrowedSocket):
-    """One whose sends never wait.
-
-    The descriptor's own mode will not do: O_NONBLOCK is shared by all that hold the socket.
-    """
-
-    __slots__ = ()
-
-    def send(self, data: Any, flags: int = 0, /) -> int:
-        """Send or raise BlockingIOError."""
-        return super().send(data, flags | _DONTWAIT)
-
-    def sendmsg(
-        self,
-        buffers: Iterable[Any],
-        ancdata: Iterable[Any] = (),
-        flags: int = 0,
-        address: Any = None,
-        /,
-    ) -> int:
-        """Send or raise BlockingIOError."""
-        return super().sendmsg(buffers, ancdata, flags | _DONTWAIT)
-
-
 def without_timeout(sock: _Socket) -> _Socket:
     """Free ``sock`` of the program's default timeout, which is for the user's own sockets."""
     if sock.gettimeout() is not None:
@@ -66,13 +39,9 @@ def without_timeout(sock: _Socket) -> _Socket:
 class LocalChannel(UnixChannel):
     """A channel that can also be asked not to wait, whoever else uses the same end."""
 
-    __slots__ = ("_non_waiting",)
+    __slots__ = ()
 
     can_try_send = True
-
-    def __init__(self, owner: Descriptor) -> None:
-        super().__init__(owner)
-        self._non_waiting: NonWaitingSocket | None = None
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room but not, as ``send``, until a bulky one is read."""
@@ -80,21 +49,22 @@ class LocalChannel(UnixChannel):
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
-        sock = self._non_waiting
-        if sock is None:
-            sock = self._non_waiting = NonWaitingSocket(self._owner)
+        # The descriptor's own mode will not do: O_NONBLOCK is shared by all that hold the socket.
         try:
-            packet.send(sock, payload, buffers, ballast=True)
+            packet.send(self._sock, payload, buffers, ballast=True, wait=False)
+            return True
+        except BlockingIOError:
+            grow(self._sock)
+        try:
+            packet.send(self._sock, payload, buffers, ballast=True, wait=False)
         except BlockingIOError:
             return False
         return True
 
-    def close(self) -> None:
-        """Close this holder's descriptor."""
-        non_waiting, self._non_waiting = self._non_waiting, None
-        if non_waiting is not None:
-            non_waiting.detach()  # the same descriptor
-        super().close()
+    @property
+    def room_events(self) -> int:
+        """Which event of ``fileno()`` says that ``try_send`` is worth another try."""
+        return select.POLLOUT
 
 
 class LocalCounter(UnixCounter):

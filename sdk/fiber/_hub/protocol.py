@@ -50,6 +50,9 @@ class ObjectKind(IntEnum):
     MEMORY = 3
     SEMAPHORE = 4
     WAIT_LIST = 5
+    # A channel's end and, beside it, a block
+    SENDER = 6
+    RECEIVER = 7
 
 
 class Extent(NamedTuple):
@@ -75,8 +78,8 @@ class Op(IntEnum):
 
     HELLO = 1  # version, key
     CONNECT = 2  # host
-    REGISTER = 3  # kind, flags, offset, size; a descriptor beside it -> grant, identity
-    FETCH = 4  # grant -> a descriptor beside the reply
+    REGISTER = 3  # kind, flags, offset, size; descriptors beside it -> grant, identity
+    FETCH = 4  # grant -> its descriptors beside the reply
     ATTACH = 5  # token, grant: the token is for more streams of the same user, without a grant
     GRANT = 6  # flags, token -> grant, identity
     RELEASE = 7  # grant; silent

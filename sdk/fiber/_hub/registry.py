@@ -15,7 +15,7 @@ import stat
 import struct
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory
@@ -37,8 +37,8 @@ class SharedObject:
 
     __slots__ = (
         "__weakref__",
+        "_descriptors",
         "attached",
-        "descriptor",
         "extent",
         "identity",
         "kind",
@@ -46,10 +46,14 @@ class SharedObject:
     )
 
     def __init__(
-        self, kind: ObjectKind, descriptor: Descriptor, extent: Extent, identity: bytes
+        self,
+        kind: ObjectKind,
+        descriptors: Sequence[Descriptor],
+        extent: Extent,
+        identity: bytes,
     ) -> None:
         self.kind = kind
-        self.descriptor = descriptor
+        self._descriptors = descriptors
         self.extent = extent
         self.identity = identity
         """Of shared memory: the same in each handle of it, and known to its users alone."""
@@ -61,6 +65,18 @@ class SharedObject:
         """Serves those who are attached."""
         assert self.server is not None
         return self.server
+
+    def duplicates(self) -> list[int]:
+        """Duplicate its descriptors."""
+        numbers: list[int] = []
+        try:
+            for descriptor in self._descriptors:
+                numbers.append(os.dup(descriptor.fileno()))
+        except OSError:
+            for number in numbers:
+                os.close(number)
+            raise
+        return numbers
 
     def end_service(self) -> None:
         """Nobody is attached any more."""
@@ -108,15 +124,25 @@ class Registry:
         """By their tokens; an entry for each stream."""
 
     def register(
-        self, kind: ObjectKind, fd: int, extent: Extent = WHOLE, *, reusable: bool
+        self,
+        kind: ObjectKind,
+        fd: int,
+        extent: Extent = WHOLE,
+        *,
+        beside: Sequence[int] = (),
+        reusable: bool,
     ) -> tuple[bytes, bytes]:
-        """Keep what ``fd`` refers to, which stays the caller's; a grant and its identity."""
+        """Keep what ``fd`` refers to, which stays the caller's; a grant and its identity.
+
+        ``beside`` are further descriptors that belong to it.
+        """
         known = (kind, _identity(kind, fd), extent.offset)
         shared = self._objects.get(known)
         if shared is None:
             identity = NO_SECRET if kind in _WITHOUT_IDENTITY else self._identify(known)
             with naming_the_limit("sharing a pipe or queue with another process"):
-                shared = SharedObject(kind, opened(os.dup, fd), extent, identity)
+                kept = [opened(os.dup, number) for number in (fd, *beside)]
+                shared = SharedObject(kind, kept, extent, identity)
             self._objects[known] = shared
         grant = os.urandom(SECRET_BYTES)
         self._registered.append((grant, Grant(shared, reusable)))
@@ -143,13 +169,13 @@ class Registry:
         self._grants[grant] = Grant(shared, reusable)
         return grant, shared.identity
 
-    def fetch(self, grant: bytes) -> int:
-        """A descriptor for someone on this host; uses up a plain grant."""
+    def fetch(self, grant: bytes) -> list[int]:
+        """Its descriptors for someone on this host; uses up a plain grant."""
         shared = self._granted(grant)
         with naming_the_limit("receiving a pipe or queue from another process"):
-            fd = os.dup(shared.descriptor.fileno())
+            fds = shared.duplicates()
         self._use(grant)
-        return fd
+        return fds
 
     def attach(self, token: bytes, grant: bytes = NO_SECRET) -> Attachment:
         """Someone on another host uses it now; ``detach`` ends that.
@@ -215,7 +241,8 @@ class Registry:
             del self._grants[grant]
 
 
-_WITHOUT_IDENTITY = (ObjectKind.CHANNEL, ObjectKind.COUNTER)
+_CHANNELS = (ObjectKind.CHANNEL, ObjectKind.SENDER, ObjectKind.RECEIVER)
+_WITHOUT_IDENTITY = (*_CHANNELS, ObjectKind.COUNTER)
 
 _NOT_THERE = (
     "the pipe, queue or event that this handle stands for is not there any more: "
@@ -228,9 +255,10 @@ def _identity(kind: ObjectKind, fd: int) -> int:
     if kind is ObjectKind.COUNTER:
         return _event_counter(fd)
     status = os.fstat(fd)
-    if kind is ObjectKind.CHANNEL and not stat.S_ISSOCK(status.st_mode):
+    is_channel = kind in _CHANNELS
+    if is_channel and not stat.S_ISSOCK(status.st_mode):
         raise ValueError(f"descriptor {fd} is not a socket")
-    if kind is not ObjectKind.CHANNEL and not stat.S_ISREG(status.st_mode):
+    if not is_channel and not stat.S_ISREG(status.st_mode):
         raise ValueError(f"descriptor {fd} is not shared memory")
     return status.st_ino
 

@@ -19,7 +19,6 @@ All of this is on the loop's thread.
 from __future__ import annotations
 
 import itertools
-import os
 import struct
 from collections.abc import Callable
 from enum import IntEnum
@@ -30,7 +29,7 @@ from fiber._hub.coherence import Twin
 from fiber._hub.heap import Block, block_of
 from fiber._hub.protocol import ObjectKind, Origin
 from fiber._hub.registry import NoSuchObject, Registry
-from fiber._wire.descriptor import opened
+from fiber._wire.descriptor import own
 from fiber._wire.messages import Memory, ProtocolError
 
 Identity = tuple[str, bytes]
@@ -167,7 +166,8 @@ class Replicas:
         told = ObjectKind.MEMORY, origin.identity, origin.size
         if told != (shared.kind, shared.identity, shared.extent.size):
             raise NoSuchObject("there is no such block of shared memory")
-        return block_of(opened(os.dup, shared.descriptor.fileno()), *shared.extent)
+        (segment,) = map(own, shared.duplicates())
+        return block_of(segment, *shared.extent)
 
     def _towards(self, host: str) -> MemoryLink:
         link = self._links.get(host, self._links.get(None))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _socket
 import errno
+import functools
 import os
 import select
 import socket
@@ -67,6 +68,22 @@ class BorrowedSocket(socket.socket):
         self.detach()
 
 
+@functools.cache
+def _usual_room() -> int:
+    """The size of a socket's buffer that nobody has changed: net.core.wmem_default."""
+    one, other = socketpair("opening a pipe")
+    with one, other:
+        return one.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+
+
+def grow(sock: socket.socket) -> None:
+    """Double the room of a socket that is full; more than once changes nothing.
+
+    It is done late: a larger buffer takes a larger ballast (``packet.send``).
+    """
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _usual_room())  # the kernel doubles it
+
+
 # How a receiver looks for an answer before it sleeps (decision 16)
 
 _LOOK = 50e-6
@@ -114,14 +131,22 @@ class UnixChannel:
         """The socket itself, for event loops."""
         return self._sock
 
+    @property
+    def owner(self) -> Descriptor:
+        """The socket's descriptor, for another channel over the same socket."""
+        return self._owner
+
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room; a bulky one until it is read."""
         global _last_asked
         _last_asked = id(self)
-        if packet.send(self._sock, payload, buffers, ballast=True):
-            poller = select.poll()
-            poller.register(self._sock, select.POLLOUT)
-            poller.poll()
+        try:
+            bulky = packet.send(self._sock, payload, buffers, ballast=True, wait=False)
+        except BlockingIOError:
+            grow(self._sock)
+            bulky = packet.send(self._sock, payload, buffers, ballast=True)
+        if bulky:
+            wait_until(self._sock.fileno(), select.POLLOUT)
 
     send_unconfirmed = send
 
@@ -251,6 +276,13 @@ class UnixCounter:
         """Close this holder's descriptor."""
         self._fd = -1
         self._owner.close()
+
+
+def wait_until(fd: int, events: int) -> None:
+    """Wait for one of ``events``, or for the end of ``fd``."""
+    poller = select.poll()
+    poller.register(fd, events)
+    poller.poll()
 
 
 def wait_readable(fd: int, timeout: float | None) -> bool:

@@ -11,6 +11,7 @@ Layout (little endian)::
                         then payload and buffers, here or (IN_MEMFD) in the first descriptor
     kind:u8 = PASSED    the same, then where each of them lies in the first descriptor:u64 (0 for
                         the payload: here); they came from another host, and lie where they arrived
+    kind:u8 = WAKE_UP   no message: it says that a backlog has some (``fiber._hub.one_way``)
 
 Buffers are pickle protocol 5's out-of-band buffers (PEP 574).
 """
@@ -49,8 +50,9 @@ INLINE_LIMIT = 1 << 16
 BULK = 1 << 18
 """Bytes above which a blocking sender waits until its message is read, as it would on a pipe."""
 
-BALLAST = bytes(1 << 16)
-"""More than a quarter of a socket's buffer (net.core.wmem_default), where it stops being writable.
+_BALLAST = memoryview(bytes(7 << 14))
+"""More than a quarter of a socket's buffer, where it stops being writable; also of one that has
+grown (net.core.wmem_default, doubled).
 """
 
 OUT_OF_BAND_MIN = 1 << 16
@@ -66,6 +68,7 @@ PLAIN = b"\x00"
 PARTS = 1
 PARTS_IN_MEMFD = 2
 PASSED = 3
+WAKE_UP = 4
 
 ALIGNMENT = 64
 """Of parts in a descriptor, for vector loads."""
@@ -73,10 +76,11 @@ ALIGNMENT = 64
 _PARTS = struct.Struct("<BIQ")
 _SIZE = struct.Struct("<Q")
 _FD = struct.Struct("i")
-_RECEIVE = INLINE_LIMIT + len(BALLAST) + 32768
+_RECEIVE = INLINE_LIMIT + len(_BALLAST) + 32768
 _ANCILLARY = socket.CMSG_SPACE(_FD.size * (MAX_DESCRIPTORS + 1))
 _CLOEXEC = int(socket.MSG_CMSG_CLOEXEC)
 _DONTWAIT = int(socket.MSG_DONTWAIT) | _CLOEXEC
+_DONTWAIT_TO_SEND = int(socket.MSG_DONTWAIT)
 _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
@@ -95,6 +99,18 @@ class _Buffer:
         self.data = bytearray(_RECEIVE)
         self.view = memoryview(self.data)
         self.call = (((self.data,), _ANCILLARY_ONE, _CLOEXEC),)
+
+
+class WakeUp(Exception):
+    """A wake-up packet came in place of a message; with the descriptor that was in it."""
+
+    def __init__(self, sender: Descriptor) -> None:
+        super().__init__()
+        self.sender = sender
+
+
+class NothingYet(BlockingIOError):
+    """A receiver's time limit was over before a message came."""
 
 
 class _FreeBuffers(threading.local):
@@ -215,27 +231,32 @@ def send(
     fds: Sequence[int] = (),
     *,
     ballast: bool = False,
+    wait: bool = True,
 ) -> bool:
     """Send one packet.
 
-    On a non-blocking socket BlockingIOError means that nothing was sent.  BrokenPipeError: no one
-    can ever read it.  ``fds`` (at most MAX_DESCRIPTORS) are duplicated into whoever receives the
-    packet.
+    Without ``wait``, or on a non-blocking socket, BlockingIOError means that nothing was sent.
+    BrokenPipeError: no one can ever read it.  ``fds`` (at most MAX_DESCRIPTORS) are duplicated into
+    whoever receives the packet.
 
     With ``ballast`` a message above BULK weighs enough in the socket's buffer that the socket is
     not writable until the message is read; True says that it was such a message.
     """
     size = len(payload) if isinstance(payload, bytes) else memoryview(payload).nbytes
+    flags = 0 if wait else _DONTWAIT_TO_SEND
     try:
         if not buffers and not fds and size <= INLINE_LIMIT:
             if size < 2048 and isinstance(payload, bytes):
-                sock.send(PLAIN + payload)
+                sock.send(PLAIN + payload, flags)
             else:
-                sock.sendmsg((PLAIN, payload))
+                sock.sendmsg((PLAIN, payload), (), flags)
         else:
             total = size + sum(view.nbytes for view in buffers)
-            weight = BALLAST if ballast and total > BULK else b""
-            _send_parts(sock, payload, size, buffers, fds, weight)
+            weight: BytesLike = b""
+            if ballast and total > BULK:
+                room = sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+                weight = _BALLAST[: room // 4 + 1]
+            _send_parts(sock, payload, size, buffers, fds, weight, flags)
             return bool(weight)
     except ConnectionResetError as error:
         raise BrokenPipeError(errno.EPIPE, "the other end is closed") from error
@@ -262,23 +283,24 @@ def _send_parts(
     size: int,
     buffers: Sequence[memoryview],
     fds: Sequence[int],
-    ballast: bytes,
+    ballast: BytesLike,
+    flags: int,
 ) -> None:
     check_buffers(buffers)
     sizes = [view.nbytes for view in buffers]
     table = b"".join(map(_SIZE.pack, sizes))
     if size + sum(sizes) <= INLINE_LIMIT:
         head = _PARTS.pack(PARTS, len(sizes), size) + table
-        _sendmsg(sock, [head, payload, *buffers], fds)
+        _sendmsg(sock, [head, payload, *buffers], fds, flags)
         return
-    if _pass_on(sock, payload, buffers, fds, [size, *sizes], ballast):
+    if _pass_on(sock, payload, buffers, fds, [size, *sizes], ballast, flags):
         return
     offsets, total = _offsets([size, *sizes])
     head = _PARTS.pack(PARTS_IN_MEMFD, len(sizes), size) + table
     block = _arena.claim(total)
     try:
         fill(block, [memoryview(payload).cast("B"), *buffers], offsets)
-        _sendmsg(sock, [head, ballast], [block.fd, *fds])
+        _sendmsg(sock, [head, ballast], [block.fd, *fds], flags)
     except BlockingIOError:
         _arena.settle(block, sent=False)
         raise
@@ -292,7 +314,8 @@ def _pass_on(
     buffers: Sequence[memoryview],
     fds: Sequence[int],
     sizes: list[int],
-    ballast: bytes,
+    ballast: BytesLike,
+    flags: int,
 ) -> bool:
     """Send the descriptor of the memory in which the parts arrived; False if they lie elsewhere."""
     inline = sizes[0] <= INLINE_LIMIT
@@ -308,16 +331,24 @@ def _pass_on(
         return False
     table = b"".join(map(_SIZE.pack, [*sizes[1:], *offsets]))
     head = _PARTS.pack(PASSED, len(buffers), sizes[0]) + table
-    _sendmsg(sock, [head, payload if inline else b"", ballast], [owner.fileno(), *fds])
+    parts = [head, payload if inline else b"", ballast]
+    _sendmsg(sock, parts, [owner.fileno(), *fds], flags)
     return True
 
 
-def _sendmsg(sock: socket.socket, parts: Sequence[BytesLike], fds: Sequence[int]) -> None:
+def send_wake_up(sock: socket.socket, sender: int) -> None:
+    """Send a wake-up packet with the descriptor ``sender`` in it, if there is room."""
+    _sendmsg(sock, [bytes([WAKE_UP])], [sender], _DONTWAIT_TO_SEND)
+
+
+def _sendmsg(
+    sock: socket.socket, parts: Sequence[BytesLike], fds: Sequence[int], flags: int
+) -> None:
     if not fds:
-        sock.sendmsg(parts)
+        sock.sendmsg(parts, (), flags)
         return
     rights = struct.pack(f"{len(fds)}i", *fds)
-    sock.sendmsg(parts, [(socket.SOL_SOCKET, socket.SCM_RIGHTS, rights)])
+    sock.sendmsg(parts, [(socket.SOL_SOCKET, socket.SCM_RIGHTS, rights)], flags)
 
 
 def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
@@ -331,12 +362,18 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
 
 
 def receive_object(sock: socket.socket) -> Any:
-    """``loads(receive(sock))``, without a Message between them where the packet is a small one."""
+    """``loads(receive(sock))``, without a Message between them where the packet is a small one.
+
+    NothingYet on a socket whose receivers wait for a limited time.
+    """
     free = _buffers.free
     buffer = free.pop() if free else _Buffer()
     ours = True
     try:
-        received = _recvmsg(sock, buffer.data, buffer.call)
+        try:
+            received = _recvmsg(sock, buffer.data, buffer.call)
+        except BlockingIOError as error:
+            raise NothingYet(*error.args) from None
         size = received[0][0]
         if size and not buffer.data[0]:
             return pickle.loads(buffer.view[1:size])
@@ -386,7 +423,7 @@ def _recvmsg(sock: socket.socket, data: bytearray, call: _Call) -> _Received:
             # the peer sent before; the next call delivers that, or the end.
             received.extend(starmap(sock.recvmsg_into, call))
         ancillary = received[0][1]
-        if ancillary and data[0] in (PARTS_IN_MEMFD, PASSED):
+        if ancillary and data[0] in (PARTS_IN_MEMFD, PASSED, WAKE_UP):
             received.extend(map(own, _rights(ancillary)[:1]))
         return received
     except BaseException:
@@ -416,6 +453,8 @@ def _receive_parts(buffer: _Buffer, received: _Received, *, passing: bool = Fals
             # Descriptors were attached and this process had no room for them.
             raise TooManyOpenFiles("receiving a descriptor")
         kind, count, length = _PARTS.unpack_from(view)
+        if kind == WAKE_UP and memory:
+            raise WakeUp(memory[0])
         offset = _PARTS.size + _SIZE.size * count
         sizes = [length, *(n for (n,) in _SIZE.iter_unpack(view[_PARTS.size : offset]))]
         if kind == PARTS:

@@ -1,0 +1,401 @@
+"""One-way channels: what a pipe or queue holds that nobody reads, and who gets it."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import multiprocessing
+import os
+import pickle
+import select
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import fiber
+from census import wait_until
+from fiber._hub import one_way
+from fiber._hub.backlog import AMBIGUOUS
+from fiber._hub.local import LocalChannel
+from fiber._hub.one_way import Receiver, Sender
+from fiber._wire import packet
+from fiber.errors import ConnectionClosed
+from hosts import PATIENCE, Far, background
+
+SIZES = (0, 1, 40, 100, 1000, 10_000, 60_000)
+MORE_THAN_A_SOCKET = 1000
+"""Small messages that no socket holds."""
+
+Ends = tuple[Receiver, Sender]
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    receiver, sender = one_way.pair()
+    yield receiver, sender
+    receiver.close()
+    sender.close()
+
+
+def is_readable(channel: Receiver) -> bool:
+    """Whether ``select`` and its like say so."""
+    poller = select.poll()
+    poller.register(channel.fileno(), select.POLLIN)
+    return bool(poller.poll(0))
+
+
+def overflow(sender: Sender, count: int = MORE_THAN_A_SOCKET) -> None:
+    for number in range(count):
+        assert sender.try_send(b"%d" % number)
+    assert sender.backlog
+
+
+def drain(receiver: Receiver) -> list[bytes]:
+    taken = []
+    while (message := receiver.try_recv()) is not None:
+        taken.append(message.tobytes())
+    return taken
+
+
+def numbers(count: int) -> list[bytes]:
+    return [b"%d" % number for number in range(count)]
+
+
+# How much there is room for
+
+
+def filled(send: Callable[[], bool]) -> int:
+    count = 0
+    while send():
+        count += 1
+    return count
+
+
+def held_by_multiprocessing(size: int, *, duplex: bool) -> int:
+    reader, writer = multiprocessing.Pipe(duplex)
+    os.set_blocking(writer.fileno(), False)
+
+    def send() -> bool:
+        try:
+            writer.send("x" * size)
+        except BlockingIOError:
+            return False
+        return True
+
+    with reader, writer:
+        return filled(send)
+
+
+def held_by_fiber(size: int, *, duplex: bool) -> int:
+    if duplex:
+        one, other = fiber.Pipe()
+        channel = pickle.loads(pickle.dumps(one._channel))
+    else:
+        other, one = fiber.Pipe(duplex=False)
+        channel = one._channel
+    message = pickle.dumps("x" * size)
+    with one, other:
+        count = filled(lambda: channel.try_send(message))
+        channel.close()
+    return count
+
+
+@pytest.mark.parametrize("duplex", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_a_pipe_holds_as_much_as_multiprocessings(size: int, duplex: bool) -> None:
+    assert held_by_fiber(size, duplex=duplex) >= held_by_multiprocessing(size, duplex=duplex)
+
+
+@pytest.mark.parametrize("size", [1, 40, 1000])
+def test_so_does_a_simple_queue_of_another_host(size: int, far: Far) -> None:
+    count = held_by_multiprocessing(size, duplex=False)
+    here: Any = fiber.SimpleQueue()
+    there = far(here)
+    item = "x" * size
+    sender = background(lambda: [there.put(item) for _ in range(count)])
+    sender.join(60)
+    assert not sender.is_alive()
+    assert [there.get() for _ in range(count)] == [item] * count
+
+
+def test_small_and_large_messages_share_the_room(ends: Ends) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    assert sender.try_send(bytes(20_000))
+    assert sender.try_send(b"last")
+    taken = drain(receiver)
+    assert taken == [*numbers(MORE_THAN_A_SOCKET), bytes(20_000), b"last"]
+
+
+# What a receiver gets
+
+
+def test_the_descriptor_is_readable_as_long_as_there_is_something(ends: Ends) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    for number in range(MORE_THAN_A_SOCKET):
+        assert is_readable(receiver)
+        assert receiver.poll(0)
+        assert receiver.recv().tobytes() == b"%d" % number
+    assert not is_readable(receiver)
+    assert not receiver.poll(0)
+    assert receiver.try_recv() is None
+
+
+def test_once_it_is_empty_the_next_message_goes_through_the_socket(ends: Ends) -> None:
+    receiver, sender = ends
+    for _ in range(3):
+        overflow(sender)
+        assert drain(receiver) == numbers(MORE_THAN_A_SOCKET)
+        assert not sender.backlog
+        sender.send(b"direct")
+        assert not sender.backlog
+        assert receiver.recv().tobytes() == b"direct"
+
+
+def test_a_message_that_was_sent_a_moment_too_late_keeps_its_place(ends: Ends) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    first = receiver.recv().tobytes()
+    # A sender that had found no backlog, and whose next message goes into it.
+    late = LocalChannel(sender.owner)
+    assert late.try_send(b"late")
+    sender.backlog.words[AMBIGUOUS] = True
+    assert sender.try_send(b"later")
+    taken = [first, *drain(receiver)]
+    assert sorted(taken) == sorted([*numbers(MORE_THAN_A_SOCKET), b"late", b"later"])
+    assert [item for item in taken if item.isdigit()] == numbers(MORE_THAN_A_SOCKET)
+    assert taken.index(b"late") < taken.index(b"later")
+    assert not is_readable(receiver)
+
+
+def test_every_receiver_that_sleeps_is_woken(ends: Ends) -> None:
+    receiver, sender = ends
+    got: list[bytes] = []
+
+    def receive() -> None:
+        got.append(receiver.recv().tobytes())
+
+    overflow(sender)
+    # All that is in the socket, and nothing of the backlog: what a receiver that is woken finds.
+    while (message := _received(receiver)) is not None:
+        message.release()
+    sleepers = [background(receive) for _ in range(5)]
+    for sleeper in sleepers:
+        sleeper.join(PATIENCE)
+    assert len(set(got)) == 5
+    assert is_readable(receiver)
+
+
+def _received(receiver: Receiver) -> packet.Message | None:
+    """The next message of the socket alone; the wake-up packet stays there."""
+    if receiver._peek() == bytes([packet.WAKE_UP]):
+        return None
+    return packet.receive(receiver.sock)
+
+
+def test_a_receiver_that_dies_with_the_wake_up_keeps_no_message(ends: Ends) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    taken = []
+    while (message := _received(receiver)) is not None:
+        taken.append(message.tobytes())
+    with pytest.raises(packet.WakeUp):
+        packet.receive(receiver.sock)
+    assert not is_readable(receiver)
+    assert receiver.poll(0)  # it looks at the backlog
+    assert sender.try_send(b"next")
+    assert is_readable(receiver)  # and a sender mends the rest
+    assert [*taken, *drain(receiver)] == [*numbers(MORE_THAN_A_SOCKET), b"next"]
+
+
+def test_a_receiver_that_slept_before_it_was_lost_wakes_all_the_same(ends: Ends) -> None:
+    receiver, sender = ends
+    answers: list[bytes] = []
+    sleeper = background(lambda: answers.append(receiver.recv().tobytes()))
+    sender.backlog.put(memoryview(b"unannounced"))
+    sleeper.join(PATIENCE)
+    assert answers == [b"unannounced"]
+
+
+def test_the_end_comes_after_the_backlog(ends: Ends) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    sender.close()
+    for number in range(MORE_THAN_A_SOCKET):
+        assert receiver.recv().tobytes() == b"%d" % number
+    with pytest.raises(ConnectionClosed):
+        receiver.recv()
+
+
+# What a sender waits for
+
+
+def test_a_full_channel_makes_its_sender_wait_and_then_go_on(ends: Ends) -> None:
+    receiver, sender = ends
+    count = filled(lambda: sender.try_send(b"x" * 40))
+    more = background(lambda: [sender.send(b"y" * 40) for _ in range(count)])
+    got = [receiver.recv().tobytes() for _ in range(2 * count)]
+    more.join(PATIENCE)
+    assert got == [b"x" * 40] * count + [b"y" * 40] * count
+
+
+@pytest.mark.parametrize("size", [64_000, 66_000, 300_000])
+def test_a_message_too_large_for_the_backlog_waits_for_its_turn(size: int, ends: Ends) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    large = background(sender.send, bytes(size))
+    got = [receiver.recv().tobytes() for _ in range(MORE_THAN_A_SOCKET + 1)]
+    large.join(PATIENCE)
+    assert got == [*numbers(MORE_THAN_A_SOCKET), bytes(size)]
+
+
+def test_senders_that_wait_hear_that_nobody_can_receive(ends: Ends) -> None:
+    receiver, sender = ends
+    filled(lambda: sender.try_send(b"x" * 40))
+    errors: list[BaseException] = []
+
+    def send() -> None:
+        try:
+            sender.send(b"one more")
+        except BrokenPipeError as error:
+            errors.append(error)
+
+    sleeper = background(send)
+    receiver.close()
+    sleeper.join(PATIENCE)
+    assert len(errors) == 1
+
+
+def test_a_sender_with_a_backlog_hears_it_at_once(ends: Ends) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    receiver.close()
+    with pytest.raises(BrokenPipeError):
+        sender.send(b"one more")
+
+
+# Processes
+
+
+def put_numbers(queue: Any, who: int, count: int) -> None:
+    for number in range(count):
+        queue.put((who, number, b"x" * (number % 7 * 100)))
+
+
+def take_until_none(queue: Any, answers: Any) -> None:
+    answers.send([item[:2] for item in iter(queue.get, None)])
+
+
+def test_many_processes_put_and_get_more_than_there_is_room_for() -> None:
+    queue: Any = fiber.SimpleQueue()
+    count = 3000
+    writers = [fiber.Process(target=put_numbers, args=(queue, who, count)) for who in range(3)]
+    pipes = [fiber.Pipe(duplex=False) for _ in range(3)]
+    readers = [fiber.Process(target=take_until_none, args=(queue, pipe[1])) for pipe in pipes]
+    for process in (*writers, *readers):
+        process.start()
+    for writer in writers:
+        writer.join(60)
+    for _ in readers:
+        queue.put(None)
+    taken = [answers.recv() for answers, _ in pipes]
+    for items in taken:
+        for who in range(3):
+            assert [n for w, n in items if w == who] == sorted(n for w, n in items if w == who)
+    assert sorted(itertools.chain(*taken)) == [(who, n) for who in range(3) for n in range(count)]
+    for process in readers:
+        process.join(60)
+    assert queue.empty()
+
+
+def put_for_ever(queue: Any, ready: Any) -> None:
+    ready.send(None)
+    number = 0
+    while True:
+        queue.put(number)
+        number += 1
+
+
+@pytest.mark.slow
+def test_a_writer_killed_anywhere_stops_no_other() -> None:
+    queue: Any = fiber.SimpleQueue()
+    for _ in range(10):
+        told, ready = fiber.Pipe(duplex=False)
+        process = fiber.Process(target=put_for_ever, args=(queue, ready))
+        process.start()
+        told.recv()
+        wait_until(lambda: bool(queue._reader._channel.backlog), PATIENCE)
+        for _ in range(500):
+            queue.get()
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGKILL)
+        process.join(PATIENCE)
+        while not queue.empty():
+            assert isinstance(queue.get(), int)
+        queue.put("mine")
+        assert queue.get() == "mine"
+
+
+def get_and_report(queue: Any, taken: Any) -> None:
+    while True:
+        taken.send(queue.get())
+
+
+@pytest.mark.slow
+def test_readers_killed_anywhere_take_at_most_the_item_they_hold() -> None:
+    queue: Any = fiber.SimpleQueue()
+    total, killed = 2500, 8
+    for number in range(total):
+        queue.put(number)
+    reported = []
+    for _ in range(killed):
+        reports, taken = fiber.Pipe(duplex=False)
+        process = fiber.Process(target=get_and_report, args=(queue, taken))
+        process.start()
+        taken.close()
+        reported += [reports.recv() for _ in range(200)]
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGKILL)
+        process.join(PATIENCE)
+        with contextlib.suppress(EOFError):
+            while True:
+                reported.append(reports.recv())
+    while not queue.empty():
+        reported.append(queue.get())
+    assert len(set(reported)) == len(reported)
+    assert total - killed <= len(reported) <= total
+
+
+def hold_the_backlog(queue: Any) -> None:
+    queue._writer._channel.backlog.run(lambda: os.kill(os.getpid(), signal.SIGKILL))
+
+
+def test_a_process_killed_within_the_backlog_leaves_it_to_others() -> None:
+    queue: Any = fiber.SimpleQueue()
+    process = fiber.Process(target=hold_the_backlog, args=(queue,))
+    process.start()
+    process.join(60)
+    for number in range(MORE_THAN_A_SOCKET):
+        queue.put(number)
+    assert [queue.get() for _ in range(MORE_THAN_A_SOCKET)] == list(range(MORE_THAN_A_SOCKET))
+
+
+def test_threads_keep_their_own_order() -> None:
+    receiver, sender = one_way.pair()
+    writers = [
+        threading.Thread(
+            target=lambda who=who: [sender.send(b"%d %d" % (who, n)) for n in range(2000)]
+        )
+        for who in range(4)
+    ]
+    for writer in writers:
+        writer.start()
+    taken = [receiver.recv().tobytes().split() for _ in range(4 * 2000)]
+    for writer in writers:
+        writer.join(PATIENCE)
+    for who in range(4):
+        assert [int(n) for w, n in taken if int(w) == who] == list(range(2000))
