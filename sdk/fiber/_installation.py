@@ -47,7 +47,7 @@ def warn_of_foreign_files(folder: str, names: Iterable[str]) -> None:
         "same name overwrite each other's files, and what is imported may be of either. "
         + _REMEDY.format(others=" ".join(others) or "what they were installed by"),
         RuntimeWarning,
-        stacklevel=2,
+        stacklevel=4,
     )
 
 

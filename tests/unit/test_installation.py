@@ -118,7 +118,8 @@ def test_files_of_another_distribution_are_found(site: Path) -> None:
     assert run(site, "import fiber") == ""
     (site / "fiber" / "core.py").touch()
     printed = run(site, "import fiber")
-    assert f"RuntimeWarning: the folder of Fiber, {site}/fiber, has modules" in printed
+    assert printed.startswith("<string>:1: RuntimeWarning: the folder of Fiber, ")
+    assert f", {site}/fiber, has modules" in printed
     assert "core.py. They belong to the distribution fiber." in printed
     assert "pip uninstall fiber, and then pip install --force-reinstall fiberpool" in printed
 
