@@ -186,7 +186,7 @@ class ProgramTooLarge(FiberError):
         lines = [f"{size:>12}  {path}" for path, size in largest.items()]
         super().__init__(
             f"the program in {folder!r} cannot be sent to its workers: it has {size}, and what is "
-            f"sent is at most {limit}.\n{_block('What takes most:', lines)}\n"
+            f"sent is at most {limit}.\n{block('What takes most:', lines)}\n"
             f"Name what workers do not need in {folder}/.fiberignore, one line each, as in "
             ".gitignore, or move it out of the folder; data that they do need belongs in their "
             "image or on a volume."
@@ -206,7 +206,7 @@ class StartError(FiberError):
         tries = f" after {attempts} attempts" if attempts > 1 else ""
         message = f"{who} did not start{tries}: {reason}"
         if cause:
-            message += f"\n{_block('What it said:', cause.splitlines())}"
+            message += f"\n{block('What it said:', cause.splitlines())}"
         super().__init__(message)
         self.who = who
         self.reason = reason
@@ -273,7 +273,8 @@ class WorkerDied(FiberError):
 
     The attributes are the last attempt's: `task` and `worker` are names, `exitcode` follows
     multiprocessing (negative: the signal; None: unknown), `log` holds the last lines that
-    the worker wrote, `attempts` counts how often the task was tried. On Kubernetes `pod` and
+    the worker wrote, `stack` the Python stacks of its threads if native code crashed,
+    `attempts` counts how often the task was tried. On Kubernetes `pod` and
     `node` are the names of the worker's pod and of the pod's node, elsewhere None, and `reason`
     begins with Kubernetes' word where the pod has ended ("OOMKilled: ...").
     """
@@ -288,6 +289,7 @@ class WorkerDied(FiberError):
         exitcode: int | None,
         reason: str,
         log: Sequence[str] = (),
+        stack: str = "",
         attempts: int = 1,
         pod: str | None = None,
         node: str | None = None,
@@ -299,6 +301,7 @@ class WorkerDied(FiberError):
         self.exitcode = exitcode
         self.reason = reason
         self.log = tuple(log)
+        self.stack = stack
         self.attempts = attempts
         self.pod = pod
         self.node = node
@@ -311,9 +314,11 @@ class WorkerDied(FiberError):
         ]
         if self.attempts > 1:
             lines.append(f"The task was tried {self.attempts} times; each time its worker died.")
-        lines.append(f"What to do: {_advice(self.exitcode, self.reason)}")
+        lines.append(f"What to do: {_advice(self.exitcode, self.reason, self.stack)}")
+        if self.stack:
+            lines.append(block("Where it was:", self.stack.splitlines()))
         if self.log:
-            lines.append(_block("Its last output:", self.log))
+            lines.append(block("Its last output:", self.log))
         return "\n".join(lines)
 
     def _place(self) -> str:
@@ -341,7 +346,7 @@ _ADVICE_BY_WORD = {
 """By the first word of the reason: Kubernetes' for the end of a pod, or Fiber's."""
 
 
-def _advice(exitcode: int | None, reason: str) -> str:
+def _advice(exitcode: int | None, reason: str, stack: str) -> str:
     by_word = _ADVICE_BY_WORD.get(reason.partition(":")[0])
     if by_word:
         return by_word
@@ -353,10 +358,10 @@ def _advice(exitcode: int | None, reason: str) -> str:
             "Use fewer workers or smaller tasks, or ask for more with @fiber.meta(memory=)."
         )
     if -exitcode in _CRASHES:
-        return (
-            "native code crashed: an extension module or a library under it. "
-            "Run with PYTHONFAULTHANDLER=1 to see the Python line that it was called from."
-        )
+        crashed = "native code crashed: an extension module or a library under it. "
+        if stack:
+            return f"{crashed}The first line below that is not Python's own says who called it."
+        return f"{crashed}Run with PYTHONFAULTHANDLER=1 to see the Python line that called it."
     if exitcode < 0:
         return "find out who sends this signal to the program's processes."
     ended_itself = (
@@ -371,5 +376,6 @@ def _advice(exitcode: int | None, reason: str) -> str:
     return ended_itself
 
 
-def _block(title: str, lines: Sequence[str]) -> str:
+def block(title: str, lines: Sequence[str]) -> str:
+    """Return lines from somewhere else as a part of a message."""
     return "\n".join([title, *(f"  | {line}" for line in lines)])

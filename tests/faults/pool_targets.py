@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import resource
 import signal
 import sys
 import threading
@@ -136,3 +138,31 @@ def wait_for_company(folder: str, number: int, size: int) -> int:
             break
         time.sleep(0.005)
     return os.getpid()
+
+
+def wait_beside(begun: threading.Event) -> None:
+    begun.set()
+    time.sleep(600)
+
+
+def start_beside() -> None:
+    begun = threading.Event()
+    threading.Thread(target=wait_beside, args=(begun,)).start()
+    begun.wait()
+
+
+def hang_in_python() -> NoReturn:
+    start_beside()
+    while True:
+        pass
+
+
+def hang_in_native_code() -> None:
+    """With the GIL, so that no handler of a signal in Python runs."""
+    start_beside()
+    ctypes.PyDLL(None).sleep(600)
+
+
+def crash(signum: int) -> None:
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    os.kill(os.getpid(), signum)

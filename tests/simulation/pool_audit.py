@@ -170,7 +170,7 @@ class PoolAudit:
     def _check_messages(self) -> None:
         held = self._ledger.batches.keys()
         require(self._executor._sender._unsent <= held, "what is not sent is not held by anybody")
-        require(self._executor._sender._deadlines.keys() <= held, "a deadline is nobody's")
+        require(self._executor._limits._timers.keys() <= held, "a deadline is nobody's")
 
     def _check_news(self) -> None:
         if self._failures and self._workers.error is None and not self._told:
@@ -270,7 +270,7 @@ class PoolAudit:
             self._workers.members,
             self._ledger.demand(),
             self._ledger.batches,
-            executor._sender._deadlines,
+            executor._limits._timers,
             executor._sender._unsent,
             executor._jobs._streams,
             *(queue.called for queue in executor.calls._queues),

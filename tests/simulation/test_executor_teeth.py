@@ -20,6 +20,7 @@ from fiber._runtime.leases import Lease, Leases
 from fiber._runtime.outcome import Pickled
 from fiber._runtime.receiver import Receiver
 from fiber._runtime.sender import Sender
+from fiber._runtime.time_limits import TimeLimits
 from fiber._runtime.work_items import Call
 from fiber._runtime.worker_handle import WorkerHandle
 from simulation.explore import first_failure
@@ -136,7 +137,7 @@ def dismisses_nobody(patch: Patch) -> None:
 
 
 def forgets_deadlines(patch: Patch) -> None:
-    patch.setattr(Executor, "_timed_out", lambda *_: None)
+    patch.setattr(TimeLimits, "_over", lambda *_: None)
 
 
 def keeps_deadlines(patch: Patch) -> None:

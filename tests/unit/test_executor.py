@@ -15,8 +15,9 @@ from typing import Any
 import pytest
 
 from fiber._agent.interface import ExitReport
+from fiber._agent.last_words import TELL
 from fiber._engine import ledger
-from fiber._runtime import worker_view
+from fiber._runtime import time_limits, worker_view
 from fiber._runtime.executor import Executor
 from fiber._runtime.input_stream import InputStream
 from fiber._runtime.latch import Latch
@@ -364,11 +365,32 @@ def test_a_task_over_its_time_fails_and_its_worker_is_killed(rig: Rig) -> None:
     results = rig.call(timeout=2.0)
     (handle,) = rig.busy
     rig.loop.pass_time(2.0)
+    assert rig.child(handle).signals == [TELL]
+    assert results.done == 0
+    rig.lose(handle, stack="line 3 in f")
     assert "2 s" in str(results.outcomes[0].error)
-    assert results.done == 1
-    assert rig.child(handle).signals == [signal.SIGKILL]
+    assert "line 3 in f" in str(results.outcomes[0].error)
+    assert (len(results.outcomes), results.done) == (1, 1)
+
+
+def test_an_answer_that_comes_before_its_worker_ends_counts(rig: Rig) -> None:
+    results = rig.call(timeout=2.0)
+    (handle,) = rig.busy
+    rig.loop.pass_time(2.0)
     rig.answer(handle, rig.child(handle).packets[0][0], [9])
     rig.lose(handle)
+    assert (results.outcomes, results.done) == ({0: 9}, 1)
+
+
+def test_nobody_waits_long_for_the_end_of_a_worker(rig: Rig) -> None:
+    results = rig.call(timeout=2.0)
+    (handle,) = rig.busy
+    rig.loop.pass_time(2.0)
+    rig.loop.pass_time(time_limits.PATIENCE)
+    assert "2 s" in str(results.outcomes[0].error)
+    assert rig.child(handle).signals == [TELL, signal.SIGKILL]
+    rig.answer(handle, rig.child(handle).packets[0][0], [9])
+    rig.lose(handle, stack="too late")
     assert (len(results.outcomes), results.done) == (1, 1)
 
 

@@ -119,10 +119,13 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         (Output(1, "x").encode() + b"\xff", "of kind output .* is malformed"),
         (Exited(1, 0, 0, "").encode()[:-1], "of kind exited .* is malformed"),
         (
-            Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, "0", "", [], null, [], "", 0]',
+            Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, "0", "", [], null, [], "", 0, ""]',
             "number",
         ),
-        (Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, 0, 1, [], null, [], "", 0]', "text"),
+        (
+            Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, 0, 1, [], null, [], "", 0, ""]',
+            "text",
+        ),
         (Recall(1).encode()[:1] + b"\x08" + bytes(8) + b"7", "of kind exited .* is malformed"),
         (
             Recall(1).encode()[:1] + b"\x08" + bytes(8) + b"[" * 30_000,
@@ -182,10 +185,10 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
         ),
         (Output(3, SECRET), "Output(child=3, text=<14 characters>)"),
         (
-            Exited(3, 2, -9, SECRET, (1, 2), (1, 0), (SECRET,), SECRET),
+            Exited(3, 2, -9, SECRET, (1, 2), (1, 0), (SECRET,), SECRET, 0, SECRET),
             "Exited(child=3, delivered=2, exitcode=-9, reason=<14 characters>, "
             "unread=(1, 2), running=(1, 0), "
-            "log=<1 items>, host=<14 characters>, cause=0)",
+            "log=<1 items>, host=<14 characters>, cause=0, stack=<14 characters>)",
         ),
         (
             TunnelData(3, bytearray(SECRET.encode())),

@@ -157,7 +157,8 @@ class Agent:
             child.release_descriptors()
             child.observer.started(reply[2])
         elif reply[0] == zygote.EXITED:
-            self._child_exited(child, reply[2], self.describe_end(reply[2]))
+            reason, stack = self.describe_end(reply[2]), "".join(reply[3:])
+            self._child_exited(child, reply[2], reason, stack=stack)
         elif reply[0] == zygote.FAILED:
             self._refused(child, reply[2])
         elif reply[0] == zygote.FORK_UNSAFE:
@@ -206,7 +207,12 @@ class Agent:
         self._child_exited(child, 1, f"could not be started: {why}", Cause.REFUSED)
 
     def _child_exited(
-        self, child: LocalChild, exitcode: int, reason: str, cause: Cause = Cause.CHILD
+        self,
+        child: LocalChild,
+        exitcode: int,
+        reason: str,
+        cause: Cause = Cause.CHILD,
+        stack: str = "",
     ) -> None:
         del self._children[child.id]
         child.leave_zygote()
@@ -214,7 +220,9 @@ class Agent:
         unread, running = self._release(child)
         if child.fault is not None:
             reason = f"killed by its agent: {child.fault}"
-        report = ExitReport(exitcode, reason, unread, running, host=self.host, cause=cause)
+        report = ExitReport(
+            exitcode, reason, unread, running, host=self.host, cause=cause, stack=stack
+        )
         child.observer.exited(report)
 
     def describe_end(self, exitcode: int) -> str:

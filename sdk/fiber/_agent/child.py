@@ -17,7 +17,7 @@ from multiprocessing import util
 from typing import Any, NamedTuple, cast
 
 from fiber import _logs
-from fiber._agent import program_folder
+from fiber._agent import last_words, program_folder
 from fiber._agent.progress import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import client as hub_client
@@ -128,18 +128,24 @@ def become_subreaper() -> None:
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def run(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> int:
-    """Run what was asked for and return the exit code."""
+def run(
+    start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int, words: int
+) -> int:
+    """Run what was asked for and return the exit code; ``words`` is for the stacks of a crash."""
     if start.method == "spawn":
-        _exec(start, fds, progress_table, agent)
+        _exec(start, fds, progress_table, agent, words)
     # What the zygote's imports registered, say to remove a folder, is not for each child to do.
     atexit._clear()
     atexit.register(util._exit_function)  # type: ignore[attr-defined]
-    return _run(start, fds, progress_table, agent)
+    return _run(start, fds, progress_table, agent, words)
 
 
-def _run(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> int:
+def _run(
+    start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int, words: int
+) -> int:
     global _task_channel, _progress, _descriptors, ancestors
+    if words >= 0:
+        last_words.write_to(words)
     ancestors = start.ancestors
     _adopt_stdio(fds, captured=start.captured)
     rest = fds[2:]
@@ -273,14 +279,17 @@ def _tell(problem: str) -> None:
     sys.stderr.write(problem)
 
 
-def _exec(start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int) -> None:
+def _exec(
+    start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int, words: int
+) -> None:
     """Replace this forked process by a fresh interpreter that goes on in ``spawned``."""
     again = os.memfd_create("fiber-start")
-    plan = (tuple(start._replace(method="fork")), fds, progress_table.fd, agent)
+    plan = (tuple(start._replace(method="fork")), fds, progress_table.fd, agent, words)
     with os.fdopen(os.dup(again), "wb") as file:
         pickle.dump(plan, file)
-    for fd in (*fds, progress_table.fd, agent, again):
-        os.set_inheritable(fd, True)
+    for fd in (*fds, progress_table.fd, agent, again, words):
+        if fd >= 0:
+            os.set_inheritable(fd, True)
     executable = os.fsdecode(start.executable or sys.executable)
     statement = f"from fiber._agent.child import spawned; spawned({again})"
     try:
@@ -293,11 +302,12 @@ def spawned(plan_fd: int) -> None:
     """Entry point of a child in an interpreter of its own."""
     with os.fdopen(plan_fd, "rb") as file:
         file.seek(0)
-        fields, fds, progress_table, agent = pickle.load(file)
-    for fd in (*fds, progress_table, agent):
-        os.set_inheritable(fd, False)
+        fields, fds, progress_table, agent, words = pickle.load(file)
+    for fd in (*fds, progress_table, agent, words):
+        if fd >= 0:
+            os.set_inheritable(fd, False)
     code = 1
     try:
-        code = _run(StartRequest(*fields), fds, ProgressTable(progress_table), agent)
+        code = _run(StartRequest(*fields), fds, ProgressTable(progress_table), agent, words)
     finally:
         os._exit(code)

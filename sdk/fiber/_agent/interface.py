@@ -48,6 +48,8 @@ class ExitReport(NamedTuple):
     """The last lines that it wrote, where its output is captured."""
     host: str = ""
     cause: int = Cause.CHILD
+    stack: str = ""
+    """The Python stacks of its threads, if it crashed or was told to write them."""
     pod: str = ""
     """The pod that it ran in, and that pod's node, where there is one."""
     node: str = ""

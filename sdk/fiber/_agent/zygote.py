@@ -9,7 +9,8 @@ Packets from the agent: ``(SETUP, ancestors, imports, cleanup directory, program
 and once, with the descriptors of the progress table and, if there is a folder, of what belongs in
 it; ``(START, child, start request)``, ``(SIGNAL, child, signum)``,
 ``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
-Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``,
+Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``
+with the Python stacks of a child that has written them (``last_words.py``),
 ``(FORK_UNSAFE, child, imports)``: this zygote's imports made forking unsafe, start that child in a
 zygote that makes ``imports`` alone.  ``(FAILED, None, text)``: the next child of those asked for;
 its request is lost.
@@ -30,7 +31,7 @@ import warnings
 from typing import Any, NoReturn
 
 from fiber._agent import child as child_module
-from fiber._agent import program_folder
+from fiber._agent import last_words, program_folder
 from fiber._agent.child import StartRequest
 from fiber._agent.preload import Imports, Unfit, preload
 from fiber._agent.progress import ProgressTable
@@ -75,6 +76,8 @@ class Zygote:
         self._pid = os.getpid()
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
+        self._words: dict[int, int] = {}  # pid -> where it writes the stacks of a crash
+        self._overdue: dict[int, float] = {}  # pid -> when it is killed, if it has not died before
         self._descriptors: tuple[int, list[int]] = (0, [])  # child, what came ahead for it
         self._sigchld, self._sigchld_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self._poller = select.poll()
@@ -88,9 +91,10 @@ class Zygote:
         """
         self._listen_to_signals()
         while True:
-            ready = {fd for fd, _ in self._poller.poll()}
+            ready = {fd for fd, _ in self._poller.poll(self._patience())}
             if self._sigchld in ready:
                 self._reap()
+            self._kill_overdue()
             try:
                 if self._control.fileno() in ready and not self._serve():
                     self._kill_children(0)
@@ -153,11 +157,14 @@ class Zygote:
         # Until the child has undone it, it ignores what we ignore: a signal sent to it right after
         # its birth has to wait, not to be lost.
         signal.pthread_sigmask(signal.SIG_BLOCK, _SHUTDOWN_SIGNALS)
+        words = last_words.make_file()
         try:
             pid = os.fork()
             if pid == 0:
-                self._run_child(start, fds)
+                self._run_child(start, fds, words)
         except OSError as error:
+            if words >= 0:
+                os.close(words)
             self._reply(FAILED, child, f"the system refused a new process: {error.strerror}")
             return
         finally:
@@ -165,6 +172,8 @@ class Zygote:
             _close_all(fds)
         self._pids[child] = pid
         self._children[pid] = child
+        if words >= 0:
+            self._words[pid] = words
         self._reply(STARTED, child, pid)
 
     def _unpack_program(self) -> None:
@@ -186,7 +195,7 @@ class Zygote:
                 print(f"fiber: {self._unfit.reason}", file=sys.stderr, flush=True)
         return self._unfit is None
 
-    def _run_child(self, start: StartRequest, fds: list[int]) -> NoReturn:
+    def _run_child(self, start: StartRequest, fds: list[int], words: int) -> NoReturn:
         """In the forked process: drop what is the zygote's and run the child."""
         code = 1
         try:
@@ -198,10 +207,10 @@ class Zygote:
             self._control.close()
             os.close(self._sigchld)
             os.close(self._sigchld_in)
-            _close_all(self._ancestors[1:])
+            _close_all([*self._ancestors[1:], *self._words.values()])
             child_module.die_with_parent(self._pid)
             resource.setrlimit(resource.RLIMIT_NOFILE, start.open_files)
-            code = child_module.run(start, fds, self._progress_table, self._ancestors[0])
+            code = child_module.run(start, fds, self._progress_table, self._ancestors[0], words)
         except BaseException:
             # The user's own errors do not come here: these are of the system, or Fiber's.
             import traceback  # rarely needed, and long to import
@@ -212,8 +221,24 @@ class Zygote:
 
     def _signal(self, child: int, signum: int) -> None:
         pid = self._pids.get(child)
-        if pid is not None:
-            _kill(pid, signum)
+        if pid is None:
+            return
+        if signum == last_words.TELL:
+            self._overdue[pid] = time.monotonic() + last_words.GRACE
+        _kill(pid, signum)
+
+    def _patience(self) -> float | None:
+        """Return the milliseconds until a child is to be killed."""
+        if not self._overdue:
+            return None
+        return max(0.0, min(self._overdue.values()) - time.monotonic()) * 1000
+
+    def _kill_overdue(self) -> None:
+        now = time.monotonic()
+        for pid, due in list(self._overdue.items()):
+            if due <= now:
+                self._overdue[pid] = now + last_words.GRACE
+                _kill(pid, signal.SIGKILL)
 
     def _reap(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -225,10 +250,19 @@ class Zygote:
                 return
             if not pid:
                 return
-            child = self._children.pop(pid, None)
-            if child is not None:
-                del self._pids[child]
-                self._reply(EXITED, child, os.waitstatus_to_exitcode(status))
+            self._buried(pid, status)
+
+    def _buried(self, pid: int, status: int) -> None:
+        child = self._children.pop(pid, None)
+        if child is None:
+            return
+        self._pids.pop(child, None)
+        exitcode = os.waitstatus_to_exitcode(status)
+        if self._overdue.pop(pid, None) is not None and exitcode == -last_words.TELL:
+            exitcode = -signal.SIGKILL  # it was to be killed in any case
+        words = self._words.pop(pid, -1)
+        stack = last_words.read(words) if words >= 0 else ""
+        self._reply(EXITED, child, exitcode, *([stack] if stack else []))
 
     def _reply(self, *answer: Any) -> None:
         # An agent that is gone shows on its own descriptor.
@@ -245,10 +279,7 @@ class Zygote:
         for pid in self._children:
             _kill(pid, signal.SIGKILL)
         while self._children:
-            pid, status = os.waitpid(-1, 0)
-            child = self._children.pop(pid, None)
-            if child is not None:
-                self._reply(EXITED, child, os.waitstatus_to_exitcode(status))
+            self._buried(*os.waitpid(-1, 0))
 
 
 def _kill(pid: int, signum: int) -> None:

@@ -44,6 +44,7 @@ from fiber._runtime.options import PoolOptions
 from fiber._runtime.outcome import Failure, decode
 from fiber._runtime.receiver import Receiver
 from fiber._runtime.sender import Sender
+from fiber._runtime.time_limits import TimeLimits
 from fiber._runtime.work_items import Call, Future, WorkItem, pickle_call
 from fiber._runtime.worker_handle import WorkerHandle
 from fiber._runtime.worker_resources import WorkerResources
@@ -87,13 +88,14 @@ class Executor:
         self._ledger = self._scheduler.ledger
         self.workers = WorkerView(self._scheduler.workers, host.loop)
         self._jobs = Jobs(self._ledger, options.retries, retry=bool(options.retryable))
+        self._limits = TimeLimits(self._loop, self._scheduler, self._jobs, advance=self._advance)
         self._sender = Sender(
             self._loop,
             self._background,
             self._ledger,
             self._jobs,
+            self._limits,
             advance=self._advance,
-            on_timeout=self._timed_out,
         )
         self._resources = WorkerResources(options.resources)
         self._launcher = Launcher(
@@ -444,19 +446,6 @@ class Executor:
         """A worker will never see these batches."""
         self._receiver.recalled(handle, seqs)
 
-    def _timed_out(self, seq: int) -> None:
-        """A task had its time."""
-        batch = self._ledger.batches.get(seq)
-        if batch is None:
-            return
-        handle: WorkerHandle = batch.worker.key
-        receipt = self._ledger.expire(seq)
-        if receipt is not None:
-            self._jobs.put_timeout(receipt, handle.name)
-        self._scheduler.let_go(handle)
-        handle.kill()
-        self._advance()
-
     def _adopt(self, handle: WorkerHandle, seq: int, call: Call) -> None:
         """A caller sent this worker a call, and leaves the answer to us."""
         item = WorkItem(work.CALLS, exact=True)
@@ -510,6 +499,7 @@ class Executor:
         if lent and not self._leases.recall_one(handle):
             self._exits[handle] = report  # whoever uses it notices, and brings it back
             return
+        self._limits.ended(handle, report.stack)
         # A lost host says nothing of the worker.
         failure = None if report.cause == Cause.AGENT_LOST else handle.start_failure(report)
         self._lost(handle, failure, report)
@@ -569,7 +559,7 @@ class Executor:
         if self._wake is not None:
             self._wake.cancel()
         self._launcher.close()
-        self._sender.close()
+        self._limits.close()
         self._leases.close()
         self.threads.stop()
         # Its traceback may hold the pool, whose finalizer holds this.

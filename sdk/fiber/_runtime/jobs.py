@@ -15,7 +15,7 @@ from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
 from fiber._runtime.outcome import Failure, Pickled
 from fiber._runtime.work_items import Call, WorkItem
 from fiber._wire import work
-from fiber.errors import TimeoutError, WorkerDied
+from fiber.errors import TimeoutError, WorkerDied, block
 
 
 class Jobs:
@@ -139,15 +139,17 @@ class Jobs:
             future.add_results(0, [outcome], mixed)
             future.set_done()
 
-    def put_timeout(self, receipt: Receipt, worker: str) -> None:
-        """A task took too long."""
+    def put_timeout(self, receipt: Receipt, worker: str, stack: str) -> None:
+        """A task took too long; ``stack`` says where it was."""
         item: WorkItem = receipt.job.owner
         name = item.task_name(receipt.start, receipt.item(receipt.start))
-        error = TimeoutError(
+        lines = [
             f"{name} took longer than its timeout of {item.timeout:g} s; "
             f"its worker {worker!r} was killed"
-        )
-        self.put(receipt, [Failure(error)])
+        ]
+        if stack:
+            lines.append(block("Where it was:", stack.splitlines()))
+        self.put(receipt, [Failure(TimeoutError("\n".join(lines)))])
 
     def put_losses(
         self, losses: list[Loss], worker: str, pid: int | None, report: ExitReport
@@ -163,6 +165,7 @@ class Jobs:
                 exitcode=report.exitcode,
                 reason=report.reason,
                 log=report.log,
+                stack=report.stack,
                 attempts=loss.attempts,
                 pod=report.pod or None,
                 node=report.node or None,

@@ -10,9 +10,10 @@ from collections.abc import Callable
 
 from fiber._engine.ledger import Batch, Job, Ledger, Worker
 from fiber._runtime.background import BackgroundThread
-from fiber._runtime.host import Loop, Timer
+from fiber._runtime.host import Loop
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.outcome import Failure
+from fiber._runtime.time_limits import TimeLimits
 from fiber._runtime.work_items import (
     Encoded,
     WorkItem,
@@ -27,8 +28,7 @@ from fiber._runtime.worker_handle import WorkerHandle
 
 
 class Sender:
-    """Sends batches.  ``advance`` is called when something follows, ``on_timeout`` with the number
-    of a batch whose task has had its time."""
+    """Sends batches.  ``advance`` is called when something follows."""
 
     def __init__(
         self,
@@ -36,19 +36,18 @@ class Sender:
         background: BackgroundThread,
         ledger: Ledger,
         jobs: Jobs,
+        limits: TimeLimits,
         *,
         advance: Callable[[], None],
-        on_timeout: Callable[[int], None],
     ) -> None:
         self._loop = loop
         self._background = background
         self._ledger = ledger
         self._jobs = jobs
         self._advance = advance
-        self._on_timeout = on_timeout
+        self._limits = limits
         self._unsent: set[int] = set()
         """Batches that their workers do not have: nobody can have run them."""
-        self._deadlines: dict[int, Timer] = {}
 
     def send(self, batch: Batch) -> None:
         """Send a batch, or have it encoded where the user's code may run."""
@@ -102,7 +101,7 @@ class Sender:
         assert handle.child is not None
         seq = batch.seq
         if item.timeout is not None:
-            self._deadlines[seq] = self._loop.call_later(item.timeout, self._expire, seq)
+            self._limits.begin(seq, item.timeout)
         try:
             taken = handle.child.deliver(seq, *pack(item, batch, encoded, handle.known))
         except Exception as error:  # the system has no memory or descriptor for it
@@ -151,21 +150,6 @@ class Sender:
         self._unsent -= held
         return unsent
 
-    # Deadlines
-
     def settled(self, seq: int) -> None:
-        """What becomes of a batch is known: its deadline, if it has one, is off."""
-        if self._deadlines:
-            timer = self._deadlines.pop(seq, None)
-            if timer is not None:
-                timer.cancel()
-
-    def close(self) -> None:
-        """Nothing is waited for any more."""
-        for timer in self._deadlines.values():
-            timer.cancel()
-        self._deadlines.clear()
-
-    def _expire(self, seq: int) -> None:
-        if self._deadlines.pop(seq, None) is not None:
-            self._on_timeout(seq)
+        """What becomes of a batch is known: its time limit, if it has one, is off."""
+        self._limits.settled(seq)

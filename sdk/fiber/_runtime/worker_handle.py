@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from fiber import _logs
 from fiber._agent.interface import Cause, ChildHandle, ExitReport
+from fiber._agent.last_words import TELL
 from fiber._engine.ledger import Worker
 from fiber._engine.start_failures import StartFailure
 from fiber._runtime.latch import Latch
@@ -189,6 +190,10 @@ class WorkerHandle:
     def kill(self) -> None:
         """SIGKILL."""
         self.signal(signal.SIGKILL)
+
+    def kill_with_stack(self) -> None:
+        """Have it write the Python stacks of its threads, and kill it."""
+        self.signal(TELL)
 
     def close(self) -> None:
         """Give the descriptor back."""

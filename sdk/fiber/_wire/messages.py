@@ -178,6 +178,7 @@ class Exited(NamedTuple):
     log: tuple[str, ...] = ()
     host: str = ""
     cause: int = 0
+    stack: str = ""
 
     def encode(self) -> bytes:
         """The frame."""
@@ -452,7 +453,7 @@ def _read_recalled(view: memoryview) -> Recalled:
 
 def _read_exited(view: memoryview) -> Exited:
     child = _NUMBER.unpack_from(view)[2]
-    delivered, exitcode, reason, unread, running, log, host, cause = json.loads(
+    delivered, exitcode, reason, unread, running, log, host, cause, stack = json.loads(
         _text(view[_NUMBER.size :])
     )
     if running is not None:
@@ -468,6 +469,7 @@ def _read_exited(view: memoryview) -> Exited:
         tuple(map(_string, log)),
         _string(host),
         _integer(cause),
+        _string(stack),
     )
 
 

@@ -1,0 +1,44 @@
+"""Where a task was when its worker was killed over its time, or crashed: on each backend."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+
+import pytest
+
+import fiber
+from faults import pool_targets as tasks
+from fiber.errors import WorkerDied
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+
+@pytest.mark.parametrize("hang", [tasks.hang_in_python, tasks.hang_in_native_code])
+def test_a_task_over_its_time_says_where_each_thread_was(hang: Callable[[], None]) -> None:
+    with fiber.Pool(1) as pool:
+        with pytest.raises(fiber.TimeoutError, match="took longer than its timeout") as caught:
+            pool.apply(hang, timeout=0.5)
+        text = str(caught.value)
+        assert f" in {hang.__name__}" in text
+        assert " in wait_beside" in text
+        assert "worker.py" not in text
+        assert pool.apply(abs, (-1,)) == 1
+
+
+@pytest.mark.parametrize("signum", [signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS])
+def test_a_worker_that_crashes_says_where_it_was(signum: signal.Signals) -> None:
+    with fiber.Pool(1, retries=0) as pool, pytest.raises(WorkerDied) as caught:
+        pool.apply(tasks.crash, (signum,))
+    error = caught.value
+    assert error.exitcode == -signum
+    assert "Fatal Python error" in error.stack
+    assert " in crash" in error.stack
+    assert " in crash" in str(error)
+
+
+def test_of_a_worker_that_is_killed_nothing_is_known() -> None:
+    with fiber.Pool(1, retries=0) as pool, pytest.raises(WorkerDied) as caught:
+        pool.apply(tasks.die)
+    assert caught.value.stack == ""
+    assert "Where it was" not in str(caught.value)
