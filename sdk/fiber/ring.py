@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, Generic, NamedTuple, NoReturn, TypeVar
 
 from fiber._agent.travelling import Travelling
 from fiber._exceptions import add_note, fresh
@@ -25,6 +25,8 @@ from fiber.process import Process
 from fiber.resources import resources_of, with_resources
 
 __all__ = ["Member", "Ring", "current"]
+
+_T = TypeVar("_T")
 
 _member: Member | None = None
 
@@ -111,7 +113,7 @@ class Member:
         self._ends[end.rank] = end
 
 
-class Ring:
+class Ring(Generic[_T]):
     """So many ``processes``, each of which calls ``func(rank, size)``.
 
     Before, each calls ``initializer(member, *initargs)`` with its ``Member``, which ``current()``
@@ -122,7 +124,7 @@ class Ring:
     def __init__(
         self,
         processes: int,
-        func: Callable[[int, int], Any],
+        func: Callable[[int, int], _T],
         initializer: Callable[..., object] | None = None,
         initargs: Iterable[Any] = (),
     ) -> None:
@@ -137,7 +139,7 @@ class Ring:
         self._work = partial(_run, func=func, initializer=initializer, initargs=tuple(initargs))
         self._wishes = resources_of(func)
 
-    def run(self) -> list[Any]:
+    def run(self) -> list[_T]:
         """Start the members and wait until all have ended; returns their results, by rank.
 
         When one raises or is lost, the others are told, by a MemberLost where they wait for it,

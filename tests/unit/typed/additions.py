@@ -59,6 +59,16 @@ def connections() -> None:
     reveal_type(dealt.get())  # int
 
 
+def train(rank: int, size: int) -> float:
+    return rank / size
+
+
+def rings() -> None:
+    reveal_type(fiber.Ring(4, train).run())  # list[float]
+    reveal_type(fiber.ring.current().rank)  # int
+    fiber.Ring(4, show)  # error
+
+
 @fiber.meta(cpu=2, memory="1Gi")
 def wish(number: int) -> str:
     return str(number)
