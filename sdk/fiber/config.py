@@ -390,7 +390,10 @@ def _unknown(setting: _Setting) -> str:
     written = setting.spelling(setting.key)
     # An agent's variables are suggested only to who meant one: they configure no program.
     close = difflib.get_close_matches(written, AGENT_VARIABLES, n=1, cutoff=0.9)
-    close = close or difflib.get_close_matches(written, valid, n=1)
+    if not close:  # by its own part: what all names begin with makes any two alike
+        close = [
+            setting.spelling(key) for key in difflib.get_close_matches(setting.key, _KEYS, 1, 0.58)
+        ]
     hint = f" Did you mean {close[0]!r}?" if close else ""
     return f"unknown key {written!r} in {setting.source}.{hint} Valid are: {', '.join(valid)}."
 

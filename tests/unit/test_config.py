@@ -216,6 +216,9 @@ class TestUnknownKeys:
         with pytest.raises(ConfigError) as caught:
             load({"zzz": 3})
         assert "Did you mean" not in str(caught.value)
+        with pytest.raises(ConfigError) as caught:
+            load(environ={"FIBER_QUIET": "3"})  # the prefix that it shares with all others is long
+        assert "Did you mean" not in str(caught.value)
 
     def test_it_can_be_caught_as_value_error_and_as_fibers(self) -> None:
         with pytest.raises(ValueError, match="zzz"):
