@@ -14,7 +14,7 @@ from fiber._runtime.worker_handle import WorkerHandle
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import WorkerDied
-from unit.executor_rig import Rig
+from unit.executor_rig import Results, Rig
 
 
 def _say_for_another(rig: Rig, liar: WorkerHandle, other: WorkerHandle) -> None:
@@ -100,3 +100,39 @@ def test_the_error_of_a_task_that_sends_wrong_answers_says_so(rig: Rig) -> None:
     assert isinstance(error, WorkerDied)
     assert error.reason.startswith("WrongAnswer: it answered for batch")
     assert "What to do: only Fiber itself writes to the channel of a worker" in str(error)
+
+
+# What an agent says of the end of a worker
+
+
+def two_calls(rig: Rig) -> tuple[Results, WorkerHandle, Results, WorkerHandle]:
+    """Two calls, each with the worker that runs it."""
+    first, second = rig.call(timeout=60.0), rig.call(timeout=60.0)
+    one, other = (batch.worker.key for batch in rig.ledger.batches.values())
+    return first, one, second, other
+
+
+def number_of(handle: WorkerHandle) -> int:
+    assert handle.worker is not None
+    return handle.worker.queue[0].seq
+
+
+def test_an_agent_gives_back_only_what_its_own_worker_has(rig: Rig) -> None:
+    first, one, _, other = two_calls(rig)
+    other.recalled([number_of(one)])
+    assert len(rig.child(one).packets) == 1, "the task of another worker was given out again"
+    assert len(rig.loop.timers) == 2, "the deadline of another worker's task is off"
+    rig.answer(one, number_of(one), [9])
+    assert first.outcomes == {0: 9}
+
+
+def test_an_exit_report_blames_and_spares_only_the_tasks_of_its_own_worker(rig: Rig) -> None:
+    first, one, second, other = two_calls(rig)
+    jobs = [batch.job for batch in rig.ledger.batches.values()]
+    rig.lose(other, unread=(number_of(one),), running=(number_of(one), 0))
+    assert [job.attempts for job in jobs if job is not None] == [{}, {0: 1}]
+    rig.answer(one, number_of(one), [9])
+    rig.background.run()
+    rig.all_ready()
+    rig.answer_all()
+    assert (first.outcomes[0], first.done, second.done) == (9, 1, 1)
