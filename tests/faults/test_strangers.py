@@ -219,6 +219,16 @@ def test_another_user_is_not_heard_at_the_door(door: str) -> None:
     works()
 
 
+@pytest.mark.usefixtures("door")
+def test_named_shared_memory_is_this_users_alone() -> None:
+    memory = fiber.shared_memory.SharedMemory(create=True, size=1)
+    try:
+        assert os.stat(f"/dev/shm/{memory.name}").st_mode & 0o077 == 0
+    finally:
+        memory.close()
+        memory.unlink()
+
+
 @pytest.mark.parametrize("data", [data for data in GARBAGE if data], ids=range(len(GARBAGE) - 1))
 def test_garbage_at_the_door(door: str, data: bytes) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
