@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
-from concurrent.futures._base import CANCELLED, CANCELLED_AND_NOTIFIED, RUNNING
+from concurrent.futures._base import CANCELLED, CANCELLED_AND_NOTIFIED, FINISHED, RUNNING
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from typing import Any, TypeVar
@@ -65,21 +65,24 @@ class CallFuture(Future[_T]):
 
     def result(self, timeout: float | None = None) -> _T:
         """As in concurrent.futures; each call raises an exception of its own."""
-        self._check_may_wait(timeout)
-        error = super().exception(timeout)
+        error = self._error(timeout)
         if error is not None:
             raise fresh(error)
-        return super().result()
+        result: Any = self._result
+        return result  # type: ignore[no-any-return]
 
     def exception(self, timeout: float | None = None) -> BaseException | None:
         """As in concurrent.futures; each call returns an exception of its own."""
-        self._check_may_wait(timeout)
-        error = super().exception(timeout)
+        error = self._error(timeout)
         return error and fresh(error)
 
-    def _check_may_wait(self, timeout: float | None) -> None:
-        if (timeout is None or timeout > 0) and not self.done():
-            self._threads.check_may_wait()
+    def _error(self, timeout: float | None) -> BaseException | None:
+        """Wait, and return the stored exception."""
+        if self._state != FINISHED:
+            if (timeout is None or timeout > 0) and not self.done():
+                self._threads.check_may_wait()
+            return super().exception(timeout)
+        return self._exception
 
     def _decide(self) -> bool:
         try:
