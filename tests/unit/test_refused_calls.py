@@ -28,6 +28,8 @@ from unit import pool_tasks as tasks
 from unit.pool_programs import wait_until
 from unit.test_loopback import running
 
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
 CALLS = 10_000
 _WARM_UP = 100
 
@@ -156,7 +158,6 @@ def test_a_terminated_pool() -> None:
     check_that_nothing_stays(ValueError, lambda: pool.apply(tasks.square, (1,)))
 
 
-@pytest.mark.slow
 def test_a_broken_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     waits = [sys.executable, "-c", "import signal; signal.pause()"]
     monkeypatch.setattr(agent_process, "interpreter_arguments", lambda *_: waits)
