@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -212,6 +213,31 @@ def test_an_answer_that_cannot_be_pickled(vector_env: Make) -> None:
     ]
     works(env)
     assert np.isfinite(env.step([GOOD] * 4)[0]).all()
+
+
+def test_one_whose_answer_cannot_be_pickled_is_made_anew(vector_env: Make) -> None:
+    env = vector_env(on_error="restart")
+    with pytest.warns(RuntimeWarning, match="environment 3 made anew: step raised TypeError"):
+        _, rewards, _, truncations, infos = env.step([GOOD, GOOD, GOOD, Faulty.UNPICKLABLE])
+    assert rewards.tolist() == [1, 1, 1, 0]
+    assert truncations.tolist() == [False, False, False, True]
+    assert "cannot pickle" in infos["restarted"][3]
+    assert env.step([GOOD] * 4)[0].tolist() == [[2], [2], [2], [0]]
+    works(env)
+
+
+class NeverPicklable(Faulty):
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        observation, _ = super().reset(**options)
+        return observation, {"lock": threading.Lock()}
+
+
+def test_one_whose_answers_can_never_be_pickled_is_given_up(backend: str) -> None:
+    env = VectorEnv([Faulty, NeverPicklable], num_workers=1, on_error="restart")
+    with pytest.raises(TypeError, match="cannot pickle") as caught:
+        env.reset()
+    assert "an answer that cannot be pickled of environment 1" in caught.value.__notes__[0]
+    env.close()
 
 
 PROGRAM = """

@@ -32,6 +32,9 @@ WEIGHT = 0.1
 """Of the last step in how long one of an environment is expected to take."""
 
 
+_UNPICKLABLE = "an answer that cannot be pickled"
+
+
 class Setup(NamedTuple):
     """What a worker is to be."""
 
@@ -227,9 +230,9 @@ class Worker:
         try:
             self._tell(Results(generation, in_band(list(values.values())), failures))
         except Exception:  # whatever it raised that cannot be pickled
-            for failure in _refused(values.items()):
-                del values[failure.row]
-                failures.append(failure)
+            for row, refusal in _refused(values.items()):
+                del values[row]
+                failures.append(Failure.of(row, _UNPICKLABLE, refusal))
             self._tell(Results(generation, in_band(list(values.values())), failures))
 
     # What they have in common
@@ -249,12 +252,13 @@ class Worker:
         expected to keep it waiting, or at the end if they are wanted ``together``.
         """
         clock = time.perf_counter
+        send = partial(self._send, operation, doing)
         worker, at_work, limit = self._setup.worker, self._at_work, self._limit
         now = clock()
         for row in self._each(rows):
             began = now
             if report.rows and not together and began + self._expected[row] > report.due:
-                self._send(report, whole=False)
+                send(report, whole=False)
                 report = _Report(report.generation)
             at_work[worker] = row + 1
             try:
@@ -271,7 +275,7 @@ class Worker:
             if len(report.rows) == 1:
                 report.due = now + self._report_after
         at_work[worker] = 0
-        self._send(report, whole=rows is None and len(report.rows) == len(self._all))
+        send(report, whole=rows is None and len(report.rows) == len(self._all))
 
     def _retry(
         self,
@@ -280,8 +284,9 @@ class Worker:
         doing: str,
         error: Exception,
         report: _Report,
+        failed: str = "",
     ) -> None:
-        """Try again with a new environment, if that is wished; else tell."""
+        """Try again with a new environment, if that is wished; else tell what ``failed``."""
         losses = self._losses.get(row, 0) + 1
         if self._setup.restart and losses <= ATTEMPTS:
             self._losses[row] = losses
@@ -296,21 +301,36 @@ class Worker:
             else:
                 report.add(row, note)
                 return
-        report.failures.append(Failure.of(row, doing, error))
+        report.failures.append(Failure.of(row, failed or doing, error))
 
-    def _send(self, report: _Report, *, whole: bool) -> None:
-        try:
-            self._tell(report.answer(self._arrays, whole=whole, shared=self._shared))
-        except Exception:  # whatever it raised that cannot be pickled
-            self._blame(report)
-            self._tell(report.answer(self._arrays, whole=False, shared=self._shared))
+    def _send(
+        self,
+        operation: Callable[[int], Note | None],
+        doing: str,
+        report: _Report,
+        *,
+        whole: bool,
+    ) -> None:
+        while True:
+            try:
+                self._tell(report.answer(self._arrays, whole=whole, shared=self._shared))
+                return
+            except Exception:  # whatever it raised that cannot be pickled
+                whole = False
+                refused = self._refused(report)
+                if not refused:
+                    raise
+            for row, error in refused:
+                report.remove(row)
+                self._at_work[self._setup.worker] = row + 1
+                self._retry(row, operation, doing, error, report, _UNPICKLABLE)
+            self._at_work[self._setup.worker] = 0
 
-    def _blame(self, report: _Report) -> None:
-        """Some of it does not pickle: those environments have failed."""
+    def _refused(self, report: _Report) -> list[tuple[int, Exception]]:
+        """Return the environments whose answers cannot be pickled, and why."""
         notes = {note.row: note for note in report.notes}
         pack = partial(self._arrays.observations.pack, shared=self._shared)
-        for failure in _refused((row, (notes.get(row), pack([row]))) for row in report.rows):
-            report.fail(failure)
+        return _refused((row, (notes.get(row), pack([row]))) for row in report.rows)
 
 
 class _Report:
@@ -331,11 +351,10 @@ class _Report:
         if note is not None:
             self.notes.append(note)
 
-    def fail(self, failure: Failure) -> None:
-        """One of them cannot be told."""
-        self.rows.remove(failure.row)
-        self.notes = [note for note in self.notes if note.row != failure.row]
-        self.failures.append(failure)
+    def remove(self, row: int) -> None:
+        """Take out an environment whose answer cannot be sent."""
+        self.rows.remove(row)
+        self.notes = [note for note in self.notes if note.row != row]
 
     def answer(self, arrays: StepArrays, *, whole: bool, shared: bool) -> Answer:
         """What is told; ``whole``: all environments of the worker are in it."""
@@ -356,15 +375,15 @@ def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
     made.add(newest)
 
 
-def _refused(answers: Iterable[tuple[int, Any]]) -> list[Failure]:
-    """Those of the environments whose answers, given by row, cannot be pickled."""
-    failures = []
+def _refused(answers: Iterable[tuple[int, Any]]) -> list[tuple[int, Exception]]:
+    """Those of the environments whose answers, given by row, cannot be pickled, and why."""
+    refused = []
     for row, answer in answers:
         try:
             reduction.dumps(answer)
         except Exception as error:
-            failures.append(Failure.of(row, "an answer that cannot be pickled", error))
-    return failures
+            refused.append((row, error))
+    return refused
 
 
 def _limit(setup: Setup) -> contextlib.AbstractContextManager[None]:
