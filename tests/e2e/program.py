@@ -115,8 +115,7 @@ class Outside(Program):
         self._temporary = tempfile.TemporaryDirectory(prefix="program-")
         self._process = subprocess.Popen(
             [sys.executable, str(script), *arguments],
-            # Buffered, as what pods say may come between the two writes of an unbuffered print.
-            env={**environment, "TMPDIR": self._temporary.name},
+            env={**environment, "PYTHONUNBUFFERED": "1", "TMPDIR": self._temporary.name},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

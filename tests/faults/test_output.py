@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -143,6 +145,55 @@ def test_in_development_mode_nothing_of_ours_is_warned_of(
     )
     assert program.finish() == "3\n4\n"
     assert program.stderr == ""
+
+
+LINES = """
+    import fiber, sys
+    def talk(number):
+        for turn in range(300):
+            print("worker", number, "turn", turn, "." * 60, "end")
+            print("worker", number, "turn", turn, "." * 3000, "end", file=sys.stderr)
+    if __name__ == "__main__":
+        with fiber.Pool(3) as pool:
+            result = pool.map_async(talk, range(3), chunksize=1)
+            while not result.ready():
+                print("master", "." * 60, "end")
+                result.wait(0.0001)
+            result.get()
+"""
+LINE = re.compile(r"(\[[^]]+\] )?worker \d turn \d+ \.+ end|master \.+ end|\[fiber\] .*")
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"], ids=["buffered", "unbuffered"])
+def test_no_two_processes_share_a_line(
+    launch_on: Callable[..., Program], unbuffered: str, tmp_path: Path
+) -> None:
+    with (tmp_path / "output").open("w+") as output:
+        env = {"PYTHONUNBUFFERED": unbuffered}
+        assert launch_on(LINES, stdout=output, stderr=output, env=env).wait() == 0
+        output.seek(0)
+        lines = output.read().splitlines()
+    assert [line for line in lines if not LINE.fullmatch(line)] == []
+    said = [line.partition("worker ")[2] for line in lines if "worker " in line]
+    assert len(said) == 2 * 3 * 300
+
+
+PARTS = """
+    import fiber
+    def count():
+        for number in range(3):
+            print(number, end=" ", flush=number == 1)
+    if __name__ == "__main__":
+        child = fiber.Process(target=count)
+        child.start()
+        child.join()
+"""
+
+
+def test_a_line_without_an_end_arrives_when_its_process_ends(
+    launch: Callable[..., Program],
+) -> None:
+    assert launch(PARTS).finish() == "0 1 2 "
 
 
 WRITES_A_LOT = """

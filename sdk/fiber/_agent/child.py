@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
-import io
 import multiprocessing.spawn
 import os
 import pickle
@@ -14,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from multiprocessing import process as mp_process
 from multiprocessing import util
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from fiber import _logs
 from fiber._agent import last_words, program_folder
@@ -24,6 +23,9 @@ from fiber._hub import client as hub_client
 from fiber._hub.protocol import HubAddress
 from fiber._transport.unix import UnixChannel
 from fiber._wire.descriptor import Descriptor, contents, own
+
+_LONGEST_LINE = 1 << 16
+"""Bytes of one line that are collected before they are written."""
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
@@ -56,8 +58,6 @@ class StartRequest(NamedTuple):
     slot: int | None
     """Its place on the progress table; a worker's first descriptor is its task channel."""
     executable: str | None
-    captured: bool
-    """Whether its output goes to its agent, which wants it line by line."""
     open_files: tuple[int, int]
     """Its limits of descriptors, soft and hard: those of its agent's process."""
     hub: HubAddress | None
@@ -147,7 +147,7 @@ def _run(
     if words >= 0:
         last_words.write_to(words)
     ancestors = start.ancestors
-    _adopt_stdio(fds, captured=start.captured)
+    _adopt_stdio(fds)
     rest = fds[2:]
     if start.slot is not None:
         _task_channel = UnixChannel.from_fd(rest.pop(0))
@@ -257,15 +257,25 @@ def _prepare_environment(data: dict[str, Any]) -> None:
 _SPAWN_KEYS = ("name", "authkey", "log_to_stderr", "log_level", "orig_dir")
 
 
-def _adopt_stdio(fds: list[int], *, captured: bool) -> None:
+def _adopt_stdio(fds: list[int]) -> None:
     for target, fd in enumerate(fds[:2], start=1):
         os.dup2(fd, target)
         os.close(fd)
+    write_whole_lines()
+
+
+def write_whole_lines() -> None:
+    """Have each line that is printed on stdout and stderr leave this process in one write.
+
+    The processes of a program share its terminal, file or pipe, and the kernel keeps together the
+    bytes of one write.  A full buffer, and each part of an unbuffered print, would end in mid-line.
+    """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # closed, or replaced by something of the user's
-            cast("io.TextIOWrapper", stream).reconfigure(
-                line_buffering=captured or stream.isatty() or stream is sys.stderr
-            )
+            if stream.fileno() in (1, 2):
+                text: Any = stream
+                text.reconfigure(line_buffering=True, write_through=False)
+                text._CHUNK_SIZE = _LONGEST_LINE
 
 
 def _tell(problem: str) -> None:

@@ -110,7 +110,6 @@ class LocalChild:
             spec.payload,
             self.slot,
             spec.executable,
-            captured=spec.stdio is not None,
             open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
             hub=hub,
             ancestors=lineage(),

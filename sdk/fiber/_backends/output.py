@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import os
 import queue
+import select
 import sys
 import threading
 
@@ -89,10 +92,26 @@ class Output:
                 line, self._redraws = self._line, False
             # A full disk or a closed terminal must not cost more than the lines.
             with contextlib.suppress(OSError, ValueError):
-                sys.stderr.write(f"{_ERASE if shown else ''}{lines}{line}")
-                sys.stderr.flush()
+                _write(f"{_ERASE if shown else ''}{lines}{line}")
             shown = line
             with self._lock:
                 self._waiting -= len(lines)
                 if not self._waiting:
                     self._say_what_is_left_out()
+
+
+def _write(text: str) -> None:
+    stream = sys.stderr
+    if not isinstance(stream, io.TextIOWrapper) or stream is not sys.__stderr__:
+        stream.write(text)
+        stream.flush()
+        return
+    # Past its buffer, where another thread's print may have put half of a line.
+    descriptor = stream.fileno()
+    data = text.encode(stream.encoding, stream.errors or "strict")
+    while data:
+        # A pipe keeps together what is written by one call, up to this size.
+        end = data.rfind(b"\n", 0, select.PIPE_BUF) + 1
+        if not end:  # a longer line, or the last one
+            end = data.find(b"\n") + 1 or len(data)
+        data = data[os.write(descriptor, data[:end]) :]

@@ -41,6 +41,7 @@ class Runtime:
     def __init__(self) -> None:
         self.config = config.current()
         _logs.show(self.config.log_level)
+        child.write_whole_lines()
         self.loop = Loop()
         self.host = child.host or "local"
         self.hub: Hub | None = None
