@@ -210,7 +210,7 @@ class LedgerMaster:
                 self._hear(member.worker, said)
             except WrongAnswer as error:
                 self.world.note("%s is convicted: %s", member.child.name, error)
-                member.convicted = member.leaving = True
+                member.convicted = True  # it is replaced once it is gone
                 self.ledger.retire(member.worker)
                 member.child.signal(signal.SIGKILL)
         self._settle()

@@ -308,9 +308,11 @@ class StagedThread:
             self._put(partial(action, *args))
         return not self.stopped
 
-    def stop(self) -> None:
-        """Take nothing more."""
+    def stop(self, then: Callable[[], object] | None = None) -> None:
+        """Take nothing more, and call ``then`` at the end."""
         self.stopped = True
+        if then is not None:
+            self._put(then)
 
     def _put(self, action: Callable[[], object]) -> None:
         self._entries.append(action)
