@@ -44,6 +44,13 @@ class Model:
         return 2 * value
 
 
+def make_model(manager: Any) -> Any:
+    """Return a proxy that no other process has."""
+    there = ModelManager(manager)
+    there.connect()
+    return there.Model()  # type: ignore[attr-defined]
+
+
 class RaisesWhenPickled:
     def __init__(self, kind: type[BaseException]) -> None:
         self._kind = kind

@@ -15,9 +15,10 @@ import pytest
 import fiber
 from faults import targets
 from faults.program import wait_for
-from faults.raising import AsyncModelManager, ModelManager
+from faults.raising import AsyncModelManager, ModelManager, make_model
 from fiber.errors import ConnectionClosed
 from fiber.managers import RemoteError
+from fiber.pool import MaybeEncodingError
 from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -80,6 +81,15 @@ def test_calls_behind_it_are_made(kind: type[BaseException]) -> None:
         assert (before.get(PATIENCE), after.get(PATIENCE)) == (2, 4)
         with pytest.raises(kind, match="no display"):
             ended.get(PATIENCE)
+
+
+def test_a_proxy_that_a_task_alone_had_says_why_it_is_gone() -> None:
+    with ModelManager() as manager, fiber.Pool(1) as pool:
+        result = pool.apply_async(make_model, (manager.address,))
+        result.wait(PATIENCE)
+        wait_for(lambda: manager._number_of_objects() == 0)  # type: ignore[attr-defined]
+        with pytest.raises(MaybeEncodingError, match="gone: it went with its last proxy"):
+            result.get(PATIENCE)
 
 
 # The manager's process

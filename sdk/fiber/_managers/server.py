@@ -168,10 +168,7 @@ class Server(_mp.Server):  # type: ignore[misc]
         try:
             return self.id_to_obj[ident]
         except KeyError:
-            raise KeyError(
-                f"the manager has no object {ident!r} any more: it went with its last proxy. Keep "
-                "a proxy until whoever was sent one has received it"
-            ) from None
+            raise _gone(ident) from None
 
     def _made(self, client: Client, typeid: str, obj: Any) -> tuple[Any, Token, tuple[str, ...]]:
         ident, exposed = self.create(client, typeid, obj)
@@ -204,6 +201,8 @@ class Server(_mp.Server):  # type: ignore[misc]
     def incref(self, c: Any, ident: str) -> None:
         """The client has one more reference."""
         with self.mutex:
+            if ident not in self.id_to_refcount:
+                raise _gone(ident)
             self.id_to_refcount[ident] += 1
         with c.mutex:
             c.references[ident] += 1
@@ -236,6 +235,13 @@ class Server(_mp.Server):  # type: ignore[misc]
 
 def _start(target: Any, *args: Any) -> None:
     threading.Thread(target=target, args=args, daemon=True).start()
+
+
+def _gone(ident: str) -> KeyError:
+    return KeyError(
+        f"the manager's object {ident!r} is gone: it went with its last proxy. Keep a proxy until "
+        "the process that was sent one has received it"
+    )
 
 
 def _error(error: BaseException) -> _Answer:
