@@ -135,6 +135,24 @@ import later
     master.close()
 
 
+@pytest.mark.parametrize(
+    ("text", "modules"),
+    [
+        ("import quiet\nquiet.level = 1\nimport later", ("quiet",)),
+        ("def f(): import later\nimport quiet\nf()", ()),
+        ("import sys\nsys.path.append('x')\nimport later", ("sys", "later")),
+        ("'docs'\nfrom __future__ import annotations\nN = 1\nimport quiet, later",
+         ("__future__", "quiet", "later")),
+    ],
+)  # fmt: skip
+def test_imports_that_could_depend_on_the_main_module_are_not_made_without_it(
+    progress_table: ProgressTable, tmp_path: Path, text: str, modules: tuple[str, ...]
+) -> None:
+    main = f"{text}\nif True: pass\n{NATIVE_THREAD}"
+    kind, _, safe = Program(tmp_path, progress_table, main=main, quiet="", later="").ask()
+    assert (kind, safe.modules) == (zygote.FORK_UNSAFE, modules)
+
+
 def test_imports_that_start_threads_only_there_are_left_out_in_turn(
     progress_table: ProgressTable, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

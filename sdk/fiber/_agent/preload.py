@@ -46,7 +46,7 @@ class Unfit(NamedTuple):
     reason: str
     """For the user; empty where importing the main module fails, as each child will report."""
     safe: Imports
-    """Imports for the next zygote: those of the program up to the one that starts threads."""
+    """Imports for the next zygote: the first of the program, up to what starts threads."""
 
 
 def preload(data: dict[str, Any], only: Imports | None) -> Unfit | None:
@@ -65,6 +65,16 @@ def preload(data: dict[str, Any], only: Imports | None) -> Unfit | None:
     return preloader.verdict()
 
 
+class _Step(NamedTuple):
+    """An import that started no threads."""
+
+    modules: tuple[str, ...]
+    line: int
+    """Line of the main module; 0 for an import that is not its own."""
+    seconds: float
+    environ: dict[bytes, bytes]
+
+
 class _Preloader:
     """Imports modules, and looks after each of them for threads that a fork would break."""
 
@@ -75,11 +85,12 @@ class _Preloader:
             self._threads = _count_threads()
         self._culprit: str | None = None
         self._names = ""
+        self._steps: list[_Step] = []
+        self._file = ""
+        """File of the main module."""
         self._has_failed = False
-        self._safe: list[str] = []
-        self._environ = dict(os.environb)
         self._seconds = 0.0
-        """Duration of all imports but those in ``_safe``."""
+        self._environ = dict(os.environb)
 
     def load(self, name: str) -> None:
         """Import the module ``name``."""
@@ -87,10 +98,8 @@ class _Preloader:
         # Whatever an import raises, a child that needs the module meets, and reports, itself.
         with contextlib.suppress(BaseException):
             importlib.import_module(name)
-        is_fit = self._check(name)
+        self._note((name,), 0, time.perf_counter() - begin)
         self._seconds += time.perf_counter() - begin
-        if is_fit:
-            self._keep((name,), begin)
 
     def load_main(self, data: dict[str, Any]) -> None:
         """Import the main module, as the children will."""
@@ -108,14 +117,17 @@ class _Preloader:
         """None if this process may be forked."""
         if self._culprit is None:
             return None
+        end = _end_of_leading_imports(self._file)
+        safe = [step for step in self._steps if step.line <= end]
+        seconds = self._seconds - sum(step.seconds for step in safe)
         reason = (
             f"importing {self._culprit} starts threads ({self._names}), and a process that has "
             "threads cannot be forked safely. Each process makes that import for itself, which "
-            f"takes {self._seconds * 1000:.0f} ms. "
-            "Start the threads in a function to save that time."
+            f"takes {seconds * 1000:.0f} ms. Start the threads in a function to save that time."
         )
-        reason = "" if self._has_failed else reason
-        return Unfit(reason, Imports(tuple(self._safe), self._environ))
+        modules = tuple(module for step in safe for module in step.modules)
+        environ = safe[-1].environ if safe else self._environ
+        return Unfit("" if self._has_failed else reason, Imports(modules, environ))
 
     @contextlib.contextmanager
     def _checking_imports(self, main: str) -> Iterator[None]:
@@ -129,14 +141,18 @@ class _Preloader:
             fromlist: Sequence[str] | None = (),
             level: int = 0,
         ) -> ModuleType:
-            is_mains = globals is not None and globals.get("__name__") == _MAIN
-            is_fit = is_mains and self._check(main)
+            if globals is None or globals.get("__name__") != _MAIN:
+                return original(name, globals, locals, fromlist or (), level)
+            self._check(main)
             begin = time.perf_counter()
             module = original(name, globals, locals, fromlist or (), level)
+            seconds = time.perf_counter() - begin
+            frame = sys._getframe(1)
+            self._file = frame.f_code.co_filename
             whole = module.__name__ if level else name
-            if is_fit and self._check(whole):
-                parts = [f"{whole}.{part}" for part in fromlist or ()]
-                self._keep((whole, *(part for part in parts if part in sys.modules)), begin)
+            parts = [f"{whole}.{part}" for part in fromlist or ()]
+            modules = (whole, *(part for part in parts if part in sys.modules))
+            self._note(modules, frame.f_lineno, seconds)
             return module
 
         builtins.__import__ = checked
@@ -146,23 +162,54 @@ class _Preloader:
             if builtins.__import__ is checked:
                 builtins.__import__ = original
 
+    def _note(self, modules: tuple[str, ...], line: int, seconds: float) -> None:
+        """Note an import, as safe or as what starts threads."""
+        if self._check(modules[0]):
+            self._steps.append(_Step(modules, line, seconds, dict(os.environb)))
+
     def _check(self, culprit: str) -> bool:
         """Whether a fork is safe up to here; if it no longer is, ``culprit`` is the reason."""
         if self._culprit is None and not self._is_fit():
             self._culprit, self._names = culprit, _names_of_threads()
         return self._culprit is None
 
-    def _keep(self, modules: Sequence[str], begin: float) -> None:
-        """Let the next zygote import ``modules``, which were imported since ``begin``."""
-        self._safe += modules
-        self._environ = dict(os.environb)
-        self._seconds -= time.perf_counter() - begin
-
     def _is_fit(self) -> bool:
         """Whether no thread is there that a fork would break."""
         return _count_threads() <= self._threads or (
             _trial_fork_ends() and _comes_down_to(self._threads)
         )
+
+
+def _end_of_leading_imports(path: str) -> int:
+    """Return the last line of the file's first imports, before code that could change later ones.
+
+    An import may depend on all that the main module did before.  Here those are only imports, and
+    changes of variables that the next zygote is given.
+    """
+    import ast  # rarely needed, and long to import
+
+    try:
+        with open(path, "rb") as file:
+            statements = ast.parse(file.read()).body
+    except (OSError, SyntaxError, ValueError):
+        return 0
+    end = 0
+    for statement in statements:
+        match statement:
+            case ast.Import() | ast.ImportFrom() | ast.Expr(ast.Constant()):
+                pass
+            case ast.Assign([ast.Name()], ast.Constant()):
+                pass
+            case ast.Assign([ast.Subscript(ast.Attribute(ast.Name("os"), "environ"))]):
+                pass
+            case ast.Expr(ast.Call(ast.Attribute(ast.Attribute(ast.Name("os"), "environ")))):
+                pass
+            case ast.Expr(ast.Call(ast.Attribute(ast.Attribute(ast.Name("sys"), "path")))):
+                pass
+            case _:
+                break
+        end = statement.end_lineno or 0
+    return end
 
 
 def _count_threads() -> int:
