@@ -51,11 +51,10 @@ class Backlog:
         self._mutex = RobustMutex(block.address)
 
     @classmethod
-    def create(cls, room: int) -> Backlog:
-        """Make an empty one for a socket with this size of buffer."""
+    def create(cls) -> Backlog:
+        """Make an empty one."""
         new = cls(heap.allocate(_SIZE))
         new._mutex.create()
-        new.words[ROOM] = room
         return new
 
     def run(self, action: Callable[[], _Result]) -> _Result:

@@ -287,11 +287,11 @@ ENDS: dict[ObjectKind, type[Sender | Receiver]] = {
 
 def pair() -> tuple[Receiver, Sender]:
     """Return the two ends of a new channel."""
+    backlog = Backlog.create()  # first: an error in there must not keep the sockets open
     one, other = LocalChannel.pair()
-    room = other.sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+    backlog.words[ROOM] = other.sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
     limit = struct.pack("ll", int(_LOOK_AGAIN), 0)
     one.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
-    backlog = Backlog.create(room)
     return Receiver(one.owner, backlog), Sender(other.owner, backlog)
 
 
