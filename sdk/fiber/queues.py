@@ -2,7 +2,7 @@
 
 ::
 
-    put ── a slot ── pickle ─┬─ room in the channel ─────────► channel ──► get ── the slot is free
+    put ── pickle ── a slot ─┬─ room in the channel ─────────► channel ──► get ── the slot is free
                              └─ no room: feeder ────────────►
 
 There is no lock between processes: an item is one message, which the kernel gives to exactly one
@@ -19,6 +19,7 @@ from __future__ import annotations
 import threading
 import time
 import types
+from collections.abc import Callable
 from multiprocessing import util
 from queue import Empty, Full
 from typing import Any, Generic, TypeVar
@@ -81,18 +82,26 @@ class Queue(Generic[_T]):
         """
         if self._closed:
             raise ValueError(f"Queue {self!r} is closed")
+        if not block and self._slots.full():
+            raise Full
+        # Before it has a place: a process that dies while it pickles has taken none.
+        message = _encode(obj)
+        if isinstance(message, Exception):
+            self._on_queue_feeder_error(message, obj)
+            return
+        payload, buffers, revoke = message
+        placed = False
         taken: list[Any] = []
         try:
-            if not self._slots.take(timeout if block else 0, taken):
+            placed = self._slots.take(timeout if block else 0, taken)
+            if not placed:
                 raise Full
-            message = _encode(obj)
-            if isinstance(message, tuple):
-                self._send(*message, taken)
+            self._send(payload, buffers, taken)
         finally:
             if taken:  # it was not sent
                 self._slots.give_back()
-        if isinstance(message, Exception):
-            self._on_queue_feeder_error(message, obj)
+            if not placed:
+                revoke()
 
     def _send(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
         self._feeder.put(payload, buffers, taken)
@@ -169,10 +178,10 @@ class Queue(Generic[_T]):
         return types.GenericAlias(cls, item)
 
 
-def _encode(obj: Any) -> tuple[bytes, list[memoryview]] | Exception:
-    """An item, pickled, or why it does not pickle."""
+def _encode(obj: Any) -> tuple[bytes, list[memoryview], Callable[[], None]] | Exception:
+    """An item, pickled, and how to take that back; or why it does not pickle."""
     try:
-        return reduction.encode(obj)
+        return reduction.encode_revocable(obj)
     except Exception as error:
         return reduction.blame({"the item": obj}, error)
 

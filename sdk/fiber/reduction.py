@@ -293,6 +293,18 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
         pickling.done = True
 
 
+def encode_revocable(obj: Any) -> tuple[bytes, list[memoryview], Callable[[], None]]:
+    """As ``encode``, for what may not be sent: call the third value in this case."""
+    pickling = handles.begin_pickling()
+    try:
+        return *_encode(obj), pickling.take_back
+    except BaseException:
+        pickling.take_back()
+        raise
+    finally:
+        pickling.done = True
+
+
 def _encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     try:
         encoded = packet.dumps(obj)

@@ -294,3 +294,27 @@ def make_a_push_queue(connection: Any) -> None:
 def echo_large(connection: Any, requests: Any, replies: Any) -> None:
     connection.send_bytes(connection.recv_bytes())
     replies.put(requests.get())
+
+
+class NeverPickled:
+    """Says that it is being pickled, and does not come to an end."""
+
+    def __init__(self, there: Any) -> None:
+        self._there = there
+
+    def __reduce__(self) -> Any:
+        self._there.send("pickling")
+        return self._there.recv()
+
+
+def put_what_never_pickles(queue: Any, there: Any) -> None:
+    """Put an item that takes for ever to pickle."""
+    queue.put(NeverPickled(there))
+
+
+def put_bulky_items(queue: Any, count: int, there: Any) -> None:
+    """Put more than the channel holds, say so and stay."""
+    for _ in range(count):
+        queue.put(bytes(1 << 20))
+    there.send("put")
+    there.recv()

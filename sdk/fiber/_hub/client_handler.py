@@ -433,6 +433,14 @@ class ClientHandler:
         """Tell how many died waiting."""
         self._request(message).answer(Status.OK, self._wait_list().places.bury())
 
+    def hold(self, message: Message) -> None:
+        """Note how many things the stream's place has."""
+        self._wait_list().places.hold(self._own_place(), ONE.unpack(message.payload)[2])
+
+    def reclaim(self, message: Message) -> None:
+        """Tell how many things the dead had."""
+        self._request(message).answer(Status.OK, self._wait_list().places.reclaim())
+
     def get(self, message: Message) -> None:
         """Tell a word."""
         value = self._wait_list().places.get(ONE.unpack(message.payload)[2] & 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import weakref
@@ -12,34 +13,64 @@ from queue import SimpleQueue
 from typing import Any
 
 from fiber._exceptions import report_uncaught
+from fiber._hub.claims import Claims
 from fiber._hub.local import LocalCounter
 from fiber._transport.base import SharedChannel, SharedCounter
 from fiber._wire import packet
+
+_LOOK_FOR_THE_DEAD = 1.0
+"""Seconds that ``put`` waits at a time."""
+
+_COUNT_AGAIN = 0.2
+"""Seconds between two looks whether there are too many places."""
 
 _MOVE = 1e-4
 """Seconds to wait while an item moves: its thread may have to wait for a processor."""
 
 
 class Slots:
-    """The places of a queue with a maximum size: a count of those that are free."""
+    """The places of a queue with a maximum size: a count of those that are free.
+
+    The places of a process that dies before it has sent its items become free again.  If it dies
+    while one is under way, that place may become free as well, and there is one too many until the
+    queue is empty.
+    """
 
     def __init__(self, maximum: int) -> None:
         self._maximum = maximum
+        self._claims = Claims()
         self._free: SharedCounter = LocalCounter.create(maximum)
+        self._next_count = math.inf
 
     def take(self, timeout: float | None, taken: list[Any]) -> bool:
         """Take a place for an item, and note it in ``taken``; False if none gets free in time."""
-        return self._free.take(timeout, taken)
+        now = time.monotonic()
+        if now > self._next_count:
+            self._next_count = now + _COUNT_AGAIN
+            self._remove_excess()
+        deadline = math.inf if timeout is None else now + timeout
+        while True:
+            left = deadline - time.monotonic()
+            if self._free.take(min(left, _LOOK_FOR_THE_DEAD), taken):
+                self._claims.add()
+                return True
+            if not self._recover() and left <= _LOOK_FOR_THE_DEAD:
+                return False
 
     def give_back(self) -> None:
         """The item is not sent after all."""
         self._free.add(1)
+        self._claims.drop()
 
     def sending(self) -> None:
         """The item leaves this process."""
 
     def not_sent(self) -> None:
         """It did not, but will."""
+
+    def sent(self) -> None:
+        """It did: its place is free once it is received."""
+        self._claims.drop()
 
     def free(self) -> None:
         """An item was received."""
@@ -51,7 +82,19 @@ class Slots:
 
     def full(self) -> bool:
         """Whether there is no place."""
-        return not self._free.wait(0)
+        return not self._free.wait(0) and not self._recover()
+
+    def _recover(self) -> bool:
+        """Make the places of dead processes free; whether there were any."""
+        lost = self._claims.recover()
+        if lost:
+            self._free.add(lost)
+            self._next_count = 0.0
+        return bool(lost)
+
+    def _remove_excess(self) -> None:
+        for _ in range(self._free.value() - self._maximum):
+            self._free.take(0)
 
 
 class ItemCount:
@@ -79,6 +122,9 @@ class ItemCount:
     def not_sent(self) -> None:
         """It did not, but will."""
         self._sent.take(0)
+
+    def sent(self) -> None:
+        """It did."""
 
     def free(self) -> None:
         """An item was received."""
@@ -160,6 +206,7 @@ class Feeder:
         self._slots.sending()
         try:
             if self._outbox.try_send(payload, buffers):
+                self._slots.sent()
                 return True
         except OSError:
             self._slots.not_sent()
@@ -227,6 +274,7 @@ class Feeder:
     def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
         try:
             self._outbox.post(payload, buffers)
+            self._slots.sent()
         except (BrokenPipeError, EOFError):
             self._unsent.clear()  # nobody can ever read them
         except OSError as error:

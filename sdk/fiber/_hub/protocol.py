@@ -114,6 +114,8 @@ class Op(IntEnum):
     BURY = 55  # -> how many
     GET = 56  # which -> the word
     SET = 57  # which, the word
+    HOLD = 58  # how many things the stream's place has; silent
+    RECLAIM = 59  # -> how many things the dead had
 
 
 class Status(IntEnum):

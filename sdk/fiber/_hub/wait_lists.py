@@ -69,6 +69,14 @@ class RemoteWaitList(RemoteObject):
         """How many died while they waited, since this was asked last."""
         return self._ask(Op.BURY, 0)
 
+    def hold(self, place: HubStream, number: int) -> None:
+        """Note how many things the owner of a place has.  Waits for nothing."""
+        place.say(Op.HOLD, number, form=ONE)
+
+    def reclaim(self) -> int:
+        """Free the places of dead processes, and return how many things they had."""
+        return self._ask(Op.RECLAIM, 0)
+
     def get(self, number: int) -> int:
         """One of the user's two words."""
         value = self._ask(Op.GET, number)

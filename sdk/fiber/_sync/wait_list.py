@@ -30,6 +30,7 @@ _PLACES = range(8, SIZE // 8, 8)
 _STATE = 0
 _WHO = 1  # the process, or 0: it is free
 _CAME = 2
+_HELD = 3  # what ``hold`` was told
 _BELL = 4
 _WAITS, _WAITS_AFAR, _LOST, _NOTIFIED = range(4)
 
@@ -52,6 +53,7 @@ class WaitList:
         make_semaphore(self._bell(place), 0)
         words[place] = _WAITS_AFAR if afar else _WAITS
         words[_TICKET] = words[place + _CAME] = words[_TICKET] + 1
+        words[place + _HELD] = 0
         words[place + _WHO] = identity.me()  # last: from here on it is taken
         return place
 
@@ -106,6 +108,19 @@ class WaitList:
         for place in dead:
             self._words[place + _WHO] = 0
         return len(dead)
+
+    def hold(self, place: int, number: int) -> None:
+        """Note how many things the owner of a place has.  Without the lock."""
+        self._words[place + _HELD] = number
+
+    def reclaim(self) -> int:
+        """Free the places of dead processes, and return how many things they had."""
+        dead = [place for place in self._used() if self._is_dead(place)]
+        held = 0
+        for place in dead:
+            held += self._words[place + _HELD]
+            self._words[place + _WHO] = 0
+        return held
 
     def get(self, number: int) -> int:
         """One of the user's two words."""
