@@ -1,10 +1,11 @@
 """`fiber.adopt`: run a library that was written for multiprocessing, and cannot be edited.
 
 A function finds its globals in the namespace of its module at each call, so rebinding the
-names there is enough, and touches nobody else. What Python evaluated when the module was
-imported (base classes, default values, class attributes, objects that were made then) is out
-of reach. It is looked for and refused, where it belongs to a class or function of the module
-or to the module itself; inside of containers and closures it is not found.
+names there is enough, and touches nobody else. The same is done with default values of the
+module's functions and with attributes of its classes. What else Python evaluated when the module
+was imported (base classes, objects that were made then) is out of reach. It is looked for and
+refused, where it belongs to a class or function of the module or to the module itself; inside of
+containers and closures it is not found.
 """
 
 from __future__ import annotations
@@ -15,12 +16,11 @@ import multiprocessing
 import sys
 import threading
 import weakref
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from multiprocessing.context import BaseContext, DefaultContext
 from multiprocessing.process import BaseProcess
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType, TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from fiber.errors import AdoptionError
 
@@ -32,9 +32,10 @@ def adopt(module: str | ModuleType) -> Adoption:
 
     `module` is a module or its name, which is imported if need be. Every name in it that is
     bound to the multiprocessing package, one of its submodules, or a class, function or
-    context from there is bound to what Fiber has in its place. All or nothing: if a name has
-    no equivalent, AdoptionError says which and the module is left as it was. Adopting a
-    module again changes nothing more.
+    context from there is bound to what Fiber has in its place. So are default values of its
+    functions and attributes of its classes. All or nothing: if one has no equivalent,
+    AdoptionError says which and the module is left as it was. Adopting a module again changes
+    nothing more.
 
     The effect lasts as long as the program, or, used as a context manager, until the block
     ends. It is this process's: a child that imports the module anew has the original.
@@ -53,10 +54,12 @@ class Adoption:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names in the module that are bound to Fiber's objects now."""
+        """The names in the module that are bound to Fiber's objects now, and of default values
+        and class attributes where they are: `start.context`, `Worker.make_queue`.
+        """
         with _lock:
             state = _states.get(self.module)
-            return tuple(sorted(state.bindings)) if state else ()
+            return tuple(sorted({place.name for place in state.bindings})) if state else ()
 
     def __enter__(self) -> ModuleType:
         self._hold()
@@ -80,12 +83,11 @@ class Adoption:
             state = _states.get(self.module) or _State()
             # Again even if adopted already: a reload of the module undoes it.
             bindings = _plan(self.module, self._fiber, adopted=bool(state.holders))
+            _rebind(self.module, bindings)
             state.bindings.update(bindings)
             state.holders += 1
             _states[self.module] = state
             self._held = True
-            for name, binding in bindings.items():
-                setattr(self.module, name, binding.new)
 
     def _release(self) -> None:
         with _lock:
@@ -97,10 +99,83 @@ class Adoption:
             if state.holders:
                 return
             del _states[self.module]
-            for name, binding in state.bindings.items():
+            for place, binding in state.bindings.items():
                 # What somebody else has bound since is theirs.
-                if vars(self.module).get(name) is binding.new:
-                    setattr(self.module, name, binding.old)
+                if place.read(self.module) is binding.new:
+                    place.write(self.module, binding.old)
+
+
+class _Place(Protocol):
+    """Something of a module that refers to an object; it does not refer to the module."""
+
+    @property
+    def name(self) -> str:
+        """How its user calls it."""
+
+    def read(self, module: ModuleType) -> object:
+        """Return what it refers to now."""
+
+    def write(self, module: ModuleType, value: object) -> None:
+        """Have it refer to ``value``."""
+
+
+@dataclass(frozen=True)
+class _Name:
+    """A name in the namespace of the module."""
+
+    name: str
+
+    def read(self, module: ModuleType) -> object:
+        return vars(module).get(self.name)
+
+    def write(self, module: ModuleType, value: object) -> None:
+        setattr(module, self.name, value)
+
+
+@dataclass(frozen=True)
+class _ClassAttribute:
+    name: str
+    owner: type
+    attribute: str
+
+    def read(self, module: ModuleType) -> object:
+        return vars(self.owner).get(self.attribute)
+
+    def write(self, module: ModuleType, value: object) -> None:
+        setattr(self.owner, self.attribute, value)
+
+
+@dataclass(frozen=True)
+class _Default:
+    """The default value of a parameter."""
+
+    name: str
+    function: FunctionType
+    index: int
+
+    def read(self, module: ModuleType) -> object:
+        return dict(enumerate(self.function.__defaults__ or ())).get(self.index)
+
+    def write(self, module: ModuleType, value: object) -> None:
+        defaults = list(self.function.__defaults__ or ())
+        defaults[self.index] = value
+        self.function.__defaults__ = tuple(defaults)
+
+
+@dataclass(frozen=True)
+class _KeywordDefault:
+    """The default value of a keyword-only parameter."""
+
+    name: str
+    function: FunctionType
+    parameter: str
+
+    def read(self, module: ModuleType) -> object:
+        return (self.function.__kwdefaults__ or {}).get(self.parameter)
+
+    def write(self, module: ModuleType, value: object) -> None:
+        defaults = self.function.__kwdefaults__ or {}
+        self.function.__kwdefaults__ = {**defaults, self.parameter: value}
 
 
 class _Binding(NamedTuple):
@@ -112,7 +187,7 @@ class _Binding(NamedTuple):
 class _State:
     """What is in effect in one module, and how many Adoptions want it to be."""
 
-    bindings: dict[str, _Binding] = field(default_factory=dict)
+    bindings: dict[_Place, _Binding] = field(default_factory=dict)
     holders: int = 0
 
 
@@ -142,28 +217,107 @@ def _resolve(module: str | ModuleType) -> ModuleType:
 # ---- deciding -------------------------------------------------------------------------------
 
 
-def _plan(module: ModuleType, fiber: Any, *, adopted: bool) -> dict[str, _Binding]:
+def _plan(module: ModuleType, fiber: Any, *, adopted: bool) -> dict[_Place, _Binding]:
     """What to rebind in the module, or AdoptionError with everything that is in the way."""
-    bindings: dict[str, _Binding] = {}
-    problems: list[str] = []
-    uses_any = adopted
-    for name, value in list(vars(module).items()):
-        if taken := _taken(value):
-            uses_any = True
-            try:
-                new = _equivalent(value, taken, fiber)
-            except LookupError:
-                problems.append(f"{name!r} is {taken}, for which Fiber has no equivalent")
-            else:
-                if new is not value:
-                    bindings[name] = _Binding(value, new)
-        else:
-            problems += _fixed_at_import(module, name, value, fiber)
-    if problems:
-        raise AdoptionError(_refusal(module, problems))
-    if not uses_any:
+    survey = _Survey(module, fiber)
+    if survey.problems:
+        raise AdoptionError(_refusal(module, survey.problems))
+    if not (survey.uses_any or adopted):
         raise AdoptionError(_nothing_taken(module))
-    return bindings
+    return survey.bindings
+
+
+class _Survey:
+    """What in one module is multiprocessing's: what to rebind, and what is in the way."""
+
+    def __init__(self, module: ModuleType, fiber: Any) -> None:
+        self.bindings: dict[_Place, _Binding] = {}
+        self.problems: list[str] = []
+        self.uses_any = False
+        self._fiber = fiber
+        self._module = module
+        for name, value in list(vars(module).items()):
+            if not self._take(_Name(name), value, repr(name)):
+                self._look_into(name, value)
+
+    def _take(
+        self, place: _Place, value: object, what: str, around: type[Any] | None = None
+    ) -> bool:
+        """Plan to rebind a place whose ``value``, inside of ``around``, was taken from
+        multiprocessing; False if it was not.
+        """
+        if not (taken := _taken(value)):
+            return False
+        self.uses_any = True
+        try:
+            new = _equivalent(value, taken, self._fiber)
+        except LookupError:
+            self.problems.append(f"{what} is {taken}, for which Fiber has no equivalent")
+        else:
+            if new is not value:
+                wrapped = new if around is None else around(new)
+                self.bindings[place] = _Binding(place.read(self._module), wrapped)
+        return True
+
+    def _look_into(self, name: str, value: object) -> None:
+        """Look for what was decided when the module was imported."""
+        if isinstance(value, FunctionType):
+            if value.__module__ == self._module.__name__:
+                self._look_into_function(name, value)
+        elif isinstance(value, type):
+            if value.__module__ == self._module.__name__:
+                self._look_into_class(name, value)
+        elif left := _leftover(value, self._fiber):
+            self.problems.append(f"{name!r} holds {left}, made when the module was imported")
+
+    def _look_into_class(self, name: str, cls: type) -> None:
+        for base in cls.__bases__:
+            if left := _leftover(base, self._fiber):
+                self.problems.append(f"class {name!r} has the base {left}")
+        for attribute, value in list(vars(cls).items()):
+            around = type(value) if isinstance(value, staticmethod | classmethod) else None
+            inner = value if around is None else value.__func__
+            full = f"{name}.{attribute}"
+            what = f"class attribute {full!r}"
+            if self._take(_ClassAttribute(full, cls, attribute), inner, what, around):
+                continue
+            if left := _leftover(inner, self._fiber):
+                self.problems.append(f"{what} is {left}")
+            elif isinstance(inner, FunctionType):
+                self._look_into_function(full, inner)
+
+    def _look_into_function(self, name: str, function: FunctionType) -> None:
+        names = function.__code__.co_varnames[: function.__code__.co_argcount]
+        defaults = function.__defaults__ or ()
+        for index, (parameter, value) in enumerate(
+            zip(names[-len(defaults) :], defaults, strict=False)
+        ):
+            self._take_default(name, _Default(f"{name}.{parameter}", function, index), value)
+        for parameter, value in (function.__kwdefaults__ or {}).items():
+            place = _KeywordDefault(f"{name}.{parameter}", function, parameter)
+            self._take_default(name, place, value)
+        wrapped = getattr(function, "__wrapped__", None)  # a decorator's, as singledispatch's
+        if isinstance(wrapped, FunctionType) and wrapped.__module__ == self._module.__name__:
+            self._look_into_function(name, wrapped)
+
+    def _take_default(self, name: str, place: _Place, value: object) -> None:
+        what = f"the default value of {place.name!r}"
+        if not self._take(place, value, what) and (left := _leftover(value, self._fiber)):
+            self.problems.append(f"function {name!r} has the default value {left}")
+
+
+def _rebind(module: ModuleType, bindings: dict[_Place, _Binding]) -> None:
+    """Rebind all places or, where one cannot be written to, none."""
+    done: list[_Place] = []
+    try:
+        for place, binding in bindings.items():
+            place.write(module, binding.new)
+            done.append(place)
+    except Exception as error:  # of a metaclass
+        for before in done:
+            before.write(module, bindings[before].old)
+        problem = f"{place.name!r} cannot be rebound: {type(error).__name__}: {error}"
+        raise AdoptionError(_refusal(module, [problem])) from error
 
 
 def _taken(value: object) -> str | None:
@@ -235,36 +389,6 @@ def _leftover(value: object, fiber: Any) -> str | None:
     return None if _is_shared(kind, taken, fiber) else f"an object of {taken}"
 
 
-def _fixed_at_import(module: ModuleType, name: str, value: object, fiber: Any) -> Iterator[str]:
-    """What was decided when the module was imported, inside of a value that was not taken."""
-    if isinstance(value, FunctionType):
-        if value.__module__ == module.__name__:
-            yield from _fixed_in_function(name, value, fiber)
-    elif isinstance(value, type):
-        if value.__module__ == module.__name__:
-            yield from _fixed_in_class(name, value, fiber)
-    elif left := _leftover(value, fiber):
-        yield f"{name!r} holds {left}, made when the module was imported"
-
-
-def _fixed_in_class(name: str, cls: type, fiber: Any) -> Iterator[str]:
-    for base in cls.__bases__:
-        if left := _leftover(base, fiber):
-            yield f"class {name!r} has the base {left}"
-    for attribute, value in vars(cls).items():
-        inner = value.__func__ if isinstance(value, staticmethod | classmethod) else value
-        if left := _leftover(inner, fiber):
-            yield f"class attribute {name + '.' + attribute!r} is {left}"
-        elif isinstance(inner, FunctionType):
-            yield from _fixed_in_function(f"{name}.{attribute}", inner, fiber)
-
-
-def _fixed_in_function(name: str, function: FunctionType, fiber: Any) -> Iterator[str]:
-    for default in (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()):
-        if left := _leftover(default, fiber):
-            yield f"function {name!r} has the default value {left}"
-
-
 # ---- explaining -----------------------------------------------------------------------------
 
 
@@ -272,7 +396,8 @@ def _refusal(module: ModuleType, problems: list[str]) -> str:
     lines = "".join(f"\n  - {problem}" for problem in problems)
     return (
         f"cannot adopt {module.__name__!r}, which was left as it is:{lines}\n"
-        "fiber.adopt() can only rebind names of the module to what Fiber has. What to do: put "
+        "fiber.adopt() can only rebind names, default values and class attributes to what Fiber "
+        "has. What to do: put "
         "something of your own in these places before it, which will be left alone, or let "
         "the module stay on multiprocessing."
     )

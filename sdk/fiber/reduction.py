@@ -137,6 +137,11 @@ def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
             raise _blame_process(process, error) from error
         finally:
             fds.clear()
+    except RuntimeError as error:
+        fds.clear()
+        if _is_of_multiprocessing(error):
+            raise _blame_process(process, error) from error
+        raise
     except BaseException:
         fds.clear()  # now: the traceback, which holds them, may be kept for long
         raise
@@ -204,11 +209,25 @@ def _refusal(obj: Any) -> str | None:
     try:
         dumps(obj)
     except Exception as error:
-        return str(error)  # the error itself would keep what our callers hold, in a cycle
+        # The error itself would keep what our callers hold, in a cycle.
+        return _SHARED_BY_MULTIPROCESSING if _is_of_multiprocessing(error) else str(error)
     finally:
         pickling.take_back()
         pickling.done = True
     return None
+
+
+_SHARED_BY_MULTIPROCESSING = (
+    "it is a lock of multiprocessing, or holds one, and Fiber's processes cannot share that. Make "
+    "it with Fiber (fiber.Lock, fiber.Queue, fiber.Array), or name the module that makes it to "
+    "fiber.adopt()"
+)
+
+
+def _is_of_multiprocessing(error: Exception) -> bool:
+    """Whether it is multiprocessing's complaint about start methods, which are not the reason."""
+    text = str(error)
+    return isinstance(error, RuntimeError) and ("SemLock" in text or "through inheritance" in text)
 
 
 def _way_to_culprit(obj: Any) -> str:

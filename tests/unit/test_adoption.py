@@ -189,6 +189,72 @@ class TestWhatIsRebound:
         assert dict(vars(multiprocessing)) == before
 
 
+class TestWhatWasEvaluatedAtImport:
+    """Default values and class attributes are rebound, too, and restored."""
+
+    @pytest.mark.parametrize(
+        ("source", "name", "path"),
+        [
+            ("def f(a, mp=multiprocessing, b=1): return mp", "f.mp", "f(0)"),
+            ("def f(*, mp=multiprocessing): return mp", "f.mp", "f()"),
+            ("class C:\n    def m(self, mp=multiprocessing): return mp", "C.m.mp", "C().m()"),
+            (
+                "class C:\n    @classmethod\n    def m(cls, mp=multiprocessing): return mp",
+                "C.m.mp",
+                "C.m()",
+            ),
+            ("class C:\n    mp = multiprocessing", "C.mp", "C.mp"),
+            (
+                "@functools.singledispatch\ndef f(a, mp=multiprocessing): return mp",
+                "f.mp",
+                "f(0)",
+            ),
+        ],
+    )
+    def test_is_rebound_and_restored(
+        self, library: Library, fiber: Any, source: str, name: str, path: str
+    ) -> None:
+        module = library(f"import functools, multiprocessing\n{source}")
+        with Adoption(module, fiber) as adopted:
+            assert eval(path, vars(adopted)) is fiber
+            assert Adoption(module, fiber).names == (name, "multiprocessing")
+        # The second one lasts.
+        assert eval(path, vars(module)) is fiber
+
+    def test_a_static_method_stays_one(self, library: Library, fiber: Any) -> None:
+        source = "import multiprocessing\nclass C:\n    make = staticmethod(multiprocessing.Queue)"
+        module = library(source)
+        before = vars(module.C)["make"]
+        with Adoption(module, fiber):
+            assert module.C().make is fiber.Queue
+        assert vars(module.C)["make"] is before
+
+    def test_a_class_that_refuses_leaves_the_module_as_it_was(
+        self, library: Library, fiber: Any
+    ) -> None:
+        module = library(
+            "import multiprocessing\n"
+            "class Meta(type):\n"
+            "    def __setattr__(cls, name, value): raise TypeError('it is frozen')\n"
+            "class C(metaclass=Meta): mp = multiprocessing\n"
+        )
+        with pytest.raises(AdoptionError, match=r"'C.mp' cannot be rebound: TypeError: it is fro"):
+            Adoption(module, fiber)
+        assert module.multiprocessing is module.C.mp is multiprocessing
+
+    def test_what_somebody_rebound_meanwhile_is_theirs(self, library: Library, fiber: Any) -> None:
+        module = library(
+            "import multiprocessing as mp\ndef f(a=mp, *, b=mp): return a, b\nclass C: mp = mp"
+        )
+        with Adoption(module, fiber):
+            assert module.f() == (fiber, fiber)
+            module.f.__defaults__ = ()
+            module.f.__kwdefaults__ = None
+            module.C.mp = "theirs"
+        assert (module.f.__defaults__, module.f.__kwdefaults__, module.C.mp) == ((), None, "theirs")
+        assert module.mp is multiprocessing
+
+
 class TestRefusals:
     def test_names_without_equivalent_are_all_named_and_nothing_changes(
         self, library: Library, fiber: Any
@@ -223,32 +289,20 @@ class TestRefusals:
                 "class 'Worker' has the base multiprocessing.context.Process",
             ),
             (
-                "class Holder:\n    queue = multiprocessing.Queue",
-                "class attribute 'Holder.queue' is multiprocessing.Queue",
-            ),
-            (
-                "class Holder:\n    make = staticmethod(multiprocessing.Queue)",
-                "class attribute 'Holder.make' is multiprocessing.Queue",
+                "class Holder:\n    array = multiprocessing.Array",
+                "'Holder.array' is multiprocessing.Array, for which Fiber has no equivalent",
             ),
             (
                 "class Holder:\n    lock = multiprocessing.Lock()",
                 "'Holder.lock' is an object of multiprocessing.synchronize.Lock",
             ),
             (
-                "def f(make=multiprocessing.Queue): pass",
-                "function 'f' has the default value multiprocessing.Queue",
+                "def f(number, make=multiprocessing.Array): pass",
+                "'f.make' is multiprocessing.Array, for which Fiber has no equivalent",
             ),
             (
-                "def f(*, mp=multiprocessing): pass",
-                "function 'f' has the default value multiprocessing",
-            ),
-            (
-                "class C:\n    def m(self, mp=multiprocessing): pass",
-                "function 'C.m' has the default value multiprocessing",
-            ),
-            (
-                "class C:\n    @classmethod\n    def m(cls, mp=multiprocessing): pass",
-                "function 'C.m' has the default value multiprocessing",
+                "def f(lock=multiprocessing.Lock()): pass",
+                "function 'f' has the default value an object of multiprocessing",
             ),
             (
                 "lock = multiprocessing.Lock()",

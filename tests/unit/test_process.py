@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import multiprocessing.process
 import os
 import signal
@@ -121,6 +122,17 @@ def test_what_does_not_pickle_is_refused_at_the_start_and_leaks_nothing(
 def test_what_does_not_pickle_is_named(options: dict[str, Any], culprit: str) -> None:
     with pytest.raises(UnpicklableError, match=f"{culprit} of process 'odd' cannot be pickled"):
         fiber.Process(name="odd", **options).start()
+
+
+@pytest.mark.parametrize(
+    ("make", "way"), [("Lock", "._semlock"), ("Queue", "._rlock._semlock")], ids=["lock", "queue"]
+)
+def test_what_multiprocessing_made_is_refused_with_what_to_do(make: str, way: str) -> None:
+    """Its own error is about start methods, which are not the reason."""
+    theirs = getattr(multiprocessing.get_context("fork"), make)()
+    with pytest.raises(UnpicklableError, match=r"fiber\.adopt\(\)") as caught:
+        fiber.Process(name="odd", target=print, args=(theirs,)).start()
+    assert f"argument 0 of process 'odd' cannot be pickled (at {way})" in str(caught.value)
 
 
 def test_an_error_of_the_objects_own_pickling_is_left_as_it_is() -> None:
