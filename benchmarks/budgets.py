@@ -12,6 +12,7 @@ from benchmarks import (
     endings,
     executors,
     kubernetes_start,
+    large_messages,
     latency,
     overhead,
     parallel_loops,
@@ -289,6 +290,25 @@ def _endings() -> Iterator[Budget]:
             yield Budget(what, "endings", case, time, bound, contender=contender, unit="s")
 
 
+def _large(contender: str, where: str) -> Iterator[Budget]:
+    """A large message keeps up with a fast network, and a small task hardly waits for it."""
+    for case in large_messages.CASES:
+        for metric, bound, at_least in (
+            (large_messages.RATE, 300e6, True),
+            (large_messages.BESIDE, 0.02, False),
+        ):
+            yield Budget(
+                f"{where}{case}, {metric.label}",
+                "large_messages",
+                case,
+                metric.name,
+                bound,
+                at_least=at_least,
+                contender=contender,
+                unit=metric.unit,
+            )
+
+
 def _many() -> Iterator[Budget]:
     case = agents.agents(1024)
     what = "1,024 remote agents"
@@ -339,5 +359,6 @@ BUDGETS = (
     *_remote(),
     *_many(),
     *_endings(),
+    *_large("fiber-loopback", "loopback: "),
 )
-ON_PODS = tuple(_on_pods())
+ON_PODS = (*_on_pods(), *_large("fiber-kubernetes", ""))

@@ -15,6 +15,7 @@ from benchmarks import (
     coldstart,
     endings,
     executors,
+    large_messages,
     latency,
     overhead,
     parallel_loops,
@@ -210,6 +211,21 @@ def _endings(run: Run, path: Path) -> None:
     _finish(figure, path)
 
 
+def _large_messages(run: Run, path: Path) -> None:
+    figure, grid = plt.subplots(2, 4, figsize=(16, 8), sharey="row")
+    sizes = large_messages.SIZES
+    for row, metric in zip(grid, (large_messages.RATE, large_messages.BESIDE), strict=True):
+        for panel, way in zip(row, large_messages.WAYS, strict=True):
+            points = [
+                (float(n), large_messages.case_name(label, way)) for label, n in sizes.items()
+            ]
+            _lines(panel, run, points, metric)
+            panel.set(title=f"{way}: {metric.label}", xlabel="message")
+            panel.set_xticks(list(sizes.values()), list(sizes))
+            panel.xaxis.set_minor_formatter(NullFormatter())
+    _finish(figure, path)
+
+
 def _agents(run: Run, path: Path) -> None:
     figure, panels = plt.subplots(1, 3, figsize=(14, 5))
     points = [(float(count), agents.agents(count)) for count in agents.AGENTS]
@@ -231,6 +247,7 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "executors": _executors,
     "parallel_loops": _parallel_loops,
     "pipes": _pipes,
+    "large_messages": _large_messages,
     "vector": _vector,
     "sharing": _sharing,
     "startup": _startup,

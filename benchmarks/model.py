@@ -18,7 +18,7 @@ MANY_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of a case. `unit` is "s", "1/s" or "B"."""
+    """One number of a case. `unit` is "s", "1/s", "B" or "B/s"."""
 
     name: str
     label: str

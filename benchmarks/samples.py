@@ -58,6 +58,8 @@ def in_words(value: float, unit: str) -> str:
         return _scaled(value, _TIMES)
     if unit == "B":
         return _scaled(value, _SIZES)
+    if unit == "B/s":
+        return f"{_scaled(value, _SIZES)}/s"
     return f"{_digits(value)} /s"
 
 

@@ -19,6 +19,7 @@ from benchmarks import (  # noqa: E402
     budgets,
     coldstart,
     contenders,
+    large_messages,
     latency,
     link_floor,
     machine,
@@ -272,3 +273,21 @@ def test_what_knows_the_engine_from_inside_works_with_it_as_it_is(
     # A few links, as here, may fit into memory that the processes had already.
     assert all(value > 0 for name, value in sample.items() if "memory" not in name), sample
     assert not left
+
+
+# Large messages
+
+
+def test_a_message_that_memory_has_no_room_for_is_not_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    memory = {"SC_PHYS_PAGES": 2 << 20, "SC_PAGE_SIZE": 4096}
+    monkeypatch.setattr(large_messages.os, "sysconf", memory.__getitem__)
+    cases = {case.name: case for case in large_messages.cases(1.0)}
+    assert list(cases) == large_messages.CASES
+    assert not cases["2 GB, Pipe"].not_run
+    assert cases["4 GB, Pipe"].not_run["fiber-loopback"] == "it takes 16 GB of memory"
+
+
+def test_a_rate_of_bytes_in_words() -> None:
+    assert samples.in_words(312.5e6, "B/s") == "312 MB/s"
