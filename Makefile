@@ -19,7 +19,7 @@ PARTS = test-prepare test-modules $(addprefix test-python-,$(OTHER_PYTHONS)) tes
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds images cluster cluster-down clean
+.PHONY: help demo test test-fast test-pythons e2e large-messages lint bench bench-operator bench-kubernetes conformance conformance-original crds images cluster cluster-down clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -63,6 +63,10 @@ test-python-%: .venv-%/.with-test
 e2e: $(VENV)/.with-dev
 	$(CLUSTER) prepare
 	$(BIN)/python -m pytest tests/e2e
+
+## make large-messages  messages of 256 MB to 4 GB between hosts: minutes, and 14 GB of free memory
+large-messages: $(VENV)/.with-dev
+	$(BIN)/python -m pytest -m long tests/faults/test_large_messages.py
 
 ## make lint          style, types and import contracts, each tool's own words
 lint: $(VENV)/.with-dev

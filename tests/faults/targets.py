@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -291,9 +292,25 @@ def make_a_push_queue(connection: Any) -> None:
     block()
 
 
+def content(size: int) -> bytes:
+    """Bytes whose pieces differ, whatever the size of a piece is."""
+    return bytes(range(251)) * (size // 251 + 1)
+
+
+def checksum(data: bytes) -> int:
+    return zlib.crc32(data)
+
+
 def echo_large(connection: Any, requests: Any, replies: Any) -> None:
-    connection.send_bytes(connection.recv_bytes())
-    replies.put(requests.get())
+    """Send back what comes, after its checksum; first on a pipe, then on queues."""
+    for receive, send, send_large in (
+        (connection.recv_bytes, connection.send, connection.send_bytes),
+        (requests.get, replies.put, replies.put),
+    ):
+        data = receive()
+        send(checksum(data))
+        send_large(data)
+        del data
 
 
 class NeverPickled:

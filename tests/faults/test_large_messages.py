@@ -11,50 +11,50 @@ import pytest
 import fiber
 from faults import targets
 from faults.runtime import running
-from fiber._runtime.state import Runtime
 
-SIZE = 64 << 20
-EXTREME = [pytest.param(size << 20, marks=pytest.mark.long) for size in (256, 2048, 4100)]
+MEGABYTES = [64, *(pytest.param(size, marks=pytest.mark.long) for size in (256, 2048, 4100))]
+"""The largest is above 4 GiB."""
 
-
-def content(size: int) -> bytes:
-    """Bytes that are no piece's twice."""
-    pattern = os.urandom(1_000_003)
-    return pattern * (size // len(pattern) + 1)
+pytestmark = pytest.mark.timeout(900)
 
 
 @pytest.fixture
-def hosts() -> Iterator[Runtime]:
-    with running(backend="loopback", agents=1) as runtime:
-        yield runtime
-
-
-@pytest.fixture
-def one_agent(hosts: Runtime) -> Iterator[None]:
-    """The test must cost no worker."""
-    with fiber.Pool(1) as pool:
+def one_agent() -> Iterator[None]:
+    """The test must not cost the only agent."""
+    with running(backend="loopback", agents=1), fiber.Pool(1) as pool:
         before = pool.apply(os.getppid)
         yield
         assert pool.apply(os.getppid) == before
 
 
-@pytest.mark.usefixtures("one_agent")
-@pytest.mark.parametrize("size", [SIZE, *EXTREME])
-@pytest.mark.timeout(600)
-def test_arguments_and_results(size: int) -> None:
-    data = content(size)
-    with fiber.Pool(2) as pool:
-        large = pool.apply_async(targets.same, (data,))
-        small = [pool.apply(abs, (-number,)) for number in range(100)]
-        assert small == list(range(100))
-        assert large.get() == data
+def small_tasks(pool: Any, until: Any) -> None:
+    """Run some at least, and go on for as long as the large message travels."""
+    done = 0
+    while not until.ready() or done < 100:
+        assert pool.apply(abs, (-done,)) == done
+        done += 1
 
 
 @pytest.mark.usefixtures("one_agent")
-@pytest.mark.parametrize("size", [SIZE, *EXTREME])
-@pytest.mark.timeout(600)
-def test_pipes_and_queues(size: int) -> None:
-    data = content(size)
+@pytest.mark.parametrize("megabytes", MEGABYTES)
+def test_arguments_and_results(megabytes: int) -> None:
+    data = targets.content(megabytes << 20)
+    expected = targets.checksum(data)
+    with fiber.Pool(1) as pool, fiber.Pool(1) as other:
+        argument = pool.apply_async(targets.checksum, (data,))
+        del data
+        small_tasks(other, argument)
+        assert argument.get() == expected
+        result = pool.apply_async(targets.content, (megabytes << 20,))
+        small_tasks(other, result)
+        assert targets.checksum(result.get()) == expected
+
+
+@pytest.mark.usefixtures("one_agent")
+@pytest.mark.parametrize("megabytes", MEGABYTES)
+def test_pipes_and_queues(megabytes: int) -> None:
+    data = targets.content(megabytes << 20)
+    expected = targets.checksum(data)
     ours, theirs = fiber.Pipe()
     requests: Any = fiber.Queue()
     replies: Any = fiber.Queue()
@@ -62,7 +62,13 @@ def test_pipes_and_queues(size: int) -> None:
     child.start()
     theirs.close()
     ours.send_bytes(data)
-    assert ours.recv_bytes() == data
-    requests.put(data)
-    assert replies.get() == data
+    del data
+    assert ours.recv() == expected
+    received = ours.recv_bytes()
+    assert targets.checksum(received) == expected
+    requests.put(received)
+    del received
+    assert replies.get() == expected
+    assert targets.checksum(replies.get()) == expected
     child.join()
+    assert child.exitcode == 0

@@ -152,7 +152,8 @@ class Message:
 
     def tobytes(self) -> bytes:
         """Copy the payload out and release the message."""
-        data = self.payload.tobytes()
+        large = self.payload.nbytes > INLINE_LIMIT
+        data = large_bytes(self.payload) if large else self.payload.tobytes()
         self.release()
         return data
 
