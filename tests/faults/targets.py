@@ -335,3 +335,7 @@ def put_bulky_items(queue: Any, count: int, there: Any) -> None:
         queue.put(bytes(1 << 20))
     there.send("put")
     there.recv()
+
+
+def send_checksum(connection: Any, data: bytes) -> None:
+    connection.send(checksum(data))

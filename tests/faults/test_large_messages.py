@@ -72,3 +72,16 @@ def test_pipes_and_queues(megabytes: int) -> None:
     assert targets.checksum(replies.get()) == expected
     child.join()
     assert child.exitcode == 0
+
+
+@pytest.mark.usefixtures("one_agent")
+@pytest.mark.parametrize("megabytes", [1, *MEGABYTES[:-1]])
+def test_arguments_of_a_process(megabytes: int) -> None:
+    ours, theirs = fiber.Pipe()
+    data = targets.content(megabytes << 20)
+    child = fiber.Process(target=targets.send_checksum, args=(theirs, data))
+    child.start()
+    theirs.close()
+    assert ours.recv() == targets.checksum(data)
+    child.join()
+    assert child.exitcode == 0

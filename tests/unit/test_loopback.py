@@ -447,8 +447,8 @@ class Silent:
     def attach(self, _observer: Any) -> None:
         pass
 
-    def send(self, frame: Any, **_: Any) -> None:
-        self.sent.append(messages.decode(frame))
+    def send(self, *frame: Any, **_: Any) -> None:
+        self.sent.append(messages.decode(b"".join(frame)))
 
 
 @pytest.fixture

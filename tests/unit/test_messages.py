@@ -45,7 +45,7 @@ any_text = st.text(st.characters(), max_size=50)
 digests = st.binary(min_size=DIGEST_BYTES, max_size=DIGEST_BYTES)
 
 messages: st.SearchStrategy[Message] = st.one_of(
-    st.builds(Start, ids, data),
+    st.builds(Start, ids, data, data),
     st.builds(Blob, digests, data),
     st.builds(Forget, digests),
     st.builds(Lacking, digests),
@@ -170,7 +170,7 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
 @pytest.mark.parametrize(
     ("message", "shown"),
     [
-        (Start(3, SECRET.encode()), "Start(child=3, spec=<14 bytes>)"),
+        (Start(3, SECRET.encode(), b"1"), "Start(child=3, spec=<14 bytes>, process=<1 bytes>)"),
         (
             Blob(bytes(DIGEST_BYTES), SECRET.encode()),
             "Blob(digest=<32 bytes>, data=<14 bytes>)",

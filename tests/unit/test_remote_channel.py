@@ -37,7 +37,7 @@ class Far:
     def sent(self) -> list[int]:
         """The packets that the link was given."""
         self.loop.run_for(0)
-        frames = [messages.decode(call.args[0]) for call in self.link.send.call_args_list]
+        frames = [messages.decode(b"".join(call.args)) for call in self.link.send.call_args_list]
         return [frame.seq for frame in frames if isinstance(frame, messages.Deliver)]
 
     def says(self, word: object) -> None:

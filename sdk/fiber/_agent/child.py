@@ -68,6 +68,8 @@ class StartRequest(NamedTuple):
     """Where the program's files are, if they were sent here."""
     has_arguments: bool = False
     """Whether a descriptor, the next one, brings the arguments of its Process."""
+    payload_at: tuple[int, int] | None = None
+    """Offset and size of the payload in another descriptor, if it is large."""
 
 
 def lineage() -> tuple[int, ...]:
@@ -153,18 +155,21 @@ def _run(
         _task_channel = UnixChannel.from_fd(rest.pop(0))
         _progress = progress_table.slot(start.slot)
     arguments = own(rest.pop(0)) if start.has_arguments else None
+    payload = own(rest.pop(0)) if start.payload_at is not None else None
     _descriptors = rest
     try:
-        return _load_and_run(start, agent, arguments)
+        return _load_and_run(start, agent, arguments, payload)
     finally:
         # Up to Python 3.12 ``_bootstrap`` runs multiprocessing's own, which know that they ran.
         atexit._run_exitfuncs()
         util._flush_std_streams()  # type: ignore[attr-defined]
 
 
-def _load_and_run(start: StartRequest, agent: int, arguments: Descriptor | None) -> int:
+def _load_and_run(
+    start: StartRequest, agent: int, arguments: Descriptor | None, payload: Descriptor | None
+) -> int:
     try:
-        process = _load(start, arguments)
+        process = _load(start, arguments, payload)
     except UnguardedMainError as error:
         is_worker = _task_channel is not None
         _tell(f"{'' if is_worker else f'fiber: process {start.name!r} did not start: '}{error}\n")
@@ -177,7 +182,9 @@ def _load_and_run(start: StartRequest, agent: int, arguments: Descriptor | None)
     return int(process._bootstrap(parent_sentinel=agent))
 
 
-def _load(start: StartRequest, arguments: Descriptor | None = None) -> Any:
+def _load(
+    start: StartRequest, arguments: Descriptor | None = None, payload: Descriptor | None = None
+) -> Any:
     data = read_preparation(start)
     if start.hub is not None:
         hub_client.set_hub_address(start.hub)
@@ -185,7 +192,7 @@ def _load(start: StartRequest, arguments: Descriptor | None = None) -> Any:
     _prepare_environment(data)
     with inheriting():
         prepare_main(data)
-        process = pickle.loads(start.payload)
+        process = pickle.loads(_payload(start, payload))
         if arguments is not None:
             process._args = pickle.loads(contents(arguments.fileno()))
             arguments.close()
@@ -194,6 +201,14 @@ def _load(start: StartRequest, arguments: Descriptor | None = None) -> Any:
             os.close(fd)
     _descriptors.clear()
     return process
+
+
+def _payload(start: StartRequest, payload: Descriptor | None) -> bytes | memoryview:
+    """The pickled Process."""
+    if payload is None or start.payload_at is None:
+        return start.payload
+    offset, size = start.payload_at
+    return memoryview(contents(payload.fileno()))[offset : offset + size]
 
 
 def read_preparation(start: StartRequest) -> dict[str, Any]:

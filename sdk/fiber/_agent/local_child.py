@@ -115,6 +115,7 @@ class LocalChild:
             ancestors=lineage(),
             folder=zygote.folder,
             has_arguments=spec.arguments is not None,
+            payload_at=None if spec.payload_at is None else spec.payload_at[1:],
         )
         zygote.start(self.id, request, fds)
 
@@ -124,12 +125,14 @@ class LocalChild:
             self.zygote.children -= 1
 
     def _descriptors(self) -> list[int]:
-        """New descriptors for the child: stdout, stderr, task channel, arguments, and those of its
-        handles.
+        """New descriptors for the child: stdout, stderr, task channel, arguments, a large payload,
+        and those of its handles.
         """
         ours = [] if self._theirs is None else [self._theirs.fileno()]
         if self._spec.arguments is not None:
             ours.append(self._spec.arguments.fileno())
+        if self._spec.payload_at is not None:
+            ours.append(self._spec.payload_at[0].fileno())
         fds: list[int] = []
         try:
             with naming_the_limit("starting a process"):
@@ -150,7 +153,9 @@ class LocalChild:
     def release_descriptors(self) -> None:
         """It has its own now: the other end must see EOF when the child lets go."""
         self._spec.close()
-        self._spec = replace(self._spec, payload=b"", fds=(), program=None, arguments=None)
+        self._spec = replace(
+            self._spec, payload=b"", payload_at=None, fds=(), program=None, arguments=None
+        )
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to the worker; False if it is gone."""

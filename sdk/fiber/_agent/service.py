@@ -21,8 +21,9 @@ from fiber._transport.loop import Loop
 from fiber._transport.stream import Frame
 from fiber._transport.unix import naming_the_limit
 from fiber._wire import messages, packet
-from fiber._wire.assembly import pass_on
+from fiber._wire.assembly import pass_on, place_of
 from fiber._wire.descriptor import contents
+from fiber._wire.packet import BytesLike
 
 _KNOWN_HERE = ExitReport._fields.index("pod")
 """Fields of an exit report that an agent knows; the master adds the others."""
@@ -117,7 +118,7 @@ class AgentService:
         child = self._children[message.child] = _Observed(self, message.child)
         try:
             with naming_the_limit("starting a process"):
-                spec = self._specification(*pickle.loads(message.spec))
+                spec = self._specification(message.process, *pickle.loads(message.spec))
         except BlobLacking as error:
             self.send(messages.Lacking(error.digest))
             child.refuse(self._agent.host, error)
@@ -128,18 +129,22 @@ class AgentService:
 
     def _specification(
         self,
+        process: BytesLike,
         name: str,
         method: str,
-        payload: bytes,
         tasks: bool,
         digests: tuple[bytes, bytes | None, bytes | None],
     ) -> ChildSpec:
         preparation, program, arguments = digests
+        view = memoryview(process)
+        pass_on(view)
+        place = place_of(view)
         return ChildSpec(
             name,
             method,
             bytes(contents(self._blobs.get(preparation).fileno())),
-            payload,
+            bytes(view) if place is None else b"",
+            payload_at=None if place is None else (*place, len(view)),
             tasks=tasks,
             program=None if program is None else self._blobs.get(program),
             arguments=None if arguments is None else self._blobs.get(arguments),

@@ -202,8 +202,8 @@ class RemoteChild:
         self.blobs = [blob for blob in needed if blob is not None]
         """What its agent must have, for as long as it lives."""
         digests = tuple(blob and blob.digest for blob in needed)
-        fields = (spec.name, spec.method, spec.payload, spec.tasks, digests)
-        self._start: bytes | None = pickle.dumps(fields, protocol=5)
+        fields = (spec.name, spec.method, spec.tasks, digests)
+        self._start: tuple[bytes, bytes] | None = pickle.dumps(fields, protocol=5), spec.payload
 
     @property
     def node(self) -> str:
@@ -229,7 +229,7 @@ class RemoteChild:
         self._agent, self._number, self.host = agent, number, agent.host
         start, self._start = self._start, None
         assert start is not None
-        agent.transmit(messages.Start(number, start))
+        agent.transmit(messages.Start(number, *start))
         early, self._early = self._early, []
         for packet_ in early:
             self.deliver(*packet_)

@@ -32,14 +32,20 @@ class ProtocolError(FiberError):
 
 
 class Start(NamedTuple):
-    """Master to agent: start a child as ``spec`` says."""
+    """Master to agent: start a child as ``spec`` says; ``process`` is the pickled Process."""
 
     child: int
     spec: BytesLike
+    process: BytesLike
 
     def encode(self) -> bytes:
         """The frame."""
-        return _NUMBER.pack(PROTOCOL, _START, self.child) + self.spec
+        return b"".join(self.pieces())
+
+    def pieces(self) -> Sequence[BytesLike]:
+        """The frame, of which the Process is not copied."""
+        head = _NUMBER.pack(PROTOCOL, _START, self.child)
+        return _pieces(head, self.spec, [self.process])
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -333,7 +339,7 @@ _PACKET = struct.Struct("<IQ")
 
 def pieces(message: Message) -> Sequence[BytesLike]:
     """A message's frame, in pieces if it has large ones: these are not copied."""
-    if isinstance(message, Deliver | FromChild | TunnelData):
+    if isinstance(message, Start | Deliver | FromChild | TunnelData):
         return message.pieces()
     return (message.encode(),)
 
@@ -405,7 +411,8 @@ def _json(value: Any) -> bytes:
 
 
 def _read_start(view: memoryview) -> Start:
-    return Start(_NUMBER.unpack_from(view)[2], view[_NUMBER.size :])
+    spec, (process,) = _read_packet(view, _NUMBER.size)
+    return Start(_NUMBER.unpack_from(view)[2], spec, process)
 
 
 def _read_blob(view: memoryview) -> Blob:
