@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 from fiber._engine.ledger import WrongAnswer
 from fiber._runtime.outcome import outcomes
@@ -17,66 +17,52 @@ from fiber._wire import work
 from fiber._wire.packet import Message
 
 Words: TypeAlias = tuple[Any, ...]
+"""What a worker says.  Results are (seq, offset, kept, seconds, values, mixed, size): among the
+values, if they are mixed, are ``Pickled`` ones; ``size`` is that of the message."""
+
+OTHER = object()
+"""In place of a result: the message is something else."""
 
 
-class Results(NamedTuple):
-    """Results of the batch ``seq``, its tasks from ``offset`` on."""
-
-    seq: int
-    offset: int
-    kept: int | None
-    seconds: float
-    values: list[Any]
-    """Plain values; what is not plain is ``Pickled``."""
-    mixed: bool
-    """Whether any is."""
-    size: int
-    """Bytes of the message."""
-
-    def is_single(self, seq: int) -> bool:
-        """Whether they are the result of a call that was sent alone as ``seq``."""
-        return self.seq == seq and not self.offset and self.kept is None and len(self.values) == 1
+def single(message: Message, seq: int) -> Any:
+    """Return the result of the call that was sent alone as ``seq``, or OTHER."""
+    try:
+        number, offset, kept, _, values, odd = pickle.loads(message.payload)
+        if number == seq and offset == 0 and kept is None and len(values) == 1:
+            return outcomes(values, odd, message.buffers)[0] if odd else values[0]
+    except Exception:  # any bytes may be there
+        pass
+    return OTHER
 
 
-def read(message: Message) -> Results | Words:
+def read(message: Message) -> Words:
     """Read a message; anything but results stays as ``fiber._wire.work`` has it.
 
     Raises WrongAnswer for what no worker sends.  The message can be read again until its release.
     """
-    size = len(message.payload) + sum([buffer.nbytes for buffer in message.buffers])
     try:
         words = pickle.loads(message.payload)
-        if type(words[0]) is int:
-            return _results(message.buffers, size, *words)
-        if type(words) is tuple and _FORMS[words[0]](*words[1:]):
-            return words
+        if type(words[0]) is not int:
+            if type(words) is tuple and _FORMS[words[0]](*words[1:]):
+                return words
+            raise ValueError("it has another form")
+        seq, offset, kept, seconds, values, odd = words
+        if (
+            type(offset) is not int
+            or offset < 0
+            or not (kept is None or type(kept) is int)
+            or type(seconds) is not float
+            or not 0.0 <= seconds < math.inf
+            or type(values) is not list
+        ):
+            raise ValueError("a field has an impossible value")
+        size = len(message.payload)
+        if odd:
+            size += sum([buffer.nbytes for buffer in message.buffers])
+            outcomes(values, odd, message.buffers)
+        return seq, offset, kept, seconds, values, bool(odd), size
     except Exception as error:  # any bytes may be there
         raise WrongAnswer(f"it sent a malformed message ({error!r})") from None
-    raise WrongAnswer("it sent a malformed message")
-
-
-def _results(
-    buffers: list[memoryview],
-    size: int,
-    seq: int,
-    offset: int,
-    kept: int | None,
-    seconds: float,
-    values: list[Any],
-    odd: Any,
-) -> Results:
-    if (
-        type(offset) is not int
-        or offset < 0
-        or not (kept is None or type(kept) is int)
-        or type(seconds) is not float
-        or not 0 <= seconds < math.inf
-        or type(values) is not list
-    ):
-        raise ValueError("a field has an impossible value")
-    if odd:
-        outcomes(values, odd, buffers)
-    return Results(seq, offset, kept, seconds, values, bool(odd), size)
 
 
 _FORMS: dict[str, Callable[..., bool]] = {

@@ -27,7 +27,7 @@ from typing import Any
 from fiber._agent.interface import DirectChannel
 from fiber._engine.ledger import WrongAnswer
 from fiber._engine.scheduler import Scheduler
-from fiber._runtime.answers import Results, read
+from fiber._runtime.answers import OTHER, read, single
 from fiber._runtime.host import Loop, Timer
 from fiber._runtime.work_items import Call
 from fiber._runtime.worker_handle import WorkerHandle
@@ -85,6 +85,7 @@ class Leases:
         on_back: Callable[[WorkerHandle], None],
     ) -> None:
         self._scheduler = scheduler
+        self._batches = scheduler.ledger.batches
         self._loop = loop
         self._on_adopted = on_adopted
         self._on_back = on_back
@@ -131,20 +132,22 @@ class Leases:
                 return ADOPTED
             if message is None:
                 return ADOPTED
-            try:
-                answer = read(message)
-            except WrongAnswer:
-                answer = ()
-            if isinstance(answer, Results):
-                if answer.is_single(seq):
-                    message.release()
-                    handle.tasks += 1
-                    return answer.values[0]
-                if answer.seq < seq and answer.seq not in self._scheduler.ledger.batches:
-                    message.release()  # it answers a call that was given up
-                    continue
-            lease.surprise = message
-            return ADOPTED
+            result = single(message, seq)
+            if result is OTHER and not self._is_late(message, seq):
+                lease.surprise = message
+                return ADOPTED
+            message.release()
+            if result is not OTHER:
+                handle.tasks += 1
+                return result
+
+    def _is_late(self, message: Message, seq: int) -> bool:
+        """Whether it answers a call before ``seq``, which was given up."""
+        try:
+            number = read(message)[0]
+        except WrongAnswer:
+            return False
+        return type(number) is int and number < seq and number not in self._batches
 
     def _put_back(self, lease: Lease) -> None:
         self._idle.append(lease)

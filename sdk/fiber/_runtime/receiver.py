@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from fiber._engine.ledger import Batch, WrongAnswer
 from fiber._engine.scheduler import Scheduler
-from fiber._runtime.answers import Results, Words, read
+from fiber._runtime.answers import Words, read
 from fiber._runtime.background import BackgroundThread, say
 from fiber._runtime.host import Loop
 from fiber._runtime.jobs import Jobs
@@ -50,7 +50,7 @@ class Receiver:
         self._leases = leases
         self._advance = advance
         self._on_ready = on_ready
-        self._last_words: dict[WorkerHandle, Results] = {}
+        self._last_words: dict[WorkerHandle, Words] = {}
         """Of workers that callers use, whose agents heard them first since they died."""
         self._taken_back: dict[WorkerHandle, list[int]] = {}
         """From workers that callers use: calls of theirs, which are no batches yet."""
@@ -65,8 +65,8 @@ class Receiver:
         finally:
             message.release()
 
-    def _take(self, handle: WorkerHandle, words: Results | Words) -> None:
-        if isinstance(words, Results):
+    def _take(self, handle: WorkerHandle, words: Words) -> None:
+        if type(words[0]) is int:
             if handle.worker is not None and handle.worker.lent:
                 self._last_words[handle] = words
             else:
@@ -115,7 +115,7 @@ class Receiver:
         self._last_words.pop(handle, None)
         self._taken_back.pop(handle, None)
 
-    def _answered(self, handle: WorkerHandle, results: Results) -> None:
+    def _answered(self, handle: WorkerHandle, results: Words) -> None:
         seq, offset, kept, seconds, values, mixed, size = results
         if handle.worker is None:
             raise WrongAnswer(_NOT_READY.format(seq))
