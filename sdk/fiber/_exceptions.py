@@ -78,8 +78,11 @@ def set_fields(error: BaseException, values: Mapping[str, Any]) -> None:
 
 def _constructor(kind: type[BaseException]) -> Callable[..., Any]:
     """Return the ``__new__`` of the class's native base, which knows its fields."""
-    found = (vars(base).get("__new__") for base in kind.__mro__)
-    return next(new for new in found if isinstance(new, BuiltinFunctionType))
+    base: Any = kind
+    # Of several bases ``__base__`` is the one whose fields the instance has.
+    while not isinstance(new := vars(base).get("__new__"), BuiltinFunctionType):
+        base = base.__base__
+    return new
 
 
 def _value(field: Any, error: BaseException) -> Any:

@@ -95,6 +95,10 @@ class Two(KeyError, AttributeError):
         AttributeError.__init__(self, key, name=name)
 
 
+class Missing(KeyError, OSError):
+    """Instances have the fields of the second base."""
+
+
 class Several(ExceptionGroup[Exception]):
     def __new__(cls, errors: list[Exception], *, step: int) -> Several:
         made = super().__new__(cls, f"several at {step}", errors)
@@ -173,6 +177,24 @@ class Holding(Exception):
         super().__init__("holds", threading.Lock())
         self.lock = threading.Lock()
         self.step = step
+
+
+class Chained(Exception):
+    """It holds the exception that it replaces."""
+
+    def __init__(self, replaces: object) -> None:
+        super().__init__("chained")
+        self.replaces = replaces
+
+
+class CountsPickles:
+    """It cannot be pickled, and counts the attempts."""
+
+    attempts = 0
+
+    def __reduce__(self) -> NoReturn:
+        self.attempts += 1
+        raise TypeError("cannot be pickled")
 
 
 class Hopeless(Exception):

@@ -41,6 +41,10 @@ class Frozen(Exception):
     code: int
 
 
+class Missing(KeyError, OSError):
+    """Instances have the fields of the second base."""
+
+
 class OwnGroup(ExceptionGroup[Exception]):
     def __new__(cls, errors: list[Exception]) -> OwnGroup:
         return super().__new__(cls, "several", errors)
@@ -77,6 +81,7 @@ KINDS = [
     Slotted(None),
     Frozen(4),
     Guarded("guarded"),
+    Missing(2, "no such file"),
     ConnectionClosed("worker 1", "killed"),
     WorkerDied(task="f", worker="w", host="h", pid=1, exitcode=-9, reason="killed", log=["line"]),
 ]

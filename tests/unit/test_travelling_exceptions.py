@@ -38,6 +38,7 @@ def travelled(error: BaseException) -> Any:
         (kinds.NoModule("module", why="none"), ("name", "path", "msg")),
         (kinds.NoSyntax(3), ("lineno", "offset", "text", "end_offset", "filename")),
         (kinds.Two("key", name="name"), ("name",)),
+        (kinds.Missing(2, "none"), ("errno", "strerror")),
         (kinds.BadlyReduced(3, 0.5), ("step", "loss")),
         (kinds.Refusing(3), ()),
         (AttributeError("none", name="name"), ("name",)),
@@ -112,6 +113,19 @@ def test_what_cannot_travel_is_left_out_with_a_note() -> None:
     assert lost == f"attribute 'lock' did not come along: {refusal}"
     assert shown == f"argument 1 came as text: {refusal}"
     assert found.__notes__[0] == "on the device"
+
+
+def test_each_exception_of_a_chain_is_checked_once() -> None:
+    part = kinds.CountsPickles()
+    error = kinds.Chained(part)
+    length = 12
+    for _ in range(length):
+        error = kinds.Chained(error)
+    found = travelled(error)
+    for _ in range(length):
+        found = found.replaces
+    assert not hasattr(found, "replaces")
+    assert part.attempts < 3 * length
 
 
 def test_what_cannot_be_made_again_says_why() -> None:

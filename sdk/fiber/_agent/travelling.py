@@ -165,6 +165,10 @@ class _Pickling:
         self._incomplete = incomplete
         self._by_own_reduce: dict[int, BaseException] = {}
         self._open: set[int] = set()
+        """Exceptions whose parts are being checked."""
+        self._met: set[int] = set()
+        """Open exceptions that are parts of the one being checked."""
+        self._checked: dict[int, tuple[BaseException, _Reduced]] = {}
 
     def checked(self, obj: Any) -> bytes:
         """Pickle ``obj``, and unpickle it as a check."""
@@ -178,6 +182,8 @@ class _Pickling:
 
     def _reduce(self, error: BaseException) -> _Reduced:
         kind = type(error)
+        if id(error) in self._checked:
+            return self._checked[id(error)][1]
         if id(error) in self._by_own_reduce or not (self._incomplete or _needs_rebuilding(error)):
             return _own_reduced(error)
         if _has_own_reduce(kind):
@@ -187,13 +193,33 @@ class _Pickling:
             del self._by_own_reduce[id(error)]
         args, attributes, fields = error.args, dict(vars(error)), _fields(error)
         if self._incomplete and id(error) not in self._open:
-            self._open.add(id(error))
-            try:
-                args = self._without_refused(args, attributes, fields)
-            finally:
-                self._open.remove(id(error))
-        state = args, attributes, fields
-        return make, (kind, group_of(error)), state, None, None, _set_state
+            return self._reduce_checked(error, args, attributes, fields)
+        self._met.add(id(error))
+        return _rebuilt(error, args, attributes, fields)
+
+    def _reduce_checked(
+        self,
+        error: BaseException,
+        args: tuple[Any, ...],
+        attributes: dict[str, Any],
+        fields: dict[str, Any],
+    ) -> _Reduced:
+        """Reduce an exception to what travels of it.
+
+        The outcome is kept: a part is pickled at each check of what it is a part of.
+        """
+        met, self._met = self._met, set()
+        self._open.add(id(error))
+        try:
+            args = self._without_refused(args, attributes, fields)
+        finally:
+            self._open.remove(id(error))
+            is_in_cycle = bool(self._met)  # Then the outcome depends on where the check began.
+            self._met = met | self._met - {id(error)}
+        reduced = _rebuilt(error, args, attributes, fields)
+        if not is_in_cycle:
+            self._checked[id(error)] = error, reduced
+        return reduced
 
     def _without_refused(
         self, args: tuple[Any, ...], attributes: dict[str, Any], fields: dict[str, Any]
@@ -232,6 +258,16 @@ class _Exceptions(dict[type, Callable[[Any], _Reduced]]):
         if issubclass(kind, BaseException):
             return self._reduce
         raise KeyError(kind)
+
+
+def _rebuilt(
+    error: BaseException,
+    args: tuple[Any, ...],
+    attributes: dict[str, Any],
+    fields: dict[str, Any],
+) -> _Reduced:
+    state = args, attributes, fields
+    return make, (type(error), group_of(error)), state, None, None, _set_state
 
 
 def _set_state(
