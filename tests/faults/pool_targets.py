@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
+import collections
+import itertools
 import os
 import resource
 import signal
@@ -158,9 +159,9 @@ def hang_in_python() -> NoReturn:
 
 
 def hang_in_native_code() -> None:
-    """With the GIL, so that no handler of a signal in Python runs."""
+    """With the GIL, so that no thread and no handler of a signal in Python runs."""
     start_beside()
-    ctypes.PyDLL(None).sleep(600)
+    collections.deque(itertools.repeat(None), maxlen=0)
 
 
 def crash(signum: int) -> None:

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from faults.pool_targets import hang_in_native_code
 from fiber.managers import AsyncManager, BaseManager
 
 
@@ -71,7 +72,7 @@ ModelManager.register("Model", Model)
 AsyncModelManager.register("Model", Model)
 
 
-class DivergingEnv(gymnasium.Env[Any, Any]):
+class HangingEnv(gymnasium.Env[Any, Any]):
     observation_space = spaces.Box(0, 1, (1,), np.float64)
     action_space = spaces.Discrete(9)
 
@@ -81,5 +82,11 @@ class DivergingEnv(gymnasium.Env[Any, Any]):
         super().reset(seed=seed)
         return np.zeros(1), {}
 
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        hang_in_native_code()
+        raise AssertionError
+
+
+class DivergingEnv(HangingEnv):
     def step(self, action: Any) -> NoReturn:
         diverge(int(action))

@@ -9,7 +9,9 @@ import pytest
 
 import fiber
 from faults import pool_targets as tasks
+from faults.raising import HangingEnv
 from fiber.errors import WorkerDied
+from fiber.vector import VectorEnv, worker_process
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -35,6 +37,19 @@ def test_a_worker_that_crashes_says_where_it_was(signum: signal.Signals) -> None
     assert "Fatal Python error" in error.stack
     assert " in crash" in error.stack
     assert " in crash" in str(error)
+
+
+def test_an_environment_that_nothing_stops_says_where_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(worker_process, "GRACE", 0.3)
+    env = VectorEnv([HangingEnv], num_workers=1, timeout=0.5)
+    env.reset()
+    with pytest.raises(fiber.TimeoutError, match="nothing but its end stopped worker") as caught:
+        env.step([0])
+    env.close(terminate=True)
+    assert " in hang_in_native_code" in str(caught.value)
+    assert "slot.py" not in str(caught.value)
 
 
 def test_of_a_worker_that_is_killed_nothing_is_known() -> None:

@@ -92,6 +92,7 @@ def test_one_that_ends_its_worker(action: int, backend: str, vector_env: Make) -
     assert caught.value.task == f"step of {whose}"
     assert caught.value.worker == "VectorEnv-worker-1"
     assert caught.value.exitcode == (7 if action == Faulty.EXIT else -signal.SIGSEGV)
+    assert (" in step" in caught.value.stack) == (action == Faulty.SEGFAULT)
     for _ in range(2):
         with pytest.raises(fiber.WorkerDied):
             env.step([GOOD] * 4)

@@ -20,7 +20,13 @@ GRACE = 0.5
 LIMIT = 1 << 14
 """Bytes of the stacks that are kept."""
 
-_OUR_FRAME = f'  File "{os.path.dirname(__file__)}{os.sep}'
+_HERE = os.path.dirname(__file__)
+
+_OUR_FRAMES = tuple(
+    f'  File "{os.path.normpath(os.path.join(_HERE, place))}'
+    for place in ("worker.py", "child.py", "../vector/slot.py", "../vector/worker.py")
+)
+"""What calls the code of the user."""
 
 
 def make_file() -> int:
@@ -60,7 +66,7 @@ def _without_our_frames(lines: Iterable[str]) -> list[str]:
     kept = []
     ours = False
     for line in lines:
-        ours = line.startswith("  ") and (ours or line.startswith(_OUR_FRAME))
+        ours = line.startswith("  ") and (ours or line.startswith(_OUR_FRAMES))
         if not ours and not line.startswith("Extension modules:"):
             kept.append(line)
     return kept

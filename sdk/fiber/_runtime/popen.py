@@ -9,6 +9,7 @@ from multiprocessing.process import BaseProcess
 
 from fiber import _logs
 from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
+from fiber._agent.last_words import TELL
 from fiber._exceptions import fresh
 from fiber._runtime.latch import Latch
 from fiber._runtime.state import runtime
@@ -135,6 +136,10 @@ class Popen:
     def kill(self) -> None:
         """SIGKILL."""
         self._signal(signal.SIGKILL)
+
+    def kill_with_stack(self) -> None:
+        """Have it write the Python stacks of its threads, and kill it."""
+        self._signal(TELL)
 
     def _signal(self, signum: int) -> None:
         child = self._child

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from fiber import reduction
 from fiber.connection import Connection, Pipe
 from fiber.context import BaseContext
-from fiber.errors import UnpicklableError, WorkerDied
+from fiber.errors import UnpicklableError, WorkerDied, block
 from fiber.process import Process
 from fiber.resources import largest, resources_of, with_resources
 from fiber.vector.arrays import StepArrays
@@ -100,14 +100,17 @@ class WorkerProcess:
         if self.process.exitcode is None:
             self.process.kill()  # its connection is lost: nothing that it does reaches us
             self.process.join(NEWS)
-        if self.stuck:
-            self.stuck = False
-            return TookTooLong(
-                f"{doing} of {whose} took longer than {self.setup.timeout:g} s (timeout) for each, "
-                f"and nothing but its end stopped worker {self.name!r}"
-            )
         popen: Any = self.process._popen
         report = popen.report
+        if self.stuck:
+            self.stuck = False
+            lines = [
+                f"{doing} of {whose} took longer than {self.setup.timeout:g} s (timeout) for each, "
+                f"and nothing but its end stopped worker {self.name!r}"
+            ]
+            if report and report.stack:
+                lines.append(block("Where it was:", report.stack.splitlines()))
+            return TookTooLong("\n".join(lines))
         return WorkerDied(
             task=f"{doing} of {whose}",
             worker=self.name,
@@ -116,6 +119,7 @@ class WorkerProcess:
             exitcode=self.process.exitcode,
             reason=report.reason if report else "its connection is lost",
             log=report.log if report else (),
+            stack=report.stack if report else "",
             pod=(report and report.pod) or None,
             node=(report and report.node) or None,
         )
@@ -141,7 +145,8 @@ class WorkerProcess:
         if self.deadline is not None and self.deadline < time.monotonic():
             self.deadline = None
             self.stuck = True
-            self.process.kill()
+            popen: Any = self.process._popen
+            popen.kill_with_stack()
 
     def hang_up(self, *, kill: bool) -> None:
         """Have it end: now, or when it hears that nobody listens."""
