@@ -95,7 +95,6 @@ def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.
         payload=reduction.dump_process(process, same_host=True)[0],
         slot=None,
         executable=options.pop("executable", None),
-        captured=False,
         open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
         hub=None,
         ancestors=(os.getpid(),),
