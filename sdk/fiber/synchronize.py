@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 import weakref
@@ -272,8 +273,11 @@ class Barrier(threading.Barrier):
     ) -> None:
         self._parties, self._action, self._timeout = parties, action, timeout
         self._cond = condition
-        self._members: Any = members  # processes that took part; with the lock
-        self._is_member = False
+        # Processes that took part, and how many of their threads are counted; with the lock.
+        self._members: Any = members
+        self._membership: Any = None
+        self._member = 0
+        self._counted = 0
 
     def __reduce__(self) -> tuple[Any, ...]:
         parts = self._parties, self._action, self._timeout, self._cond, self._members
@@ -288,23 +292,33 @@ class Barrier(threading.Barrier):
             self._join()
             self._enter()
             index = self._count
-            self._count += 1
+            self._change_count(1)
             try:
                 if index + 1 == self._parties:
                     self._release()
                 else:
                     self._wait(self._timeout if timeout is None else timeout)
             finally:
-                # None may be counted, if one was buried who had waited to come in.
-                self._count = max(0, self._count - 1)
+                self._change_count(-1)
                 self._exit()
         return index
 
+    def reset(self) -> None:
+        """Return to the initial state; those that wait get BrokenBarrierError."""
+        with self._cond:
+            self._bury()
+        super().reset()
+
     def _join(self) -> None:
-        if not self._is_member:
-            self._is_member = True
+        if self._member != os.getpid():  # a process that was forked is another one
+            self._member, self._counted = os.getpid(), 0
+            self._membership = self._members.enter()
             # Who ends in good order is not missed.
-            weakref.finalize(self, self._members.dismiss, self._members.enter())
+            weakref.finalize(self, self._members.dismiss, self._membership)
+
+    def _change_count(self, by: int) -> None:
+        self._counted += by
+        self._members.tally(self._membership, self._counted, self._count + by)
 
     def _enter(self) -> None:
         while self._state in (_RESETTING, _DRAINING):
@@ -331,10 +345,11 @@ class Barrier(threading.Barrier):
             raise threading.BrokenBarrierError
 
     def _bury(self) -> int:
-        """How many members died; they wait no more."""
-        waited = self._cond._waiters.bury()
-        self._count = max(0, self._count - waited)
-        return int(waited + self._members.bury())
+        """How many members died; they wait no more, and are not counted."""
+        died = self._cond._waiters.bury() + self._members.bury()
+        if died:
+            self._members.set(1, self._members.held())
+        return int(died)
 
     # What threading's class keeps, in shared memory
 
@@ -348,11 +363,8 @@ class Barrier(threading.Barrier):
 
     @property
     def _count(self) -> int:
-        return self._cond._waiters.get(1)
-
-    @_count.setter
-    def _count(self, value: int) -> None:
-        self._cond._waiters.set(1, value)
+        count: int = self._members.get(1)
+        return count
 
     if TYPE_CHECKING:  # threading's own, of which its stub does not tell
 

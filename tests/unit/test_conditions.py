@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -252,27 +253,25 @@ def test_a_timeout_breaks_it_until_it_is_reset(brought: Callable[[Any], Any]) ->
     assert there.n_waiting == 0
 
 
-def test_who_leaves_and_is_not_counted_any_more_takes_nobodys_place() -> None:
-    barrier, broken = fiber.Barrier(2), []
+def test_one_killed_before_it_was_counted_takes_nobodys_place() -> None:
+    barrier = fiber.Barrier(2)
 
-    def wait() -> None:
-        try:
-            barrier.wait(PATIENCE)
-        except threading.BrokenBarrierError:
-            broken.append(True)
+    def wait_to_come_in() -> None:
+        with barrier._cond:
+            barrier._cond.wait()
 
-    slow = background(wait)
+    first = background(barrier.wait, PATIENCE)
     wait_until(lambda: barrier.n_waiting == 1, PATIENCE)
+    pid = fork_that(wait_to_come_in)
+    wait_until(lambda: barrier._cond._waiters.waiters() == 2, PATIENCE)
+    with barrier._cond:  # it has let go of it
+        pass
+    kill(pid)
     with barrier._cond:
-        barrier._count = 0  # as it is when one is buried who waited to come in
-        barrier.abort()
-    slow.join(PATIENCE)
-    assert broken == [True]
-    barrier.reset()
-    threads = [background(wait) for _ in range(2)]
-    for thread in threads:
-        thread.join(PATIENCE)
-    assert broken == [True]
+        assert barrier._bury() == 1
+    assert barrier.n_waiting == 1
+    barrier.wait(PATIENCE)
+    first.join(PATIENCE)
     assert barrier.n_waiting == 0
 
 
@@ -333,3 +332,40 @@ def test_members_that_end_in_good_order_are_not_missed() -> None:
     with barrier._cond:
         assert not barrier._bury()
     assert pickle.loads(pickle.dumps(barrier)).parties == 2
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.filterwarnings("ignore:.* ended while it held a lock:RuntimeWarning")
+def test_after_a_reset_one_killed_with_the_lock_is_not_counted() -> None:
+    reader, writer = os.pipe()
+    parent = os.getpid()
+
+    def act() -> None:
+        if os.getpid() != parent:
+            os.write(writer, b"!")
+            signal.pause()
+
+    barrier = fiber.Barrier(2, act)
+    outcomes: list[Any] = []
+
+    def wait() -> None:
+        try:
+            outcomes.append(barrier.wait(PATIENCE))
+        except threading.BrokenBarrierError:
+            outcomes.append("broken")
+
+    first = background(wait)
+    wait_until(lambda: barrier.n_waiting == 1, PATIENCE)
+    pid = fork_that(barrier.wait)
+    assert os.read(reader, 1) == b"!"
+    kill(pid)
+    first.join(PATIENCE)
+    assert outcomes == ["broken"]
+    barrier.reset()
+    assert barrier.n_waiting == 0
+    threads = [background(wait) for _ in range(2)]
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert sorted(outcomes[1:]) == [0, 1]
+    os.close(reader)
+    os.close(writer)

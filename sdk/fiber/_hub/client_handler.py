@@ -437,6 +437,16 @@ class ClientHandler:
         """Note how many things the stream's place has."""
         self._wait_list().places.hold(self._own_place(), ONE.unpack(message.payload)[2])
 
+    def tally(self, message: Message) -> None:
+        """Note how many things the stream's place has, and set the second word."""
+        _, _, held, total = TWO.unpack(message.payload)
+        self._wait_list().places.tally(self._own_place(), held, total)
+        self._request(message).answer(Status.OK)
+
+    def held(self, message: Message) -> None:
+        """Tell how many things all places have."""
+        self._request(message).answer(Status.OK, self._wait_list().places.held())
+
     def reclaim(self, message: Message) -> None:
         """Tell how many things the dead had."""
         self._request(message).answer(Status.OK, self._wait_list().places.reclaim())

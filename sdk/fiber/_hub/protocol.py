@@ -116,6 +116,8 @@ class Op(IntEnum):
     SET = 57  # which, the word
     HOLD = 58  # how many things the stream's place has; silent
     RECLAIM = 59  # -> how many things the dead had
+    TALLY = 60  # how many things the stream's place has; the second word
+    HELD = 61  # -> how many things all places have
 
 
 class Status(IntEnum):

@@ -73,6 +73,14 @@ class RemoteWaitList(RemoteObject):
         """Note how many things the owner of a place has.  Waits for nothing."""
         place.say(Op.HOLD, number, form=ONE)
 
+    def tally(self, place: HubStream, held: int, total: int) -> None:
+        """Note how many things the owner of a place has, and set the user's second word."""
+        place.ask(Op.TALLY, held, total, form=TWO)
+
+    def held(self) -> int:
+        """How many things all owners of places have."""
+        return self._ask(Op.HELD, 0)
+
     def reclaim(self) -> int:
         """Free the places of dead processes, and return how many things they had."""
         return self._ask(Op.RECLAIM, 0)

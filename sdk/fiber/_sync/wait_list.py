@@ -113,6 +113,15 @@ class WaitList:
         """Note how many things the owner of a place has.  Without the lock."""
         self._words[place + _HELD] = number
 
+    def tally(self, place: int, held: int, total: int) -> None:
+        """Note how many things the owner of a place has, and set the user's second word."""
+        self._words[place + _HELD] = held
+        self.set(1, total)
+
+    def held(self) -> int:
+        """How many things all owners of places have."""
+        return sum(self._words[place + _HELD] for place in self._used())
+
     def reclaim(self) -> int:
         """Free the places of dead processes, and return how many things they had."""
         dead = [place for place in self._used() if self._is_dead(place)]
