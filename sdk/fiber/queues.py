@@ -16,6 +16,7 @@ Differs from multiprocessing in that an item is pickled when it is put, not some
 
 from __future__ import annotations
 
+import operator
 import threading
 import time
 import types
@@ -45,7 +46,9 @@ class Queue(Generic[_T]):
     """A first-in first-out queue for any number of processes and threads."""
 
     def __init__(self, maxsize: int = 0, *, ctx: Any = None) -> None:
-        self._slots: Slots | ItemCount = Slots(maxsize) if maxsize > 0 else ItemCount()
+        self._slots: Slots | ItemCount = (
+            ItemCount() if maxsize <= 0 else Slots(operator.index(maxsize))
+        )
         self._inbox, self._outbox = LocalChannel.pair()
         self._open()
 

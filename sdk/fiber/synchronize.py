@@ -9,7 +9,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import operator
 import os
 import threading
 import time
@@ -118,8 +120,12 @@ class Semaphore(SemLock):
 
     @staticmethod
     def _check(value: int) -> None:
-        if not 0 <= value <= SEM_VALUE_MAX:
-            raise ValueError(f"a semaphore's value is from 0 to {SEM_VALUE_MAX}, not {value}")
+        operator.index(value)  # TypeError for what is no integer
+        reason = f"a semaphore's value is from 0 to {SEM_VALUE_MAX}, not {value}"
+        if value < 0:
+            raise OSError(errno.EINVAL, reason)
+        if value > SEM_VALUE_MAX:
+            raise OverflowError(reason)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}(value={self.get_value()})>"
@@ -230,7 +236,7 @@ class Condition:
     def notify(self, n: int = 1) -> None:
         """Wake ``n`` of those who wait, the first to come first."""
         self._check("notify")
-        self._waiters.notify(n)
+        self._waiters.notify(max(0, n))
 
     def notify_all(self) -> None:
         """Wake all who wait."""

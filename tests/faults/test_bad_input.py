@@ -92,7 +92,7 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
         (lambda: fiber.Pool(2, task_timeout=math.nan), ValueError, "task_timeout.*nan"),
         (lambda: Connection(cast("Any", 0)), TypeError, "multiprocessing.connection.Connection"),
         (lambda: fiber.Process(group=cast("Any", 1)), AssertionError, "group"),
-        (lambda: fiber.Semaphore(-1), ValueError, "value"),
+        (lambda: fiber.Semaphore(-1), OSError, "value"),
         (lambda: fiber.get_context("typo"), ValueError, "typo"),
         (lambda: fiber.set_start_method("typo", force=True), ValueError, "typo"),
         (lambda: fiber.init(bakend="local"), fiber.ConfigError, "'bakend'.*'backend'"),  # type: ignore[call-arg]

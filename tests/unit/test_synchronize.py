@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import multiprocessing
 import os
 import signal
 import threading
@@ -58,8 +60,30 @@ def test_a_bounded_semaphore_refuses_what_was_not_acquired() -> None:
 
 @pytest.mark.parametrize("value", [-1, synchronize.SEM_VALUE_MAX + 1])
 def test_a_value_that_cannot_be(value: int) -> None:
-    with pytest.raises(ValueError, match=str(value)):
+    with pytest.raises((OSError, OverflowError), match=str(value)):
         fiber.Semaphore(value)
+
+
+def refusal(make: Callable[[Any], object], value: Any) -> type[Exception] | None:
+    try:
+        make(value)
+    except Exception as error:
+        return type(error)
+    return None
+
+
+@pytest.mark.parametrize("value", [2.0, -1, "2", None, math.nan, 1 << 80])
+@pytest.mark.parametrize("name", ["Semaphore", "BoundedSemaphore", "Queue", "JoinableQueue"])
+def test_a_wrong_number_is_refused_as_by_multiprocessing(name: str, value: Any) -> None:
+    expected = refusal(getattr(multiprocessing, name), value)
+    assert refusal(getattr(fiber, name), value) is expected
+
+
+def test_to_notify_fewer_than_none_wakes_nobody() -> None:
+    condition = fiber.Condition()
+    with condition:
+        condition.notify(-1)
+        assert not condition.wait(0.01)
 
 
 def in_turn(semaphore: Any, inside: Any, times: int) -> None:
