@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import signal
@@ -362,9 +363,11 @@ def test_readers_killed_anywhere_take_at_most_the_item_they_hold() -> None:
     queue: Any = fiber.Queue()
     total, killed = 2000, 10
     reported = []
-    for number in range(total):
-        queue.put(number)
+    numbers = iter(range(total))
     for _ in range(killed):
+        # New items for each reader: the one before may have taken all others until it was killed.
+        for number in itertools.islice(numbers, total // killed):
+            queue.put(number)
         reports, taken = fiber.Pipe(duplex=False)
         process = start(get_and_report, queue, taken)
         taken.close()
