@@ -54,6 +54,8 @@ class LocalChannel(UnixChannel):
             packet.send(self._sock, payload, buffers, ballast=True, wait=False)
             return True
         except BlockingIOError:
+            if packet.is_bulky(payload, buffers):
+                return False
             grow(self._sock)
         try:
             packet.send(self._sock, payload, buffers, ballast=True, wait=False)

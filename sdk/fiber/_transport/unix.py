@@ -143,7 +143,8 @@ class UnixChannel:
         try:
             bulky = packet.send(self._sock, payload, buffers, ballast=True, wait=False)
         except BlockingIOError:
-            grow(self._sock)
+            if not packet.is_bulky(payload, buffers):
+                grow(self._sock)
             bulky = packet.send(self._sock, payload, buffers, ballast=True)
         if bulky:
             wait_until(self._sock.fileno(), select.POLLOUT)

@@ -243,7 +243,7 @@ def send(
     With ``ballast`` a message above BULK weighs enough in the socket's buffer that the socket is
     not writable until the message is read; True says that it was such a message.
     """
-    size = len(payload) if isinstance(payload, bytes) else memoryview(payload).nbytes
+    size = _size(payload)
     flags = 0 if wait else _DONTWAIT_TO_SEND
     try:
         if not buffers and not fds and size <= INLINE_LIMIT:
@@ -268,6 +268,15 @@ def send(
             raise FileTooLarge("sending a message") from error
         raise
     return False
+
+
+def is_bulky(payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
+    """Whether a message is above BULK."""
+    return _size(payload) + sum(view.nbytes for view in buffers) > BULK
+
+
+def _size(payload: BytesLike) -> int:
+    return len(payload) if isinstance(payload, bytes) else memoryview(payload).nbytes
 
 
 def check_buffers(buffers: Sequence[memoryview]) -> None:
