@@ -52,9 +52,11 @@ class Claims:
 
     def drop(self) -> None:
         """Note that this process has one place less: the item was sent, or the place given back."""
-        with suppress(IndexError):  # interrupted before it was noted
+        try:
             self._own.pop()
-            self._tell()
+        except IndexError:  # interrupted before it was noted
+            return
+        self._tell()
 
     def recover(self) -> int:
         """Return the number of places that dead processes had; each is told once."""
@@ -71,13 +73,17 @@ class Claims:
     def _tell(self) -> None:
         if not self._entry:
             self._enter()
-        for entry in self._entry[:1]:
+        if not self._entry:
+            return
+        entry, own = self._entry[0], self._own
+        try:
             while True:
-                count = len(self._own)
-                with suppress(OSError, Unreachable):  # the hub is gone, and the queue with it
-                    self._table.hold(entry, count)
-                if count == len(self._own):  # else another thread may have told the old number last
+                count = len(own)
+                self._table.hold(entry, count)
+                if count == len(own):  # else another thread may have told the old number last
                     return
+        except (OSError, Unreachable):
+            pass  # the hub is gone, and the queue with it
 
     def _enter(self) -> None:
         self._lock.acquire()
