@@ -284,7 +284,7 @@ def test_small_frames_pass_a_large_one_also_over_connections_that_break(
     large = random.Random(1).randbytes(20_000_000)
     cable.agent.send(large, lane="one")
     for number in range(1, 10):
-        loop.run_for(0.02)
+        loop.run_for(0.005)
         cable.agent.send(b"%d" % number, lane=number)
         if breaks and number % 3 == 0:
             cable.break_off()
