@@ -224,7 +224,7 @@ _HOMES = {
 }
 
 
-if not TYPE_CHECKING:  # to a type checker any name would be one of ours
+if not TYPE_CHECKING:  # a type checker would accept any name
 
     def __getattr__(name: str) -> object:
         """Names are looked up when first used, so that importing Fiber costs nothing."""

@@ -14,7 +14,7 @@ USUAL = "WARNING"
 
 
 def debug(message: str, *args: object) -> None:
-    """Log an event of Fiber's; free of cost where nobody has imported ``logging``."""
+    """Log an event of Fiber's; free of cost where ``logging`` is not imported."""
     # Another thread may be importing the module at this moment.
     get_logger: Any = getattr(sys.modules.get("logging"), "getLogger", None)
     if get_logger is None:

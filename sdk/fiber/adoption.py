@@ -1,7 +1,7 @@
 """`fiber.adopt`: run a library that was written for multiprocessing, and cannot be edited.
 
 A function finds its globals in the namespace of its module at each call, so rebinding the
-names there is enough, and touches nobody else. The same is done with default values of the
+names there is enough, and touches no other module. The same is done with default values of the
 module's functions and with attributes of its classes. What else Python evaluated when the module
 was imported (base classes, objects that were made then) is out of reach. It is looked for and
 refused, where it belongs to a class or function of the module or to the module itself; inside of
@@ -228,7 +228,7 @@ def _plan(module: ModuleType, fiber: Any, *, adopted: bool) -> dict[_Place, _Bin
 
 
 class _Survey:
-    """What in one module is multiprocessing's: what to rebind, and what is in the way."""
+    """Uses of multiprocessing in one module: places to rebind, and problems that prevent it."""
 
     def __init__(self, module: ModuleType, fiber: Any) -> None:
         self.bindings: dict[_Place, _Binding] = {}

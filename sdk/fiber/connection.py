@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     def wait(object_list: Iterable[Any], timeout: float | None = None) -> list[Any]:
         """multiprocessing's, whose own types know no connections but its own."""
 
-else:  # to a type checker any name would be one of ours
+else:  # a type checker would accept any name
 
     def __getattr__(name: str) -> object:
         if name not in vars(_mp):

@@ -64,7 +64,7 @@ __all__ = [
 MaybeEncodingError: type[Exception]
 
 
-if not TYPE_CHECKING:  # to a type checker any name would be one of ours
+if not TYPE_CHECKING:  # a type checker would accept any name
 
     def __getattr__(name: str) -> object:
         # multiprocessing.pool is most of the import time that this module would have.

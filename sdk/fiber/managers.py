@@ -318,7 +318,7 @@ class SyncManager(BaseManager, mp_managers.SyncManager):
     """A manager of lists, dicts, queues, locks and all else that multiprocessing registers."""
 
     if TYPE_CHECKING:
-        Pool: ClassVar[type[_Pool]]  # type: ignore[assignment]  # it takes options of ours
+        Pool: ClassVar[type[_Pool]]  # type: ignore[assignment]  # it takes Fiber's options
 
 
 def _pool(*args: Any, **options: Any) -> Any:

@@ -409,7 +409,7 @@ class Pool:
         try:
             return self._executor.threads.callbacks.submit(action)
         except RuntimeError:
-            report_uncaught()  # nobody else would hear of it
+            report_uncaught()  # no other code would report it
             return False
 
     def _calls_back_here(self) -> bool:

@@ -225,7 +225,7 @@ _SHARED_BY_MULTIPROCESSING = (
 
 
 def _is_of_multiprocessing(error: Exception) -> bool:
-    """Whether it is multiprocessing's complaint about start methods, which are not the reason."""
+    """Return whether multiprocessing complains about start methods, which are not the reason."""
     text = str(error)
     return isinstance(error, RuntimeError) and ("SemLock" in text or "through inheritance" in text)
 

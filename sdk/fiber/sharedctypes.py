@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fiber.synchronize import LockLike
 
     Locked: TypeAlias = Literal[True] | LockLike
-    """What ``lock=`` is for an object that is to have a lock."""
+    """Values of ``lock=`` for an object that is to have a lock."""
     Size: TypeAlias = int | Sequence[Any]
     """How many elements an array has, or their values."""
 

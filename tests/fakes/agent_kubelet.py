@@ -41,7 +41,7 @@ class AgentKubelet:
         self.services: dict[str, str] = {}
         """By the names of FiberPools, ``host:port`` that all their masters are at."""
         self.cut_off = False
-        """Whether agents started from now on dial an address at which no master is."""
+        """True if agents started from now on dial an address at which no master is."""
         store.pods_linger = True
         store.created = self._created
 

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 
 class Unpicklable(Exception):
-    """Nothing makes it again."""
+    """Exception that cannot be unpickled."""
 
     def __setstate__(self, state: Any) -> None:
         raise TypeError("this does not unpickle")

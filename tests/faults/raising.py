@@ -1,4 +1,4 @@
-"""What raises an exception whose ``__init__`` takes other arguments than it passes on."""
+"""Targets that raise an exception whose ``__init__`` takes other arguments than it passes on."""
 
 from __future__ import annotations
 

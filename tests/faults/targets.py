@@ -293,7 +293,7 @@ def make_a_push_queue(connection: Any) -> None:
 
 
 def content(size: int) -> bytes:
-    """Bytes whose pieces differ, whatever the size of a piece is."""
+    """Return bytes whose pieces differ, for pieces of any size."""
     return bytes(range(251)) * (size // 251 + 1)
 
 

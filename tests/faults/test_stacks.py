@@ -1,4 +1,4 @@
-"""Where a task was when its worker was killed over its time, or crashed: on each backend."""
+"""Stack of a task whose worker was killed over its time, or crashed: on each backend."""
 
 from __future__ import annotations
 

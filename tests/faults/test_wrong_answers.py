@@ -1,4 +1,4 @@
-"""Tasks that write to the channel of their worker: they reach nobody's results but their own."""
+"""Tasks that write to the channel of their worker: they reach no results but their own."""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ class PoolAudit:
     def _check_messages(self) -> None:
         held = self._ledger.batches.keys()
         require(self._executor._sender._unsent <= held, "what is not sent is not held by anybody")
-        require(self._executor._limits._timers.keys() <= held, "a deadline is nobody's")
+        require(self._executor._limits._timers.keys() <= held, "a deadline belongs to no batch")
 
     def _check_news(self) -> None:
         if self._failures and self._workers.error is None and not self._told:

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 
 class Diverged(Exception):
-    """Its ``__init__`` takes other arguments than it passes on."""
+    """Exception whose ``__init__`` takes other arguments than it passes on."""
 
     def __init__(self, step: int, *, loss: float) -> None:
         super().__init__(f"loss {loss} at step {step}")
@@ -19,7 +19,7 @@ class Diverged(Exception):
 
 
 class Rewords(Exception):
-    """It can be called with what it passes on, and says something else then."""
+    """Exception that can be called with what it passes on, and says something else then."""
 
     def __init__(self, code: object, detail: str = "no detail") -> None:
         super().__init__(f"{code}: {detail}")
@@ -39,7 +39,7 @@ class Slotted(Exception):
 
 
 class Made(Exception):
-    """It has a ``__new__`` with other arguments."""
+    """Exception that has a ``__new__`` with other arguments."""
 
     def __new__(cls, *, step: int) -> Made:
         made = super().__new__(cls, f"step {step}")
@@ -112,7 +112,7 @@ class Several(ExceptionGroup[Exception]):
 
 
 class Reduced(Exception):
-    """Its own ``__reduce__`` works, and leaves out what is not to travel."""
+    """Exception whose own ``__reduce__`` works, and leaves out what is not to travel."""
 
     def __init__(self, step: int, secret: str) -> None:
         super().__init__(step, secret)
@@ -133,7 +133,7 @@ copyreg.pickle(Registered, lambda error: (Registered, (error.args[0], "left out"
 
 
 class BadlyReduced(Exception):
-    """Its own ``__reduce__`` pickles; it fails when that is unpickled."""
+    """Exception whose own ``__reduce__`` pickles, but fails when it is unpickled."""
 
     def __init__(self, step: int, loss: float) -> None:
         super().__init__("badly reduced")
@@ -150,7 +150,7 @@ class Refusing(Exception):
 
 
 class WithState(Exception):
-    """It has a ``__setstate__``, which pickle calls."""
+    """Exception that has a ``__setstate__``, which pickle calls."""
 
     def __init__(self, step: int, loss: float) -> None:
         super().__init__("with state")
@@ -161,7 +161,7 @@ class WithState(Exception):
 
 
 class Wraps(Exception):
-    """It has another exception for an attribute, and itself through that."""
+    """Exception with another one for an attribute, which refers back to it."""
 
     def __init__(self, inner: Exception, *, step: int) -> None:
         super().__init__("wraps")
@@ -171,7 +171,7 @@ class Wraps(Exception):
 
 
 class Holding(Exception):
-    """It holds what cannot be pickled."""
+    """Exception that holds what cannot be pickled."""
 
     def __init__(self, step: int) -> None:
         super().__init__("holds", threading.Lock())
@@ -180,7 +180,7 @@ class Holding(Exception):
 
 
 class Chained(Exception):
-    """It holds the exception that it replaces."""
+    """Exception that holds the exception that it replaces."""
 
     def __init__(self, replaces: object) -> None:
         super().__init__("chained")
@@ -188,7 +188,7 @@ class Chained(Exception):
 
 
 class CountsPickles:
-    """It cannot be pickled, and counts the attempts."""
+    """Object that cannot be pickled, and counts the attempts."""
 
     attempts = 0
 
@@ -198,7 +198,7 @@ class CountsPickles:
 
 
 class Hopeless(Exception):
-    """Nothing makes it again."""
+    """Exception that cannot be unpickled."""
 
     def __setstate__(self, state: Any) -> None:
         raise LookupError("its state cannot be set")

@@ -94,7 +94,7 @@ def test_no_test_asserts_how_long_something_took() -> None:
 
 
 def measures_a_duration(path: Path) -> bool:
-    """Whether the module subtracts something from what a clock shows."""
+    """Return whether the module subtracts something from what a clock shows."""
     return any(
         isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub) and reads_a_clock(node.left)
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))

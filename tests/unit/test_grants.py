@@ -105,7 +105,7 @@ def test_a_token_ends_with_its_user(hosts: Hosts, far: Far, home: HubAddress) ->
 
 
 def knows(home: HubAddress, token: bytes) -> bool:
-    """Whether a hub lets a user with this token attach."""
+    """Return whether a hub lets a user with this token attach."""
     stream = HubStream(home)
     try:
         stream._send(SECRETS.pack(Op.ATTACH, 1, token, NO_SECRET))

@@ -1,4 +1,4 @@
-"""What is installed: the wheel, the packages of its extras, and files of another distribution."""
+"""Installed files: the wheel, the packages of its extras, and files of another distribution."""
 
 from __future__ import annotations
 

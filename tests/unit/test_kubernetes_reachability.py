@@ -96,7 +96,7 @@ class Site:
 
     @property
     def told(self) -> list[str]:
-        """What was said of agents that do not come."""
+        """Lines about agents that do not come."""
         return [line for line in self.lines if "has reached this program" in line]
 
 

@@ -102,7 +102,7 @@ def test_the_root_logger_has_the_records_of_a_program_without_multiprocessings(
 
 @pytest.fixture
 def records() -> Iterator[list[str]]:
-    """What the handlers of the logger ``fiber`` get."""
+    """Messages that the handlers of the logger ``fiber`` get."""
     got: list[str] = []
 
     class Handler(logging.Handler):

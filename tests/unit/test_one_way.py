@@ -1,4 +1,4 @@
-"""One-way channels: what a pipe or queue holds that nobody reads, and who gets it."""
+"""One-way channels: how much a pipe or queue holds unread, and which reader gets it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def ends() -> Iterator[Ends]:
 
 
 def is_readable(channel: Receiver) -> bool:
-    """Whether ``select`` and its like say so."""
+    """Return whether ``select`` and its like find the channel readable."""
     poller = select.poll()
     poller.register(channel.fileno(), select.POLLIN)
     return bool(poller.poll(0))

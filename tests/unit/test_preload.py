@@ -1,4 +1,4 @@
-"""What a zygote imports for its children, and which threads keep it from being forked."""
+"""Modules that a zygote imports for its children, and which threads keep it from being forked."""
 
 from __future__ import annotations
 

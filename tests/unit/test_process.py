@@ -128,7 +128,7 @@ def test_what_does_not_pickle_is_named(options: dict[str, Any], culprit: str) ->
     ("make", "way"), [("Lock", "._semlock"), ("Queue", "._rlock._semlock")], ids=["lock", "queue"]
 )
 def test_what_multiprocessing_made_is_refused_with_what_to_do(make: str, way: str) -> None:
-    """Its own error is about start methods, which are not the reason."""
+    """multiprocessing's own error is about start methods, which are not the reason."""
     theirs = getattr(multiprocessing.get_context("fork"), make)()
     with pytest.raises(UnpicklableError, match=r"fiber\.adopt\(\)") as caught:
         fiber.Process(name="odd", target=print, args=(theirs,)).start()

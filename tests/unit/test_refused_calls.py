@@ -88,7 +88,7 @@ def check_that_nothing_stays(
     caller.repeat(turns, kind, _WARM_UP)
     blocks, descriptors = held()
     caller.repeat(turns, kind, calls)
-    gc.collect()  # asyncio makes cycles of its own
+    gc.collect()  # asyncio makes cycles, too
     wait_until(lambda: len(caller.locals) == 0, "the frames of callers are gone")
     assert len(caller.frames) <= len(functions)
     after = held()

@@ -1,4 +1,4 @@
-"""What the master believes of an agent: what it says of its own children, and nothing else."""
+"""Messages of an agent that the master believes: those about the agent's own children."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ UNTYPED_UPSTREAM = {
 
 
 class Finding(NamedTuple):
-    """What a checker says about a line: a type, or the rule that the line breaks."""
+    """Result of a checker for one line: a type, or the rule that the line breaks."""
 
     line: int
     type: str = ""

@@ -88,8 +88,7 @@ class ChildSpec:
     program: Blob | None = None
     """The program's files, for an agent that has not the program's own file system."""
     payload_at: tuple[Descriptor, int, int] | None = None
-    """Where the payload is instead, if it is large: a descriptor, the offset in it, and its size.
-    """
+    """Place of a large payload, used instead: a descriptor, the offset in it, and its size."""
     arguments: Blob | None = None
     """The pickled arguments of the Process, where they are not in the payload."""
     resources: Resources = field(default=Resources())

@@ -26,7 +26,7 @@ _OUR_FRAMES = tuple(
     f'  File "{os.path.normpath(os.path.join(_HERE, place))}'
     for place in ("worker.py", "child.py", "../vector/slot.py", "../vector/worker.py")
 )
-"""What calls the code of the user."""
+"""Starts of the lines of a stack that show Fiber's frames around the code of the user."""
 
 
 def make_file() -> int:

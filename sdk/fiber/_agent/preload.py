@@ -95,7 +95,7 @@ class _Preloader:
     def load(self, name: str) -> None:
         """Import the module ``name``."""
         begin = time.perf_counter()
-        # Whatever an import raises, a child that needs the module meets, and reports, itself.
+        # A child that needs the module meets the same exception, and reports it.
         with contextlib.suppress(BaseException):
             importlib.import_module(name)
         self._note((name,), 0, time.perf_counter() - begin)
@@ -168,13 +168,13 @@ class _Preloader:
             self._steps.append(_Step(modules, line, seconds, dict(os.environb)))
 
     def _check(self, culprit: str) -> bool:
-        """Whether a fork is safe up to here; if it no longer is, ``culprit`` is the reason."""
+        """Return whether a fork is still safe; if it no longer is, ``culprit`` is the reason."""
         if self._culprit is None and not self._is_fit():
             self._culprit, self._names = culprit, _names_of_threads()
         return self._culprit is None
 
     def _is_fit(self) -> bool:
-        """Whether no thread is there that a fork would break."""
+        """Return whether no thread is there that a fork would break."""
         return _count_threads() <= self._threads or (
             _trial_fork_ends() and _comes_down_to(self._threads)
         )

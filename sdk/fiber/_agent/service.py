@@ -74,7 +74,7 @@ class AgentService:
         self.send(message, partial(self._output_left, len(message.text)))
 
     def busy(self) -> bool:
-        """Whether so much output waits for the link that no more should be read."""
+        """Return whether so much output waits for the link that no more should be read."""
         return self._output > _BACKLOG
 
     def _output_left(self, size: int) -> None:

@@ -118,7 +118,7 @@ def _exception(obj: Any) -> BaseException:
 
 
 def _links(error: BaseException) -> Iterator[tuple[str, BaseException]]:
-    """What led to ``error``: each with the attribute of the one before it that holds it."""
+    """Yield the causes of ``error``: each with the attribute of the one before that holds it."""
     seen = {id(error)}
     while len(seen) <= LINKS:
         name, link = "__cause__", error.__cause__
@@ -283,7 +283,7 @@ def _set_state(
 
 
 def _needs_rebuilding(error: BaseException) -> bool:
-    """Whether pickle's own way may run code in Python, or lose a member."""
+    """Return whether pickle's own way may run code in Python, or lose a member."""
     kind = type(error)
     methods = (kind.__new__, kind.__init__, kind.__reduce__)
     return (

@@ -252,7 +252,7 @@ class LoopbackBackend:
 
     @property
     def _starting(self) -> list[_Slot]:
-        """Those whose agents have not joined and not failed."""
+        """Slots whose agents have neither joined nor failed."""
         joined = self.agents.agents
         return [slot for slot in self._by_name.values() if slot.name not in joined]
 

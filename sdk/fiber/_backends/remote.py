@@ -305,7 +305,7 @@ class RemoteChild:
         missed = list(self._latest)[max(0, len(self._latest) - crossed) :]
         report = report._replace(unread=(*report.unread, *missed))
         if self._agent is not None:
-            at = self._agent  # whatever it says of itself
+            at = self._agent  # the report's claims do not count
             report = report._replace(host=at.host, pod=at.pod, node=at.node)
             if self._agent.ending and report.exitcode < 0:  # together with its pod
                 report = report._replace(reason=self._agent.ending)

@@ -15,8 +15,8 @@ RAISED_PATIENCE = 1.0
 raises, before that is the answer."""
 
 KILLED_PATIENCE = 10.0
-"""The same for those that are killed, or refused by the system: spot nodes and OOM killers come in
-waves, and go."""
+"""Seconds for which starting processes may be killed, or refused by the system: spot nodes and OOM
+killers come in waves, and go."""
 
 TRIES = 3
 """Starts that must have failed, however long it took."""
@@ -25,7 +25,7 @@ FIRST_PAUSE, LAST_PAUSE = 0.05, 1.0
 """Seconds from one wave of failures to the next try, doubled from wave to wave."""
 
 LAST_PAUSE_AT_WORK = 60.0
-"""The same, at most, while other processes are at work."""
+"""Longest pause, in seconds, while other processes are at work."""
 
 SAID_AFTER = 2.0
 """Seconds of failures after which the user is told."""
@@ -37,15 +37,15 @@ class StartFailure(NamedTuple):
     who: str
     reason: str
     text: str = ""
-    """What it said."""
+    """Message of the process."""
     killed: bool = False
     """By a signal, or the system had no room for it: it may have done nothing wrong."""
     cause: BaseException | None = None
     final: FiberError | None = None
-    """What keeps every process from starting: another try is of no use."""
+    """Error that keeps every process from starting: another try is of no use."""
 
     def error(self, attempts: int) -> FiberError:
-        """What the user hears."""
+        """Return the error that the user gets."""
         if self.final is not None:
             return self.final
         error = StartError(self.who, self.reason, self.text, attempts)

@@ -88,8 +88,8 @@ class Job:
 class Batch:
     """A slice of a job's tasks in one message.
 
-    ``job`` is None once nobody wants its results; ``received`` counts those that came, the last of
-    them from ``_received_from`` on; ``stride`` is the number of tasks between two notes of the
+    ``job`` is None once its results are not wanted; ``received`` counts those that came, the last
+    of them from ``_received_from`` on; ``stride`` is the number of tasks between two notes of the
     worker's progress.
     """
 

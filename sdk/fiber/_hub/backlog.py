@@ -98,7 +98,7 @@ class Backlog:
             payload = self._read(start, end)
             needed = words[_NEEDED]
             if needed and self._capacity - (words[TAIL] - end) >= needed:
-                say_room()  # before: who dies here leaves a sender that looks once in vain
+                say_room()  # first: after a death here a sender looks once in vain
                 words[_NEEDED] = 0
             if words[HEAD] == head:
                 words[HEAD] = end

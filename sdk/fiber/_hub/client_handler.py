@@ -234,7 +234,7 @@ class ClientHandler:
 
     @property
     def _hosted(self) -> Hosted | None:
-        """What the stream is attached to."""
+        """Hosted object that the stream is attached to."""
         return None if self._attachment is None else self._attachment.shared.hosted
 
     def ring(self, message: Message) -> None:

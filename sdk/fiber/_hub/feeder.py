@@ -66,10 +66,10 @@ class Slots:
         """The item leaves this process."""
 
     def not_sent(self) -> None:
-        """It did not, but will."""
+        """Note that the item was not sent yet, but will be."""
 
     def sent(self) -> None:
-        """It did: its place is free once it is received."""
+        """Note that the item was sent: its place is free once it is received."""
         self._claims.drop()
 
     def free(self) -> None:
@@ -120,11 +120,11 @@ class ItemCount:
         self._sent.add(1)
 
     def not_sent(self) -> None:
-        """It did not, but will."""
+        """Note that the item was not sent yet, but will be."""
         self._sent.take(0)
 
     def sent(self) -> None:
-        """It did."""
+        """Do nothing: ``sending`` has counted the item."""
 
     def free(self) -> None:
         """An item was received."""

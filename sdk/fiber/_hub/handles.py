@@ -59,7 +59,7 @@ class HubHandle(NamedTuple):
     home: HubAddress
     grant: bytes
     identity: bytes
-    """Of shared memory: the same in all handles of it."""
+    """Identity of shared memory: the same in all handles of it."""
 
     def __repr__(self) -> str:
         return f"HubHandle(home={self.home!r})"
@@ -118,7 +118,7 @@ class EndHandle(NamedTuple):
     extent: Extent
 
     def end(self) -> SharedChannel:
-        """Where it was unpickled: the end."""
+        """Return the end for the process that unpickled the handle."""
         if isinstance(self.socket, HubHandle) and not self.socket.here():
             return RemoteChannel(*self.socket)
         socket, *beside = _descriptors(self.socket)

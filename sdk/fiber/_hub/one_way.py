@@ -173,7 +173,7 @@ class Receiver(OneWayEnd):
                 return message
 
     def recv_object(self) -> Any:
-        """The same, unpickled."""
+        """Return the object in the next message; ConnectionClosed at the end."""
         words = self._words
         if words[HEAD] == words[TAIL]:
             try:

@@ -1,9 +1,9 @@
 """Which objects of its host a hub keeps for others, and what keeps each of them there.
 
 An object stays as long as someone on another host is attached to it or a grant for it is out.  A
-grant is the permission that travels inside a pickled handle: 128 random bits.  A plain one is used
-up by whoever takes it first; a reusable one lasts until it is released.  A user that attaches by a
-grant brings a *token*, 128 random bits of its own choice.  While it is attached, the token lets it
+grant is the permission that travels inside a pickled handle: 128 random bits.  A plain one ends
+with its first use; a reusable one lasts until it is released.  A user that attaches by a grant
+brings a *token*, 128 random bits that it has chosen.  While it is attached, the token lets it
 attach again and grant the object to others.
 """
 
@@ -56,7 +56,7 @@ class SharedObject:
         self._descriptors = descriptors
         self.extent = extent
         self.identity = identity
-        """Of shared memory: the same in each handle of it, and known to its users alone."""
+        """Identity of shared memory, the same in each handle of it, known to its users alone."""
         self.attached = 0
         self.server: Hosted | None = None
 
@@ -149,28 +149,28 @@ class Registry:
         return grant, shared.identity
 
     def _identify(self, known: tuple[int, ...]) -> bytes:
-        """The same for each thread that shares it, and however often it is forgotten meanwhile."""
+        """Return an object's identity, the same each time, even after the object was forgotten."""
         return hmac.digest(self._secret, struct.pack("<3Q", *known), "sha256")[:SECRET_BYTES]
 
     def release(self, grants: Iterable[bytes]) -> None:
-        """Nobody will use them any more.  It is done in a moment."""
+        """Have the loop take ``grants`` back, which no process will use from now on."""
         self._call_soon(self.take_back, grants)
 
     def take_back(self, grants: Iterable[bytes]) -> None:
-        """The same, now."""
+        """Take ``grants`` back now."""
         self._settle()
         for grant in grants:
             self._grants.pop(grant, None)
 
     def grant(self, token: bytes, *, reusable: bool) -> tuple[bytes, bytes]:
-        """One more grant for what the user with this token is attached to, and its identity."""
+        """Make one more grant for the object of this token's user; return it and the identity."""
         shared = self._used_by(token)
         grant = os.urandom(SECRET_BYTES)
         self._grants[grant] = Grant(shared, reusable)
         return grant, shared.identity
 
     def fetch(self, grant: bytes) -> list[int]:
-        """Its descriptors for someone on this host; uses up a plain grant."""
+        """Return an object's descriptors for a process on this host; use up a plain grant."""
         shared = self._granted(grant)
         with naming_the_limit("receiving a pipe or queue from another process"):
             fds = shared.duplicates()
@@ -178,9 +178,9 @@ class Registry:
         return fds
 
     def attach(self, token: bytes, grant: bytes = NO_SECRET) -> Attachment:
-        """Someone on another host uses it now; ``detach`` ends that.
+        """Attach a user on another host; ``detach`` ends that.
 
-        Who is attached already may attach again with the same token and no grant.
+        A user that is attached already may attach again with the same token and no grant.
         """
         shared = self._used_by(token) if grant == NO_SECRET else self._granted(grant)
         if self._users.get(token, [shared])[0] is not shared:

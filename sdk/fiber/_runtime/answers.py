@@ -1,7 +1,7 @@
 """Messages of pool workers, checked before anything believes them.
 
-A task can write to the channel of its own worker, by mistake or because it was taken over.  Their
-form is in ``fiber._wire.work``.
+A task can write to the channel of its own worker, by mistake or because it was taken over.  The
+form of the messages is in ``fiber._wire.work``.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from fiber._wire import work
 from fiber._wire.packet import Message
 
 Words: TypeAlias = tuple[Any, ...]
-"""What a worker says.  Results are (seq, offset, kept, seconds, values, mixed, size): among the
-values, if they are mixed, are ``Pickled`` ones; ``size`` is that of the message."""
+"""Content of a worker's message.  Results are (seq, offset, kept, seconds, values, mixed, size):
+among the values, if they are mixed, are ``Pickled`` ones; ``size`` is that of the message."""
 
 OTHER = object()
 """In place of a result: the message is something else."""

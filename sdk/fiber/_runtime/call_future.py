@@ -64,7 +64,7 @@ class CallFuture(Future[_T]):
         return self._claimed is False or self._state in (CANCELLED, CANCELLED_AND_NOTIFIED)
 
     def result(self, timeout: float | None = None) -> _T:
-        """As in concurrent.futures; each call raises an exception of its own."""
+        """As in concurrent.futures; each call raises a new exception."""
         error = self._error(timeout)
         if error is not None:
             raise fresh(error)
@@ -72,7 +72,7 @@ class CallFuture(Future[_T]):
         return result  # type: ignore[no-any-return]
 
     def exception(self, timeout: float | None = None) -> BaseException | None:
-        """As in concurrent.futures; each call returns an exception of its own."""
+        """As in concurrent.futures; each call returns a new exception."""
         error = self._error(timeout)
         return error and fresh(error)
 
@@ -174,7 +174,7 @@ class CallFuture(Future[_T]):
             if thread.submit(action):
                 return
         try:
-            action()  # else nobody would hear of it
+            action()  # else the outcome, or its callbacks, would be lost
         except BaseException:  # of a callback that exits: the loop has to go on
             report_uncaught()
 

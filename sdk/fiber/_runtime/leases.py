@@ -142,7 +142,7 @@ class Leases:
                 return result
 
     def _is_late(self, message: Message, seq: int) -> bool:
-        """Whether it answers a call before ``seq``, which was given up."""
+        """Return whether ``message`` answers a call before ``seq``, which was given up."""
         try:
             number = read(message)[0]
         except WrongAnswer:

@@ -151,5 +151,5 @@ class Sender:
         return unsent
 
     def settled(self, seq: int) -> None:
-        """What becomes of a batch is known: its time limit, if it has one, is off."""
+        """End the time limit of a batch, if it has one: its outcome is known."""
         self._limits.settled(seq)

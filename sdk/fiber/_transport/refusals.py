@@ -26,7 +26,7 @@ class Refusals:
     def news(self, host: str, origin: str, reason: str, now: float, *, own: bool = False) -> str:
         """Return what to tell of a refusal, which is nothing if it was told lately.
 
-        ``own``: of an agent of the program, which is told whatever strangers do.
+        ``own`` marks a refusal of an agent of the program: no number of strangers suppresses it.
         """
         told = self._own if own else self._strangers
         _forget(told, now)

@@ -40,7 +40,7 @@ Pieces: TypeAlias = Sequence[BytesLike]
 
 
 class Entry(NamedTuple):
-    """What a datagram has of one frame."""
+    """A frame, or a piece of one, in a datagram."""
 
     word: int
     pieces: Pieces

@@ -70,7 +70,7 @@ class BorrowedSocket(socket.socket):
 
 @functools.cache
 def _usual_room() -> int:
-    """The size of a socket's buffer that nobody has changed: net.core.wmem_default."""
+    """Return the default size of a socket's buffer: net.core.wmem_default."""
     one, other = socketpair("opening a pipe")
     with one, other:
         return one.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)

@@ -132,7 +132,7 @@ class Mapping(mmap.mmap):
 
     owner: Descriptor | None = None
     process = 0
-    """Where it was made.  A process that this one forks has no say."""
+    """Id of the process that made it.  A fork of that process does not give it back."""
 
     def __del__(self) -> None:
         if self.process == os.getpid() and len(self) >= SLOWLY:
@@ -156,7 +156,7 @@ def mapping(memory: Descriptor, size: int) -> Mapping:
 
 
 class _Lent(Mapping):
-    """A sender's block as its reader has it: its sender's again once nobody looks at it."""
+    """A sender's block as its reader has it: its sender's again once no view of it is left."""
 
     def __del__(self) -> None:
         if self.process == os.getpid():

@@ -52,7 +52,7 @@ class Assembly:
 
 
 class Memory(Mapping):
-    """Memory of one frame, laid out as an arena's block, which nobody uses again.
+    """Memory of one frame, laid out as an arena's block, which is not used again.
 
     It has no ``owner`` where the system had no descriptor for it, or lets this process write no
     files.
@@ -62,7 +62,7 @@ class Memory(Mapping):
 
 
 def pass_on(view: memoryview) -> None:
-    """Let packets refer to the memory of ``view``.  Nobody may write to it from now on."""
+    """Let packets refer to the memory of ``view``, which must not change from now on."""
     memory = view.obj
     if isinstance(memory, Memory):
         memory.passes_on = True

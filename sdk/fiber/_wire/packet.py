@@ -71,7 +71,7 @@ PASSED = 3
 WAKE_UP = 4
 
 ALIGNMENT = 64
-"""Of parts in a descriptor, for vector loads."""
+"""Alignment of parts in a descriptor, for vector loads."""
 
 _PARTS = struct.Struct("<BIQ")
 _SIZE = struct.Struct("<Q")
@@ -238,7 +238,7 @@ def send(
 
     Without ``wait``, or on a non-blocking socket, BlockingIOError means that nothing was sent.
     BrokenPipeError: no one can ever read it.  ``fds`` (at most MAX_DESCRIPTORS) are duplicated into
-    whoever receives the packet.
+    the process that receives the packet.
 
     With ``ballast`` a message above BULK weighs enough in the socket's buffer that the socket is
     not writable until the message is read; True says that it was such a message.
@@ -271,7 +271,7 @@ def send(
 
 
 def is_bulky(payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
-    """Whether a message is above BULK."""
+    """Return whether a message is above BULK."""
     return _size(payload) + sum(view.nbytes for view in buffers) > BULK
 
 
@@ -508,7 +508,7 @@ def _memory_parts(sizes: list[int], lent: Message, memory: Descriptor, *, passin
 
 
 def _passed_parts(rest: memoryview, sizes: list[int], lent: Message, memory: Descriptor) -> Message:
-    """Map the parts, which nobody else uses, or copy them if they are not large."""
+    """Map the parts, which have no other user, or copy them if they are not large."""
     table = _SIZE.size * len(sizes)
     offsets = [offset for (offset,) in _SIZE.iter_unpack(rest[:table])]
     places = list(zip(offsets, sizes, strict=True))

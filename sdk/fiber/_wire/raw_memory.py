@@ -1,4 +1,4 @@
-"""Where a buffer lies, and copies of it that let other threads of the interpreter run."""
+"""Address of a buffer, and copies of it that let other threads of the interpreter run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _content.restype = ctypes.c_void_p
 
 
 def address(view: memoryview) -> int:
-    """Where ``view`` lies, for as long as it exists."""
+    """Return the address of ``view``'s memory, valid for as long as ``view`` exists."""
     buffer = _Buffer()
     pythonapi.PyObject_GetBuffer(ctypes.py_object(view), ctypes.byref(buffer), _SIMPLE)
     try:
@@ -49,6 +49,6 @@ def copy(view: memoryview) -> bytes:
     """``bytes(view)``, during which other threads run: to copy a gigabyte takes a second."""
     made: bytes = _new_bytes(None, view.nbytes)
     if made:
-        # A new object that nobody else has seen may be written to.
+        # A new object that no other code has seen may be written to.
         ctypes.memmove(_content(made), address(view), view.nbytes)
     return made

@@ -126,8 +126,8 @@ def pack_batch(head: Head, function: bytes, items: BytesLike) -> bytes:
 
 
 def is_plain(items: Sequence[Any]) -> bool:
-    """Whether pickling ``items`` runs none of the user's code and takes no time: plain values that
-    are not large, or rows of them.
+    """Return whether pickling ``items`` runs none of the user's code and takes no time: plain
+    values that are not large, or rows of them.
     """
     if type(items) is range:
         return True
@@ -141,7 +141,7 @@ def is_plain(items: Sequence[Any]) -> bool:
 
 
 def is_plain_value(value: Any) -> bool:
-    """The same of one value: as it is now it can be kept, pickled later and unpickled anywhere."""
+    """Return whether ``value`` is plain: to keep as it is, pickle later and unpickle anywhere."""
     kind = type(value)
     if kind is tuple:
         return PLAIN.issuperset(map(type, value)) and not _has_large(value)

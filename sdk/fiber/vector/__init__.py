@@ -26,7 +26,7 @@ _HOMES = {
 __all__ = ["VecEnv", "VectorEnv", "make_vec", "register"]
 
 
-if not TYPE_CHECKING:  # to a type checker any name would be one of ours
+if not TYPE_CHECKING:  # a type checker would accept any name
 
     def __getattr__(name: str) -> object:
         # stable-baselines3, and with it torch, is imported by those who ask for VecEnv.

@@ -229,7 +229,7 @@ class Worker:
         at_work[worker] = 0
         try:
             self._tell(Results(generation, in_band(list(values.values())), failures))
-        except Exception:  # whatever it raised that cannot be pickled
+        except Exception:  # of any class: an answer cannot be pickled
             for row, refusal in _refused(values.items()):
                 del values[row]
                 failures.append(Failure.of(row, _UNPICKLABLE, refusal))
@@ -315,7 +315,7 @@ class Worker:
             try:
                 self._tell(report.answer(self._arrays, whole=whole, shared=self._shared))
                 return
-            except Exception:  # whatever it raised that cannot be pickled
+            except Exception:  # of any class: an answer cannot be pickled
                 whole = False
                 refused = self._refused(report)
                 if not refused:
@@ -376,7 +376,7 @@ def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
 
 
 def _refused(answers: Iterable[tuple[int, Any]]) -> list[tuple[int, Exception]]:
-    """Those of the environments whose answers, given by row, cannot be pickled, and why."""
+    """Return the rows of the answers that cannot be pickled, each with the error."""
     refused = []
     for row, answer in answers:
         try:

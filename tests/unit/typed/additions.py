@@ -1,5 +1,5 @@
 # pyright: strict
-"""What Fiber adds: each line says which type is revealed in it, or that it is an error."""
+"""Additions of Fiber: each line says which type is revealed in it, or that it is an error."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # pyright: strict
-"""What users write.  Type checkers are to find in it what they find with multiprocessing."""
+"""Code as users write it.  Type checkers are to find in it what they find with multiprocessing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether ready pods reach the program.
+"""Reachability of the program from ready pods.
 
 Pure: ``now`` is an argument.
 """

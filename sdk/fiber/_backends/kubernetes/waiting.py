@@ -125,7 +125,7 @@ class Waiting:
 
     @property
     def _alone(self) -> bool:
-        """Whether somebody waits and no agent is there."""
+        """Return whether children wait and no agent is there."""
         return bool(self._placement.waiting) and not self._placement.loads
 
     @property
