@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from types import BuiltinFunctionType, GetSetDescriptorType, MemberDescriptorType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 _E = TypeVar("_E", bound=BaseException)
 
@@ -18,12 +18,17 @@ def fresh(error: _E) -> _E:
     raised at every call would keep the frames of all callers alive, with everything in them.
 
     The copy has the class, arguments, attributes, notes, cause, context and traceback of ``error``.
-    No code of its class runs, so the copy can be made on any thread.
+    A group's copy has copies of its exceptions: a caller may raise one of them.  No code of its
+    class runs, so the copy can be made on any thread.
     """
+    copies: _Copies = {}
     try:
-        return _copy(error)
+        copy = _make_copy(error, copies)
+        for original, its_copy in copies.values():
+            _fill(its_copy, original, copies)
     except Exception:  # A class from native code that Python cannot copy.
         return error
+    return copy
 
 
 def add_note(error: BaseException, note: str) -> None:
@@ -31,16 +36,43 @@ def add_note(error: BaseException, note: str) -> None:
     vars(error)["__notes__"] = [*(getattr(error, "__notes__", None) or ()), note]
 
 
-def _copy(error: _E) -> _E:
-    copy = make(type(error), group_of(error))
+_Copies = dict[int, tuple[BaseException, BaseException]]
+"""Exceptions and their copies, by the identity of the exception."""
+
+
+def _make_copy(error: _E, copies: _Copies) -> _E:
+    """Make the copies of an exception and of those in it, all without their fields."""
+    if id(error) not in copies:
+        group = group_of(error)
+        if group:
+            message, members = group
+            group = message, [_make_copy(member, copies) for member in members]
+        copies[id(error)] = error, make(type(error), group)
+    return cast(_E, copies[id(error)][1])
+
+
+def _fill(copy: BaseException, error: BaseException, copies: _Copies) -> None:
     set_fields(copy, fields_of(error))
     attributes = dict(vars(error))
     if isinstance(notes := attributes.get("__notes__"), list):
         attributes["__notes__"] = list(notes)  # Notes that a caller adds are for that caller.
     vars(copy).update(attributes)
-    for name in ("args", "__cause__", "__context__", "__suppress_context__", "__traceback__"):
-        object.__setattr__(copy, name, getattr(error, name))
-    return copy
+    for name in ("__cause__", "__context__", "__suppress_context__", "__traceback__"):
+        object.__setattr__(copy, name, _copied(getattr(error, name), copies))
+    args = error.args
+    if isinstance(error, BaseExceptionGroup):  # The arguments have its exceptions, too.
+        args = tuple(
+            type(arg)(_copied(member, copies) for member in arg)
+            if type(arg) in (list, tuple)
+            else arg
+            for arg in args
+        )
+    object.__setattr__(copy, "args", args)
+
+
+def _copied(value: Any, copies: _Copies) -> Any:
+    """Return the copy of an exception that has one, and anything else itself."""
+    return copies[id(value)][1] if id(value) in copies else value
 
 
 def make(kind: type[_E], group: tuple[Any, ...]) -> _E:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import sys
 import threading
 from collections.abc import Iterator
@@ -74,8 +75,6 @@ KINDS = [
     StopIteration(7),
     SystemExit(3),
     AttributeError("no attribute", name="name", obj=3),
-    ExceptionGroup("several", [ValueError(1), KeyError(2)]),
-    OwnGroup([ValueError(1)]),
     Demanding(0.5, step=3),
     Slotted("here"),
     Slotted(None),
@@ -101,6 +100,48 @@ def test_a_copy_is_the_same_but_for_its_identity(error: BaseException) -> None:
     assert copy.args == error.args
     assert str(copy) == str(error)
     assert attributes(copy) == attributes(error)
+
+
+GROUPS = [
+    ExceptionGroup("several", [ValueError(1), ExceptionGroup("inner", [KeyError(2)])]),
+    OwnGroup([ValueError(1)]),
+]
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: type(group).__name__)
+def test_a_group_is_copied_with_its_exceptions(group: ExceptionGroup[Exception]) -> None:
+    before = repr(group)
+    copy = fresh(group)
+    assert type(copy) is type(group)
+    assert repr(copy) == before
+    pairs = list(zip(_leaves(copy), _leaves(group), strict=True))
+    for leaf, original in pairs:
+        assert leaf is not original
+        assert (type(leaf), leaf.args) == (type(original), original.args)
+        with pytest.raises(type(original)):
+            raise leaf
+        assert original.__traceback__ is None
+        assert original.__context__ is None
+
+
+def _leaves(group: ExceptionGroup[Exception]) -> list[Exception]:
+    nested = [
+        _leaves(error) if isinstance(error, ExceptionGroup) else [error]
+        for error in group.exceptions
+    ]
+    return list(itertools.chain.from_iterable(nested))
+
+
+def test_an_exception_that_is_twice_in_a_group_is_copied_once() -> None:
+    first, second = ValueError("first"), KeyError("second")
+    first.__context__ = second
+    group = ExceptionGroup("outer", [first, ExceptionGroup("inner", [first]), second])
+    copy = fresh(group)
+    leaf, inner, other = copy.exceptions
+    assert isinstance(inner, ExceptionGroup)
+    assert inner.exceptions == (leaf,)
+    assert leaf.__context__ is other is not second
+    assert copy.args == ("outer", [leaf, inner, other])
 
 
 def test_a_copy_has_the_cause_the_notes_and_the_traceback() -> None:
