@@ -59,13 +59,15 @@ def test_a_child_with_a_large_result_on_its_way_is_not_heard_until_that_has_left
     assert child.mock_calls == [mock.call.pause(), mock.call.resume()]
 
 
-def test_output_waits_for_output_and_not_for_large_messages() -> None:
+def test_output_waits_for_output_of_the_same_child_and_not_for_large_messages() -> None:
     link, nothing = mock.Mock(), mock.MagicMock()
     loop: Any = SimulatedLoop()
     service = AgentService(loop, link, nothing, nothing, nothing)
+    child, other = _Observed(service, 1), _Observed(service, 2)
     service.send(messages.FromChild(1, b"", [bytes(8 << 20)]))
-    assert not service.busy()
-    service.send_output(messages.Output(1, "x" * (8 << 20)))
-    assert service.busy()
+    assert not child.busy()
+    child.wrote("x" * (8 << 20))
+    assert child.busy()
+    assert not other.busy()
     link.send.call_args.kwargs["on_left"]()
-    assert not service.busy()
+    assert not child.busy()

@@ -29,8 +29,8 @@ _KNOWN_HERE = ExitReport._fields.index("pod")
 """Fields of an exit report that an agent knows; the master adds the others."""
 
 _BACKLOG = 4 << 20
-"""Bytes waiting on the link above which no more is read: of output of all children, of messages of
-one.
+"""Bytes of one child's output, or of one message of it, that wait for the link.  Above that the
+agent reads no more from that child.
 """
 
 
@@ -51,8 +51,6 @@ class AgentService:
         self._on_end = on_end
         self._blobs = BlobStore(config.current().runtime_directory)
         self._children: dict[int, _Observed] = {}
-        self._output = 0
-        """Characters of output that wait for the link."""
         self._stopping = False
         self._reason = ""
         self._lost = False
@@ -67,18 +65,6 @@ class AgentService:
     ) -> None:
         lane = messages.lane(message)
         self._link.send(*messages.pieces(message), lane=lane, on_left=on_left)
-
-    def send_output(self, message: messages.Output) -> None:
-        """Tell the master what a child wrote."""
-        self._output += len(message.text)
-        self.send(message, partial(self._output_left, len(message.text)))
-
-    def busy(self) -> bool:
-        """Return whether so much output waits for the link that no more should be read."""
-        return self._output > _BACKLOG
-
-    def _output_left(self, size: int) -> None:
-        self._output -= size
 
     # What comes over the link
 
@@ -184,13 +170,15 @@ class _Observed:
         self._service = service
         self._number = number
         self._delivered = 0
+        self._output = 0
+        """Characters of output that wait for the link."""
         self._capture: Capture | None = None
         self._child: LocalChild | None = None
 
     def start(self, agent: Agent, loop: Loop, spec: ChildSpec) -> None:
         """Start it."""
         try:
-            self._capture = Capture(loop, self._wrote, self._service.busy)
+            self._capture = Capture(loop, self.wrote, self.busy)
             spec = replace(spec, stdio=self._capture.stdio, passing=True)
             self._child = agent.child(spec, self)
             self._child.start()
@@ -252,5 +240,18 @@ class _Observed:
         self._service.send(end)
         self._service.forget(self._number)
 
-    def _wrote(self, text: str) -> None:
-        self._service.send_output(messages.Output(self._number, text))
+    def wrote(self, text: str) -> None:
+        """Pass its output on."""
+        self._output += len(text)
+        left = partial(self._output_left, len(text))
+        self._service.send(messages.Output(self._number, text), left)
+
+    def busy(self) -> bool:
+        """Return whether so much output waits for the link that no more should be read.
+
+        Output waits for the child's own large results.  Other children's output does not.
+        """
+        return self._output > _BACKLOG
+
+    def _output_left(self, size: int) -> None:
+        self._output -= size
