@@ -37,6 +37,7 @@ class Notes:
         self.events: list[str] = []
         self.links: list[Link] = []
         self.refusals: list[str] = []
+        self.proofs: list[None] = []
         self.errors: list[Exception] = []
 
     def add(self, notes: list[Any], note: Any) -> None:
@@ -67,6 +68,9 @@ class Notes:
     def on_refused(self, reason: str) -> None:
         self.add(self.refusals, reason)
 
+    def on_proven(self) -> None:
+        self.add(self.proofs, None)
+
     def on_failed(self, error: Exception) -> None:
         self.add(self.errors, error)
 
@@ -95,6 +99,7 @@ class Site:
             self.credentials,
             on_agent=notes.on_link,
             on_refused=notes.on_refused,
+            on_proven=notes.on_proven,
             keepalive=keepalive,
         )
         self._closing.append(lambda: self.close(listener, linger=0.1))

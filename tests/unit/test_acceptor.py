@@ -138,6 +138,7 @@ def test_a_certificate_of_another_pool_is_told_with_its_fault(site: Site) -> Non
         stranger.close()
     master.wait(lambda: master.refusals)
     assert "its certificate is refused" in master.refusals[0]
+    assert master.proofs == []
 
 
 def test_a_crowd_from_one_address_is_bounded_and_keeps_nobody_out(

@@ -276,6 +276,20 @@ class Dialled(SimpleNamespace):
         super().__init__(peer=SimpleNamespace(name=name), attach=nothing, send=nothing)
 
 
+def test_only_agents_of_the_pool_show_that_pods_reach_the_program(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stranger shows nothing: a port scan, or a pod of another program."""
+    pods = site.pods(until_the_end)
+    reached: list[None] = []
+    monkeypatch.setattr(pods._waiting, "reached", lambda: reached.append(None))
+    pods.on_refused("127.0.0.1:1 was turned away: the TLS handshake failed")
+    assert reached == []
+    pods.on_proven()
+    assert reached == [None]
+    pods.close()
+
+
 def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> None:
     """After this program was stopped for so long that its agents gave it up."""
     pods = site.pods(lambda cancel: pytest.fail("nothing is to be opened"))

@@ -210,6 +210,7 @@ def test_another_version_is_refused_and_both_sides_hear_both(
     agent.wait(lambda: agent.errors)
     assert isinstance(agent.errors[0], VersionMismatch)
     master.wait(lambda: master.refusals)
+    assert master.proofs  # it is the pool's, wanted or not
     of_master = f"{ours.protocol} (fiberpool" if what == "Fiber protocol" else ours.python
     for text in (str(agent.errors[0]), master.refusals[0]):
         assert text.startswith(f"{what} version mismatch")

@@ -23,7 +23,8 @@ class MasterListener:
 
     ``address`` is ``host:port``; port 0 takes a free one, and ``address`` then says which.  The
     callbacks run on the loop's thread: ``on_agent`` attaches an observer to the new link, or
-    returns why it does not want it; ``on_refused`` hears who was turned away and why.
+    returns why it does not want it; ``on_refused`` hears who was turned away and why;
+    ``on_proven`` hears of each connection that proved by certificate that it is the pool's.
     ``lost_grace`` is told to the agents: for so many seconds they wait for another master if this
     one is lost.
     """
@@ -36,11 +37,13 @@ class MasterListener:
         *,
         on_agent: Callable[[Link], str | None],
         on_refused: Callable[[str], None],
+        on_proven: Callable[[], None] = lambda: None,
         keepalive: Keepalive = DEFAULT_KEEPALIVE,
         lost_grace: float | None = None,
     ) -> None:
         self._loop = loop
         self._on_agent = on_agent
+        self._on_proven = on_proven
         self._keepalive = keepalive
         self._lost_grace = lost_grace
         self._identity = Identity.of_this_process("the master")
@@ -88,6 +91,7 @@ class MasterListener:
 
     def _greet(self, pending: PendingConnection, words: bytes) -> None:
         """Somebody with the right credentials has said its first words."""
+        self._on_proven()
         try:
             hello = handshake.decode(words)
         except ProtocolError as error:

@@ -184,15 +184,17 @@ class Pods:
 
     # -- Agents
 
+    def on_proven(self) -> None:
+        """Note that pods reach this program.  A stranger's connection does not show that."""
+        self._waiting.reached()
+
     def on_refused(self, why: str) -> None:
         """Somebody dialled who is not served."""
-        self._waiting.reached()
         if not self._closing.is_set():  # else that is how it is to be
             self._output.write("fiber", f"an agent was refused: {why}")
 
     def on_agent(self, link: Link) -> str | None:
         """An agent has dialled; why it is not wanted, if it is not."""
-        self._waiting.reached()
         name = link.peer.name
         if name in self._given_up:
             return f"{name}, which had been given up"

@@ -38,6 +38,9 @@ class ListenerObserver(Protocol):
     def on_agent(self, link: Link) -> str | None:
         """One with the pool's credentials; why it is not wanted, if it is not."""
 
+    def on_proven(self) -> None:
+        """One has proved by certificate that it is the pool's, whether or not it is wanted."""
+
     def on_refused(self, why: str) -> None:
         """Somebody was turned away."""
 
@@ -127,6 +130,7 @@ class Program:
                 credentials,
                 on_agent=observer.on_agent,
                 on_refused=observer.on_refused,
+                on_proven=observer.on_proven,
                 keepalive=Keepalive(*patience),
                 lost_grace=Master.lost_grace,
             )

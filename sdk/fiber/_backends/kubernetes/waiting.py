@@ -89,7 +89,7 @@ class Waiting:
         self._judge_reachability()
 
     def reached(self) -> None:
-        """Note that something has dialled: pods reach this program."""
+        """Note that an agent of the pool has dialled: pods reach this program."""
         self._reachability.prove()
         self._judge_reachability()
 
