@@ -79,6 +79,19 @@ def test_a_full_queue_refuses() -> None:
     assert [queue.get(), queue.get()] == [2, 3]
 
 
+def test_a_place_that_is_given_back_twice_is_removed() -> None:
+    """As by a put that a signal interrupts after its item has left."""
+    queue = fiber.Queue(2)
+    queue.put(1)
+    queue._slots.give_back()
+    assert queue.get() == 1
+    queue.put(1)
+    queue.put(2)
+    with pytest.raises(Full):
+        queue.put_nowait(3)
+    assert [queue.get(), queue.get()] == [1, 2]
+
+
 @pytest.mark.parametrize("maxsize", [0, -1])
 def test_without_a_positive_maxsize_it_is_never_full(maxsize: int) -> None:
     queue = fiber.Queue(maxsize)

@@ -61,6 +61,7 @@ class Slots:
         """The item is not sent after all."""
         self._free.add(1)
         self._claims.drop()
+        self._next_count = 0.0  # a put that was interrupted may give a place back twice
 
     def sending(self) -> None:
         """The item leaves this process."""
@@ -93,8 +94,10 @@ class Slots:
         return bool(lost)
 
     def _remove_excess(self) -> None:
-        for _ in range(self._free.value() - self._maximum):
-            self._free.take(0)
+        while self._free.value() > self._maximum and self._free.take(0):
+            if self._free.value() < self._maximum:  # another process has removed it as well
+                self._free.add(1)
+                return
 
 
 class ItemCount:
