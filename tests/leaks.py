@@ -34,8 +34,8 @@ _MESSAGE_MEMORY = "/memfd:fiber-message (deleted)"
 _MESSAGE_MEMORY_LIMIT = 2 * RETAINED_BLOCKS
 # So is memory for small shared objects: a segment for each size of them, and a full one of which
 # places are free again; each may hold two descriptors.
-_HEAP = "/memfd:fiber-heap (deleted)"
-_HEAP_LIMIT = 4 * len(SIZES)
+HEAP = "/memfd:fiber-heap (deleted)"
+HEAP_LIMIT = 4 * len(SIZES)
 
 
 class Lasting(NamedTuple):
@@ -147,9 +147,9 @@ def _opened(before: Snapshot, now: Snapshot) -> list[str]:
     kept = sum(target == _MESSAGE_MEMORY for _, target in now.descriptors)
     if kept <= _MESSAGE_MEMORY_LIMIT:
         excused[_MESSAGE_MEMORY] = kept
-    kept = sum(target == _HEAP for _, target in now.descriptors)
-    if kept <= _HEAP_LIMIT:
-        excused[_HEAP] = kept
+    kept = sum(target == HEAP for _, target in now.descriptors)
+    if kept <= HEAP_LIMIT:
+        excused[HEAP] = kept
     opened = []
     for number, target in sorted(now.descriptors - before.descriptors):
         if excused[target]:
