@@ -101,6 +101,7 @@ def test_of_main(launch_on: Callable[..., Program]) -> None:
     """Also of a ``__main__`` that its agents cannot import."""
     program = launch_on(
         """
+        import dataclasses
         import threading
         import fiber
 
@@ -108,6 +109,18 @@ def test_of_main(launch_on: Callable[..., Program]) -> None:
             def __init__(self, step, *, loss):
                 super().__init__(f"loss {loss} at step {step}")
                 self.step, self.loss = step, loss
+
+        class Slotted(Exception):
+            __slots__ = ("step", "loss")
+
+            def __init__(self, step, *, loss):
+                super().__init__()
+                self.step, self.loss = step, loss
+
+        @dataclasses.dataclass(frozen=True, slots=True)
+        class Frozen(Exception):
+            step: int
+            loss: float
 
         class Result:
             def __init__(self):
@@ -121,15 +134,21 @@ def test_of_main(launch_on: Callable[..., Program]) -> None:
                 pass
             raise Local(step, loss=0.5)
 
+        def slotted(step):
+            raise Slotted(step, loss=0.5)
+
+        def frozen(step):
+            raise Frozen(step, loss=0.5)
+
         def unsendable():
             return Result()
 
         if __name__ == "__main__":
             with fiber.Pool(1) as pool:
-                for task in diverge, local:
+                for task in diverge, local, slotted, frozen:
                     try:
                         pool.apply(task, (7,))
-                    except Diverged as error:
+                    except (Diverged, Slotted, Frozen) as error:
                         print(type(error).__name__, error.step, error.loss, flush=True)
                 try:
                     pool.apply(unsendable)
@@ -139,5 +158,7 @@ def test_of_main(launch_on: Callable[..., Program]) -> None:
     )
     assert program.line() == "Diverged 7 0.5"
     assert program.line() == "Local 7 0.5"
+    assert program.line() == "Slotted 7 0.5"
+    assert program.line() == "Frozen 7 0.5"
     assert "cannot pickle '_thread.lock' object" in program.line()
     assert program.wait() == 0

@@ -160,6 +160,44 @@ class WithState(Exception):
         self.step = state["step"] + 1
 
 
+@dataclass(frozen=True, slots=True)
+class FrozenSlots(Exception):
+    """Exception that has a ``__getstate__`` and a ``__setstate__`` of dataclasses: for a list."""
+
+    step: int
+    loss: float
+
+
+class HasLock(Exception):
+    """Exception that makes its lock again in its ``__setstate__``."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__("has a lock")
+        self.step = step
+        self.lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"step": self.step}
+
+    def __setstate__(self, state: Any) -> None:
+        self.step = state["step"]
+        self.lock = threading.Lock()
+
+
+class ReducedToList(Exception):
+    """Exception whose ``__setstate__`` takes a list, and whose ``__reduce__`` fails later."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__("reduced to a list")
+        self.step = step
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return ReducedToList, (), [self.step]
+
+    def __setstate__(self, state: Any) -> None:
+        (self.step,) = state
+
+
 class Wraps(Exception):
     """Exception with another one for an attribute, which refers back to it."""
 

@@ -32,6 +32,8 @@ def travelled(error: BaseException) -> Any:
         (kinds.Data(3, loss=0.5), ("step", "loss")),
         (kinds.Data(step=3), ("step", "loss")),
         (kinds.Frozen(3), ("step",)),
+        (kinds.FrozenSlots(3, 0.5), ("step", "loss")),
+        (kinds.ReducedToList(3), ("step",)),
         (kinds.NoDevice("gpu"), ("device", "errno", "strerror", "filename")),
         (kinds.NoText(3), ("line", "encoding", "object", "start", "end", "reason")),
         (kinds.Stop(value=3), ("value",)),
@@ -79,6 +81,12 @@ def test_a_reduce_that_works_is_used(kind: Any) -> None:
 
 def test_a_setstate_is_used() -> None:
     assert travelled(kinds.WithState(3, 0.5)).step == 4
+
+
+def test_a_setstate_gets_what_getstate_gives() -> None:
+    found = travelled(kinds.HasLock(3))
+    assert (found.step, found.lock.locked()) == (3, False)
+    assert not hasattr(found, "__notes__")
 
 
 def test_groups_with_groups() -> None:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from multiprocessing.reduction import ForkingPickler
 from types import BuiltinFunctionType, MethodDescriptorType, WrapperDescriptorType
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from fiber._agent import by_reference
 from fiber._exceptions import add_note, fields_of, group_of, make, set_fields
@@ -153,6 +153,22 @@ def _by_name(file: io.BytesIO, reducers: dict[type, Any]) -> pickle.Pickler:
     return made
 
 
+class _State(NamedTuple):
+    """State of an exception that is made again by its native base."""
+
+    args: tuple[Any, ...]
+    attributes: dict[str, Any]
+    fields: dict[str, Any]
+    for_setstate: bool
+    """True if the class has a ``__setstate__`` that takes the attributes."""
+
+    @classmethod
+    def of(cls, error: BaseException) -> _State:
+        own = _state_for_setstate(error)
+        attributes = dict(vars(error) if own is None else own)
+        return cls(error.args, attributes, _fields(error), own is not None)
+
+
 class _Pickling:
     """Pickles exceptions, and what has exceptions in it.
 
@@ -191,19 +207,13 @@ class _Pickling:
             if not self._refusal(error):
                 return _own_reduced(error)
             del self._by_own_reduce[id(error)]
-        args, attributes, fields = error.args, dict(vars(error)), _fields(error)
+        state = _State.of(error)
         if self._incomplete and id(error) not in self._open:
-            return self._reduce_checked(error, args, attributes, fields)
+            return self._reduce_checked(error, state)
         self._met.add(id(error))
-        return _rebuilt(error, args, attributes, fields)
+        return _rebuilt(error, state)
 
-    def _reduce_checked(
-        self,
-        error: BaseException,
-        args: tuple[Any, ...],
-        attributes: dict[str, Any],
-        fields: dict[str, Any],
-    ) -> _Reduced:
+    def _reduce_checked(self, error: BaseException, state: _State) -> _Reduced:
         """Reduce an exception to what travels of it.
 
         The outcome is kept: a part is pickled at each check of what it is a part of.
@@ -211,34 +221,33 @@ class _Pickling:
         met, self._met = self._met, set()
         self._open.add(id(error))
         try:
-            args = self._without_refused(args, attributes, fields)
+            state = self._without_refused(state)
         finally:
             self._open.remove(id(error))
             is_in_cycle = bool(self._met)  # Then the outcome depends on where the check began.
             self._met = met | self._met - {id(error)}
-        reduced = _rebuilt(error, args, attributes, fields)
+        reduced = _rebuilt(error, state)
         if not is_in_cycle:
             self._checked[id(error)] = error, reduced
         return reduced
 
-    def _without_refused(
-        self, args: tuple[Any, ...], attributes: dict[str, Any], fields: dict[str, Any]
-    ) -> tuple[Any, ...]:
+    def _without_refused(self, state: _State) -> _State:
         """Drop the attributes that do not travel, and note them; such arguments become text."""
         notes = []
-        for values in (attributes, fields):
+        for values in (state.attributes, state.fields):
             for name, value in [*values.items()]:
                 if refusal := self._refusal(value):
                     del values[name]
                     notes.append(f"attribute {name!r} did not come along: {refusal}")
         kept = []
-        for index, value in enumerate(args):
+        for index, value in enumerate(state.args):
             refusal = self._refusal(value)
             kept.append(_shown(value) if refusal else value)
             if refusal:
                 notes.append(f"argument {index} came as text: {refusal}")
-        attributes["__notes__"] = [*(attributes.get("__notes__") or ()), *notes]
-        return tuple(kept)
+        earlier = state.attributes.get("__notes__") or ()
+        state.attributes["__notes__"] = [*earlier, *notes]
+        return state._replace(args=tuple(kept))
 
     def _refusal(self, value: Any) -> str:
         try:
@@ -260,26 +269,36 @@ class _Exceptions(dict[type, Callable[[Any], _Reduced]]):
         raise KeyError(kind)
 
 
-def _rebuilt(
-    error: BaseException,
-    args: tuple[Any, ...],
-    attributes: dict[str, Any],
-    fields: dict[str, Any],
-) -> _Reduced:
-    state = args, attributes, fields
-    return make, (type(error), group_of(error)), state, None, None, _set_state
+def _rebuilt(error: BaseException, state: _State) -> _Reduced:
+    return make, (type(error), group_of(error)), tuple(state), None, None, _set_state
 
 
-def _set_state(
-    error: BaseException, state: tuple[tuple[Any, ...], dict[str, Any], dict[str, Any]]
-) -> None:
-    args, attributes, fields = state
-    set_fields(error, fields)
-    if isinstance(type(error).__setstate__, _NATIVE):
-        vars(error).update(attributes)
+def _set_state(error: BaseException, state: tuple[Any, ...]) -> None:
+    args, attributes, fields, for_setstate = state
+    # A class that came by value has lost its slots: they are attributes there, and slots here.
+    set_fields(error, {**attributes, **fields})
+    if for_setstate:
+        cast("Any", error).__setstate__(attributes)
     else:
-        error.__setstate__(attributes)
+        present = fields_of(error)
+        rest = {name: value for name, value in attributes.items() if name not in present}
+        vars(error).update(rest)
     object.__setattr__(error, "args", args)
+
+
+def _state_for_setstate(error: BaseException) -> dict[str, Any] | None:
+    """Return the attributes that a ``__setstate__`` in Python takes; None if it takes none.
+
+    One that belongs to a ``__getstate__`` or a ``__reduce__`` of the class takes what these give,
+    which need not be a dictionary.
+    """
+    kind = type(error)
+    if isinstance(kind.__setstate__, _NATIVE) or _has_own_reduce(kind):
+        return None
+    if isinstance(kind.__getstate__, _NATIVE):
+        return vars(error)
+    state: object = error.__getstate__()
+    return state if isinstance(state, dict) else None
 
 
 def _needs_rebuilding(error: BaseException) -> bool:
