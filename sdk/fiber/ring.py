@@ -180,7 +180,7 @@ def _attend(channels: list[Connection]) -> list[Any]:
             if channel in ready:
                 del running[rank]
                 end, results[rank], error = _outcome(rank, channel)
-                failure = failure or error
+                failure = error if failure is None else failure
                 _tell(end, running, len(channels))
     if failure is not None:
         raise fresh(failure)

@@ -198,6 +198,13 @@ class ReducedToList(Exception):
         (self.step,) = state
 
 
+class Untrue(Exception):
+    """Exception that has no truth value."""
+
+    def __bool__(self) -> bool:
+        raise TypeError("it is neither true nor false")
+
+
 class Wraps(Exception):
     """Exception with another one for an attribute, which refers back to it."""
 

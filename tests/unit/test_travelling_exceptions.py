@@ -34,6 +34,7 @@ def travelled(error: BaseException) -> Any:
         (kinds.Frozen(3), ("step",)),
         (kinds.FrozenSlots(3, 0.5), ("step", "loss")),
         (kinds.ReducedToList(3), ("step",)),
+        (kinds.Untrue(3), ()),
         (kinds.NoDevice("gpu"), ("device", "errno", "strerror", "filename")),
         (kinds.NoText(3), ("line", "encoding", "object", "start", "end", "reason")),
         (kinds.Stop(value=3), ("value",)),

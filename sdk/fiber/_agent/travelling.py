@@ -37,6 +37,17 @@ def encode_error(error: BaseException) -> bytes:
     return pickle.dumps(Travelling(error))
 
 
+def format_error(error: BaseException) -> str:
+    """Return the traceback as text, also of an exception that raises while it is formatted."""
+    import traceback  # rarely needed, and long to import
+
+    try:
+        return "".join(traceback.format_exception(error))
+    except BaseException:  # traceback calls the __bool__ of exceptions
+        frames = "".join(traceback.format_tb(error.__traceback__))
+        return f"Traceback (most recent call last):\n{frames}{_shown(error)}\n"
+
+
 class Travelling:
     """Stands for an exception in a pickle: unpickling gives the exception itself.
 
@@ -45,9 +56,7 @@ class Travelling:
     """
 
     def __init__(self, error: BaseException) -> None:
-        import traceback  # rarely needed, and long to import
-
-        self.text = "".join(traceback.format_exception(error))
+        self.text = format_error(error)
         error.with_traceback(None)  # its frames keep alive what the task had
         self._shown = _shown(error)
         notes = getattr(error, "__notes__", None)

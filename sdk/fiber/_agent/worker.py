@@ -20,7 +20,7 @@ from typing import Any
 
 from fiber._agent import child
 from fiber._agent.batch_results import BatchResults, Sender
-from fiber._agent.travelling import encode_error
+from fiber._agent.travelling import encode_error, format_error
 from fiber._agent.watchdog import SPLIT_AFTER, Watchdog
 from fiber._hub.remote import Taken, confirm, loads
 from fiber._wire import work
@@ -50,11 +50,9 @@ def run(
             initializer(*initargs)
         except SystemExit:
             raise
-        except BaseException:
-            import traceback  # rarely needed, and long to import
-
+        except BaseException as error:
             with contextlib.suppress(OSError):  # the agent is gone
-                channel.send(pickle.dumps((work.INIT_FAILED, traceback.format_exc())))
+                channel.send(pickle.dumps((work.INIT_FAILED, format_error(error))))
             raise SystemExit(1) from None
     worker = Worker(channel, child.progress(), retryable)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
