@@ -27,6 +27,12 @@ def diverge_as_member(rank: int, size: int) -> NoReturn:
     diverge(7)
 
 
+def raise_with(thing: object) -> NoReturn:
+    error = ValueError("holds a handle")
+    error.thing = thing  # type: ignore[attr-defined]
+    raise error
+
+
 class Model:
     def __init__(self, kind: type[BaseException] | None = None) -> None:
         if kind is not None:

@@ -11,7 +11,14 @@ import pytest
 import fiber
 import fiber.joblib
 from faults.program import Program, wait_for
-from faults.raising import Diverged, DivergingEnv, ModelManager, diverge, diverge_as_member
+from faults.raising import (
+    Diverged,
+    DivergingEnv,
+    ModelManager,
+    diverge,
+    diverge_as_member,
+    raise_with,
+)
 from fiber.vector import VectorEnv
 from patience import PATIENCE
 
@@ -95,6 +102,15 @@ def test_its_class_and_attributes_whatever_its_init_takes(backend: str, face: st
 def test_retry_exceptions_know_it(backend: str) -> None:
     with fiber.Pool(1, retries=1, retry_exceptions=Diverged) as pool:
         heard(lambda: pool.apply(diverge, (STEP,)))
+
+
+def test_one_that_holds_a_handle(backend: str) -> None:
+    queue: Any = fiber.Queue()
+    with fiber.Pool(1) as pool, pytest.raises(ValueError, match="holds a handle") as caught:
+        pool.apply(raise_with, (queue,))
+    error: Any = caught.value
+    error.thing.put(STEP)
+    assert queue.get(timeout=PATIENCE) == STEP
 
 
 def test_of_main(launch_on: Callable[..., Program]) -> None:

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, cast
 
 from fiber._agent import by_reference
 from fiber._exceptions import add_note, fields_of, group_of, make, set_fields
+from fiber._hub.handles import collecting_grants
 
 LINKS = 8
 """Causes and contexts that travel with an exception."""
@@ -195,15 +196,27 @@ class _Pickling:
         """Open exceptions that are parts of the one being checked."""
         self._checked: dict[int, tuple[BaseException, _Reduced]] = {}
 
-    def checked(self, obj: Any) -> bytes:
-        """Pickle ``obj``, and unpickle it as a check."""
+    def checked(self, error: BaseException) -> bytes:
+        """Pickle ``error``, and unpickle it as a check."""
+        data, has_handles = self._trial(error)
+        # The handles in a trial end with it.
+        return self._dumped(error) if has_handles else data
+
+    def _trial(self, obj: Any) -> tuple[bytes, bool]:
+        """Pickle and unpickle ``obj``; return the pickle, and whether it has handles."""
+        with collecting_grants() as grants:
+            data = self._dumped(obj)
+            copy = pickle.loads(data)
+            if isinstance(obj, BaseException):
+                _exception(copy)
+            has_handles = bool(grants)
+            grants.release()
+        return data, has_handles
+
+    def _dumped(self, obj: Any) -> bytes:
         file = io.BytesIO()
         self._pickler(file, _Exceptions(self._reduce)).dump(obj)
-        data = file.getvalue()
-        copy = pickle.loads(data)
-        if isinstance(obj, BaseException):
-            _exception(copy)
-        return data
+        return file.getvalue()
 
     def _reduce(self, error: BaseException) -> _Reduced:
         kind = type(error)
@@ -260,7 +273,7 @@ class _Pickling:
 
     def _refusal(self, value: Any) -> str:
         try:
-            self.checked(value)
+            self._trial(value)
         except BaseException as error:
             return _shown(error)
         return ""
