@@ -40,7 +40,7 @@ from fiber._hub.protocol import (
     Op,
 )
 from fiber._hub.registry import NoSuchObject, Registry
-from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
+from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteEnd, RemoteObject
 from fiber._transport.base import SharedChannel, SharedCounter
 from fiber._transport.unix import UnixChannel, UnixCounter
 from fiber._wire.descriptor import Descriptor, opened, own
@@ -120,7 +120,7 @@ class EndHandle(NamedTuple):
     def end(self) -> SharedChannel:
         """Return the end for the process that unpickled the handle."""
         if isinstance(self.socket, HubHandle) and not self.socket.here():
-            return RemoteChannel(*self.socket)
+            return RemoteEnd(self.kind, self.extent, *self.socket)
         socket, *beside = _descriptors(self.socket)
         (segment,) = beside if self.segment is None else _descriptors(self.segment)
         return ENDS[self.kind](socket, Backlog(block_of(segment, *self.extent)))
@@ -155,6 +155,8 @@ def counter(handle: Handle) -> SharedCounter:
 
 def handle_for(end: Any) -> Handle | EndHandle:
     """What to pickle in place of a channel or counter."""
+    if isinstance(end, RemoteEnd):
+        return EndHandle(end.kind, _grants().for_remote(end), None, end.extent)
     if isinstance(end, RemoteObject):
         return _grants().for_remote(end)
     if isinstance(end, OneWayEnd):
@@ -488,7 +490,7 @@ def _reduce_counter(end: Any) -> tuple[Any, ...]:
     return counter, (handle_for(end),)
 
 
-for _channel in (UnixChannel, LocalChannel, Receiver, Sender, RemoteChannel):
+for _channel in (UnixChannel, LocalChannel, Receiver, Sender, RemoteChannel, RemoteEnd):
     copyreg.pickle(_channel, _reduce_channel)
 for _counter in (UnixCounter, LocalCounter, RemoteCounter):
     copyreg.pickle(_counter, _reduce_counter)

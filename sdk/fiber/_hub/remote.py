@@ -20,7 +20,9 @@ from fiber._hub.protocol import (
     ONE,
     SECRET_BYTES,
     SECRETS,
+    Extent,
     HubAddress,
+    ObjectKind,
     Op,
     Status,
 )
@@ -251,6 +253,22 @@ class RemoteChannel(RemoteObject):
     def _settled(self, operation: Op, reply: Reply) -> None:
         if reply.parts:
             self._late.append(reply)
+
+
+class RemoteEnd(RemoteChannel):
+    """An end of a one-way channel on another host, and what a handle needs to rebuild it there."""
+
+    def __init__(
+        self,
+        kind: ObjectKind,
+        extent: Extent,
+        home: HubAddress,
+        grant: bytes,
+        identity: bytes = NO_SECRET,
+    ) -> None:
+        self.kind = kind
+        self.extent = extent
+        super().__init__(home, grant, identity)
 
 
 class RemoteCounter(RemoteObject):
