@@ -1,4 +1,4 @@
-"""What processes share comes home, and reaches another process of its home, by way of a host."""
+"""Shared objects come home, and reach another process of their home, by way of another host."""
 
 from __future__ import annotations
 

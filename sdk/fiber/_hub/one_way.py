@@ -80,7 +80,7 @@ class Sender(OneWayEnd):
         bulky = self._send_now(payload, buffers)
         if bulky is None:
             self._send_in_turn(payload, buffers)
-            bulky = _size(payload, buffers) > packet.BULK
+            bulky = packet.is_bulky(payload, buffers)
         if bulky:
             wait_until(self.fileno(), select.POLLOUT)
 
@@ -135,7 +135,7 @@ class Sender(OneWayEnd):
             return select.POLLOUT
         if not (fits and self.backlog.put(view)):
             self._forget_room()
-            self.backlog.need(_size(payload, buffers))
+            self.backlog.need(packet.size_of(payload, buffers))
             return select.POLLIN
         if is_first or self._words[UNANNOUNCED] or self._nothing_unread():
             self._words[UNANNOUNCED] = True
@@ -308,7 +308,3 @@ def _wake_up(sock: socket.socket, words: memoryview) -> None:
         raise BrokenPipeError("the other end is closed") from error
     finally:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, usual // 2)
-
-
-def _size(payload: BytesLike, buffers: Sequence[memoryview]) -> int:
-    return memoryview(payload).nbytes + sum(view.nbytes for view in buffers)

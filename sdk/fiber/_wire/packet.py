@@ -272,7 +272,12 @@ def send(
 
 def is_bulky(payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
     """Return whether a message is above BULK."""
-    return _size(payload) + sum(view.nbytes for view in buffers) > BULK
+    return size_of(payload, buffers) > BULK
+
+
+def size_of(payload: BytesLike, buffers: Sequence[memoryview]) -> int:
+    """Return the bytes of a message's payload and buffers together."""
+    return _size(payload) + sum(view.nbytes for view in buffers)
 
 
 def _size(payload: BytesLike) -> int:
