@@ -68,16 +68,26 @@ ENV_TEMPLATE_HASH: Final = "FIBER_AGENT_TEMPLATE_HASH"
 ENV_ADDRESS: Final = "FIBER_AGENT_ADDRESS"
 """``host:port`` of the pool's Service."""
 ENV_CREDENTIALS: Final = "FIBER_AGENT_CREDENTIALS"
-"""The folder that holds the agent's half of the credentials."""
+"""The file with the agent's credentials.  The agent removes it before it starts a child."""
+ENV_KEY: Final = "FIBER_AGENT_KEY"
+"""The folder with the pool's key: set in the init container alone, which writes ENV_CREDENTIALS."""
 ENV_POOL: Final = "FIBER_AGENT_POOL"
 ENV_NAMESPACE: Final = "FIBER_AGENT_NAMESPACE"
 ENV_PROCESSES: Final = "FIBER_AGENT_PROCESSES"
 """How many children the agent runs: ``spec.processesPerPod``."""
 ENV_LOST_GRACE: Final = "FIBER_AGENT_LOST_GRACE"
 """Seconds that an agent outlives its master: ``spec.master.lostGraceSeconds``."""
+ENV_TERMINATION_GRACE: Final = "FIBER_AGENT_TERMINATION_GRACE"
+"""Seconds that a pod has after SIGTERM: the template's ``terminationGracePeriodSeconds``."""
 
+IDENTITY_CONTAINER: Final = "fiber-identity"
+"""The first init container: derives the agent's key from the pool's."""
+KEY_VOLUME: Final = "fiber-key"
+KEY_DIRECTORY: Final = "/etc/fiber/key"
+"""The pool's Secret, which no other container mounts."""
 CREDENTIALS_VOLUME: Final = "fiber-credentials"
 CREDENTIALS_DIRECTORY: Final = "/etc/fiber/credentials"
+CREDENTIALS_FILE: Final = "agent.json"
 
 # -- The way to the master
 
@@ -86,30 +96,13 @@ MASTER_PORT: Final = 7070
 MASTER_PORT_NAME: Final = "fiber"
 ENDPOINT_SCHEME: Final = "tls+tcp"
 
-# -- The Secret: its keys, and the files that the agent finds in CREDENTIALS_DIRECTORY
+# -- The Secret: its keys
 
-KEY_AUTHORITY: Final = "ca.crt"
-KEY_SERVER_NAME: Final = "server-name"
-KEY_AGENT_CERTIFICATE: Final = "agent.crt"
-KEY_AGENT_KEY: Final = "agent.key"
-KEY_MASTER_CERTIFICATE: Final = "master.crt"
-KEY_MASTER_KEY: Final = "master.key"
-
-AGENT_FILES: Final = {
-    KEY_AUTHORITY: "ca.crt",
-    KEY_SERVER_NAME: "server-name",
-    KEY_AGENT_CERTIFICATE: "tls.crt",
-    KEY_AGENT_KEY: "tls.key",
-}
-"""Which keys of the Secret a pod may see, and the file that each becomes.  Never the master's."""
-
-MASTER_FILES: Final = {
-    KEY_AUTHORITY: "ca.crt",
-    KEY_SERVER_NAME: "server-name",
-    KEY_MASTER_CERTIFICATE: "tls.crt",
-    KEY_MASTER_KEY: "tls.key",
-}
-"""The same for a pod that runs a master and mounts the Secret instead of reading it by the API."""
+KEY_POOL: Final = "key"
+"""256 random bits in hexadecimal digits, from which the key of each agent is derived."""
+KEY_MASTER: Final = "master"
+"""The SHA-256 of the certificate of the only master that the pool ever has; absent where one master
+may follow another."""
 
 # -- Limits
 
@@ -165,12 +158,14 @@ def endpoint_slice_name(pool: str) -> str:
     return service_name(pool)
 
 
-def secret_name(pool: str) -> str:
-    """The Secret with both halves of the credentials: at most 60 characters.
+def budget_name(pool: str) -> str:
+    """The PodDisruptionBudget of the pool's workers."""
+    return service_name(pool)
 
-    Not ``<pool>-tls``, which is what many charts have cert-manager write to.
-    """
-    return f"{pool}-fiber-tls"
+
+def secret_name(pool: str) -> str:
+    """The Secret with the pool's key: at most 60 characters."""
+    return f"{pool}-fiber-key"
 
 
 def master_lease_name(pool: str) -> str:
@@ -186,21 +181,8 @@ def operator_lease_name(release: str) -> str:
     return f"{release}.operator.{GROUP}"
 
 
-def server_name(pool: str, namespace: str) -> str:
-    """The name in the master's certificate; agents check it instead of the address.
-
-    At most 127 characters, of the 253 that a certificate takes.
-    """
-    return f"master.{pool}.{namespace}.fiber"
-
-
-def agent_server_name(pool: str, namespace: str) -> str:
-    """The name in the agents' certificate.  One for all: what they may do does not differ."""
-    return f"agent.{pool}.{namespace}.fiber"
-
-
-def address_of(host: str, port: int) -> str:
-    """``host:port``, an IPv6 address in brackets."""
+def address_of(host: str, port: int | str) -> str:
+    """``host:port``, an IPv6 address in brackets; ``port`` may be a range."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -263,6 +245,8 @@ class Reason(StrEnum):
     """The API server refuses a pod of this template (422)."""
     QUOTA_EXCEEDED = "QuotaExceeded"
     """A ResourceQuota refuses more pods (403)."""
+    REQUESTS_MISSING = "RequestsMissing"
+    """A ResourceQuota counts requests or limits that the pod does not have (403)."""
     FORBIDDEN = "Forbidden"
     """An admission policy, or a right that the operator lacks (403 for any other cause)."""
     NAME_TAKEN = "NameTaken"
@@ -272,7 +256,7 @@ class Reason(StrEnum):
     ADDRESS_CHANGED = "AddressChanged"
     """The Service was made anew with another address than the one that workers dial."""
     CREDENTIALS_CHANGED = "CredentialsChanged"
-    """The Secret was made anew, and workers hold certificates of the old one."""
+    """The Secret was made anew, and workers hold keys of the old one."""
     INVALID_RELEASE = "InvalidRelease"
     """``scaleDown.release`` names what is not a pod of this pool."""
 

@@ -220,6 +220,13 @@ class FiberPoolSpec(Model):
             lambda spec: spec.min_replicas <= spec.max_replicas,
         ),
         Rule(
+            "minAvailable",
+            "!has(self.minAvailable) || self.minAvailable < self.minReplicas",
+            "must be below spec.minReplicas, or no node with a worker could be drained: lower the "
+            "one or raise the other.",
+            lambda spec: spec.min_available is None or spec.min_available < spec.min_replicas,
+        ),
+        Rule(
             "workerContainer",
             "self.template.spec.containers.exists(c, c.name == self.workerContainer)",
             "must be the name of a container in "
@@ -249,6 +256,9 @@ class FiberPoolSpec(Model):
     """Workers that are kept even when there is nothing to do."""
     max_replicas: Annotated[int, Field(ge=1, le=100_000)] = 1000
     """Workers that there may be at most, whatever replicas says."""
+    min_available: Annotated[int, Field(ge=1, le=100_000)] | None = None
+    """Workers that a drain of nodes leaves ready, at least: the operator makes a
+    PodDisruptionBudget. Left out, there is none."""
     suspend: bool = False
     """True: delete all pods and keep the resource."""
     processes_per_pod: Annotated[int, Field(ge=1, le=1024)] = 1
@@ -282,6 +292,7 @@ class Metadata(Model):
     name: Annotated[str, Field(min_length=1)]
     namespace: str = ""
     uid: str = ""
+    labels: Mapping[str, str] = {}
     generation: int = 0
     creation_timestamp: Time | None = None
     deletion_timestamp: Time | None = None

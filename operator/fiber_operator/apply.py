@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fiber_api import names
@@ -105,7 +105,10 @@ class Work:
 
 
 class Applier:
-    """Carries out plans.  ``now`` gives unix seconds."""
+    """Carries out plans.  ``now`` gives unix seconds.
+
+    ``requests`` says what workers request of resources that their template says nothing of.
+    """
 
     def __init__(
         self,
@@ -115,17 +118,19 @@ class Applier:
         recorder: EventRecorder,
         metrics: Metrics,
         now: Callable[[], float],
+        requests: Mapping[str, str],
     ) -> None:
         self._cluster = cluster
         self._draw = draw
         self._recorder = recorder
         self._metrics = metrics
         self._now = now
+        self._requests = requests
 
     async def dry_run(self, pool: FiberPool, plan: Plan, state: State) -> ApiError | None:
         """Ask whether the API server takes a pod of this template; returns what hindered that."""
         name = names.pod_name(pool.metadata.name, self._draw())
-        body = manifests.pod(pool, name, state.address or "")
+        body = manifests.pod(pool, name, state.address or "", self._requests)
         try:
             await self._cluster.create(PODS, pool.metadata.namespace, body, dry_run=True)
         except (Refused, Invalid) as error:
@@ -203,7 +208,7 @@ class Applier:
             # Of a change an event tells; a pool that changes all the time is not looked at so.
             return Result(requeue_after=0.0 if as_planned else GAP)
         if work.pool is not None and work.state.address is not None and work.plan.create:
-            body = manifests.pod_maker(work.pool, work.state.address)
+            body = manifests.pod_maker(work.pool, work.state.address, self._requests)
             container, limit = work.pool.spec.worker_container, work.plan.batch_limit
             order = Order(work.plan.template_hash, body, container, limit)
             work.creation.aim(work.plan.create, order)

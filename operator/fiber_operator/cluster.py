@@ -6,17 +6,16 @@ whoever asks plans anew, which is safer than a repeated request that was right a
 
 from __future__ import annotations
 
-import asyncio
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import aiohttp
 from kubernetes.aio import config
 from kubernetes.aio.client.api_client import ApiClient
 from kubernetes.aio.client.configuration import Configuration
-from kubernetes.aio.client.rest import RESTClientObject
+from kubernetes.aio.client.rest import RESTClientObject, RESTResponse
 
 from fiber_api import names
 from fiber_operator.api_errors import (
@@ -31,7 +30,8 @@ from fiber_operator.api_errors import (
     document_of,
     object_of,
 )
-from fiber_operator.listing import Listing
+from fiber_operator.listing import METADATA_LIST, PIECE, Listing
+from fiber_operator.turns import Turns
 
 __all__ = [
     "ApiError",
@@ -55,8 +55,8 @@ Observer = Callable[[str, str, str, float], None]
 """Told of each call: verb, resource, HTTP status or what went wrong, seconds."""
 Permit = Callable[[str], float]
 
-AT_ONCE = 200
-"""Objects of a list that are read before others may go on."""
+PAGE = 500
+"""Objects of a page, where a list is read in pages."""
 
 READ_TIMEOUT = 30.0
 WRITE_TIMEOUT = 10.0
@@ -64,6 +64,8 @@ WRITE_TIMEOUT = 10.0
 CONNECT_TIMEOUT = 5.0
 
 _MERGE_PATCH = "application/merge-patch+json"
+_JSON = "application/json"
+_METADATA = f"{_JSON};as={METADATA_LIST};g=meta.k8s.io;v=v1"
 
 
 class Resource(NamedTuple):
@@ -86,7 +88,12 @@ SERVICES = Resource("", "v1", "services")
 SECRETS = Resource("", "v1", "secrets")
 EVENTS = Resource("", "v1", "events")
 SLICES = Resource("discovery.k8s.io", "v1", "endpointslices")
+BUDGETS = Resource("policy", "v1", "poddisruptionbudgets")
 LEASES = Resource("coordination.k8s.io", "v1", "leases")
+
+
+async def _document(response: RESTResponse, what: str) -> Body:
+    return document_of(response.status, response.headers, await response.read(), what)
 
 
 class Cluster:
@@ -94,7 +101,7 @@ class Cluster:
 
     ``permit`` is called with the namespace before each call that changes something.  It returns how
     many seconds the call may take, and raises where this process may not.  ``connections`` bounds
-    the calls under way; further ones wait for their turn.
+    the calls under way; namespaces take turns for them.
     """
 
     def __init__(
@@ -111,7 +118,7 @@ class Cluster:
         configuration.client_session_kwargs = {"trust_env": False}
         self._client = ApiClient(configuration)
         self._client.user_agent = "fiber-operator"
-        self._turns = asyncio.Semaphore(connections)
+        self._turns = Turns(connections)
         self._permit = permit
         self._observe = observe
 
@@ -128,6 +135,44 @@ class Cluster:
         answer = await self._call("get", resource, namespace, name)
         return object_of(answer, name, f"get {resource.plural} {name}")
 
+    async def list_metadata(
+        self, resource: Resource, namespace: str | None, keep: Callable[[Body], T]
+    ) -> list[T]:
+        """Return what ``keep`` makes of each object's metadata, which come in pages."""
+        try:
+            return await self._pages(resource, namespace, keep, {"limit": str(PAGE)}, _METADATA)
+        except Unavailable as error:
+            if error.status != 410:
+                raise
+        # The next page was asked for too late.  A list without pages cannot be too late.
+        return await self._pages(resource, namespace, keep, {}, _METADATA)
+
+    async def _pages(
+        self,
+        resource: Resource,
+        namespace: str | None,
+        keep: Callable[[Body], T],
+        query: dict[str, str],
+        accept: str,
+    ) -> list[T]:
+        kept: list[T] = []
+
+        async def read(response: RESTResponse, what: str) -> str:
+            if not 200 <= response.status < 300:
+                await _document(response, what)  # raises what the status means
+            listing = Listing(response.response.content.iter_chunked(PIECE), what)
+            async for item in listing:
+                kept.append(keep(item))
+            return listing.more()
+
+        while True:
+            more = await self._call(
+                "list", resource, namespace, query=query, read=read, accept=accept
+            )
+            if not more:
+                return kept
+            query["continue"] = more
+
     async def list(
         self,
         resource: Resource,
@@ -137,23 +182,14 @@ class Cluster:
         selector: str = "",
         fields: str = "",
     ) -> list[T]:
-        """What ``keep`` makes of each object there is now (``namespace`` None: anywhere).
+        """Return what ``keep`` makes of each object (``namespace`` None: of all namespaces).
 
-        In one piece, as the API server answers that, and not a list in pages, from what it has in
-        memory, once it has made sure that this is the newest: it need not read and decode all of
-        a namespace for the few objects that are selected.
+        In one piece: the API server answers that, and not a page, from what it has in memory, once
+        it has made sure that this is the newest.  It need not read and decode all of a namespace
+        for the few objects that are selected.
         """
-        kept: list[T] = []
         query = {"labelSelector": selector, "fieldSelector": fields}
-        while True:
-            listing = await self._call("list", resource, namespace, query=query, read=_listing)
-            for item in listing:
-                kept.append(keep(item))
-                if len(kept) % AT_ONCE == 0:
-                    await asyncio.sleep(0)
-            if not listing.more():
-                return kept
-            query["continue"] = listing.more()
+        return await self._pages(resource, namespace, keep, query, _JSON)
 
     async def create(
         self, resource: Resource, namespace: str, body: Body, *, dry_run: bool = False
@@ -210,21 +246,25 @@ class Cluster:
         subresource: str = "",
         query: Mapping[str, str] | None = None,
         body: Body | None = None,
-        read: Callable[[int, Mapping[str, str], bytes, str], Any] = document_of,
+        read: Callable[[RESTResponse, str], Awaitable[Any]] = _document,
+        accept: str = _JSON,
     ) -> Any:
         path = resource.path(namespace, name, subresource)
         shown = f"{resource.plural}/{subresource}" if subresource else resource.plural
         what = f"{verb} {shown} {name}".rstrip() + (f" in {namespace}" if namespace else "")
-        async with self._turns:
+        async with self._turns.take(namespace or ""):
             seconds = READ_TIMEOUT
             if verb in _WRITES:
                 seconds = min(WRITE_TIMEOUT, self._permit(namespace or ""))
             started = time.perf_counter()
             code = "cancelled"
             try:
-                status, headers, data = await self._send(verb, path, query or {}, body, seconds)
-                code = str(status)
-                return read(status, headers, data, what)
+                response = await self._send(verb, path, query or {}, body, accept, seconds)
+                code = str(response.status)
+                try:
+                    return await read(response, what)
+                finally:
+                    response.response.close()
             except (TimeoutError, aiohttp.ClientError, OSError) as error:
                 # A TimeoutError says nothing of its own.
                 code = "timeout" if isinstance(error, TimeoutError) else "connection"
@@ -236,11 +276,17 @@ class Cluster:
                 self._observe(verb, shown, code, time.perf_counter() - started)
 
     async def _send(
-        self, verb: str, path: str, query: Mapping[str, str], body: Body | None, seconds: float
-    ) -> tuple[int, Mapping[str, str], bytes]:
-        headers = {"Accept": "application/json"}
+        self,
+        verb: str,
+        path: str,
+        query: Mapping[str, str],
+        body: Body | None,
+        accept: str,
+        seconds: float,
+    ) -> RESTResponse:
+        headers = {"Accept": accept}
         if body is not None:
-            headers["Content-Type"] = _MERGE_PATCH if verb == "patch" else "application/json"
+            headers["Content-Type"] = _MERGE_PATCH if verb == "patch" else _JSON
         # Without the body: it is JSON already and need not be walked through for models.
         method, url, headers, _, _ = await self._client.param_serialize(
             _METHODS[verb],
@@ -250,15 +296,7 @@ class Cluster:
             auth_settings=["BearerToken"],
         )
         timeout = aiohttp.ClientTimeout(total=seconds, sock_connect=CONNECT_TIMEOUT)
-        response = await self._client.call_api(method, url, headers, body, _request_timeout=timeout)
-        data = await response.read()
-        return response.status, response.headers, data
-
-
-def _listing(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Listing:
-    if not 200 <= status < 300:
-        document_of(status, headers, data, what)  # raises what it means
-    return Listing(data, what)
+        return await self._client.call_api(method, url, headers, body, _request_timeout=timeout)
 
 
 _METHODS = {
@@ -285,29 +323,13 @@ async def load_configuration() -> Configuration:
     return configuration
 
 
-async def open_session(
-    configuration: Configuration, trace: aiohttp.TraceConfig
-) -> aiohttp.ClientSession:
-    """A session that is logged in, for whoever has a client of his own.
-
-    A watch brings the metadata alone, which say whose an object is.
-    """
+async def open_session(configuration: Configuration, **options: Any) -> aiohttp.ClientSession:
+    """Open a session that is logged in, for another client; ``options`` are aiohttp's."""
     token = await configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
     tls = RESTClientObject(configuration).ssl_context
     return aiohttp.ClientSession(
         connector=aiohttp.TCPConnector(limit=0, ssl=tls),
         headers={"Authorization": token} if token else None,
         proxy=configuration.proxy,
-        trace_configs=[trace],
-        middlewares=[_ask_for_metadata],
+        **options,
     )
-
-
-async def _ask_for_metadata(
-    request: aiohttp.ClientRequest, handler: aiohttp.ClientHandlerType
-) -> aiohttp.ClientResponse:
-    # Not of a list: where that is empty the API server has null for its items.
-    if request.url.query.get("watch") == "true":
-        kind = "PartialObjectMetadata;g=meta.k8s.io;v=v1"
-        request.headers["Accept"] = f"application/json;as={kind}"
-    return await handler(request)

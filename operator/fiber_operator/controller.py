@@ -12,7 +12,7 @@ import asyncio
 import dataclasses
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
@@ -57,12 +57,15 @@ class Controller:
         metrics: Metrics,
         draw: Draw = draw_suffix,
         now: Callable[[], float] = time.time,
+        requests: Mapping[str, str],
     ) -> None:
         self._cluster = cluster
         self._lease_monitor = lease_monitor
         self._metrics = metrics
         self._dependents = DependentsReconciler(cluster, now)
-        self._applier = Applier(cluster, draw=draw, recorder=recorder, metrics=metrics, now=now)
+        self._applier = Applier(
+            cluster, draw=draw, recorder=recorder, metrics=metrics, now=now, requests=requests
+        )
         self._draw = draw
         self._now = now
         self._states: dict[Key, State] = {}

@@ -1,25 +1,25 @@
-"""What a pool has beside its pods: the Service, its EndpointSlice, and the Secret.
+"""What a pool has beside its pods: the Service, its EndpointSlice, the Secret, and a
+PodDisruptionBudget where the pool asks for one.
 
 They are looked at when the operator meets a pool, again every ``LOOK_AGAIN`` seconds, and for as
 long as something is wrong with them; between that, only a new master causes a call.  A Secret that
-``spec.credentialsSecretName`` names is its maker's: the operator does not even read it.
+``spec.credentialsSecretName`` names is its maker's: the operator looks only whether it is another
+pool's.
 """
 
 from __future__ import annotations
 
 import asyncio
-import datetime
 import ipaddress
-import urllib.parse
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fiber_api import names
-from fiber_api.certificates import Certificates, InvalidCertificates, make_pool_certificates
+from fiber_api import identity, names
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, Master
 from fiber_operator.cluster import (
+    BUDGETS,
     SECRETS,
     SERVICES,
     SLICES,
@@ -29,6 +29,7 @@ from fiber_operator.cluster import (
     Conflict,
     Gone,
     Invalid,
+    Refused,
     Resource,
     Unavailable,
 )
@@ -53,6 +54,8 @@ class Dependents:
     """The Secret is the pool's own and whole, or it is not the operator's."""
     credentials_made: float = 0.0
     """When the Secret was, as the cluster says; 0.0 where that is not known."""
+    budget: int | None = None
+    """What the PodDisruptionBudget says; None: there is none, 0: not known."""
     failure: ApiError | None = None
     """A call that nobody knows the outcome of: to be raised once it is told."""
 
@@ -94,8 +97,9 @@ class DependentsReconciler:
             (f"the EndpointSlice {names.endpoint_slice_name(name)}", self._slice)
         ]
         fresh = known is not None and self._now() - known.looked < LOOK_AGAIN
-        if known is not None and fresh and not known.obstacles:
-            if known.master == pool.spec.master:
+        complete = known is None or not fresh or bool(known.obstacles)
+        if known is not None and not complete:
+            if (known.master, known.budget) == (pool.spec.master, pool.spec.min_available):
                 return known
             address, made, looked = known.address, known.credentials_made, known.looked
             whole = known.credentials
@@ -106,8 +110,11 @@ class DependentsReconciler:
                 (f"the Service {names.service_name(name)}", self._service),
                 (f"the Secret {pool.credentials_secret}", self._secret),
             ]
+        budgeted = _concerns_budget(pool, known)
+        if budgeted:
+            steps.append((f"the PodDisruptionBudget {names.budget_name(name)}", self._budget))
         found = await _all(*(self._attempt(pool, *step) for step in steps))
-        if len(found) > 1:
+        if complete:
             address, made = found[1].told, seconds(found[2].told)
             whole = found[2].obstacle is None
         led = found[0].obstacle is None
@@ -119,6 +126,7 @@ class DependentsReconciler:
             looked,
             whole,
             made,
+            0 if budgeted and found[-1].obstacle is not None else pool.spec.min_available,
             next((step.failure for step in found if step.failure is not None), None),
         )
 
@@ -134,26 +142,39 @@ class DependentsReconciler:
             return _Found(None, obstacle, error if isinstance(error, Unavailable) else None)
 
     async def _secret(self, pool: FiberPool) -> str | None:
-        if pool.spec.credentials_secret_name is not None:
+        if (brought := pool.spec.credentials_secret_name) is not None:
+            await self._check_brought(pool, brought)
             return None
-        now = datetime.datetime.fromtimestamp(self._now(), datetime.UTC)
-        name, namespace = names.secret_name(pool.metadata.name), pool.metadata.namespace
+        name = names.secret_name(pool.metadata.name)
 
         def new() -> Body:
-            made = make_pool_certificates(pool.metadata.name, namespace, now)
-            return manifests.secret(pool, made.texts())
+            return manifests.secret(pool, {names.KEY_POOL: identity.new_key()})
 
         existing = await self._have(pool, SECRETS, name, new)
         try:
-            certificates = Certificates.from_secret(mapping(existing, "data"))
-            certificates.check(names.server_name(pool.metadata.name, namespace), now)
-        except InvalidCertificates as error:
+            identity.key_in(mapping(existing, "data"))
+        except identity.InvalidKey as error:
             message = (
                 f"the Secret {name} cannot serve: {error}. Delete it: the operator makes a new "
                 "one. Then restart the master and the workers, which hold the old ones."
             )
             raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True)) from None
         return text(mapping(existing, "metadata").get("creationTimestamp"))
+
+    async def _check_brought(self, pool: FiberPool, name: str) -> None:
+        """Refuse a Secret that is another pool's."""
+        try:
+            existing = await self._cluster.read(SECRETS, pool.metadata.namespace, name)
+        except Gone:
+            return  # pods wait for it
+        if (other := manifests.other_owner(pool, existing)) is not None:
+            message = (
+                f"spec.credentialsSecretName is {name}, which is the Secret of the FiberPool "
+                f"{other}: its workers could pose as those of {other}. Leave credentialsSecretName "
+                "out, so that the operator makes a Secret, or name one that belongs to no other "
+                "pool. The field cannot be changed: make the pool anew."
+            )
+            raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True))
 
     async def _service(self, pool: FiberPool) -> str:
         name, namespace = names.service_name(pool.metadata.name), pool.metadata.namespace
@@ -170,12 +191,20 @@ class DependentsReconciler:
                 "makes a new one."
             )
             raise _Obstructed(Obstacle(Reason.NAME_TAKEN, message, True))
-        return names.address_of(host, names.MASTER_PORT)
+        hosts = spec.get("clusterIPs") or [host]
+        return ",".join(names.address_of(one, names.MASTER_PORT) for one in hosts)
 
     async def _have_service(self, pool: FiberPool, name: str, wanted: Body) -> Body:
-        """One that was deleted gets its old address again, which workers dial, if it is free."""
-        if address := _former_address(pool):
-            former = {**wanted, "spec": {**wanted["spec"], "clusterIP": address}}
+        """Make one that was deleted with its old addresses if they are free: workers dial these."""
+        if addresses := _former_addresses(pool):
+            # A second address would be another place to dial than what workers were given.
+            policy = "PreferDualStack" if len(addresses) > 1 else "SingleStack"
+            again = {
+                "clusterIP": addresses[0],
+                "clusterIPs": addresses,
+                "ipFamilyPolicy": policy,
+            }
+            former = {**wanted, "spec": {**wanted["spec"], **again}}
             try:
                 return await self._have(pool, SERVICES, name, lambda: former)
             except Invalid:
@@ -194,6 +223,26 @@ class DependentsReconciler:
         patch = manifests.slice_patch(pool, existing)
         if patch is not None:
             await self._cluster.patch(SLICES, namespace, name, patch)
+
+    async def _budget(self, pool: FiberPool) -> None:
+        name, namespace = names.budget_name(pool.metadata.name), pool.metadata.namespace
+        if pool.spec.min_available is None:
+            await self._remove_budget(pool, name)
+            return
+        wanted = manifests.budget(pool)
+        existing = await self._have(pool, BUDGETS, name, lambda: wanted)
+        if not wanted["spec"].items() <= mapping(existing, "spec").items():
+            await self._cluster.patch(BUDGETS, namespace, name, {"spec": wanted["spec"]})
+
+    async def _remove_budget(self, pool: FiberPool, name: str) -> None:
+        namespace = pool.metadata.namespace
+        try:
+            existing = await self._cluster.read(BUDGETS, namespace, name)
+        except (Gone, Refused):
+            return  # without the right to read one, none was made
+        if manifests.is_ours(pool, existing):
+            uid = str(mapping(existing, "metadata").get("uid"))
+            await self._cluster.delete(BUDGETS, namespace, name, uid=uid)
 
     async def _have(
         self, pool: FiberPool, resource: Resource, name: str, new: Callable[[], Body]
@@ -217,6 +266,14 @@ class DependentsReconciler:
         return existing
 
 
+def _concerns_budget(pool: FiberPool, known: Dependents | None) -> bool:
+    """Whether the pool has a PodDisruptionBudget, should have one, or may have one."""
+    if pool.spec.min_available is not None:
+        return True
+    # A pool of which nothing is told yet has none.
+    return pool.status.endpoint is not None if known is None else known.budget is not None
+
+
 async def _all(*steps: Awaitable[_Found]) -> list[_Found]:
     """What each step came to, once all have ended; what one raised is raised then."""
     found = []
@@ -227,13 +284,23 @@ async def _all(*steps: Awaitable[_Found]) -> list[_Found]:
     return found
 
 
-def _former_address(pool: FiberPool) -> str | None:
-    """The IP address in ``status.endpoint``, if there is one in it."""
+def _former_addresses(pool: FiberPool) -> list[str]:
+    """Return the IP addresses in ``status.endpoint``; none if its Service must have others.
+
+    The Service of one family that an older operator made leads to no master of the other.
+    """
+    endpoint = (pool.status.endpoint or "").removeprefix(f"{names.ENDPOINT_SCHEME}://")
     try:
-        host = urllib.parse.urlsplit(pool.status.endpoint or "").netloc.rpartition(":")[0]
-        return str(ipaddress.ip_address(host.strip("[]")))
+        found = [
+            ipaddress.ip_address(address.rpartition(":")[0].strip("[]"))
+            for address in endpoint.split(",")
+        ]
     except ValueError:
-        return None
+        return []
+    master = pool.spec.master
+    if master and ipaddress.ip_address(master.host).version not in {one.version for one in found}:
+        return []
+    return [str(one) for one in found]
 
 
 def _has_ports(spec: Mapping[str, Any], ports: list[Body]) -> bool:

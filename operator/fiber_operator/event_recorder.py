@@ -4,7 +4,9 @@ An event that repeats within ``WINDOW`` raises the count of the one that is ther
 often than every ``PAUSE`` seconds, so that a pool in trouble does not flood the API server.
 What would differ each time, such as a number of pods, is therefore not in the words of an event.
 
-They are posted one after the other beside the looks at pools, which wait for none.
+They are posted beside the reconciles, which wait for none.  Namespaces take turns, and each has a
+bound on the events that wait and on those that are remembered: the events of a namespace in trouble
+neither delay nor displace those of another.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import logging
 import secrets
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fiber_api import names
 from fiber_operator.cluster import EVENTS, ApiError, Body, Cluster
@@ -26,9 +28,12 @@ from fiber_operator.workqueue import Key
 
 WINDOW = 600.0
 PAUSE = 30.0
-REMEMBERED = 1000
-WAITING = 200
-"""Events that wait to be posted; beyond that the oldest are given up."""
+REMEMBERED = 200
+"""Events of a namespace of which repetitions are counted."""
+WAITING = 50
+"""Events of a namespace that wait to be posted; beyond that the oldest are given up."""
+AT_ONCE = 4
+"""Events that are posted at the same time, each of another namespace."""
 MESSAGE_LIMIT = 1024
 """The API server refuses longer ones."""
 
@@ -43,6 +48,27 @@ class _Posted:
     count: int = 1
 
 
+_Place = tuple[str, str, str]
+"""What an event is counted by: the pool's uid, its reason and its message."""
+
+
+@dataclass
+class _Namespace:
+    """The events of one namespace."""
+
+    waiting: deque[tuple[Key, str, Event]] = field(default_factory=lambda: deque(maxlen=WAITING))
+    posted: OrderedDict[_Place, _Posted] = field(default_factory=OrderedDict)
+    posting: bool = False
+
+    def forget(self, now: float) -> None:
+        """Forget what is too old to be repeated, and the oldest of too many."""
+        while self.posted:
+            oldest = next(iter(self.posted.values()))
+            if len(self.posted) <= REMEMBERED and now - oldest.first <= WINDOW:
+                return
+            self.posted.popitem(last=False)
+
+
 class EventRecorder:
     """Posts events.  ``now`` gives unix seconds."""
 
@@ -50,29 +76,65 @@ class EventRecorder:
         self._cluster = cluster
         self._now = now
         self._identity = identity
-        self._waiting: deque[tuple[Key, str, Event]] = deque(maxlen=WAITING)
         self._bell = asyncio.Event()
-        self._posted: OrderedDict[tuple[str, str, str], _Posted] = OrderedDict()
+        self._namespaces: dict[str, _Namespace] = {}
+        """In the order of their turns."""
 
     def tell(self, key: Key, uid: str, event: Event) -> None:
         """Log ``event`` and have it posted on the pool when its turn comes."""
         level = logging.WARNING if event.type == "Warning" else logging.INFO
         log.log(level, "%s", event.message, extra=about(*key, uid=uid, reason=event.reason))
-        self._waiting.append((key, uid, event))
+        self._events_of(key).waiting.append((key, uid, event))
         self._bell.set()
 
     async def run(self) -> None:
         """Post what was told, until cancelled."""
+        async with asyncio.TaskGroup() as posters:
+            for _ in range(AT_ONCE):
+                posters.create_task(self._post_in_turn())
+
+    async def _post_in_turn(self) -> None:
         while True:
-            await self._bell.wait()
-            self._bell.clear()
-            while self._waiting:
-                await self.record(*self._waiting.popleft())
+            name = self._next()
+            if name is None:
+                self._bell.clear()
+                await self._bell.wait()
+                continue
+            # It goes to the end of the line.
+            events = self._namespaces[name] = self._namespaces.pop(name)
+            events.posting = True
+            try:
+                await self.record(*events.waiting.popleft())
+            finally:
+                events.posting = False
+            self._bell.set()
+            self._forget(name)
+
+    def _next(self) -> str | None:
+        """The namespace whose turn it is, if there is one with events that wait."""
+        free = (
+            name
+            for name, events in self._namespaces.items()
+            if events.waiting and not events.posting
+        )
+        return next(free, None)
+
+    def _events_of(self, key: Key) -> _Namespace:
+        return self._namespaces.setdefault(key.namespace, _Namespace())
+
+    def _forget(self, name: str) -> None:
+        """Forget what is too old here and in the namespace that waits longest for its turn."""
+        for known in (name, next(iter(self._namespaces))):
+            events = self._namespaces[known]
+            events.forget(self._now())
+            if not (events.posted or events.waiting or events.posting):
+                del self._namespaces[known]
+                return
 
     async def record(self, key: Key, uid: str, event: Event) -> None:
         """Post ``event`` on the pool; it never fails, it only may not be posted."""
-        now, place = self._now(), (uid, event.reason, event.message)
-        posted = self._posted.get(place)
+        now, place = self._now(), (uid, event.reason, event.message[:MESSAGE_LIMIT])
+        posted = self._events_of(key).posted.get(place)
         try:
             async with asyncio.timeout(5):
                 if posted is None or now - posted.first > WINDOW:
@@ -82,7 +144,7 @@ class EventRecorder:
         except (ApiError, TimeoutError, NotLeader) as error:
             log.warning("an event could not be posted: %s", error, extra=about(*key, uid=uid))
 
-    async def _post(self, place: tuple[str, str, str], key: Key, event: Event, now: float) -> None:
+    async def _post(self, place: _Place, key: Key, event: Event, now: float) -> None:
         name = f"{key.name}.{secrets.token_hex(8)}"
         body: Body = {
             "apiVersion": "v1",
@@ -106,10 +168,10 @@ class EventRecorder:
             "count": 1,
         }
         await self._cluster.create(EVENTS, key.namespace, body)
-        self._posted[place] = _Posted(name, now, now)
-        self._posted.move_to_end(place)
-        while len(self._posted) > REMEMBERED:
-            self._posted.popitem(last=False)
+        events = self._events_of(key)
+        events.posted[place] = _Posted(name, now, now)
+        events.posted.move_to_end(place)
+        events.forget(now)
 
     async def _repeat(self, posted: _Posted, key: Key, now: float) -> None:
         posted.count += 1

@@ -25,8 +25,9 @@ import aiohttp
 import kopf
 
 from fiber_api import names
-from fiber_operator.cluster import LEASES, Configuration, open_session
+from fiber_operator.cluster import LEASES, PAGE, Configuration
 from fiber_operator.planning.documents import mapping, text, whole
+from fiber_operator.watch_session import open_watch_session
 from fiber_operator.watches import Answered, tracing
 from fiber_operator.workqueue import Key
 
@@ -87,7 +88,7 @@ def registry(
     @kopf.on.login(registry=handlers)
     async def login(**_: Any) -> kopf.AiohttpSession:
         configuration = await configure()
-        sessions.append(await open_session(configuration, tracing(answered)))
+        sessions.append(await open_watch_session(configuration, tracing(answered)))
         return kopf.AiohttpSession(server=str(configuration.host), aiohttp_session=sessions[-1])
 
     @kopf.on.event(names.GROUP, names.VERSION, names.PLURAL, registry=handlers)
@@ -128,7 +129,7 @@ def kopf_settings() -> kopf.OperatorSettings:
     settings.watching.client_timeout = 300
     settings.watching.connect_timeout = 5
     settings.watching.inactivity_timeout = 90
-    settings.watching.chunk_size = 100
+    settings.watching.chunk_size = PAGE
     # Of the Leases of a namespace, and every node has one somewhere, those of masters.
     for resource in (("v1", "pods"), LEASES):
         settings.watching.label_selectors[resource] = names.LABEL_POOL_UID

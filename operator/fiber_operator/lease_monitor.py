@@ -14,18 +14,21 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from fiber_operator.cluster import LEASES, ApiError, Cluster, Gone, Refused
 from fiber_operator.logs import about
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.plans import LeaseVerdict
+from fiber_operator.turns import in_turn
 from fiber_operator.workqueue import Key
 
 CONFIRMED_AFTER = 1 / 3
 """Of the duration: how long a Lease that was read and had not changed may take to, before its
 master is lost.  The SDK renews as often, so that one that could not for a while has its turn."""
+MISSING_AFTER = 5.0
+"""Seconds after which a Lease that is not there is missed: a program makes it after its pool."""
 RECHECK = 60.0
 """Seconds after which the Lease of a lost master is read again."""
 AT_ONCE = 8
@@ -93,7 +96,7 @@ class LeaseMonitor:
         """Read the Leases of which nothing is heard, until cancelled."""
         while True:
             self._wake.clear()
-            due = [key for key, watched in self._watched.items() if watched.due <= self._now()]
+            due = in_turn(key for key, seen in self._watched.items() if seen.due <= self._now())
             for start in range(0, len(due), AT_ONCE):
                 await asyncio.gather(*(self._read(key) for key in due[start : start + AT_ONCE]))
             soonest = min((watched.due for watched in self._watched.values()), default=None)
@@ -141,6 +144,9 @@ class LeaseMonitor:
         To find it is no sign of life, for it may be that of a master that died long ago.
         """
         before, watched.version = watched.version, version
+        if before is None and not version:
+            watched.due = self._now() + min(MISSING_AFTER, watched.lease.seconds)
+            return True
         if version == before:
             return False
         alive = watched.verdict.alive
@@ -152,6 +158,8 @@ class LeaseMonitor:
 
     def _find_unchanged(self, key: Key, watched: _Watched) -> None:
         now, seconds = self._now(), watched.lease.seconds
+        if not (watched.version or watched.verdict.missing):
+            self._conclude(key, watched, replace(watched.verdict, missing=True))
         if now - watched.changed < seconds:
             watched.due = watched.changed + seconds
         elif not watched.doubted:

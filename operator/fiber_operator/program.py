@@ -148,6 +148,7 @@ class Program:
             metrics=self.metrics,
             draw=self._draw,
             now=self._now,
+            requests=settings.requests,
         )
         self.resync = Resync(
             cluster,

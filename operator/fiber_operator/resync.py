@@ -77,7 +77,7 @@ class Resync:
     async def _list(self, namespace: str | None) -> None:
         where = namespace or ""
         try:
-            found = await self._cluster.list(POOLS, namespace, _key)
+            found = await self._cluster.list_metadata(POOLS, namespace, _key)
         except ApiError as error:
             failure = complaint(error)
             if self.failures.get(where) != failure:

@@ -21,6 +21,7 @@ PREFIX = "FIBER_OPERATOR_"
 _SERVICE_LINK = re.compile(r".*SERVICE_(HOST|PORT\w*)|(.*_)?PORT(_\d+_(TCP|UDP|SCTP)(_\w+)?)?")
 _OWN_NAMESPACE = Path("/var/run/secrets/kubernetes.io/serviceaccount/namespace")
 _DNS_LABEL = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
+_QUANTITY = re.compile(r"[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi|T|Ti|P|Pi|E|Ei|e[0-9]+)?", re.ASCII)
 _LOG_LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 _LOG_FORMATS = ("json", "text")
 
@@ -57,10 +58,21 @@ class Settings:
     """FIBER_OPERATOR_CONCURRENCY: pools that are worked on at the same time."""
     connections: int = 32
     """FIBER_OPERATOR_CONNECTIONS: connections to the API server, watches not included."""
+    cpu_request: str = "50m"
+    """FIBER_OPERATOR_CPU_REQUEST: what a worker requests where neither the template nor the program
+    says anything, as a quantity of Kubernetes; empty: nothing."""
+    memory_request: str = "64Mi"
+    """FIBER_OPERATOR_MEMORY_REQUEST: the same of memory."""
     log_level: str = "INFO"
     """FIBER_OPERATOR_LOG_LEVEL: DEBUG, INFO, WARNING or ERROR."""
     log_format: str = "json"
     """FIBER_OPERATOR_LOG_FORMAT: json, or text for people."""
+
+    @property
+    def requests(self) -> dict[str, str]:
+        """What a worker requests of resources that nothing else speaks of."""
+        asked = {"cpu": self.cpu_request, "memory": self.memory_request}
+        return {kind: amount for kind, amount in asked.items() if amount}
 
     @classmethod
     def from_environment(
@@ -128,6 +140,12 @@ def _whole(least: int, most: int) -> Callable[[str], int]:
     return parse
 
 
+def _quantity(value: str) -> str:
+    if value and not _QUANTITY.fullmatch(value):
+        raise ValueError("must be a quantity such as 50m or 64Mi, or empty")
+    return value
+
+
 def _address(value: str) -> dict[str, Any]:
     host, separator, port = value.rpartition(":")
     if not separator:
@@ -146,6 +164,8 @@ _READERS: dict[str, Callable[[str], dict[str, Any]]] = {
     "RESYNC_SECONDS": _reader("resync_seconds", _whole(5, 3600)),
     "CONCURRENCY": _reader("concurrency", _whole(1, 100)),
     "CONNECTIONS": _reader("connections", _whole(4, 1000)),
+    "CPU_REQUEST": _reader("cpu_request", _quantity),
+    "MEMORY_REQUEST": _reader("memory_request", _quantity),
     "LOG_LEVEL": _reader("log_level", _choice(_LOG_LEVELS, str.upper)),
     "LOG_FORMAT": _reader("log_format", _choice(_LOG_FORMATS, str.lower)),
 }

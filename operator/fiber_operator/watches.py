@@ -13,15 +13,13 @@ from types import SimpleNamespace
 import aiohttp
 
 from fiber_operator.api_errors import ApiError, complaint, document_of
-from fiber_operator.cluster import LEASES, PODS, POOLS
+from fiber_operator.watch_session import WATCHED
 
 Answered = Callable[[str, ApiError | None], None]
 """Told of an answer: what was asked (``watch pods in team``) and why that failed, if it did."""
 
 _PASSES = frozenset({401, 410})
 """A login that has expired and a watch that is too old: both are begun anew at once."""
-
-WATCHED = (POOLS, PODS, LEASES)
 
 log = logging.getLogger(__name__)
 

@@ -16,6 +16,10 @@ Pools that are in trouble do not hold up the others.  A reconcile that lasts, si
 webhook hangs for instance, hands its place on to the next after ``LONG`` seconds; pools whose last
 one failed let others go first and never take all places.
 
+Namespaces take turns: the next pool is one of the namespace with the fewest reconciles under way.
+Among those it is the namespace whose last reconcile began first.  A namespace with none under way
+gets a place beside those that are taken, so that it does not wait for the others.
+
 Runs in one event loop and reads its clock; nothing here is called from another thread.
 """
 
@@ -25,7 +29,8 @@ import asyncio
 import heapq
 import itertools
 import logging
-from collections.abc import Awaitable, Callable
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -52,6 +57,8 @@ log = logging.getLogger(__name__)
 
 
 _Heap = list[tuple[float, int, "Key"]]
+_Heaps = dict[str, _Heap]
+"""By namespace."""
 
 
 class Key(NamedTuple):
@@ -123,11 +130,13 @@ class Queue:
         self._reconcile = reconcile
         self._concurrency = concurrency
         self._entries: dict[Key, _Entry] = {}
-        self._well: _Heap = []
-        self._failing: _Heap = []
+        self._well: _Heaps = {}
+        self._failing: _Heaps = {}
+        self._last_begun: dict[str, int] = {}
+        """By namespace: the order of its last reconcile."""
         self._orders = itertools.count()
-        self._tasks: dict[asyncio.Task[None], float] = {}
-        """Reconciles under way, the oldest first, and since when."""
+        self._tasks: dict[asyncio.Task[None], tuple[float, str]] = {}
+        """Reconciles under way, the oldest first: since when, and the namespace."""
         self._wake = asyncio.Event()
         self._last_end = self._now()
 
@@ -207,48 +216,69 @@ class Queue:
     def _place(self, key: Key, entry: _Entry, due: float) -> None:
         entry.due, entry.order = due, next(self._orders)
         if entry.running is None:
-            heapq.heappush(self._failing if entry.failures else self._well, (due, entry.order, key))
+            heaps = self._failing if entry.failures else self._well
+            heapq.heappush(heaps.setdefault(key.namespace, []), (due, entry.order, key))
             self._wake.set()
 
-    def _first(self, heap: _Heap) -> tuple[float, Key] | None:
-        """The first place in the heap that is not void."""
+    def _first(self, heaps: _Heaps, namespace: str) -> tuple[float, Key] | None:
+        """The first place in the namespace's heap that is not void."""
+        heap = heaps[namespace]
         while heap:
             due, order, key = heap[0]
             entry = self._entries.get(key)
             if entry is not None and entry.order == order:
                 return due, key
             heapq.heappop(heap)
+        del heaps[namespace]
         return None
 
-    def _open(self) -> list[_Heap]:
-        """From where a reconcile may begin now."""
-        now, most = self._now(), self._concurrency
-        working = sum(started + LONG > now for started in self._tasks.values())
+    def _firsts(self) -> Iterator[tuple[float, _Heaps, str]]:
+        """When the first pool of each namespace that may begin is due, and where it is."""
+        under_way = Counter(namespace for _, namespace in self._tasks.values())
+        everywhere, alone = self._open(self._concurrency), self._open(2 * self._concurrency)
+        for heaps in alone:
+            for namespace in list(heaps):
+                if heaps not in everywhere and under_way[namespace]:
+                    continue
+                if first := self._first(heaps, namespace):
+                    yield first[0], heaps, namespace
+
+    def _open(self, most: int) -> list[_Heaps]:
+        """From where a reconcile may begin now if ``most`` may work at the same time."""
+        now = self._now()
+        working = sum(started + LONG > now for started, _ in self._tasks.values())
         if working >= most or len(self._tasks) >= CROWD * most:
             return []
         if working >= max(1, most - most // 4) or len(self._tasks) >= (CROWD - 1) * most:
             return [self._well]
         return [self._well, self._failing]
 
-    def _next(self) -> _Heap | None:
-        """Where the one is that is to be next."""
+    def _next(self) -> tuple[_Heaps, str] | None:
+        """Where the pool is that is to be next."""
         now = self._now()
-        due = {
-            first[0] + (YIELD if heap is self._failing else 0.0): heap
-            for heap in self._open()
-            if (first := self._first(heap)) and first[0] <= now
-        }
-        return due[min(due)] if due else None
+        under_way = Counter(namespace for _, namespace in self._tasks.values())
+        turns = []
+        for due, heaps, namespace in self._firsts():
+            late = due + (YIELD if heaps is self._failing else 0.0) > now
+            if due <= now:
+                turn = (late, under_way[namespace], self._last_begun.get(namespace, -1), due)
+                turns.append((turn, heaps, namespace))
+        if not turns:
+            return None
+        _, heaps, namespace = min(turns, key=lambda found: found[0])
+        return heaps, namespace
 
     def _start_due(self) -> None:
-        while heap := self._next():
-            now, (_, _, key) = self._now(), heapq.heappop(heap)
+        while found := self._next():
+            heaps, namespace = found
+            now, (_, _, key) = self._now(), heapq.heappop(heaps[namespace])
             entry = self._entries[key]
             entry.owed = max(0.0, entry.rested - now) if entry.limit is not None else 0.0
             entry.due, entry.limit, entry.order = None, None, -1
             entry.running, entry.rush, entry.lull = now, False, False
             task = asyncio.create_task(self._take(key, entry), name=f"reconcile of {key}")
-            self._tasks[task] = now
+            self._tasks[task] = now, namespace
+            self._last_begun[namespace] = next(self._orders)
             task.add_done_callback(self._done)
 
     def _done(self, task: asyncio.Task[None]) -> None:
@@ -258,8 +288,9 @@ class Queue:
     async def _sleep(self) -> None:
         """Until a place is due or comes free, or something happens."""
         now = self._now()
-        firsts = [first[0] for heap in self._open() if (first := self._first(heap))]
-        handing_on = [started + LONG for started in self._tasks.values() if started + LONG > now]
+        firsts = [due for due, _, _ in self._firsts()]
+        begun = [started for started, _ in self._tasks.values()]
+        handing_on = [started + LONG for started in begun if started + LONG > now]
         timeout = None
         if self._concurrency and (times := firsts + handing_on):
             timeout = max(0.0, min(times) - now)
@@ -284,6 +315,8 @@ class Queue:
         wanted = entry.due is not None  # added while it ran
         if result.forget and not wanted:
             del self._entries[key]
+            if all(other.namespace != key.namespace for other in self._entries):
+                self._last_begun.pop(key.namespace, None)
             return
         entry.failures = entry.failures + 1 if result.failed else 0
         entry.blocked = now + result.rest

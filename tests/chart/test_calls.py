@@ -44,6 +44,7 @@ def calls() -> list[Call]:
             for happens in (
                 grows,
                 loses_workers,
+                keeps_a_budget,
                 gets_stuck,
                 meets_masters,
                 is_orphaned,
@@ -82,6 +83,17 @@ async def loses_workers(world: World) -> None:
         world.store.delete("pods", NAMESPACE, world.names()[0], {})
         await world.settled(PAUSE + 1)
         await world.ready(2)
+
+
+async def keeps_a_budget(world: World) -> None:
+    """Its owner asks for one, somebody meddles with it, and its owner thinks better of it."""
+    world.edit(minAvailable=1)
+    await world.until(lambda: bool(counted(world, "create", "poddisruptionbudgets")))
+    meddled = {"spec": {"minAvailable": 5}}
+    world.store.merge("poddisruptionbudgets", NAMESPACE, "es-fiber", meddled)
+    await world.until(lambda: bool(counted(world, "patch", "poddisruptionbudgets")), 120)
+    world.edit(minAvailable=None)
+    await world.until(lambda: bool(counted(world, "delete", "poddisruptionbudgets")))
 
 
 async def gets_stuck(world: World) -> None:

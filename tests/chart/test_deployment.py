@@ -89,6 +89,7 @@ def test_the_chart_says_no_other_settings_than_the_operator_would_choose(helm: H
         "resync_seconds",
         "concurrency",
         "connections",
+        "requests",
         "log_level",
         "log_format",
     ):
@@ -104,7 +105,10 @@ def test_every_setting_arrives(helm: Helm) -> None:
         "connections": 5,
         "leaseSeconds": 20,
     }
-    settings = Settings.from_environment(environment(helm.render({"operator": values})))
+    workers = {"defaultRequests": {"cpu": 0.1, "memory": ""}}
+    rendered = helm.render({"operator": values, "workers": workers})
+    settings = Settings.from_environment(environment(rendered))
+    assert settings.requests == {"cpu": "0.1"}
     assert (settings.log_level, settings.log_format) == ("DEBUG", "text")
     assert (settings.resync_seconds, settings.lease_seconds) == (30, 20)
     assert (settings.concurrency, settings.connections) == (3, 5)

@@ -59,6 +59,7 @@ def test_a_program_may_do_what_the_sdk_calls_and_nothing_else(roles: list[Manife
         "secrets": {"create"},
         "leases": {"create", "get", "patch", "update"},
         "pods": {"get", "list", "watch"},
+        "persistentvolumeclaims": {"get"},
     }
 
 

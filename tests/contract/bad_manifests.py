@@ -91,6 +91,11 @@ BAD = (
         ("spec.minReplicas", "must not be above spec.maxReplicas", "raise the other"),
     ),
     Bad(
+        "a budget that no drain can keep",
+        {"spec.minAvailable": 2, "spec.minReplicas": 2},
+        ("spec.minAvailable", "must be below spec.minReplicas", "raise the other"),
+    ),
+    Bad(
         "negative replicas", {"spec.replicas": -1}, ("spec.replicas", "greater than or equal to 0")
     ),
     Bad("replicas in quotes", {"spec.replicas": "3"}, ("spec.replicas", "integer")),

@@ -34,8 +34,9 @@ GARBAGE: tuple[Any, ...] = (
 
 FULL_SPEC: dict[str, Any] = {
     "replicas": 1,
-    "minReplicas": 0,
+    "minReplicas": 2,
     "maxReplicas": 2,
+    "minAvailable": 1,
     "suspend": False,
     "processesPerPod": 1,
     "template": {
@@ -234,7 +235,7 @@ def test_what_is_wanted_lies_between_the_bounds(replicas: int | None, wanted: in
 
 
 def test_the_credentials_are_the_pools_own_unless_it_names_others() -> None:
-    assert FiberPool.read(GOOD).credentials_secret == "es-fiber-tls"
+    assert FiberPool.read(GOOD).credentials_secret == "es-fiber-key"
     named = changed(GOOD, {"spec.credentialsSecretName": "mine"})
     assert FiberPool.read(named).credentials_secret == "mine"
 

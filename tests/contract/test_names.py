@@ -38,20 +38,11 @@ def test_every_name_made_from_a_pools_is_one_that_kubernetes_takes(pool: str, su
     assert len(names.service_name(pool)) <= 63
 
 
-@settings(deadline=None)
-@given(POOLS, st.from_regex(r"\A[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?\Z"))
-def test_the_names_in_certificates_are_dns_names(pool: str, namespace: str) -> None:
-    for name in (names.server_name(pool, namespace), names.agent_server_name(pool, namespace)):
-        assert len(name) <= 253
-        assert all(LABEL.fullmatch(label) and len(label) <= 63 for label in name.split("."))
-
-
 def test_the_longest_names() -> None:
     pool = "p" * names.MAX_POOL_NAME
     assert len(names.pod_name(pool, "0" * 10)) == 61
     assert len(names.service_name(pool)) == 56
     assert len(names.secret_name(pool)) == 60
-    assert len(names.server_name(pool, "n" * 63)) == 127
 
 
 @pytest.mark.parametrize("pool", ["", "E", "3d", "-a", "a-", "a.b", "a_b", "ä", "a\n", "a/b"])
@@ -112,15 +103,10 @@ def test_reasons_are_single_words_in_camel_case() -> None:
         assert all(re.fullmatch(r"[A-Z][A-Za-z]+", member) for member in kind)
 
 
-def test_agents_get_nothing_of_the_masters() -> None:
-    assert not {names.KEY_MASTER_CERTIFICATE, names.KEY_MASTER_KEY} & set(names.AGENT_FILES)
-    assert sorted(names.AGENT_FILES.values()) == sorted(names.MASTER_FILES.values())
-
-
 def test_names_need_the_standard_library_alone() -> None:
     program = (
         "import sys\n"
-        "import fiber_api.names, fiber_api.times, fiber_api.certificates\n"
+        "import fiber_api.names, fiber_api.times, fiber_api.identity\n"
         "heavy = {'pydantic', 'yaml', 'kubernetes', 'kopf', 'cryptography', 'fiber'}\n"
         "print(*heavy & set(sys.modules))\n"
     )

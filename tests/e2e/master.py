@@ -16,7 +16,6 @@ into the pool.
 
 from __future__ import annotations
 
-import base64
 import http
 import json
 import os
@@ -31,12 +30,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fiber._transport.credentials import Credentials
+from fiber._transport.credentials import MasterCredentials, make_credentials
 from fiber._transport.link import Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber._wire.messages import Recall
-from fiber_api import names
+from fiber_api import identity, names
 
 ACCOUNT = Path("/var/run/secrets/kubernetes.io/serviceaccount")
 IDENTITY = f"{socket.gethostname()}:{os.getpid()}"
@@ -57,16 +56,9 @@ class Api:
         self._secret = f"/api/v1/namespaces/{namespace}/secrets/{names.secret_name(pool)}"
         self._pool = f"/apis/{names.API_VERSION}/namespaces/{namespace}/{names.PLURAL}/{pool}"
 
-    def credentials(self) -> Credentials:
-        """The master's half."""
-        data = self._call("GET", self._secret)["data"]
-        texts = {key: base64.b64decode(data[key]).decode() for key in names.MASTER_FILES}
-        return Credentials(
-            texts[names.KEY_SERVER_NAME],
-            texts[names.KEY_AUTHORITY],
-            texts[names.KEY_MASTER_CERTIFICATE],
-            texts[names.KEY_MASTER_KEY],
-        )
+    def credentials(self) -> MasterCredentials:
+        """The master's, for the key of the pool."""
+        return make_credentials(identity.key_in(self._call("GET", self._secret)["data"]))
 
     def attach(self, master: dict[str, Any]) -> int:
         """Be the pool's master, with an epoch above those of all before; which that is."""

@@ -211,8 +211,17 @@ def state_of(pod: Body) -> Body:
 
 
 def waits_for(*reasons: str) -> Callable[[Body], bool]:
-    """Whether a pod's worker waits, and the kubelet gives one of these reasons."""
-    return lambda pod: state_of(pod).get("waiting", {}).get("reason") in reasons
+    """Whether a container of a pod waits, and the kubelet gives one of these reasons."""
+    return lambda pod: any(
+        state.get("waiting", {}).get("reason") in reasons for state in _states(pod)
+    )
+
+
+def _states(pod: Body) -> list[Body]:
+    # The init container has the worker's image and environment, and starts first.
+    status = pod.get("status", {})
+    kinds = ("initContainerStatuses", "containerStatuses")
+    return [found["state"] for kind in kinds for found in status.get(kind, [])]
 
 
 def has_ended(pod: Body) -> bool:

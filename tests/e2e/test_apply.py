@@ -70,7 +70,7 @@ def test_the_minimal_example_gives_workers(scene: Scene, image: str) -> None:
 def test_a_deleted_pool_takes_everything_along(pool: Pool, agent: Body) -> None:
     scene = pool.scene
     pool.apply(agent, minReplicas=2).ready(2)
-    secret, service = scene.path("secrets", "es-fiber-tls"), scene.path("services", "es-fiber")
+    secret, service = scene.path("secrets", "es-fiber-key"), scene.path("services", "es-fiber")
     assert scene.kube.get(secret)
     assert scene.kube.get(service)
     pool.kubectl("delete", "fiberpool", "es")
@@ -150,11 +150,11 @@ def test_suspend_and_resume(pool: Pool, agent: Body) -> None:
         "Suspended",
     )
     assert not pool.status["problems"]
-    secret = scene.kube.get(scene.path("secrets", "es-fiber-tls"))
+    secret = scene.kube.get(scene.path("secrets", "es-fiber-key"))
     pool.patch(suspend=False)
     assert set(pool.ready(2)).isdisjoint(before)
     assert pool.condition("Suspended")["status"] == "False"
-    assert scene.kube.get(scene.path("secrets", "es-fiber-tls")) == secret
+    assert scene.kube.get(scene.path("secrets", "es-fiber-key")) == secret
     assert pool.status["failures"].get("total", 0) == 0
 
 

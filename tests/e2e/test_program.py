@@ -67,10 +67,9 @@ def test_the_first_pool_waits_for_pods_and_the_next_for_nothing(
 ) -> None:
     program = programs.start("outside", "pools.py", 4)
     program.ends(seconds=120)
+    # A quick program has ended before Kubernetes calls its first worker Ready.
     first, *others = (said for said in program.said if said["event"] == "first")
-    ready = scene.first("pods", lambda pod: is_worker(pod) and is_ready(pod))
-    beyond = first["asked"] + first["took"] - ready
-    record("a first result follows the first Ready worker", beyond)
+    record("a first result of a program without pods", first["took"])
     for said in others:
         record("a first result on pods that are there", said["took"])
     assert len(list(filter(is_worker, ever(scene, "pods").values()))) <= 8

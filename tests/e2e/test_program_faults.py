@@ -126,9 +126,9 @@ def node_back_too_late(site: Site) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("fault", "seconds"),
     [
-        (pod_deleted, 0.1),
-        (container_killed, 0.1),
-        (operator_killed, 0.1),
+        (pod_deleted, 0.04),
+        (container_killed, 0.04),
+        (operator_killed, 0.04),
         pytest.param(api_server_stopped, 0.25, marks=pytest.mark.long),
         pytest.param(node_cut_off, 0.1, marks=pytest.mark.long),
         pytest.param(node_back_in_time, 0.1, marks=pytest.mark.long),

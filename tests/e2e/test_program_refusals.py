@@ -15,7 +15,6 @@ from e2e.pools import Pool
 from e2e.program import Programs
 from e2e.release import Release
 from e2e.scene import Scene
-from e2e.test_program_faults import RUNNING
 from fiber_api import names
 
 
@@ -118,7 +117,7 @@ def test_a_second_program_is_told_who_holds_a_pool(
     warm = Pool(scene, "warm").apply(agent, minReplicas=2)
     may_read_credentials(scene, "warm")
     there = warm.ready(2)
-    first = programs.start("outside", "mapping.py", "--workers", 2, *RUNNING, pool="warm")
+    first = programs.start("outside", "mapping.py", "--workers", 2, "--seconds", 0.05, pool="warm")
     first.says("first")
     identity = warm.body["spec"]["master"]["identity"]
     output = programs.start("outside", "mapping.py", pool="warm").ends(status=1, seconds=15)

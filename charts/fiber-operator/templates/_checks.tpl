@@ -89,6 +89,10 @@ contradictions are told at once, each with what, why and what to do.
 
 {{- end -}}
 
+{{- if and .Values.workerNetworkPolicy.create (eq .Values.scope "cluster") (empty .Values.workerNetworkPolicy.namespaces) -}}
+{{- $faults = append $faults "workerNetworkPolicy.create is true and scope is cluster, but workerNetworkPolicy.namespaces is empty: a NetworkPolicy belongs to one namespace. Name the namespaces of the pools." -}}
+{{- end -}}
+
 {{- with include "fiber-operator.otherOwner" . -}}
 {{- $faults = append $faults (printf "crds.install is true, but the resource type FiberPool belongs to release %s, which runs and installs it too: each upgrade of the one would undo the other's. Set crds.install=false here; or first there, and then add --take-ownership here." .) -}}
 {{- end -}}

@@ -23,6 +23,10 @@
   value: {{ .Values.operator.concurrency | quote }}
 - name: FIBER_OPERATOR_CONNECTIONS
   value: {{ .Values.operator.connections | quote }}
+- name: FIBER_OPERATOR_CPU_REQUEST
+  value: {{ .Values.workers.defaultRequests.cpu | toString | quote }}
+- name: FIBER_OPERATOR_MEMORY_REQUEST
+  value: {{ .Values.workers.defaultRequests.memory | toString | quote }}
 - name: FIBER_OPERATOR_LOG_LEVEL
   value: {{ .Values.operator.logLevel }}
 - name: FIBER_OPERATOR_LOG_FORMAT

@@ -23,12 +23,16 @@ pools:
   - apiGroups: [""]
     resources: [services]
     verbs: [create, get, patch]
-  # Never list: the operator knows the name of each Secret that it made, and reads no other.
+  # Never list: the operator knows the name of each Secret that it made or that a pool names, and reads no other.
   - apiGroups: [""]
     resources: [secrets]
     verbs: [create, get]
   - apiGroups: [discovery.k8s.io]
     resources: [endpointslices]
+    verbs: [create, delete, get, patch]
+  # For pools with spec.minAvailable.
+  - apiGroups: [policy]
+    resources: [poddisruptionbudgets]
     verbs: [create, delete, get, patch]
   # Get, list, watch: the Leases that masters renew, which the operator only looks at. The name of what is created
   # cannot be restricted.
@@ -70,6 +74,10 @@ user:
   - apiGroups: [""]
     resources: [pods]
     verbs: [get, list, watch]
+  # Whether workers on other nodes can mount the claims of that pod.
+  - apiGroups: [""]
+    resources: [persistentvolumeclaims]
+    verbs: [get]
 viewer:
   - apiGroups: [fiber.dev]
     resources: [fiberpools]

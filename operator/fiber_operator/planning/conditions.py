@@ -135,6 +135,7 @@ _UNACCEPTABLE = (
     Reason.INVALID_SPEC,
     Reason.INVALID_TEMPLATE,
     Reason.FORBIDDEN,
+    Reason.REQUESTS_MISSING,
     Reason.NAME_TAKEN,
     Reason.INVALID_CREDENTIALS,
 )

@@ -1,7 +1,7 @@
 """Workers that cannot reach their master: what they were given when they were made is of no use.
 
 Somebody has deleted the pool's Service, whose old address could not be had again, or its Secret,
-the new one of which has another authority.  A pod keeps what it was made with.
+the new one of which has another key.  A pod keeps what it was made with.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _credentials_changed(situation: Situation) -> str:
             None,
             (
                 f"The Secret {names.secret_name(pool.name)} was made anew at {made}, after "
-                "somebody had deleted it: workers hold certificates of the old one, and a master "
+                "somebody had deleted it: workers hold keys of the old one, and a master "
                 "with the new ones refuses them.",
                 fate,
                 f"{first}, to have new ones at once: {_delete(situation)}.",

@@ -19,8 +19,10 @@ from fiber_operator.planning.podspec import owner_reference, pod, pod_maker
 from fiber_operator.planning.revisions import template_hash
 
 __all__ = [
+    "budget",
     "endpoint_slice",
     "is_ours",
+    "other_owner",
     "pod",
     "pod_maker",
     "secret",
@@ -38,7 +40,10 @@ def selector(pool: FiberPool) -> str:
 
 
 def service(pool: FiberPool) -> dict[str, Any]:
-    """The Service without a selector that agents dial."""
+    """The Service without a selector that agents dial, of both IP families if the cluster has both.
+
+    The master may be of either, and agents dial both.
+    """
     port = {
         "name": names.MASTER_PORT_NAME,
         "port": names.MASTER_PORT,
@@ -49,7 +54,7 @@ def service(pool: FiberPool) -> dict[str, Any]:
         "apiVersion": "v1",
         "kind": "Service",
         "metadata": _metadata(pool, names.service_name(pool.metadata.name)),
-        "spec": {"type": "ClusterIP", "ports": [port]},
+        "spec": {"type": "ClusterIP", "ipFamilyPolicy": "PreferDualStack", "ports": [port]},
     }
 
 
@@ -70,6 +75,21 @@ def endpoint_slice(pool: FiberPool) -> dict[str, Any]:
     }
 
 
+def budget(pool: FiberPool) -> dict[str, Any]:
+    """The PodDisruptionBudget of the pool's workers."""
+    return {
+        "apiVersion": "policy/v1",
+        "kind": "PodDisruptionBudget",
+        "metadata": _metadata(pool, names.budget_name(pool.metadata.name)),
+        "spec": {
+            "minAvailable": pool.spec.min_available,
+            "selector": {"matchLabels": {names.LABEL_POOL_UID: pool.metadata.uid}},
+            # A worker that does not get ready holds up no drain.
+            "unhealthyPodEvictionPolicy": "AlwaysAllow",
+        },
+    }
+
+
 def secret(pool: FiberPool, data: Mapping[str, str]) -> dict[str, Any]:
     """The credentials Secret; ``data`` maps the keys of ``fiber_api.names`` to plain text."""
     return {
@@ -85,6 +105,17 @@ def is_ours(pool: FiberPool, existing: Mapping[str, Any]) -> bool:
     """Whether an object that already has the name was made for this very pool."""
     owners = items(mapping(existing, "metadata").get("ownerReferences"))
     return any(o.get("uid") == pool.metadata.uid and o.get("controller") is True for o in owners)
+
+
+def other_owner(pool: FiberPool, secret: Mapping[str, Any]) -> str | None:
+    """The name of another FiberPool whose Secret this is."""
+    metadata = mapping(secret, "metadata")
+    owners = [o for o in items(metadata.get("ownerReferences")) if o.get("kind") == names.KIND]
+    for owner in owners:
+        if owner.get("uid") != pool.metadata.uid:
+            return text(owner.get("name"))
+    named = text(mapping(metadata, "labels").get(names.LABEL_POOL))
+    return named if named and not owners and named != pool.metadata.name else None
 
 
 def slice_patch(pool: FiberPool, existing: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -14,6 +14,8 @@ from fiber_api.names import Reason
 
 QUOTA_IS_FULL = "exceeded quota"
 """What the API server says where a quota allows no more."""
+_QUOTA_WANTS_REQUESTS = "must specify "
+"""What it says where a quota counts what a container does not request."""
 _NAMESPACE_ENDS = "because it is being terminated"
 """What it says where nothing new may be made because the namespace is deleted."""
 _NO_ACCOUNT_YET = "error looking up service account"
@@ -45,7 +47,11 @@ class Refusal:
         """Which problem it is."""
         if self.status != 403 and not self.may_pass:
             return Reason.INVALID_TEMPLATE
-        return Reason.QUOTA_EXCEEDED if QUOTA_IS_FULL in self.message else Reason.FORBIDDEN
+        if QUOTA_IS_FULL in self.message:
+            return Reason.QUOTA_EXCEEDED
+        if "failed quota" in self.message and _QUOTA_WANTS_REQUESTS in self.message:
+            return Reason.REQUESTS_MISSING
+        return Reason.FORBIDDEN
 
     @property
     def may_pass(self) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, Master
+from fiber_operator.planning import credentials
 from fiber_operator.planning.documents import items, mapping, text
 from fiber_operator.planning.revisions import template_hash
 
@@ -25,6 +26,9 @@ _NODE_LOST = ("node.kubernetes.io/not-ready", "node.kubernetes.io/unreachable")
 _EVICTION = "NoExecute"
 
 _LOST_GRACE: int = Master.model_fields["lost_grace_seconds"].default
+
+_TERMINATION_GRACE = 30
+"""Seconds, where the template does not say: Kubernetes' own default."""
 
 _POD = frozenset({"apiVersion", "kind", "metadata", "spec", "status"})
 _POD_METADATA = frozenset(
@@ -66,18 +70,32 @@ def owner_reference(pool: FiberPool) -> dict[str, Any]:
     }
 
 
-def pod(pool: FiberPool, name: str, address: str) -> dict[str, Any]:
-    """One worker pod.  ``address`` is ``host:port`` of the pool's Service."""
-    return pod_maker(pool, address)(name)
+NO_REQUESTS: Mapping[str, str] = {}
 
 
-def pod_maker(pool: FiberPool, address: str) -> Callable[[str], dict[str, Any]]:
+def pod(
+    pool: FiberPool, name: str, address: str, requests: Mapping[str, str] = NO_REQUESTS
+) -> dict[str, Any]:
+    """One worker pod.  ``address`` is ``host:port`` of the pool's Service.
+
+    ``requests`` says what a worker requests of a resource that the template says nothing of.
+    """
+    return pod_maker(pool, address, requests)(name)
+
+
+def pod_maker(
+    pool: FiberPool, address: str, requests: Mapping[str, str] = NO_REQUESTS
+) -> Callable[[str], dict[str, Any]]:
     """Makes worker pods by name: what is costly is done once for all of them."""
     revision = template_hash(pool)
-    return lambda name: _pod(pool, name, address, revision)
+    if pool.metadata.labels.get(names.LABEL_MANAGED_BY) == names.SDK_MANAGER:
+        requests = NO_REQUESTS  # a program has settings for that
+    return lambda name: _pod(pool, name, address, revision, requests)
 
 
-def _pod(pool: FiberPool, name: str, address: str, revision: str) -> dict[str, Any]:
+def _pod(
+    pool: FiberPool, name: str, address: str, revision: str, requests: Mapping[str, str]
+) -> dict[str, Any]:
     template = copy.deepcopy(pool.spec.template)
     spec = dict(mapping(template, "spec"))
     spec["restartPolicy"] = "Never"
@@ -89,6 +107,8 @@ def _pod(pool: FiberPool, name: str, address: str, revision: str) -> dict[str, A
     for container in _containers(spec, "containers"):
         if container.get("name") == pool.spec.worker_container:
             _equip(pool, spec, container, name, address, revision)
+            _request(spec, container, requests)
+            credentials.add(pool, spec, container)
     return {
         **_others(template, _POD),
         "apiVersion": "v1",
@@ -189,28 +209,38 @@ def _equip(
     revision: str,
 ) -> None:
     _default(container, "terminationMessagePolicy", "FallbackToLogsOnError")
-    _add_environment(pool, container, name, address, revision)
-    projected = {
-        "defaultMode": 0o444,  # by any user that the image runs as; no other container has it
-        "sources": [
-            {
-                "secret": {
-                    "name": pool.credentials_secret,
-                    "items": [{"key": k, "path": path} for k, path in names.AGENT_FILES.items()],
-                }
-            }
-        ],
-    }
-    volume = {"name": names.CREDENTIALS_VOLUME, "projected": projected}
-    _mount(spec, container, volume, names.CREDENTIALS_DIRECTORY, read_only=True)
+    _add_environment(pool, spec, container, name, address, revision)
     if mapping(container, "securityContext").get("readOnlyRootFilesystem") is True:
         # The agent's sockets are in /tmp, and Python's temporary files.  Where the root can be
         # written to, the image's own /tmp does, with what the image may have put there.
-        _mount(spec, container, {"name": _TMP_VOLUME, "emptyDir": {}}, _TMP, read_only=False)
+        _mount(spec, container, {"name": _TMP_VOLUME, "emptyDir": {}}, _TMP)
+
+
+def _request(
+    spec: Mapping[str, Any], container: dict[str, Any], requests: Mapping[str, str]
+) -> None:
+    """Request what neither the container nor the pod as a whole speaks of."""
+    resources = container.get("resources")
+    asked = mapping(resources, "requests")
+    # A limit is the request, too, if there is no other.
+    said = {
+        *asked,
+        *mapping(resources, "limits"),
+        *mapping(spec, "resources", "requests"),
+        *mapping(spec, "resources", "limits"),
+    }
+    added = {kind: amount for kind, amount in requests.items() if kind not in said}
+    if added and isinstance(resources or {}, Mapping):
+        container["resources"] = {**(resources or {}), "requests": {**asked, **added}}
 
 
 def _add_environment(
-    pool: FiberPool, container: dict[str, Any], name: str, address: str, revision: str
+    pool: FiberPool,
+    spec: Mapping[str, Any],
+    container: dict[str, Any],
+    name: str,
+    address: str,
+    revision: str,
 ) -> None:
     own = container.get("env")
     if own is not None and not isinstance(own, list):
@@ -222,11 +252,12 @@ def _add_environment(
     ours = {
         names.ENV_NAME: name,
         names.ENV_ADDRESS: address,
-        names.ENV_CREDENTIALS: names.CREDENTIALS_DIRECTORY,
+        names.ENV_CREDENTIALS: f"{names.CREDENTIALS_DIRECTORY}/{names.CREDENTIALS_FILE}",
         names.ENV_POOL: pool.metadata.name,
         names.ENV_NAMESPACE: pool.metadata.namespace,
         names.ENV_PROCESSES: str(pool.spec.processes_per_pod),
         names.ENV_LOST_GRACE: str(grace),
+        names.ENV_TERMINATION_GRACE: str(_termination_grace(spec)),
         names.ENV_TEMPLATE_HASH: revision,
     }
     uid = {"fieldRef": {"apiVersion": "v1", "fieldPath": "metadata.uid"}}
@@ -237,13 +268,16 @@ def _add_environment(
     container["env"] = [variable for variable in added if variable["name"] not in taken] + own
 
 
+def _termination_grace(spec: Mapping[str, Any]) -> int:
+    own = spec.get("terminationGracePeriodSeconds")
+    return own if isinstance(own, int) and own >= 0 else _TERMINATION_GRACE
+
+
 def _mount(
     spec: dict[str, Any],
     container: dict[str, Any],
     volume: dict[str, Any],
     path: str,
-    *,
-    read_only: bool,
 ) -> None:
     """Mount a volume, unless the template has one of that name or mounts something there."""
     volumes, mounts = spec.get("volumes") or [], container.get("volumeMounts") or []
@@ -253,7 +287,7 @@ def _mount(
         return
     if all(v.get("name") != volume["name"] for v in items(volumes)):
         spec["volumes"] = [*volumes, volume]
-    mount = {"name": volume["name"], "mountPath": path, "readOnly": read_only}
+    mount = {"name": volume["name"], "mountPath": path, "readOnly": False}
     container["volumeMounts"] = [*mounts, mount]
 
 

@@ -91,12 +91,12 @@ def _masters(situation: Situation) -> Iterator[Problem]:
 
 def _families_differ(pool: FiberPool, address: str) -> bool:
     assert pool.spec.master is not None
-    host = address.rpartition(":")[0].strip("[]")
+    hosts = [one.rpartition(":")[0].strip("[]") for one in address.split(",")]
     try:
-        service = ipaddress.ip_address(host)
+        families = {ipaddress.ip_address(host).version for host in hosts}
     except ValueError:
         return False
-    return service.version != ipaddress.ip_address(pool.spec.master.host).version
+    return ipaddress.ip_address(pool.spec.master.host).version not in families
 
 
 def _releases(situation: Situation) -> Iterator[Problem]:

@@ -258,6 +258,8 @@ def refusal(reason: Reason, refused: Refusal) -> str:
     words = _OF_THE_POD.sub("", refused.message)
     if reason == Reason.INVALID_TEMPLATE and _UNKNOWN in words:
         words, remedy = words.replace(_UNKNOWN, f"{_UNKNOWN}spec.template."), _MISSPELT
+    elif _LIMIT_RANGE.search(words):
+        remedy = _OUT_OF_RANGE
     return f"{what}{quoted(words)}. {remedy}"
 
 
@@ -274,6 +276,18 @@ _MISSPELT = (
     "leave it out; the running workers stay as they are."
 )
 
+_LIMIT_RANGE = re.compile(
+    r"must be less than or equal to \S+ limit|usage per \w+ is |limit to request ratio per "
+)
+"""How the API server says that requests and limits do not fit each other, or a LimitRange."""
+
+_OUT_OF_RANGE = (
+    "A limit that spec.template does not set comes from a LimitRange of the namespace: kubectl get "
+    "limitranges -o yaml shows its bounds and defaults. Change the LimitRange, or the requests and "
+    "limits of the container in spec.template. A program does so with @fiber.meta(cpu=, memory=), "
+    "which sets both, or with fiber.init(cpu_request=0, memory_request=0), which requests nothing, "
+    "so that the defaults of the LimitRange hold. The running workers stay as they are."
+)
 
 _REFUSALS: Mapping[Reason, tuple[str, str]] = {
     Reason.INVALID_TEMPLATE: (
@@ -284,6 +298,13 @@ _REFUSALS: Mapping[Reason, tuple[str, str]] = {
         "A quota of the namespace allows no more workers",
         "Lower replicas or what a worker asks for, or raise the ResourceQuota; the operator tries "
         "again by itself.",
+    ),
+    Reason.REQUESTS_MISSING: (
+        "A quota of the namespace counts what pods of this template do not ask for",
+        "Write what it names into resources.requests or resources.limits of the container in "
+        "spec.template. A program does so with @fiber.meta(cpu=, memory=), which sets both, or "
+        "with fiber.init(cpu_request=, memory_request=). A LimitRange of the namespace can give "
+        "defaults. The running workers stay as they are.",
     ),
     Reason.FORBIDDEN: (
         "The API server forbids pods of this template",
@@ -340,8 +361,10 @@ def wrong_family(pool: FiberPool, address: str) -> str:
     assert master is not None
     return (
         f"The master's address {master.host} and the pool's Service ({address}) are not of the "
-        "same IP family, so that no worker can reach the master. Let the master listen at an "
-        "address of the Service's family and write that in spec.master.host."
+        "same IP family, so that no worker can reach the master. In a cluster of both families, "
+        f"delete the Service {names.service_name(pool.metadata.name)}: the operator makes one of "
+        "both. Else let the master listen at an address of the Service's family and write that in "
+        "spec.master.host."
     )
 
 

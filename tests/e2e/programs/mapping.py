@@ -83,7 +83,7 @@ def pool_for(options: argparse.Namespace) -> Any:
     """As many workers as were asked for, or as many as the work asks for."""
     if options.most:
         return fiber.Pool(min_workers=0, max_workers=options.most, idle_timeout=1)
-    return fiber.Pool(options.workers)
+    return fiber.Pool(options.workers, disruptions=options.disruptions)
 
 
 def hold(seconds: int) -> None:
@@ -111,6 +111,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=0.02)
     parser.add_argument("--retries", type=int, default=3)
+    parser.add_argument("--disruptions", type=int, help="as configured, if it is not given")
     parser.add_argument("--most", type=int, help="workers, as many as the work asks for")
     parser.add_argument("--stay", action="store_true", help="keep the pool until a signal comes")
     parser.add_argument("--hold", type=int, default=0, help="seconds, when half is done")

@@ -1,0 +1,91 @@
+"""A node that is drained while a program's tasks run on it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from e2e.leftovers import leaves_nothing
+from e2e.program import Program, Programs
+from e2e.scene import Scene
+from e2e.test_program import ever, ran, workers
+from e2e.test_program_faults import node_of
+from fiber_api import names
+
+pytestmark = pytest.mark.timeout(240, func_only=True)
+
+WORKERS = 3
+
+
+@contextmanager
+def drained(scene: Scene, node: str) -> Iterator[set[str]]:
+    """Drain the node as an administrator does, and yield the workers that were on it.
+
+    All of them are gone then. The node takes pods again at the end.
+    """
+    pods = {pod["metadata"]["name"] for pod in workers(scene) if pod["spec"]["nodeName"] == node}
+    # The workers alone: the operator may be on this node, too.
+    chosen = ("--pod-selector", names.LABEL_POOL, "--delete-emptydir-data", "--timeout=50s")
+    try:
+        scene.kube.kubectl("drain", node, *chosen)
+        scene.wait("they are gone", lambda: not pods & scene.now["pods"].keys())
+        yield pods
+    finally:
+        scene.kube.kubectl("uncordon", node)
+
+
+def test_tasks_that_end_in_time_run_once(programs: Programs, scene: Scene) -> None:
+    program = start(programs, tasks=9, seconds=5)
+    _, busy = tasks_under_way(scene, program)[-1]
+    with drained(scene, node_of(scene, busy)) as pods:
+        assert program.says("done", seconds=90)["total"] == squares(9)
+    assert sorted(ran(program)) == list(range(9))
+    assert {ever(scene, "pods")[pod]["status"]["phase"] for pod in pods} == {"Succeeded"}
+    program.ends()
+    leaves_nothing(program)
+
+
+def test_tasks_that_do_not_end_in_time_run_elsewhere(
+    programs: Programs, scene: Scene, tmp_path: Path
+) -> None:
+    template = tmp_path / "template.json"
+    template.write_text(json.dumps({"spec": {"terminationGracePeriodSeconds": 6}}))
+    program = start(programs, tasks=WORKERS, seconds=20, disruptions=1, template=template)
+    began = tasks_under_way(scene, program)
+    with drained(scene, node_of(scene, began[-1][1])) as pods:
+        done = program.says("done", seconds=90)
+    assert done["total"] == squares(WORKERS)
+    assert not pods & set(done["hosts"])
+    assert Counter(ran(program)) == {task: 1 + (host in pods) for task, host in began}
+    program.ends()
+    leaves_nothing(program)
+
+
+def start(
+    programs: Programs, *, tasks: int, seconds: int, disruptions: int = 0, **settings: object
+) -> Program:
+    """A program whose tasks say that they run, and are never to run again after a death."""
+    limits = ("--retries", 0, "--disruptions", disruptions)
+    work = ("--task", "loud", "--workers", WORKERS, "--tasks", tasks, "--seconds", seconds)
+    return programs.start("outside", "mapping.py", *work, *limits, **settings)
+
+
+def tasks_under_way(scene: Scene, program: Program) -> list[tuple[int, str]]:
+    """Wait until each worker has begun a task; the tasks with their hosts, the latest last."""
+
+    def begun() -> list[tuple[int, str]]:
+        found = re.findall(r"@(\S+)\] task (\d+) runs", program.output)
+        return [(int(task), host) for host, task in found]
+
+    scene.wait(f"{WORKERS} tasks run", lambda: len(begun()) >= WORKERS, 90)
+    return begun()
+
+
+def squares(count: int) -> int:
+    return sum(number * number for number in range(count))
