@@ -9,6 +9,7 @@ import pytest
 
 from faults.program import LOOPBACK, Program, wait_for
 from faults.runtime import running
+from faults.wire import Wire, wired
 
 BACKENDS = ("local", "loopback")
 
@@ -62,3 +63,11 @@ def local() -> Iterator[None]:
     """The runtime of this very process, on the local backend."""
     with running(backend="local"):
         yield
+
+
+@pytest.fixture
+def wire(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
+    """A link that the test can cut.  The mark ``lost_after`` says how long a cut it bears."""
+    marker = request.node.get_closest_marker("lost_after")
+    with wired(monkeypatch, 10 if marker is None else marker.args[0]) as wire:
+        yield wire

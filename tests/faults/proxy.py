@@ -15,10 +15,10 @@ class Proxy:
     ones are refused, as with a crashed host.  ``heal`` ends either.
     """
 
-    def __init__(self, target: str) -> None:
+    def __init__(self, target: str, at: tuple[str, int] = ("127.0.0.1", 0)) -> None:
         host, _, port = target.rpartition(":")
         self._target = host, int(port)
-        self._door = socket.create_server(("127.0.0.1", 0))
+        self._door = socket.create_server(at)
         self.address = "{}:{}".format(*self._door.getsockname())
         self._selector = selectors.DefaultSelector()
         self._peers: dict[socket.socket, socket.socket] = {}
@@ -30,6 +30,8 @@ class Proxy:
         self.connections = 0
         self.break_after: int | None = None
         """Bytes after which all connections break, once; new ones are taken."""
+        self.silent_after: int | None = None
+        """Bytes after which nothing gets through until ``heal``."""
         self._selector.register(self._door, selectors.EVENT_READ)
         self._selector.register(self._wake_out, selectors.EVENT_READ)
         self._thread = threading.Thread(target=self._run, name="proxy")
@@ -109,6 +111,11 @@ class Proxy:
         self._drop(source)
 
     def _count(self, size: int) -> None:
+        if self.silent_after is not None:
+            self.silent_after -= size
+            if self.silent_after <= 0:
+                self.silent_after = None
+                self._silent.set()
         if self.break_after is not None:
             self.break_after -= size
             if self.break_after <= 0:

@@ -313,6 +313,28 @@ def echo_large(connection: Any, requests: Any, replies: Any) -> None:
         del data
 
 
+def exchange_large(connection: Any, requests: Any, replies: Any) -> None:
+    """Take large messages, and send each back once told to."""
+    for receive, send in ((connection.recv, connection.send), (requests.get, replies.put)):
+        data = receive()
+        connection.send(checksum(data))
+        connection.recv()
+        send(data)
+        del data
+
+
+def receive_and_block(receive: Any) -> None:
+    """Wait for a message, and keep the process that has it."""
+    receive()
+    block()
+
+
+def send_and_block(send: Any, size: int) -> None:
+    """Send a large message, and keep the process that sent it."""
+    send(content(size))
+    block()
+
+
 class NeverPickled:
     """Says that it is being pickled, and does not come to an end."""
 

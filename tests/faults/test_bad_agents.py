@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -26,7 +28,6 @@ AGENT = """
 
 MASTER = """
     import fiber, sys
-    from fiber._transport.credentials import make_credentials
     from fiber._transport.listener import MasterListener
     from fiber._transport.loop import Loop
     from fiber._transport.credentials import MasterCredentials
@@ -48,17 +49,17 @@ def master(
     launch: Callable[..., Program], tmp_path: Path
 ) -> Callable[..., tuple[Program, Program]]:
     """Starts an agent beside a master that expects it; ``before`` runs in it first."""
-    credentials = make_credentials("test")
+    credentials = make_credentials()
     path = tmp_path / "credentials"
     path.write_bytes(pickle.dumps(credentials))
-    credentials.agent_half().to_directory(tmp_path / "agent")
+    file = tmp_path / "agent.json"
+    file.write_text(json.dumps(asdict(credentials.agent("newcomer", "uid"))))
 
     def agent(before: str = "", **env: str) -> tuple[Program, Program]:
         listening = launch(MASTER, str(path))
         told = {
             "FIBER_AGENT_ADDRESS": listening.line(),
-            "FIBER_AGENT_CREDENTIALS": str(tmp_path / "agent"),
-            "FIBER_AGENT_NAME": "newcomer",
+            "FIBER_AGENT_CREDENTIALS": str(file),
             "FIBER_AGENT_PARENT": str(os.getpid()),
             "FIBER_START_TIMEOUT": "10",
         }
@@ -75,8 +76,8 @@ def test_an_agent_that_fits_is_taken(master: Callable[..., tuple[Program, Progra
 
 
 def test_wrong_credentials(master: Callable[..., tuple[Program, Program]], tmp_path: Path) -> None:
-    make_credentials("test").agent_half().to_directory(tmp_path / "other")
     other = str(tmp_path / "other")
+    Path(other).write_text(json.dumps(asdict(make_credentials().agent("newcomer", "uid"))))
     # It gives up long before its timeout.
     _, agent = master(FIBER_AGENT_CREDENTIALS=other, FIBER_START_TIMEOUT=str(9 * PATIENCE))
     assert agent.wait() == 1

@@ -2,70 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import time
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
 import fiber
 from faults import targets
 from faults.program import alive, wait_for
-from faults.proxy import Proxy
-from faults.runtime import running
-from fiber._backends.loopback import LoopbackBackend
+from faults.wire import Wire
 from patience import PATIENCE
-
-LARGE = 1 << 25
-"""Bytes of a large message."""
 
 SHORT = 0.5
 """Seconds of a cut that must cost nothing."""
-
-
-class Wire:
-    """A loopback runtime whose agents reach it through a proxy."""
-
-    def __init__(self, proxy: Proxy, backend: LoopbackBackend) -> None:
-        self.proxy = proxy
-        self.backend = backend
-
-    def agents(self) -> list[str]:
-        return [slot.name for slot in self.backend._slots]
-
-    def start(self, target: Any = targets.block, *args: Any) -> Any:
-        child = fiber.Process(target=target, args=args)
-        child.start()
-        return child
-
-
-@pytest.fixture
-def wire(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
-    original = LoopbackBackend._environment
-    proxies: list[Proxy] = []
-
-    def through_the_proxy(backend: LoopbackBackend, name: str) -> dict[str, str]:
-        environment = original(backend, name)
-        if not proxies:
-            proxies.append(Proxy(environment["FIBER_AGENT_ADDRESS"]).__enter__())
-        return {**environment, "FIBER_AGENT_ADDRESS": proxies[0].address}
-
-    monkeypatch.setattr(LoopbackBackend, "_environment", through_the_proxy)
-    marker = request.node.get_closest_marker("lost_after")
-    settings = {
-        "heartbeat_interval": 0.2,
-        "suspect_after": 0.7,
-        "lost_after": 10 if marker is None else marker.args[0],
-    }
-    try:
-        with running(backend="loopback", agents=1, **settings) as runtime:
-            assert isinstance(runtime.backend, LoopbackBackend)
-            yield Wire(proxies[0], runtime.backend)
-    finally:
-        for proxy in proxies:
-            proxy.__exit__(None, None, None)
 
 
 @pytest.mark.parametrize("way", ["silence", "sever"])
@@ -87,19 +36,6 @@ def test_a_short_cut_loses_nothing(wire: Wire, way: str) -> None:
     ours.close()
     child.join(PATIENCE)
     assert child.exitcode == 0
-
-
-def test_a_large_message_survives_the_end_of_its_connection(wire: Wire) -> None:
-    with fiber.Pool(1) as pool:
-        pool.apply(len, (b"",))
-        pid = pool.apply(os.getpid)
-        for _ in range(2):
-            wire.proxy.break_after = LARGE // 2
-            data = os.urandom(LARGE)
-            assert pool.apply(targets.same, (data,)) == data
-            assert wire.proxy.break_after is None
-        assert pool.apply(os.getpid) == pid, "the worker was started again"
-    assert wire.agents() == ["loopback-0"]
 
 
 @pytest.mark.parametrize("way", ["silence", "sever"])

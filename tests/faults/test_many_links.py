@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import resource
 import threading
 from collections.abc import Callable, Iterator
@@ -22,8 +23,8 @@ PROCESSES = 2
 DESCRIPTORS = 4 * COUNT
 
 AGENTS = """
-    import sys
-    from fiber._transport.credentials import Credentials
+    import os, sys
+    import pickle
     from fiber._transport.dialer import AgentDialer
     from fiber._transport.handshake import Identity
     from fiber._transport.loop import Loop
@@ -36,11 +37,12 @@ AGENTS = """
         def on_lost(self, reason): pass
 
     address, folder, count = sys.argv[1:]
-    credentials = Credentials.from_directory(folder)
+    credentials = pickle.load(open(folder, "rb"))
     loop = Loop()
     dialers = [
         AgentDialer(
-            loop, address, credentials, Identity.of_this_process(f"fake-{number}"),
+            loop, address, credentials.agent(f"fake-{os.getpid()}-{number}", ""),
+            Identity.of_this_process(f"fake-{os.getpid()}-{number}"),
             on_link=lambda link: link.attach(Echo(link)), on_failed=print,
         )
         for number in range(int(count))
@@ -103,8 +105,8 @@ def descriptors() -> Iterator[None]:
 
 @pytest.mark.usefixtures("descriptors")
 def test_a_thousand_agents_join_and_answer(launch: Callable[..., Program], tmp_path: Path) -> None:
-    credentials = make_credentials("test")
-    credentials.agent_half().to_directory(tmp_path / "agent")
+    credentials = make_credentials()
+    (tmp_path / "agent").write_bytes(pickle.dumps(credentials))
     master = Master(credentials)
     for _ in range(PROCESSES):
         count = COUNT // PROCESSES

@@ -20,7 +20,9 @@ import pytest
 import fiber
 from fakes.cluster import FakeCluster, fake_cluster
 from faults.program import Program
+from faults.proxy import Proxy
 from faults.runtime import running
+from fiber._backends.kubernetes.address import _local_address
 from fiber._backends.kubernetes.api import Api
 from fiber._runtime import state
 from fiber.errors import ConfigError, FiberPoolError, MemberLost, WorkerDied
@@ -467,7 +469,7 @@ def test_the_end_of_a_pipe_says_what_became_of_the_pod(cluster: FakeCluster) -> 
         with pytest.raises(EOFError, match=f"Deleted: somebody deleted the pod, in pod {victim}"):
             ours.recv()
         child.join(PATIENCE)
-        assert child.exitcode == -signal.SIGTERM
+        assert child.exitcode == -signal.SIGKILL  # once the grace of its pod was over
         ours.close()
 
 
@@ -542,6 +544,35 @@ def test_a_program_that_forks_itself_has_pods_and_its_copy_runs_beside_it(
 ) -> None:
     program = launch(FORKS, env={"FIBER_BACKEND": "kubernetes"})
     assert program.finish(PATIENCE) == "9 [0, 1, 4]\n"
+
+
+def test_pools_take_the_free_ports_of_a_range(cluster: FakeCluster) -> None:
+    first = free_port()
+    ports = range(first, first + 20)
+    with running(backend="kubernetes", listen_port=f"{ports[0]}-{ports[-1]}"):
+        with fiber.Pool(1) as pool, fiber.Pool(1) as other:
+            assert pool.apply(square, (2,)) == 4
+            assert other.apply(fiber.meta(cpu=0.5)(square), (3,)) == 9
+        taken = [one["spec"]["master"]["port"] for one in cluster.objects("fiberpools")]
+    assert len(set(taken)) == 2
+    assert set(taken) <= set(ports)
+
+
+def test_pods_dial_the_advertised_address(cluster: FakeCluster) -> None:
+    port = free_port()
+    here = _local_address("192.0.2.1")
+    assert here is not None
+    with (
+        Proxy(f"127.0.0.1:{port}", at=(here, port)) as forwarding,
+        running(
+            backend="kubernetes", listen_host="127.0.0.1", listen_port=port, advertised_host=here
+        ),
+        fiber.Pool(1) as pool,
+    ):
+        assert pool.apply(square, (2,)) == 4
+        (found,) = cluster.objects("fiberpools")
+        assert found["spec"]["master"]["host"] == here
+        assert forwarding.connections > 0
 
 
 def test_one_port_is_not_enough_for_two_pools(cluster: FakeCluster) -> None:

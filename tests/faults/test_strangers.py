@@ -10,6 +10,7 @@ import ssl
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 from fiber._transport import tls
 from fiber._transport.credentials import make_credentials
+from fiber._transport.handshake import Hello, Identity
 from patience import PATIENCE
 from unit.link_site import say
 
@@ -125,7 +127,7 @@ def test_a_crowd_of_strangers_does_not_take_the_masters_descriptors(
     assert program.stderr.count("too many come at the same time") <= 1
 
 
-def test_tls_without_a_certificate_gets_no_word(backend: LoopbackBackend) -> None:
+def test_tls_without_a_proof_gets_no_word(backend: LoopbackBackend) -> None:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -134,6 +136,7 @@ def test_tls_without_a_certificate_gets_no_word(backend: LoopbackBackend) -> Non
         try:
             with context.wrap_socket(plain, server_hostname="x") as stranger:
                 stranger.sendall(b"hello?")
+                stranger.recv(32)  # random bytes, as everybody gets
                 heard = stranger.recv(100)
         except (ssl.SSLError, ConnectionError):
             heard = b""
@@ -141,37 +144,26 @@ def test_tls_without_a_certificate_gets_no_word(backend: LoopbackBackend) -> Non
     works()
 
 
-@pytest.mark.parametrize("certificate", [True, False], ids=["another run's", "none"])
-def test_who_has_a_foreign_certificate_can_push_nothing(
-    backend: LoopbackBackend, certificate: bool, tmp_path: Path
+@pytest.mark.parametrize("pool", ["this one", "another"])
+def test_nonsense_over_tls_is_not_unpickled(
+    backend: LoopbackBackend, pool: str, tmp_path: Path
 ) -> None:
     trace = tmp_path / "unpickled"
-    foreign = make_credentials("loopback").agent_half()
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    if certificate:
-        context = tls.context_of(foreign, listens=False)
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    with socket.create_connection(address(backend), PATIENCE) as plain:
-        stranger = context.wrap_socket(plain)  # the master's part of TLS 1.3 is over before ours
-        with contextlib.suppress(OSError):
-            stranger.sendall(pickle.dumps(Bomb(trace)))
-        with pytest.raises((ssl.SSLError, ConnectionError)):
-            assert stranger.recv(100)
-        stranger.close()
+    made = backend._credentials if pool == "this one" else make_credentials()
+    credentials = replace(made.agent("loopback-0", "uid"), master="")
+    with pytest.raises(tls.HungUp):
+        say(backend._listener.address, credentials, pickle.dumps(Bomb(trace)))
     works()
     assert not trace.exists()
 
 
-def test_who_has_the_credentials_and_speaks_nonsense_is_refused_not_unpickled(
-    backend: LoopbackBackend, tmp_path: Path
-) -> None:
-    trace = tmp_path / "unpickled"
-    ours = backend._launcher._credentials
-    answer = say(backend._listener.address, ours, pickle.dumps(Bomb(trace)))
-    assert b"no agent of Fiber" in answer
+def test_a_stranger_who_claims_to_be_an_agent_is_not_believed(backend: LoopbackBackend) -> None:
+    slot = backend._slots[0]
+    hello = Hello(Identity.of_this_process(slot.name, slot.uid), "0" * 32, 0, False)
+    forged = replace(make_credentials().agent(slot.name, slot.uid), master="")
+    with pytest.raises(tls.Untrusted, match="does not believe"):
+        say(backend._listener.address, forged, hello.encode())
     works()
-    assert not trace.exists()
 
 
 # The door of the hub, a unix socket in a private directory

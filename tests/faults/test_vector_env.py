@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
 
 import fiber
 from faults.program import Program, alive, wait_for
 from fiber.vector import VectorEnv, worker_process
 from fiber.vector.failures import ATTEMPTS
 from patience import PATIENCE
-from vector_envs import Faulty
+from vector_envs import Faulty, Telling
 
 GOOD = Faulty.GOOD
 Make = Callable[..., VectorEnv]
@@ -227,6 +228,22 @@ def test_one_whose_answer_cannot_be_pickled_is_made_anew(vector_env: Make) -> No
     works(env)
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_one_whose_observation_cannot_be_pickled_is_made_anew(
+    vector_env: Make, mode: AutoresetMode
+) -> None:
+    env = vector_env(Telling, on_error="restart", autoreset_mode=mode)
+    env.step([GOOD] * 4)
+    with pytest.warns(RuntimeWarning, match="environment 3 made anew: step raised TypeError"):
+        observations, _, _, truncations, infos = env.step([GOOD, GOOD, GOOD, Faulty.UNPICKLABLE])
+    at_once = mode is AutoresetMode.SAME_STEP
+    assert observations == ("2", "2", "2", "none" if at_once else "1")
+    assert truncations.tolist() == [False, False, False, True]
+    if at_once:
+        assert infos["final_obs"][3] == "1"
+    assert env.step([GOOD] * 4)[0] == ("3", "3", "3", "1" if at_once else "none")
+
+
 class NeverPicklable(Faulty):
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         observation, _ = super().reset(**options)
@@ -246,7 +263,7 @@ PROGRAM = """
     from functools import partial
     from pathlib import Path
     from fiber.vector import VectorEnv
-    from vector_envs import Faulty
+    from vector_envs import Faulty, Telling
     if __name__ == "__main__":
         gate = Path("gate")
         env = VectorEnv([partial(Faulty, gate.absolute())] * 3, num_workers=2)

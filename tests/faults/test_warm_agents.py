@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -75,26 +76,27 @@ class Pool:
     """One address where masters come and go, and one agent that dials it."""
 
     def __init__(self, launch: Callable[..., Program], folder: Path) -> None:
-        self.credentials: MasterCredentials = make_credentials("warm")
+        self.credentials: MasterCredentials = make_credentials("ab" * 32)
         self._path = folder / "credentials"
         self._path.write_bytes(pickle.dumps(self.credentials))
-        self._folder = folder / "agent"
-        self.credentials.agent_half().to_directory(self._folder)
         self._launch = launch
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{free.getsockname()[1]}"
 
-    def agent(self, grace: float, pass_fds: tuple[int, ...] = (), **env: str) -> Program:
+    def agent(self, grace: float, script: str = AGENT, **env: str) -> Program:
+        inherited = self.credentials.agent("warm-0", "uid").to_descriptor()
         told = {
             "FIBER_AGENT_ADDRESS": self.address,
-            "FIBER_AGENT_CREDENTIALS": str(self._folder),
-            "FIBER_AGENT_NAME": "warm-0",
+            "FIBER_AGENT_CREDENTIALS": f"fd:{inherited}",
             "FIBER_AGENT_PARENT": str(os.getpid()),
             "FIBER_AGENT_LOST_GRACE": str(grace),
             "FIBER_START_TIMEOUT": "0.2",
         }
-        return self._launch(AGENT, env={**told, **env}, pass_fds=pass_fds)
+        try:
+            return self._launch(script, env={**told, **env}, pass_fds=(inherited,))
+        finally:
+            os.close(inherited)
 
     def master(self, *grace: str) -> Program:
         master = self._launch(MASTER, str(self._path), self.address, *grace)
@@ -131,15 +133,24 @@ def test_it_serves_one_master_after_the_other_and_keeps_nothing_of_them(pool: Po
     }
 
 
-def test_credentials_from_a_descriptor_serve_for_all_its_masters(pool: Pool) -> None:
-    descriptor = pool.credentials.agent_half().to_descriptor()
-    told = {"FIBER_AGENT_CREDENTIALS": f"fd:{descriptor}"}
-    pool.agent(30, pass_fds=(descriptor,), **told)
-    os.close(descriptor)
+def test_credentials_from_a_file_serve_for_all_its_masters(pool: Pool, tmp_path: Path) -> None:
+    file = tmp_path / "agent.json"
+    file.write_text(json.dumps(asdict(pool.credentials.agent("warm-0", "uid"))))
+    pool.agent(30, FIBER_AGENT_CREDENTIALS=str(file))
     for _ in range(3):
         master = pool.master()
         assert master.line() == "joined warm-0"
         master.kill()
+
+
+def test_it_serves_where_the_kernel_does_not_hide_it_and_says_so(pool: Pool) -> None:
+    refused = """
+    from fiber._agent import leftovers
+    leftovers.hide_this_process = lambda: False
+    """
+    agent = pool.agent(30, refused + AGENT)
+    assert pool.master().line() == "joined warm-0"
+    assert "fiber agent warm-0: the kernel refused prctl(PR_SET_DUMPABLE)" in agent.stderr
 
 
 def test_it_finds_the_next_master_when_the_last_was_killed(pool: Pool) -> None:

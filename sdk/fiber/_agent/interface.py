@@ -31,6 +31,8 @@ class Cause(IntEnum):
     """The way to its host."""
     NO_HOST = 3
     """There is no host for it, and none will come."""
+    DRAINED = 4
+    """Its host, which is about to go: it was killed, or never started."""
 
 
 class ExitReport(NamedTuple):
@@ -53,6 +55,8 @@ class ExitReport(NamedTuple):
     pod: str = ""
     """The pod that it ran in, and that pod's node, where there is one."""
     node: str = ""
+    disrupted: bool = False
+    """Whether the cluster ended it, by a drain, an eviction or a lost node for instance."""
 
     def describe(self) -> str:
         """The reason, and where that was if it was in a pod."""
@@ -111,6 +115,9 @@ class ChildObserver(Protocol):
 
     def recalled(self, seqs: list[int]) -> None:
         """These packets it will never see: the answer to ``recall``."""
+
+    def draining(self) -> None:
+        """Its host is about to go: give it nothing more to do."""
 
     def exited(self, report: ExitReport) -> None:
         """It is gone, or never came to be.  Exactly once, and last."""

@@ -146,6 +146,11 @@ class LocalChild:
         return fds
 
     @property
+    def tasks(self) -> bool:
+        """Whether it is a pool worker."""
+        return self._spec.tasks
+
+    @property
     def program(self) -> Blob | None:
         """The files that it needs, until it has them."""
         return self._spec.program

@@ -8,13 +8,15 @@ import signal
 import socket
 import sys
 import time
+from dataclasses import replace
 from multiprocessing import current_process
 from typing import NoReturn
 
 from fiber import _logs, config
+from fiber._agent import leftovers
 from fiber._agent.agent import Agent
 from fiber._agent.allocator import keep_memory
-from fiber._agent.child import go_on_without_parent
+from fiber._agent.child import become_subreaper, go_on_without_parent
 from fiber._agent.service import AgentService
 from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
@@ -28,14 +30,30 @@ from fiber.errors import AuthenticationError, ConfigError, FiberError, LinkError
 _ADDRESS = "FIBER_AGENT_ADDRESS"
 _CREDENTIALS = "FIBER_AGENT_CREDENTIALS"
 _DESCRIPTOR = "fd:"
-_NAME = "FIBER_AGENT_NAME"
 _PARENT = "FIBER_AGENT_PARENT"
 _INHERITS = "FIBER_AGENT_INHERITS"
 _LOST_GRACE = "FIBER_AGENT_LOST_GRACE"
 _WAITS_UNTIL = "FIBER_AGENT_WAITS_UNTIL"  # time.monotonic(), from an agent to its next life
 
-_DRAIN_GRACE = 10.0
-"""Seconds that children have to end when this process is told to (SIGTERM)."""
+_TERMINATION_GRACE = "FIBER_AGENT_TERMINATION_GRACE"
+
+_DEFAULT_GRACE = 15.0
+"""Seconds from SIGTERM to the end by force, where the environment does not say."""
+
+_CLEANING_UP = 5.0
+"""Seconds of the grace that are kept for the last results, the end of the children and of the link;
+a quarter of the grace where that is less.
+"""
+
+_DRAINED = "Drained: its host was told to end (SIGTERM)"
+
+_OPEN = (
+    "the kernel refused prctl(PR_SET_DUMPABLE), so tasks of this pod may read the credentials of "
+    "their agent. Allow prctl in the seccomp profile of the container."
+)
+
+_LEFT = 5.0
+"""Seconds to end the processes that tasks left behind."""
 
 _REFUSED_PAUSE = 0.5
 """Seconds before a master that refused this agent is asked again, or another in its place."""
@@ -46,10 +64,19 @@ class Main:
 
     def __init__(self) -> None:
         self._environment = dict(os.environ)
+        # Children of the same user shall not read its memory.
+        is_hidden = leftovers.hide_this_process()
         self._credentials = _read(_required(_CREDENTIALS))  # before anything is started
-        self._name = os.environ.get(_NAME) or f"agent-{os.getpid()}"
+        self._name = self._credentials.name
+        if not is_hidden:
+            self._complain(_OPEN)
         self._lost_grace = _seconds(_LOST_GRACE)
+        if self._lost_grace is not None:
+            become_subreaper()
         self._waits_until = _seconds(_WAITS_UNTIL)
+        grace = _seconds(_TERMINATION_GRACE)
+        self._grace = _DEFAULT_GRACE if grace is None else grace
+        self._cleaning_up = min(_CLEANING_UP, self._grace / 4)
         self._parent = _pid(_PARENT)
         if self._parent is not None:
             # What the parent leaves has to be removed when it dies.  If this process is stopped
@@ -57,12 +84,14 @@ class Main:
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
             go_on_without_parent()
         self._loop = Loop()
-        self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
-        self._agent = Agent(self._loop, self._name, self._hub)
         self._service: AgentService | None = None
         self._status = 0
         self._again = False
         self._told_to_end = False
+        # From here on there is a directory, which SIGTERM must not leave behind.
+        signal.signal(signal.SIGTERM, self._on_sigterm)
+        self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
+        self._agent = Agent(self._loop, self._name, self._hub)
 
     def run(self) -> int:
         """Serve until the end; the exit status."""
@@ -71,7 +100,6 @@ class Main:
         _logs.debug("agent with pid %d", os.getpid())
         self._dialer = self._dial()
         self._wake_by_signals()
-        signal.signal(signal.SIGTERM, self._on_sigterm)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # what an earlier life, or who began it, did
         self._end_with_parent()
@@ -83,6 +111,12 @@ class Main:
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
         if self._again and not self._is_told_to_end():
             # Nothing of what the last master did or left may reach the next one.
+            if not leftovers.end(_LEFT):
+                self._complain(
+                    "processes that tasks left behind could not be ended, so this agent serves no "
+                    "other master: it ends, and its pod with it"
+                )
+                return 1
             self._hand_on_credentials()
             os.execve(sys.executable, sys.orig_argv, self._environment)
         signal.set_wakeup_fd(-1)
@@ -91,17 +125,16 @@ class Main:
         return self._status
 
     def _hand_on_credentials(self) -> None:
-        if _descriptor_in(self._environment[_CREDENTIALS]) is not None:
-            descriptor = self._credentials.to_descriptor()
-            os.set_inheritable(descriptor, True)
-            self._environment[_CREDENTIALS] = f"{_DESCRIPTOR}{descriptor}"
+        descriptor = replace(self._credentials, epoch=self._dialer.epoch).to_descriptor()
+        os.set_inheritable(descriptor, True)
+        self._environment[_CREDENTIALS] = f"{_DESCRIPTOR}{descriptor}"
 
     def _dial(self) -> AgentDialer:
         return AgentDialer(
             self._loop,
             _required(_ADDRESS),
             self._credentials,
-            Identity.of_this_process(self._name, pid=str(os.getpid())),
+            Identity.of_this_process(self._name, self._credentials.uid, pid=str(os.getpid())),
             on_link=self._joined,
             on_failed=self._failed,
             timeout=self._timeout(),
@@ -145,7 +178,8 @@ class Main:
                 self._environment[_WAITS_UNTIL] = str(time.monotonic() + grace)
         elif lost:
             self._status = 1
-        self._link.close("the agent ended", then=self._loop.stop)
+        linger = self._cleaning_up if self._told_to_end else 1.0
+        self._link.close(reason, linger=linger, then=self._loop.stop)
 
     def _is_told_to_end(self) -> bool:
         """Also by a signal that another thread took, and of which Python has not told us yet."""
@@ -171,7 +205,7 @@ class Main:
         if self._service is None:
             self._loop.stop()
         else:
-            self._service.stop("told to end by SIGTERM", _DRAIN_GRACE)
+            self._service.leave(_DRAINED, self._grace - self._cleaning_up)
 
     def _end_with_parent(self) -> None:
         if self._parent is None:
@@ -195,10 +229,10 @@ def _read(credentials: str) -> Credentials:
     if descriptor is not None:
         return Credentials.from_descriptor(descriptor)
     if os.path.isabs(credentials):
-        return Credentials.from_directory(credentials)
+        return Credentials.from_file(credentials)
     raise ConfigError(  # and does not repeat what may be a secret in the wrong place
         f"{_CREDENTIALS} ({len(credentials)} characters) is neither an absolute path nor fd:N. It "
-        "says where the credentials are, a mounted directory for instance, and does not hold them."
+        "says where the credentials are, a file for instance, and does not hold them."
     )
 
 

@@ -15,6 +15,7 @@ from fiber._agent.blob_store import BlobLacking, BlobStore
 from fiber._agent.capture import Capture
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._agent.local_child import LocalChild
+from fiber._agent.signals import is_expected
 from fiber._hub.hub import Hub
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
@@ -51,9 +52,11 @@ class AgentService:
         self._on_end = on_end
         self._blobs = BlobStore(config.current().runtime_directory)
         self._children: dict[int, _Observed] = {}
+        self._leaving = False
         self._stopping = False
         self._reason = ""
         self._lost = False
+        self._ended = False
 
     def send(self, message: messages.Message, on_left: Callable[[], None] | None = None) -> None:
         """Tell the master; ``on_left`` is called once that is on its way."""
@@ -95,13 +98,16 @@ class AgentService:
     def on_lost(self, reason: str) -> None:
         """The master is gone for good."""
         self._hub.unlink(None, reason)
-        self._lost = not self._stopping
+        self._lost = not (self._stopping or self._leaving)
         self.stop(f"lost the master: {reason}", 0)
 
     # Children
 
     def _start(self, message: messages.Start) -> None:
         child = self._children[message.child] = _Observed(self, message.child)
+        if self._leaving:
+            child.refuse(self._agent.host, "its host is about to go", Cause.DRAINED)
+            return
         try:
             with naming_the_limit("starting a process"):
                 spec = self._specification(message.process, *pickle.loads(message.spec))
@@ -139,8 +145,29 @@ class AgentService:
     def forget(self, child: int) -> None:
         """That one is gone."""
         del self._children[child]
-        if self._stopping and not self._children:
+        if (self._stopping or self._leaving) and not self._children:
             self._loop.call_soon(self._end)
+
+    @property
+    def leaving(self) -> bool:
+        """Whether this agent takes no new work."""
+        return self._leaving
+
+    def leave(self, reason: str, grace: float) -> None:
+        """Take no new work; end when what runs has ended, by force after ``grace`` seconds.
+
+        Children that are prepared for SIGTERM get it now, as the first process of a pod does.
+        """
+        if self._leaving or self._stopping:
+            return
+        self._leaving, self._reason = True, reason
+        self.send(messages.Leave(grace, reason))
+        if not self._children:
+            self._end()
+            return
+        for child in self._children.values():
+            child.leave()
+        self._loop.call_later(grace, self.stop, reason, 0)
 
     def stop(self, reason: str, grace: float) -> None:
         """End the children, by force after ``grace`` seconds, and then the agent."""
@@ -148,6 +175,8 @@ class AgentService:
             return
         self._stopping = True
         self._reason = reason
+        for child in self._children.values():
+            child.drained = self._leaving and not self._lost
         if not self._children:
             self._end()
             return
@@ -156,6 +185,9 @@ class AgentService:
         self._loop.call_later(grace + 5, self._end)
 
     def _end(self) -> None:
+        if self._ended:
+            return
+        self._ended = True
         self._on_end(self._reason, self._lost)
 
     def _signal_all(self, signum: int) -> None:
@@ -174,6 +206,8 @@ class _Observed:
         """Characters of output that wait for the link."""
         self._capture: Capture | None = None
         self._child: LocalChild | None = None
+        self.drained = False
+        """Whether it is killed because its host has to go."""
 
     def start(self, agent: Agent, loop: Loop, spec: ChildSpec) -> None:
         """Start it."""
@@ -186,10 +220,19 @@ class _Observed:
             # Whatever keeps a child from starting here, the one who asked is the master.
             self.refuse(agent.host, error)
 
-    def refuse(self, host: str, error: Exception) -> None:
+    def refuse(self, host: str, why: object, cause: Cause = Cause.REFUSED) -> None:
         """It is not started."""
-        reason = f"could not be started: {error}"
-        self.exited(ExitReport(1, reason, host=host, cause=Cause.REFUSED))
+        self.exited(ExitReport(1, f"could not be started: {why}", host=host, cause=cause))
+
+    def leave(self) -> None:
+        """Give back what it has not begun, and signal it if it is prepared for that."""
+        child = self._child
+        if child is None:
+            return
+        if child.tasks:
+            child.recall()
+        elif child.pid is not None and is_expected(child.pid, signal.SIGTERM):
+            child.signal(signal.SIGTERM)
 
     def handle(self, message: messages.Deliver | messages.Signal | messages.Recall) -> None:
         """What the master wants of it."""
@@ -201,6 +244,9 @@ class _Observed:
             buffers = [memoryview(buffer) for buffer in message.buffers]
             for buffer in buffers:
                 pass_on(buffer)
+            if message.seq and self._service.leaving:
+                self.recalled([message.seq])
+                return
             try:
                 child.deliver(message.seq, message.payload, buffers)
             except OSError as error:
@@ -232,8 +278,13 @@ class _Observed:
         """Pass the answer on."""
         self._service.send(messages.Recalled(self._number, tuple(seqs)))
 
+    def draining(self) -> None:
+        """Its host is this one, which tells the master itself."""
+
     def exited(self, report: ExitReport) -> None:
         """Its last lines, then its end."""
+        if self.drained and report.exitcode == -signal.SIGKILL:
+            report = report._replace(cause=Cause.DRAINED)
         log = self._capture.finish() if self._capture is not None else ()
         told: Any = report._replace(log=log)[:_KNOWN_HERE]
         end = messages.Exited(self._number, self._delivered, *told)

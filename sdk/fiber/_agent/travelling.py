@@ -183,7 +183,7 @@ class _Pickling:
     """Pickles exceptions, and what has exceptions in it.
 
     With ``incomplete``, an exception travels without those of its parts that cannot, and has a note
-    that says so.
+    that says so.  A group has another exception in place of a member that cannot.
     """
 
     def __init__(self, pickler: _MakePickler, *, incomplete: bool = False) -> None:
@@ -233,7 +233,7 @@ class _Pickling:
         if self._incomplete and id(error) not in self._open:
             return self._reduce_checked(error, state)
         self._met.add(id(error))
-        return _rebuilt(error, state)
+        return _rebuilt(error, group_of(error), state)
 
     def _reduce_checked(self, error: BaseException, state: _State) -> _Reduced:
         """Reduce an exception to what travels of it.
@@ -243,15 +243,36 @@ class _Pickling:
         met, self._met = self._met, set()
         self._open.add(id(error))
         try:
+            group, state = self._without_refused_members(error, state)
             state = self._without_refused(state)
         finally:
             self._open.remove(id(error))
             is_in_cycle = bool(self._met)  # Then the outcome depends on where the check began.
             self._met = met | self._met - {id(error)}
-        reduced = _rebuilt(error, state)
+        reduced = _rebuilt(error, group, state)
         if not is_in_cycle:
             self._checked[id(error)] = error, reduced
         return reduced
+
+    def _without_refused_members(
+        self, error: BaseException, state: _State
+    ) -> tuple[tuple[Any, ...], _State]:
+        """Replace the members of a group that cannot travel by errors that say why."""
+        if not isinstance(error, BaseExceptionGroup):
+            return (), state
+        sent: dict[int, BaseException] = {}
+        for member in error.exceptions:
+            refusal = self._refusal(member)
+            sent[id(member)] = unsendable(_Text(refusal), member) if refusal else member
+        args = tuple(
+            type(arg)(sent.get(id(each), each) for each in arg)
+            if type(arg) in (list, tuple)
+            else arg
+            for arg in state.args
+        )
+        fields = {name: value for name, value in state.fields.items() if name != "exceptions"}
+        members = tuple(sent[id(member)] for member in error.exceptions)
+        return (error.message, members), state._replace(args=args, fields=fields)
 
     def _without_refused(self, state: _State) -> _State:
         """Drop the attributes that do not travel, and note them; such arguments become text."""
@@ -291,8 +312,8 @@ class _Exceptions(dict[type, Callable[[Any], _Reduced]]):
         raise KeyError(kind)
 
 
-def _rebuilt(error: BaseException, state: _State) -> _Reduced:
-    return make, (type(error), group_of(error)), tuple(state), None, None, _set_state
+def _rebuilt(error: BaseException, group: tuple[Any, ...], state: _State) -> _Reduced:
+    return make, (type(error), group), tuple(state), None, None, _set_state
 
 
 def _set_state(error: BaseException, state: tuple[Any, ...]) -> None:

@@ -67,9 +67,12 @@ class Watchdog:
                 del batch  # its results must not live until the next batch
 
     def _wait_for_slow_batch(self) -> BatchResults | None:
-        """Wait for a batch that runs for too long; None if they end before that."""
+        """Wait for a batch that runs for too long; None if they end before that.
+
+        On a busy machine it may not have begun: a worker keeps one task at least.
+        """
         while (batch := self._batch) is not None:
             time.sleep(SPLIT_EAGER_AFTER if batch.eager else SPLIT_AFTER)
-            if self._batch is batch:
+            if self._batch is batch and batch.started():
                 return batch
         return None

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -80,11 +81,18 @@ class AgentProcess:
 
     def kill(self) -> None:
         """It is out of reach, though it may run: nothing of it is wanted any more."""
+        self._end(signal.SIGKILL)
+
+    def terminate(self) -> None:
+        """Tell the agent to end.  It removes its directory first."""
+        self._end(signal.SIGTERM)
+
+    def _end(self, signum: int) -> None:
         with self._lock:
             self._unwanted = True
             if self._process is not None:
                 with contextlib.suppress(ProcessLookupError):
-                    self._process.kill()
+                    self._process.send_signal(signum)
 
     def wait(self, timeout: float) -> None:
         """Wait for its end, by force after ``timeout`` seconds.  It must not be started later."""
@@ -114,24 +122,23 @@ class AgentLauncher:
     thread of its own for each be there when the system has no more of them to give.
     """
 
-    def __init__(
-        self, credentials: Credentials, timeout: float, on_trouble: Callable[[str], None]
-    ) -> None:
+    def __init__(self, timeout: float, on_trouble: Callable[[str], None]) -> None:
         """``on_trouble`` is told, on the thread, what keeps one from starting that is tried again
         for ``timeout`` seconds.
         """
-        self._credentials = credentials
         self._timeout = timeout
         self._on_trouble = on_trouble
-        self._wanted: queue.SimpleQueue[tuple[AgentProcess, str, Mapping[str, str]] | None]
+        self._wanted: queue.SimpleQueue[tuple[AgentProcess, Credentials, Mapping[str, str]] | None]
         self._wanted = queue.SimpleQueue()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fiber-launch", daemon=True)
         self._thread.start()
 
-    def launch(self, process: AgentProcess, name: str, environment: Mapping[str, str]) -> None:
+    def launch(
+        self, process: AgentProcess, credentials: Credentials, environment: Mapping[str, str]
+    ) -> None:
         """Start it as soon as possible.  Any thread; returns at once."""
-        self._wanted.put((process, name, environment))
+        self._wanted.put((process, credentials, environment))
 
     def close(self) -> None:
         """Start nothing more."""
@@ -143,12 +150,14 @@ class AgentLauncher:
         while (wanted := self._wanted.get()) is not None and not self._closing.is_set():
             self._start(*wanted)
 
-    def _start(self, process: AgentProcess, name: str, environment: Mapping[str, str]) -> None:
+    def _start(
+        self, process: AgentProcess, credentials: Credentials, environment: Mapping[str, str]
+    ) -> None:
         deadline = time.monotonic() + self._timeout
         pause = _PAUSE_MIN
         while True:
             try:
-                process.start(environment, self._credentials)
+                process.start(environment, credentials)
                 return
             except OSError as error:
                 reason = f"its process cannot be started: {error}"
@@ -156,7 +165,9 @@ class AgentLauncher:
                 if not may_pass or time.monotonic() + pause > deadline:
                     process.fail(reason, may_pass=may_pass)
                     return
-            self._on_trouble(f"agent {name} has to wait, {reason}; next attempt in {pause:g} s")
+            self._on_trouble(
+                f"agent {credentials.name} has to wait, {reason}; next attempt in {pause:g} s"
+            )
             if self._closing.wait(pause):
                 return
             pause = min(2 * pause, _PAUSE_MAX)

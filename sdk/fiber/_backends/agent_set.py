@@ -18,8 +18,9 @@ class AgentSet:
     """Gives each child an agent: at once, or as soon as one has room.
 
     ``on_change`` is called, on the loop's thread, whenever more or fewer agents may be wanted;
-    ``on_lost`` with an agent that is gone and why, before its children are told.  ``child`` comes
-    from anywhere, everything else happens on the loop's thread.
+    ``on_lost`` with an agent that is gone and why, before its children are told; ``on_leaving``
+    with one that is about to go.  ``child`` comes from anywhere, everything else happens on the
+    loop's thread.
     """
 
     def __init__(
@@ -31,6 +32,7 @@ class AgentSet:
         *,
         on_change: Callable[[], None] = lambda: None,
         on_lost: Callable[[RemoteAgent, str], None] = lambda agent, reason: None,
+        on_leaving: Callable[[RemoteAgent], None] = lambda agent: None,
     ) -> None:
         self.loop = loop
         self.placement = placement
@@ -46,6 +48,7 @@ class AgentSet:
         self._output = output
         self._on_change = on_change
         self._on_lost = on_lost
+        self._on_leaving = on_leaving
         self._not_started: weakref.WeakSet[RemoteChild] = weakref.WeakSet()
 
     @property
@@ -140,6 +143,14 @@ class AgentSet:
             self.refuse_waiting(self.error)  # they waited for room that it would have had
         else:
             self._on_change()
+
+    def leaving(self, agent: RemoteAgent) -> None:
+        """It takes no new children: as far as room goes, it is gone already."""
+        _logs.debug("agent %s leaves: %s", agent.host, agent.leaving)
+        if agent in self.placement.loads:
+            self.placement.remove(agent)
+        self._on_leaving(agent)
+        self._on_change()
 
     def child_gone(self, agent: RemoteAgent) -> None:
         """There is room for another."""

@@ -7,6 +7,7 @@ decides, and in it the last line that matches.
 
 from __future__ import annotations
 
+import fnmatch
 import os
 from collections.abc import Iterable
 from functools import lru_cache
@@ -16,7 +17,10 @@ from pathspec import GitIgnoreSpec
 from pathspec.patterns.gitignore import GitIgnorePatternError
 from pathspec.patterns.gitignore.spec import GitIgnoreSpecPattern
 
-_FILES = (".gitignore", ".fiberignore")
+INCLUDING = ".fiberignore"
+"""The file that says what is sent of a folder, although it would not be."""
+
+_FILES = (".gitignore", INCLUDING)
 
 _REPOSITORIES = (".git", ".hg", ".svn")
 
@@ -40,10 +44,28 @@ node_modules/
 
 class _Level(NamedTuple):
     folder: str
+    name: str
     patterns: GitIgnoreSpec
 
-    def ignores(self, path: str) -> bool | None:
-        return self.patterns.check_file(path[len(self.folder) + 1 :]).include
+    def decide(self, path: str) -> _Decision | None:
+        found = self.patterns.check_file(path[len(self.folder) + 1 :])
+        if found.include is None or found.index is None:
+            return None
+        return _Decision(found.include, str(self.patterns.patterns[found.index].pattern), self)
+
+
+class _Decision(NamedTuple):
+    """One line of one file that decides about a path."""
+
+    ignored: bool
+    line: str
+    level: _Level
+
+    def names(self, path: str) -> bool:
+        """Return whether the line has the path's own name, and not that of a folder around it."""
+        last = self.line.strip().rstrip("/").rpartition("/")[2].removeprefix("!")
+        name = os.path.basename(path.rstrip("/"))
+        return bool(last.strip("*")) and fnmatch.fnmatchcase(name, last)
 
 
 class IgnoreRules:
@@ -68,20 +90,32 @@ class IgnoreRules:
 
     def within(self, folder: str) -> IgnoreRules:
         """Those that hold in ``folder``, which these are around."""
-        found = [_Level(folder.rstrip(os.sep), _compiled(text)) for text in _read_all(folder)]
+        top = folder.rstrip(os.sep)
+        found = [_Level(top, name, _compiled(text)) for name, text in _read_all(folder)]
         return IgnoreRules((*self._levels, *found)) if found else self
 
-    def ignores(self, path: str, *, is_folder: bool) -> bool:
-        """Whether ``path``, in the folder, is not needed."""
+    def ignores(self, path: str, *, is_folder: bool) -> str | None:
+        """Return why ``path``, in the folder, is not needed; None if it may be."""
         if is_folder and os.path.isfile(os.path.join(path, "pyvenv.cfg")):
-            return True  # a virtual environment: what an image has installed
+            return "a virtual environment, whose packages belong into the image"
         path += "/" if is_folder else ""
         for level in reversed(self._levels):
-            answer = level.ignores(path)
-            if answer is not None:
-                return answer
+            decision = level.decide(path)
+            if decision is not None:
+                where = os.path.join(level.folder, level.name)
+                return f"{decision.line!r} in {where}" if decision.ignored else None
         name = os.path.basename(path.rstrip("/")) + ("/" if is_folder else "")
-        return bool(_compiled(_NEVER_NEEDED).check_file(name).include)
+        tool = _compiled(_NEVER_NEEDED).check_file(name).include
+        return "left by a tool" if tool else None
+
+    def asks_for(self, path: str, *, is_folder: bool) -> bool:
+        """Return whether a line of ``.fiberignore`` has ``path`` sent, by its name: ``!name``."""
+        path += "/" if is_folder else ""
+        for level in reversed(self._levels):
+            decision = level.decide(path) if level.name == INCLUDING else None
+            if decision is not None:
+                return not decision.ignored and decision.names(path)
+        return False
 
 
 def _up_to_repository(folder: str) -> list[str]:
@@ -97,12 +131,12 @@ def _up_to_repository(folder: str) -> list[str]:
     return around[::-1]
 
 
-def _read_all(folder: str) -> Iterable[str]:
+def _read_all(folder: str) -> Iterable[tuple[str, str]]:
     for name in _FILES:
         try:
             path = os.path.join(folder, name)
             with open(path, encoding="utf-8-sig", errors="surrogateescape") as file:
-                yield file.read()
+                yield name, file.read()
         except OSError:  # there is none, or nobody may read it: git goes on, too
             continue
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import secrets
 import threading
 import time
 from collections import deque
@@ -22,7 +23,9 @@ from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._engine.start_failures import StartFailure, StartFailures
 from fiber._hub.hub import Hub
+from fiber._transport import address as addresses
 from fiber._transport.credentials import make_credentials
+from fiber._transport.handshake import Identity
 from fiber._transport.link import Keepalive, Link, Timer
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
@@ -73,6 +76,8 @@ class LoopbackBackend:
         self._limit = config.processes_per_agent or math.inf
         self._slots: list[_Slot] = []
         self._by_name: dict[str, _Slot] = {}
+        self._departing: dict[str, _Slot] = {}
+        """Those whose agents are about to go, and have been replaced."""
         self._vacant: list[_Slot] = []
         """Those whose agents are lost and not yet replaced."""
         self.agents = AgentSet(
@@ -82,18 +87,19 @@ class LoopbackBackend:
             Placement(self._limit, spread=True),
             on_change=self._changed,
             on_lost=self._lost,
+            on_leaving=self._leaving,
         )
-        credentials = make_credentials("loopback")
+        self._credentials = make_credentials()
         self._listener = MasterListener(
             loop,
-            f"{config.listen_host or _LOOPBACK}:{config.listen_port}",
-            credentials,
+            addresses.join(config.listen_host or _LOOPBACK, config.listen_port),
+            self._credentials,
             on_agent=self._joined,
+            objection=self._objection,
             on_refused=self._refused,
             keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
         )
         self._launcher = AgentLauncher(
-            credentials.agent_half(),
             config.start_timeout,
             lambda trouble: self._output.write("fiber", trouble),
         )
@@ -123,7 +129,7 @@ class LoopbackBackend:
         self._launcher.close()
         self._loop.call_soon(self._shut_down)
         deadline = time.monotonic() + _QUIT_TIMEOUT
-        for slot in self._slots:
+        for slot in [*self._slots, *self._departing.values()]:
             slot.process.wait(max(deadline - time.monotonic(), 0.0))
         done = threading.Event()
         self._listener.close("the master ended", then=done.set)
@@ -134,9 +140,12 @@ class LoopbackBackend:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
         process = AgentProcess(self._loop, partial(self._ended, name), self.elsewhere)
-        self._by_name[name] = slot = _Slot(index, name, process, self._loop.now())
+        self._by_name[name] = slot = _Slot(
+            index, name, process, self._loop.now(), secrets.token_hex(8)
+        )
         self._slots[index : index + 1] = [slot]
-        self._launcher.launch(process, name, self._environment(name))
+        credentials = self._credentials.agent(name, slot.uid)
+        self._launcher.launch(process, credentials, self._environment(name))
         self._loop.call_later(_EXPECTED_FOR, self._expect)
 
     def _environment(self, name: str) -> dict[str, str]:
@@ -155,26 +164,29 @@ class LoopbackBackend:
 
     # On the loop's thread
 
-    def _joined(self, link: Link) -> str | None:
+    def _objection(self, identity: Identity) -> str:
+        slot = self._by_name.get(identity.name)
+        if slot is None or slot.uid != identity.uid or identity.name in self.agents.agents:
+            return f"the master expects no agent named {identity.name}"
+        return ""
+
+    def _joined(self, link: Link) -> None:
         name = link.peer.name
-        if name not in self._by_name or name in self.agents.agents:
-            return f"the master expects no agent named {name}"
         self._failures = StartFailures()
         self._reasons.clear()
         self._gave_up = False
         self.agents.join(name, link)
         self._fill_vacant()
-        return None
 
     def _refused(self, reason: str) -> None:
         if not self._closing:  # else it may be one of ours, ended before it was in
             self._output.write("fiber", f"refused an agent: {reason}")
 
     def _shut_down(self) -> None:
-        for slot in self._slots:
+        for slot in [*self._slots, *self._departing.values()]:
             agent = self.agents.agents.get(slot.name)
             if agent is None:
-                slot.process.kill()  # it has not joined
+                slot.process.terminate()  # it has not joined yet, or has left
             else:
                 agent.close()
 
@@ -186,12 +198,22 @@ class LoopbackBackend:
         elif name in self._by_name and not self._closing:
             self._vacate(name)
             self._failed(name, reason, killed)
+        self._departing.pop(name, None)
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
         if not self.agents.agents:
             self._alone_since = self._loop.now()
-        if not self._closing:
+        if (departed := self._departing.get(agent.host)) is not None:
+            self._loop.call_later(_QUIT_TIMEOUT, departed.process.kill)
+        elif not self._closing:
             self._vacate(agent.host)
+            self._fill_vacant()
+
+    def _leaving(self, agent: RemoteAgent) -> None:
+        """It is replaced now, and ends by itself."""
+        if not self._closing:
+            self._departing[agent.host] = slot = self._by_name.pop(agent.host)
+            self._vacant.append(slot)
             self._fill_vacant()
 
     def _vacate(self, name: str) -> None:
@@ -264,3 +286,4 @@ class _Slot(NamedTuple):
     name: str
     process: AgentProcess
     launched: float
+    uid: str

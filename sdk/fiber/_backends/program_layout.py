@@ -4,9 +4,10 @@
   a main module of its own (``-c``, stdin, a notebook, an installed command) has its working
   directory instead.  That is only where somebody happened to be: one that is too large is left out,
   with a warning, where the folder of a script is an error.
-* What ``sys.path`` has besides: folders of ``PYTHONPATH``, projects installed for editing.
-* Of folders that are nobody's in particular, such as a home directory, which holds secrets, and of
-  modules that were found by other ways than ``sys.path``: what has been imported from there.
+* Other folders of ``sys.path`` (of ``PYTHONPATH``, of projects installed for editing) that have a
+  ``.fiberignore``, by which their people say that they are meant to be sent.
+* Of all other folders, and of modules that were found by other ways than ``sys.path``: the packages
+  and modules that have been imported.
 
 What is installed (the standard library, site-packages, Fiber) is the image's own.
 """
@@ -23,10 +24,11 @@ from multiprocessing import process as mp_process
 from typing import Any, NamedTuple
 
 from fiber._agent.program_folder import ProgramPaths
+from fiber._backends.ignore_rules import INCLUDING
 
 _INSTALLED = frozenset({"site-packages", "dist-packages"})
 
-_LOOSE = "program"
+LOOSE = "program"
 """The folder there for what is sent without the folder that it is in here."""
 
 
@@ -51,6 +53,8 @@ class Layout(NamedTuple):
     """The program's folder; of some only a part is sent."""
     files: tuple[str, ...]
     """What has been imported from the places: children need it whatever rules say."""
+    trees: tuple[str, ...]
+    """Folders of ``sys.path`` of which only that is sent."""
     session: frozenset[str]
     """Those of the places that are a session's working directory and nothing else."""
     paths: ProgramPaths
@@ -76,23 +80,24 @@ def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Lay
     # One that has a name is imported by that, and a package's not at all: importing it runs it.
     by_path = "init_main_from_path" in preparation
     path = list(map(os.path.abspath, preparation["sys_path"]))
-    whole = [folder for folder in (program, *path) if _is_sent(folder) and folder not in left_out]
-    places = Places(_named(_outermost(whole)))
-    modules = sorted(_imported())
+    whole = (folder for folder in (program, *path) if folder == program or _is_offered(folder))
+    places = Places(_named(_outermost(f for f in whole if _is_sent(f) and f not in left_out)))
+    modules = sorted(_imported(left_out))
     if main is not None:
         modules.append(_Module(main, main, os.path.basename(main)))
     loose = [module for module in modules if places.place_of(module.file) is None]
-    places.update({module.whole: f"{_LOOSE}/{module.name}" for module in loose})
+    places.update({module.whole: f"{LOOSE}/{module.name}" for module in loose})
     return Layout(
         places,
         program,
         tuple(module.file for module in modules),
+        tuple(dict.fromkeys(tree for tree in path if _is_tree(tree, places))),
         _session(here).intersection(places) if main is None else frozenset(),
         ProgramPaths(
             *_search_path(places, path),
             directory=(_is_inside(here, program) and places.name_of(here))
             or places.name_of(program)
-            or _LOOSE,
+            or LOOSE,
             main=None if main is None or not by_path else places.name_of(main),
         ),
     )
@@ -135,9 +140,17 @@ def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tupl
     library = sysconfig.get_path("stdlib")
     end = path.index(library) if library in path else len(path)
     before, after = there(path[:end]), there(path[end:])
-    if any(name.startswith(f"{_LOOSE}/") for name in places.values()):
-        before.append(_LOOSE)
+    if any(name.startswith(f"{LOOSE}/") for name in places.values()):
+        before.append(LOOSE)
     return tuple(before), tuple(after)
+
+
+def _is_offered(folder: str) -> bool:
+    return os.path.isfile(os.path.join(folder, INCLUDING))
+
+
+def _is_tree(folder: str, places: Places) -> bool:
+    return os.path.isdir(folder) and not _is_installed(folder) and places.name_of(folder) is None
 
 
 def _is_sent(path: str) -> bool:
@@ -184,18 +197,18 @@ def _named(paths: Iterable[str]) -> dict[str, str]:
     for path in paths:
         name = wanted = os.path.basename(path)
         number = 1
-        while name in (_LOOSE, *names.values()):
+        while name in (LOOSE, *names.values()):
             number += 1
             name = f"{wanted}-{number}"
         names[path] = name
     return names
 
 
-def _imported() -> Iterator[_Module]:
+def _imported(left_out: frozenset[str]) -> Iterator[_Module]:
     """The modules that are not installed; parts of packages, too."""
     for name, module in list(sys.modules.items()):
-        if name in ("__main__", "__mp_main__"):
-            continue
+        if name in ("__main__", "__mp_main__") or name.partition(".")[0] == "fiber_api":
+            continue  # the second package of Fiber lies beside the first
         file = getattr(module, "__dict__", {}).get("__file__")
         if not isinstance(file, str) or _is_installed(file) or not os.path.isfile(file):
             continue
@@ -203,7 +216,19 @@ def _imported() -> Iterator[_Module]:
         top = sys.modules.get(package, module)
         if hasattr(top, "__path__") and getattr(top, "__file__", None):
             yield _Module(file, next(iter(top.__path__)), package)
+        elif portion := _portion(top, file, left_out):
+            yield _Module(file, portion, package)
         else:  # of a namespace package, whose folder may be anything
             if not hasattr(module, "__path__"):
                 parts.pop()
             yield _Module(file, file, os.path.join(*parts, os.path.basename(file)))
+
+
+def _portion(package: Any, file: str, left_out: frozenset[str]) -> str | None:
+    """The folder of a namespace package that ``file`` is in, if only that package is there."""
+    folders = (os.path.abspath(folder) for folder in getattr(package, "__path__", ()))
+    folder = next((folder for folder in folders if _is_inside(file, folder)), None)
+    if folder is None:
+        return None
+    around = os.path.dirname(folder)
+    return None if around in left_out or _is_nobodys(around) else folder

@@ -42,6 +42,9 @@ class AgentObserver(Protocol):
     def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
         """It is silent; or heard again."""
 
+    def leaving(self, agent: RemoteAgent) -> None:
+        """It takes no new children."""
+
 
 class Starter(Protocol):
     """Sees to it that children get an agent; on the loop's thread."""
@@ -77,10 +80,14 @@ class RemoteAgent:
         """The pod that it runs in, and that pod's node; empty if it is in none."""
         self.ending = ""
         """Why its pod is about to go, where that is known."""
+        self.disrupted = False
+        """Whether the end of its pod is the cluster's doing."""
+        self.leaving = ""
+        """Why it takes no new work and is about to go; empty if it stays."""
         self.suspect = False
         """Whether it has been silent for a while."""
         self._link = link
-        self._blobs = BlobSender(loop, link.send)
+        self._blobs = BlobSender(loop, self._put)
         self._hub = hub
         self._output = output
         self._observer = observer
@@ -95,8 +102,8 @@ class RemoteAgent:
             return
         number = next(self._numbers)
         self._children[number] = child
-        self._blobs.send_missing(child.blobs)
-        child.begin(self, number)
+        child.place(self, number)
+        self._blobs.send_missing(child.blobs, child.begin)
 
     def withdraw(self, child: RemoteChild) -> bool:
         """None waits here."""
@@ -106,23 +113,36 @@ class RemoteAgent:
         """Send a message.  From anywhere."""
         self.loop.call_soon(self.transmit, message)
 
-    def transmit(self, message: messages.Message) -> None:
-        """Send a message now."""
+    def transmit(
+        self, message: messages.Message, on_left: Callable[[], None] | None = None
+    ) -> None:
+        """Send a message now; ``on_left`` is called once the last of it is on its way."""
         self._hub_link.flush()
-        self._put(message)
+        self._put(message, on_left)
 
-    def _put(self, message: messages.Message) -> None:
-        self._link.send(*messages.pieces(message), lane=messages.lane(message))
+    def _put(self, message: messages.Message, on_left: Callable[[], None] | None = None) -> None:
+        lane = messages.lane(message)
+        self._link.send(*messages.pieces(message), lane=lane, on_left=on_left)
 
     def close(self) -> None:
         """End it and its children.  From anywhere."""
         self.send(messages.Shutdown(_SHUTDOWN_GRACE))
 
-    def lose(self, reason: str) -> None:
-        """It is gone, and its children with it."""
+    def leave(self, reason: str) -> None:
+        """It is about to go: its workers get nothing more to do."""
+        if self.leaving or self.lost is not None:
+            return
+        self.leaving = reason
+        self._observer.leaving(self)
+        for child in list(self._children.values()):
+            child.observer.draining()
+
+    def lose(self, reason: str, *, disrupted: bool = False) -> None:
+        """It is gone, and its children with it.  ``disrupted``: the cluster ended it."""
         if self.lost is not None:
             return
         self.lost = reason
+        self.disrupted = bool(disrupted or self.disrupted or self.leaving)
         self._hub.unlink(self.host, reason)
         try:
             self._observer.lost(self, reason)
@@ -132,8 +152,22 @@ class RemoteAgent:
                 child.end(self._report_of_loss(reason))
 
     def _report_of_loss(self, reason: str) -> ExitReport:
-        why, cause = self.ending or f"agent {self.host} lost: {reason}", Cause.AGENT_LOST
-        return ExitReport(-signal.SIGKILL, why, host=self.host, cause=cause)
+        why = self.ending or self.leaving or f"agent {self.host} lost: {reason}"
+        return ExitReport(-signal.SIGKILL, why, host=self.host, cause=Cause.AGENT_LOST)
+
+    def explain(self, report: ExitReport) -> ExitReport:
+        """Add to a child's report where that was, and whether the cluster ended it."""
+        # The report's claims do not count.
+        report = report._replace(host=self.host, pod=self.pod, node=self.node)
+        if report.cause == Cause.AGENT_LOST:
+            return report._replace(disrupted=self.disrupted)
+        if report.cause == Cause.DRAINED:
+            why = self.ending or self.leaving
+            return report._replace(disrupted=True, reason=why or report.reason)
+        if self.ending and report.exitcode < 0:  # together with its pod
+            killed = report.exitcode in (-signal.SIGKILL, -signal.SIGTERM)
+            return report._replace(reason=self.ending, disrupted=self.disrupted and killed)
+        return report
 
     # What comes over the link
 
@@ -142,6 +176,9 @@ class RemoteAgent:
         message = messages.decode(frame)
         if isinstance(message, messages.OfHubs):
             self._hub_link.on_frame(message)
+            return
+        if isinstance(message, messages.Leave):
+            self.leave(message.reason)
             return
         if isinstance(message, messages.Lacking):
             self._blobs.lost(message.digest)
@@ -166,8 +203,8 @@ class RemoteAgent:
         self._observer.suspected(self, False)
 
     def on_lost(self, reason: str) -> None:
-        """The link is over."""
-        self.lose(reason)
+        """The link is over.  Long silence is that of a node or of a network, not of a task."""
+        self.lose(reason, disrupted=self.suspect)
 
 
 @lru_cache(maxsize=8)
@@ -192,8 +229,12 @@ class RemoteChild:
         self._loop = starter.loop
         self._agent: RemoteAgent | None = None
         self._number = 0
+        self._ended_by = 0
+        """Fatal signal that was sent to it before it had begun."""
         self._early: list[tuple[int, BytesLike, Sequence[memoryview]]] = []
-        """What to deliver once it has an agent."""
+        """What to deliver after its Start."""
+        self._unasked: list[messages.Message] | None = []
+        """Signals and recalls, which wait until its Start has left: they would pass a large one."""
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None
@@ -203,6 +244,8 @@ class RemoteChild:
         """What its agent must have, for as long as it lives."""
         digests = tuple(blob and blob.digest for blob in needed)
         fields = (spec.name, spec.method, spec.tasks, digests)
+        self._asked: tuple[bytes, bytes] | None = None
+        """Its Start, until it is started: its agent may be about to go."""
         self._start: tuple[bytes, bytes] | None = pickle.dumps(fields, protocol=5), spec.payload
 
     @property
@@ -224,21 +267,31 @@ class RemoteChild:
         self._starter = starter
         starter.start(self)
 
-    def begin(self, agent: RemoteAgent, number: int) -> None:
+    def place(self, agent: RemoteAgent, number: int) -> None:
         """It has an agent."""
         self._agent, self._number, self.host = agent, number, agent.host
+
+    def begin(self) -> None:
+        """Have its agent start it: what it needs is there."""
         start, self._start = self._start, None
-        assert start is not None
-        agent.transmit(messages.Start(number, *start))
+        if start is None or self._agent is None:
+            return  # its agent was lost meanwhile
+        self._asked = None if self.is_worker else start
+        self._agent.transmit(messages.Start(self._number, *start), self._start_left)
         early, self._early = self._early, []
         for packet_ in early:
             self.deliver(*packet_)
+
+    def _start_left(self) -> None:
+        unasked, self._unasked = self._unasked, None
+        for message in unasked or ():
+            self._tell(message)
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to its task channel; False if its end is known."""
         if self._gone:
             return False
-        if self._agent is None:
+        if self._agent is None or self._start is not None:
             self._early.append((seq, payload, buffers))
             return True
         self._delivered += 1
@@ -272,10 +325,18 @@ class RemoteChild:
         if self._gone:
             return
         if self._agent is not None:
-            self._agent.transmit(message(self._number, *fields))
+            if self.pid is None and fields and fields[0] in _FATAL:
+                self._ended_by = fields[0]
+            self._tell(message(self._number, *fields))
         elif fields and fields[0] in _FATAL and self._starter.withdraw(self):
             name = signal.Signals(fields[0]).name
             self.end(ExitReport(-fields[0], f"killed by {name} before it had a host"))
+
+    def _tell(self, message: messages.Message) -> None:
+        if self._unasked is not None:
+            self._unasked.append(message)
+        elif self._agent is not None and not self._gone:
+            self._agent.transmit(message)
 
     def heard(self, message: messages.Message, output: Output) -> None:
         """Something about this child."""
@@ -287,26 +348,37 @@ class RemoteChild:
             else:
                 self._channel.put(said)
         elif isinstance(message, messages.Started):
-            self.pid = message.pid
+            self.pid, self._asked = message.pid, None
             self.observer.started(message.pid)
         elif isinstance(message, messages.Recalled):
             self.observer.recalled(list(message.seqs))
         elif isinstance(message, messages.Output):
             output.write(f"{self.name}@{self.host}", message.text)
+        elif isinstance(message, messages.Exited) and self._may_begin_elsewhere(message):
+            self._agent, self.host, self._unasked = None, "", []
+            self._start, self._asked = self._asked, None
+            self._starter.start(self)
         elif isinstance(message, messages.Exited):
             self.end(ExitReport(*message[2:]), self._delivered - message.delivered)
 
+    def _may_begin_elsewhere(self, end: messages.Exited) -> bool:
+        """Whether its host refused to start it, since the host is about to go.
+
+        A worker's pool has replaced it already.
+        """
+        refused = end.cause == Cause.DRAINED and end.exitcode > 0 and self.pid is None
+        return refused and self._asked is not None and not self._ended_by
+
     def end(self, report: ExitReport, crossed: int = 0) -> None:
         """It is gone; the last ``crossed`` packets met the news of that on their way."""
-        self._gone, self._start = True, None
+        self._gone, self._start, self._asked = True, None, None
         self.blobs.clear()
         if self._channel is not None:
             self._channel.end()
         missed = list(self._latest)[max(0, len(self._latest) - crossed) :]
+        missed += [seq for seq, _, _ in self._early]
+        self._early.clear()
         report = report._replace(unread=(*report.unread, *missed))
         if self._agent is not None:
-            at = self._agent  # the report's claims do not count
-            report = report._replace(host=at.host, pod=at.pod, node=at.node)
-            if self._agent.ending and report.exitcode < 0:  # together with its pod
-                report = report._replace(reason=self._agent.ending)
+            report = self._agent.explain(report)
         self.observer.exited(report)

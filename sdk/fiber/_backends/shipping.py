@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from fiber._agent.program_folder import ProgramPaths
-from fiber._backends.program_archive import Entry, list_files, pack
-from fiber._backends.program_layout import find_layout, main_file
+from fiber._backends.ignore_rules import INCLUDING
+from fiber._backends.program_archive import pack
+from fiber._backends.program_files import Entry, LeftOut, Why, select
+from fiber._backends.program_layout import Layout, find_layout, main_file
 from fiber._wire.blob import Blob
 from fiber.errors import ProgramTooLarge
+
+_SHOWN = 10
+"""Entries that a warning lists."""
 
 
 class Program(NamedTuple):
@@ -27,6 +33,7 @@ class Shipping:
         self._latest: tuple[dict[str, Entry], Program] | None = None
         self._left_out: frozenset[str] = frozenset()
         self._said: set[str] = set()
+        """Warnings, and the paths that were in one."""
 
     @property
     def main_is_sent(self) -> bool:
@@ -51,7 +58,8 @@ class Shipping:
                 "folder of its own."
             )
         try:
-            files = list_files(layout)
+            files, left_out = select(layout)
+            self._tell(layout, left_out)
             latest = self._latest
             if latest is not None and latest[0] == files:
                 return files, latest[1]._replace(paths=layout.paths)
@@ -70,7 +78,34 @@ class Shipping:
             archive = latest[1].archive  # touched, and the same
         return files, Program(archive, layout.paths)
 
+    def _tell(self, layout: Layout, left_out: Iterable[LeftOut]) -> None:
+        """Say once of each path that a person would not expect it to be left out."""
+        news = [left for left in left_out if left.path not in self._said]
+        self._said.update(left.path for left in news)
+        for why, sentence in _SENTENCES.items():
+            entries = [left for left in news if left.why is why]
+            if entries:
+                shown = [f"  {left.path} ({left.detail})" for left in entries[:_SHOWN]]
+                if len(entries) > _SHOWN:
+                    shown.append(f"  and {len(entries) - _SHOWN} more: fiber.shipping.listing()")
+                self._warn("\n".join((sentence, *shown, _advice(layout, entries[0].path))))
+
     def _warn(self, message: str) -> None:
         if message not in self._said:
             self._said.add(message)
             warnings.warn(message, RuntimeWarning, stacklevel=2)
+
+
+_SENTENCES = {
+    Why.SECRET: "workers on other machines do not get these, which look like secrets:",
+    Why.LINK: "workers on other machines do not get these links, which lead out of their folder:",
+}
+
+
+def _advice(layout: Layout, path: str) -> str:
+    place = layout.places.place_of(path) or os.path.dirname(path)
+    name, rules = path[len(place) :], os.path.join(place, INCLUDING)
+    return (
+        f"To send one that workers need, write a line with its name into {rules}, "
+        f"for example {'!' + name!r}. The line {name!r} leaves it out without this warning."
+    )

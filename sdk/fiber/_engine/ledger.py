@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 from typing import Any
 
+from fiber._engine.charges import Limits
 from fiber._engine.chunks import Pace
 from fiber._engine.load import PATIENCE, WorkersByLoad
 from fiber._engine.spans import Span, Waiting
@@ -66,19 +67,19 @@ class Ledger:
         owner: Any = None,
         *,
         pace: Pace | None = None,
-        retries: int = 3,
+        limits: Limits = Limits(),  # noqa: B008 - immutable
         unit: int = 1,
         alone: bool = False,
         exact: bool = False,
     ) -> Job:
-        """A new job; a task of it runs again at most ``retries`` times.
+        """A new job; ``limits`` says how often a task of it runs again.
 
         ``unit``: its tasks are given out in contiguous chunks of at least this many.  ``alone``:
         each travels alone, to an idle worker, with nothing queued behind it.  Without retries
         they always do: a crash must not leave in doubt whether another task ran.  ``exact``:
         results are wanted one by one, and the worker notes each task that it begins.
         """
-        job = Job(owner, pace or Pace(), retries, unit, alone, exact)
+        job = Job(owner, pace or Pace(), limits, unit, alone, exact)
         self.jobs.add(job)
         return job
 
@@ -445,7 +446,7 @@ class Ledger:
         job = receipt.job
         if job not in self.jobs and not job.finished:
             return False  # cancelled
-        if not job.charge(index):
+        if not job.charges.charge(index):
             return False
         if job not in self.jobs:  # what was its last task is not done after all
             self.jobs.add(job)
@@ -472,14 +473,7 @@ class Ledger:
 
     def drop_waiting(self, job: Job, wanted: Callable[[Any], bool]) -> None:
         """Tasks that wait and are not ``wanted`` any more are done by that."""
-        waiting, job.waiting = job.waiting, Waiting()
-        while waiting:
-            span = waiting.take(len(waiting))
-            kept = [at for at, item in enumerate(span.items, span.start) if wanted(item)]
-            self._did(job, len(span.items) - len(kept))
-            whole = len(kept) == len(span.items)
-            for part in [span] if whole else [span.part(at, at + 1) for at in kept]:
-                job.waiting.append(part)
+        self._did(job, job.drop_waiting(wanted))
         self._finish(job)
 
     def split(self, seq: int, now: float) -> Receipt | None:
@@ -532,13 +526,17 @@ class Ledger:
     # Losing
 
     def lose(
-        self, worker: Worker, unread: Iterable[int], running: tuple[int, int] | None
+        self,
+        worker: Worker,
+        unread: Iterable[int],
+        running: tuple[int, int] | None,
+        disrupted: bool = False,
     ) -> list[Loss]:
-        """``worker`` is gone; its tasks wait again, and what it was running is charged an attempt.
+        """``worker`` is gone; its tasks wait again, and what it was running is charged with that.
 
         ``unread``: batches that it never read.  ``running``: batch and offset of the task it was
-        in; if that says nothing, it was in the first batch that it may have read.  Returns the
-        tasks that had their tries; they are done by that.
+        in; if that says nothing, it was in the first batch that it may have read.  ``disrupted``:
+        the cluster ended it.  Returns the tasks that had their tries; they are done by that.
         """
         self.workers.discard(worker)
         guilty = worker.in_progress(set(unread), running)
@@ -547,24 +545,22 @@ class Ledger:
             self._drop(batch)
             if batch.job is not None:
                 suspects = batch.suspects(running) if batch is guilty else range(0)
-                losses += self._lose_batch(batch.job, batch.rest(), suspects)
+                again, lost = batch.job.lose(batch.rest(), suspects, disrupted=disrupted)
+                losses += lost
+                self._run_again(batch.job, again, len(lost))
         worker.queue.clear()
         self.retire(worker)
         self._load.spent.pop(worker, None)
         return losses[::-1]
 
-    def _lose_batch(self, job: Job, rest: Span, suspects: range) -> list[Loss]:
-        losses = []
-        for span in reversed(rest.around(suspects)):
-            if span.start in suspects and not job.charge(span.start):
-                losses.append(Loss(job, span.start, job.attempts.pop(span.start), span.items[0]))
-                self._did(job, 1)
-            elif span.pin:
+    def _run_again(self, job: Job, spans: list[Span], given_up: int) -> None:
+        self._did(job, given_up)
+        for span in spans:
+            if span.pin:
                 self._unassigned_pins.append((job, span))
             else:
                 self._return(job, span)
         self._finish(job)
-        return losses
 
     # Inside
 

@@ -95,19 +95,32 @@ class Scheduler:
         *,
         unread: Iterable[int] = (),
         running: tuple[int, int] | None = None,
+        disrupted: bool = False,
         failure: StartFailure | None = None,
     ) -> list[Loss]:
         """It is gone, with or without having been told to; tasks that it had run again elsewhere.
 
-        Returns those that had their tries.  ``unread`` and ``running`` as for ``Ledger.lose``,
-        ``failure`` as for ``WorkerSet.gone``.
+        Returns those that had their tries.  ``unread``, ``running`` and ``disrupted`` as for
+        ``Ledger.lose``, ``failure`` as for ``WorkerSet.gone``.
         """
         self.workers.gone(member, now, failure)
         if member.worker is None:
             return []
         if member.worker.lent:
             self._returned(member.worker)
-        return self.ledger.lose(member.worker, unread, running)
+        return self.ledger.lose(member.worker, unread, running, disrupted=disrupted)
+
+    def drain(self, member: Member) -> bool:
+        """Give it nothing more, since its host is about to go; False if it leaves already.
+
+        Another takes its place at once.  It ends once it has run what it has begun.
+        """
+        if member not in self.workers.members or member.leaving:
+            return False
+        if member.worker is not None:
+            self.ledger.retire(member.worker)
+        self.workers.let_go(member)
+        return True
 
     def let_go(self, member: Member) -> None:
         """It is about to die by the executor's hand."""

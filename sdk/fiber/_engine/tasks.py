@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from fiber._engine.charges import Charges, Counts, Limits
 from fiber._engine.chunks import PROMPT, TARGET, Pace
 from fiber._engine.spans import Span, Waiting
 
@@ -21,8 +23,8 @@ class Job:
 
     __slots__ = (
         "alone",
-        "attempts",
         "batches",
+        "charges",
         "closed",
         "done",
         "exact",
@@ -33,24 +35,22 @@ class Job:
         "paused",
         "pins",
         "reached",
-        "retries",
         "unit",
         "waiting",
     )
 
     def __init__(
-        self, owner: Any, pace: Pace, retries: int, unit: int, alone: bool, exact: bool
+        self, owner: Any, pace: Pace, limits: Limits, unit: int, alone: bool, exact: bool
     ) -> None:
         self.owner = owner
         self.pace = pace
-        self.retries = retries
         self.unit = unit
         self.exact = exact
-        self.alone = alone or retries == 0
+        self.alone = alone or limits.retries == 0
         self.waiting = Waiting()
         self.batches: dict[Batch, None] = {}  # those of its tasks that were given out
         self.pins: dict[Worker, None] = {}  # who holds pinned tasks of it
-        self.attempts: dict[int, int] = {}
+        self.charges = Charges(limits)
         self.fed = 0
         self.done = 0
         self.closed = False
@@ -79,10 +79,34 @@ class Job:
         """No task will come any more, and all that came are done."""
         return self.closed and self.done == self.fed
 
-    def charge(self, index: int) -> bool:
-        """Count one more run that came to nothing; False if that was the last one allowed."""
-        self.attempts[index] = attempts = self.attempts.get(index, 0) + 1
-        return attempts <= self.retries
+    def drop_waiting(self, wanted: Callable[[Any], bool]) -> int:
+        """Drop the waiting tasks that are not ``wanted``; return how many."""
+        waiting, self.waiting = self.waiting, Waiting()
+        dropped = 0
+        while waiting:
+            span = waiting.take(len(waiting))
+            kept = [at for at, item in enumerate(span.items, span.start) if wanted(item)]
+            dropped += len(span.items) - len(kept)
+            whole = len(kept) == len(span.items)
+            for part in [span] if whole else [span.part(at, at + 1) for at in kept]:
+                self.waiting.append(part)
+        return dropped
+
+    def lose(
+        self, rest: Span, suspects: range, *, disrupted: bool
+    ) -> tuple[list[Span], list[Loss]]:
+        """Charge the ``suspects`` in ``rest``, tasks of a lost worker.
+
+        Returns the spans that run again and the tasks that had their tries, the last ones first.
+        """
+        again, losses = [], []
+        for span in reversed(rest.around(suspects)):
+            task, charges = span.start, self.charges
+            if task in suspects and not charges.charge(task, disrupted=disrupted):
+                losses.append(Loss(self, task, charges.settle(task), span.items[0]))
+            else:
+                again.append(span)
+        return again, losses
 
 
 class Batch:
@@ -90,12 +114,13 @@ class Batch:
 
     ``job`` is None once its results are not wanted; ``received`` counts those that came, the last
     of them from ``_received_from`` on; ``stride`` is the number of tasks between two notes of the
-    worker's progress.
+    worker's progress.  ``has_function`` is False if the message relies on the worker's memory.
     """
 
     __slots__ = (
         "_received_from",
         "alone",
+        "has_function",
         "items",
         "job",
         "pin",
@@ -110,6 +135,7 @@ class Batch:
     def __init__(self, seq: int, job: Job | None, worker: Worker, span: Span) -> None:
         self.seq = seq
         self.job = job
+        self.has_function = True
         self.worker = worker
         self.start = span.start
         self.items = span.items
@@ -133,7 +159,8 @@ class Batch:
                 f"it sent results {offset} to {stop} of batch {self.seq}, which has {size} tasks "
                 f"and {self.received} results"
             )
-        if kept is not None and not stop <= kept <= size:
+        # One that keeps none would have its tasks run again without end, and no run would count.
+        if kept is not None and not max(stop, 1) <= kept <= size:
             raise WrongAnswer(f"it kept {kept} of {size} tasks of batch {self.seq}, {stop} done")
         self._received_from, self.received = offset, stop
         return True
@@ -208,9 +235,9 @@ class Receipt(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """A task that was running in too many workers when they died."""
+    """A task that was running in too many workers when they were lost."""
 
     job: Job
     task: int
-    attempts: int
+    counts: Counts
     item: Any

@@ -9,6 +9,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 
+from fiber._engine.charges import Limits
 from fiber._engine.chunks import FLOOR
 from fiber._engine.ledger import Job
 from fiber._engine.scheduler import Scheduler
@@ -26,12 +27,12 @@ class CallQueue:
     def __init__(
         self,
         *,
-        retries: int | None = None,
+        limits: Limits | None = None,
         timeout: float | None = None,
         cancellable: bool = False,
     ) -> None:
         self.item = WorkItem(
-            work.CALLS, exact=True, timeout=timeout, retries=retries, cancellable=cancellable
+            work.CALLS, exact=True, timeout=timeout, limits=limits, cancellable=cancellable
         )
         self.called: deque[Call] = deque()
         """Those that the loop has not taken.  Any thread appends."""

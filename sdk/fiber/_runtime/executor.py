@@ -87,7 +87,7 @@ class Executor:
         )
         self._ledger = self._scheduler.ledger
         self.workers = WorkerView(self._scheduler.workers, host.loop)
-        self._jobs = Jobs(self._ledger, options.retries, retry=bool(options.retryable))
+        self._jobs = Jobs(self._ledger, options.limits, retry=bool(options.retryable))
         self._limits = TimeLimits(self._loop, self._scheduler, self._jobs, advance=self._advance)
         self._sender = Sender(
             self._loop,
@@ -121,6 +121,8 @@ class Executor:
         self._lends = options.max_tasks is None and not options.retryable
         self._exits: dict[WorkerHandle, ExitReport] = {}
         """Ends of workers that callers are using."""
+        self._draining: set[WorkerHandle] = set()
+        """Workers that callers are using and whose hosts are about to go."""
         self._functions = FunctionCache()
         self.calls = Calls(
             self._loop,
@@ -461,8 +463,12 @@ class Executor:
         """A worker is not lent any more."""
         self._receiver.forget(handle)
         report = self._exits.pop(handle, None)
+        drained = handle in self._draining
+        self._draining.discard(handle)
         if report is not None:
             self.on_exit(handle, report)
+        elif drained:
+            self.on_draining(handle)
         else:
             self._advance()
 
@@ -493,6 +499,18 @@ class Executor:
         self.workers.changed()
         self._advance()
 
+    def on_draining(self, handle: WorkerHandle) -> None:
+        """A worker's host is about to go: another takes its place, and what it has not begun."""
+        if handle.worker is not None and handle.worker.lent and not self._leases.recall_one(handle):
+            self._draining.add(handle)  # until the caller that uses it brings it back
+        elif self._scheduler.drain(handle):
+            _logs.debug("worker %s is drained", handle.name)
+            if handle.child is not None:
+                handle.child.recall()
+            handle.dismiss()
+            self.workers.changed()
+        self._advance()
+
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
         """A worker is gone, with or without having been told to."""
         lent = handle.worker is not None and handle.worker.lent
@@ -501,7 +519,8 @@ class Executor:
             return
         self._limits.ended(handle, report.stack)
         # A lost host says nothing of the worker.
-        failure = None if report.cause == Cause.AGENT_LOST else handle.start_failure(report)
+        lost_host = report.disrupted or report.cause == Cause.AGENT_LOST
+        failure = None if lost_host else handle.start_failure(report)
         self._lost(handle, failure, report)
         self._advance()
 
@@ -511,6 +530,7 @@ class Executor:
         now = self._loop.now()
         unread: set[int] = set()
         running = None
+        disrupted = report is not None and report.disrupted
         if handle.worker is not None:
             unread = self._sender.lost(handle.worker)
         if report is not None:
@@ -518,7 +538,9 @@ class Executor:
             running = report.running
             if running is not None:
                 unread.discard(running[0])
-        losses = self._scheduler.gone(handle, now, unread=unread, running=running, failure=failure)
+        losses = self._scheduler.gone(
+            handle, now, unread=unread, running=running, disrupted=disrupted, failure=failure
+        )
         self.workers.changed()
         if report is not None:
             self._jobs.put_losses(losses, handle.name, handle.pid, report)

@@ -10,6 +10,7 @@ from typing import Any
 
 from fiber import _logs
 from fiber._agent.interface import ExitReport
+from fiber._engine.charges import Limits
 from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
 from fiber._runtime.outcome import Failure, Pickled
@@ -21,9 +22,9 @@ from fiber.errors import TimeoutError, WorkerDied, block
 class Jobs:
     """Opens, feeds and ends jobs, and hands their outcomes to futures."""
 
-    def __init__(self, ledger: Ledger, retries: int, *, retry: bool) -> None:
+    def __init__(self, ledger: Ledger, limits: Limits, *, retry: bool) -> None:
         self._ledger = ledger
-        self._retries = retries
+        self._limits = limits
         self._retry = retry
         self._streams: dict[WorkItem, None] = {}
 
@@ -36,7 +37,7 @@ class Jobs:
         item.job = job = self._ledger.open(
             item,
             pace=pace,
-            retries=self._retries if item.retries is None else item.retries,
+            limits=item.limits or self._limits,
             unit=item.unit,
             alone=item.timeout is not None,
             exact=item.exact,
@@ -134,7 +135,7 @@ class Jobs:
                 self._ledger.pause(receipt.job, True)
             return
         for task, outcome in enumerate(results, receipt.start):
-            receipt.job.attempts.pop(task, None)  # the job of the calls lasts as long as the pool
+            receipt.job.charges.settle(task)  # the job of the calls lasts as long as the pool
             future = receipt.item(task).future
             future.add_results(0, [outcome], mixed)
             future.set_done()
@@ -166,7 +167,8 @@ class Jobs:
                 reason=report.reason,
                 log=report.log,
                 stack=report.stack,
-                attempts=loss.attempts,
+                attempts=loss.counts.deaths,
+                disruptions=loss.counts.disruptions,
                 pod=report.pod or None,
                 node=report.node or None,
             )

@@ -10,6 +10,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
 from fiber import config, cpu
+from fiber._engine.charges import Limits
 from fiber.resources import Resources
 
 LARGEST_CHUNK = 2**32 - 1
@@ -33,7 +34,8 @@ class PoolOptions(NamedTuple):
     maximum: int = 1
     max_tasks: int | None = None
     """Tasks, or chunks of them, after which a worker is replaced."""
-    retries: int = 3
+    limits: Limits = Limits()
+    """How often a task runs again whose worker is lost."""
     retryable: tuple[type[BaseException], ...] = ()
     idle_timeout: float = IDLE_TIMEOUT
     resources: Resources = NO_WISHES
@@ -102,13 +104,22 @@ def max_tasks(value: Any) -> int | None:
     return value
 
 
-def retries(value: Any) -> int:
-    """Times that a task may run again; None: as configured."""
-    if value is None:
-        return config.current().retries
-    count = whole("retries", value)
+def limits(retries: Any, disruptions: Any) -> Limits:
+    """Times that a task may run again; None: as configured.
+
+    Without retries a task never runs twice, unless ``disruptions`` says that it may.
+    """
+    configured = config.current()
+    again = configured.retries if retries is None else _times("retries", retries)
+    if disruptions is not None:
+        return Limits(again, _times("disruptions", disruptions))
+    return Limits(again, configured.disruptions if again else 0)
+
+
+def _times(name: str, value: Any) -> int:
+    count = whole(name, value)
     if count < 0:
-        raise ValueError(f"retries must be a whole number of at least 0, not {value!r}")
+        raise ValueError(f"{name} must be a whole number of at least 0, not {value!r}")
     return count
 
 

@@ -87,6 +87,9 @@ class Popen:
     def recalled(self, seqs: list[int]) -> None:
         """Only pool workers are given work."""
 
+    def draining(self) -> None:
+        """Its host is about to go.  The process is told by a signal, if it is prepared for one."""
+
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
         _logs.debug("process %s ended: %s", self._name, report.describe())

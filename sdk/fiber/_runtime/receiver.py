@@ -76,7 +76,9 @@ class Receiver:
         elif words[0] == work.INIT_FAILED:
             handle.complaint = words[1]
         elif words[0] == work.UNKNOWN:
-            self._held(handle, words[1])
+            batch = self._held(handle, words[1])
+            if batch is not None and batch.has_function:
+                raise WrongAnswer(f"it did not know the function that came with batch {batch.seq}")
             self.recalled(handle, [words[1]])
         else:
             kind, seq, error = words

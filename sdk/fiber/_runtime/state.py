@@ -184,6 +184,7 @@ class _Releasing:
         self.started = observer.started
         self.received = observer.received
         self.recalled = observer.recalled
+        self.draining = observer.draining
         self._observer = observer
         self._grants = grants
 
@@ -214,9 +215,9 @@ def _is_on_cluster(settings: config.Config) -> bool:
     """Whether a program that chose no backend is in a pod that may make others."""
     if settings.backend != "auto" or "KUBERNETES_SERVICE_HOST" not in os.environ:
         return False
-    from fiber._backends.kubernetes.detection import may_make_pools
+    from fiber._backends.kubernetes.detection import serves_pools
 
-    return may_make_pools(settings.namespace)
+    return serves_pools(settings.namespace)
 
 
 def _make_shipping(backend: Backend) -> Shipping | None:

@@ -12,6 +12,7 @@ from itertools import chain
 from typing import Any, Protocol
 
 from fiber import reduction
+from fiber._engine.charges import Limits
 from fiber._engine.ledger import Batch, Job
 from fiber._hub.handles import GrantSet
 from fiber._runtime.functions import Function, name_of
@@ -103,7 +104,7 @@ class WorkItem:
         "grants",
         "job",
         "kind",
-        "retries",
+        "limits",
         "stream",
         "timeout",
         "unit",
@@ -118,7 +119,7 @@ class WorkItem:
         unit: int = 1,
         exact: bool = False,
         timeout: float | None = None,
-        retries: int | None = None,
+        limits: Limits | None = None,
         cancellable: bool = False,
     ) -> None:
         self.kind = kind
@@ -127,7 +128,7 @@ class WorkItem:
         self.unit = unit
         self.exact = exact
         self.timeout = timeout
-        self.retries = retries
+        self.limits = limits
         """None: as its pool says."""
         self.cancellable = cancellable
         """Whether the futures of its calls are."""
@@ -241,6 +242,7 @@ def pack(item: WorkItem, batch: Batch, encoded: Encoded, known: dict[int, None])
         (len(function.data) or work.BESIDE) if carry else 0,
         len(function.buffers) if carry else 0,
     )
+    batch.has_function = carry
     if not carry:
         return work.pack_batch(head, b"", data), buffers
     known[function.id] = None

@@ -30,6 +30,9 @@ class Supervisor(Protocol):
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
         """The worker will never see these."""
 
+    def on_draining(self, handle: WorkerHandle) -> None:
+        """The worker's host is about to go."""
+
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
         """The worker is gone."""
 
@@ -114,6 +117,10 @@ class WorkerHandle:
     def recalled(self, seqs: list[int]) -> None:
         """It will never see these."""
         self._supervisor.on_recalled(self, seqs)
+
+    def draining(self) -> None:
+        """Its host is about to go."""
+        self._supervisor.on_draining(self)
 
     def exited(self, report: ExitReport) -> None:
         """It is gone."""

@@ -1,4 +1,4 @@
-"""Takes connections, and lets pass who proves in time to have the pool's credentials.
+"""Takes connections, and lets pass agents that prove in time which pod they are.
 
 It has a thread and a loop of its own.  TLS costs milliseconds of processor time for each who comes,
 be it a thousand agents or strangers without end, and the program's own loop must not wait for that;
@@ -14,12 +14,13 @@ import os
 import resource
 import select
 import socket
-import ssl
 from collections.abc import Callable
 
 from fiber._transport import address as addresses
 from fiber._transport import tls
 from fiber._transport.admission import Admission
+from fiber._transport.credentials import MasterCredentials
+from fiber._transport.handshake import Identity
 from fiber._transport.loop import Loop
 from fiber._transport.refusals import Refusals
 from fiber._transport.sealing import Secrets
@@ -48,22 +49,25 @@ _SHORT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM
 
 
 class Acceptor:
-    """Listens on ``address`` (port 0: a free one), which then says where it really does.
+    """Listens on ``address``, which then says where it really does.
 
-    ``on_hello`` is called on its thread with a connection that has proved itself, and its first
-    words; ``on_refused`` with why one was turned away, once in some minutes for each address and
-    reason.  Strangers from many addresses are summed up.
+    Port 0 is a free one, and a range such as 9000-9009 the first of them that is free.
+
+    ``on_hello`` is called on its thread with a connection and its first words, which are not proved
+    yet: ``trust`` tells.  ``on_refused`` is called with why one was turned away, once in some
+    minutes for each address and reason.  Strangers from many addresses are summed up.
     """
 
     def __init__(
         self,
         address: str,
-        context: ssl.SSLContext,
+        credentials: MasterCredentials,
         *,
         on_hello: Callable[[PendingConnection, bytes], None],
         on_refused: Callable[[str], None],
     ) -> None:
-        self.context = context
+        self.credentials = credentials
+        self.context = tls.master_context(credentials)
         self.on_hello = on_hello
         self.loop = Loop()
         self._on_refused = on_refused
@@ -76,7 +80,8 @@ class Acceptor:
         except BaseException:
             self.loop.stop()
             raise
-        self.address = f"{address.rpartition(':')[0]}:{self._listener.getsockname()[1]}"
+        host = address.rpartition(":")[0].strip("[]")
+        self.address = addresses.join(host, self._listener.getsockname()[1])
         self.loop.register(self._listener.fileno(), self._accept)
         self._pending: set[PendingConnection] = set()
         self.loop.start_thread("fiber-accept")
@@ -98,6 +103,10 @@ class Acceptor:
         if news:
             self._on_refused(news)
 
+    def make_room(self, connection: PendingConnection) -> None:
+        """It is no stranger, and takes no stranger's place."""
+        self._admission.leave(connection)
+
     def forget(self, connection: PendingConnection) -> None:
         """It is gone, or in."""
         self._admission.leave(connection)
@@ -114,7 +123,7 @@ class Acceptor:
                     self._pause(error)
                     return
                 continue  # that connection broke before it was taken
-            self._admit(sock, host, f"{host}:{port}")
+            self._admit(sock, host, addresses.join(host, port))
 
     def _pause(self, error: OSError) -> None:
         self.report("", "whoever comes now", f"{error.strerror}; it is tried again all the time")
@@ -157,14 +166,41 @@ class PendingConnection:
         self._acceptor = acceptor
         self._loop = acceptor.loop
         self._watched: int | None = None
+        self._awaited = ""
 
     def start(self, sock: socket.socket) -> None:
         """Prove each other and hear its first words; HungUp if it has gone already."""
         with contextlib.suppress(OSError):  # no TCP, or broken already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._handshake = tls.Handshake(sock, self._acceptor.context)
+        acceptor = self._acceptor
+        self._handshake = tls.MasterHandshake(sock, acceptor.context, acceptor.credentials)
         self._timer = self._loop.call_later(_DEADLINE, self._too_late)
         self._run(self._handshake.listen(), lambda hello: self._acceptor.on_hello(self, hello))
+
+    def trust(self, identity: Identity) -> bool:
+        """Return whether it has proved this identity; hang up if not.  On the acceptor's thread."""
+        key = self._acceptor.credentials.agent_key(identity.name, identity.uid)
+        if self._handshake.believes(key):
+            self._acceptor.make_room(self)
+            return True
+        self._acceptor.report(
+            self._host, self.origin, f"it cannot prove that it is {identity.name!r}"
+        )
+        self._run(self._handshake.disbelieve(), lambda _: self._part())
+        return False
+
+    def distrust(self, reason: str) -> None:
+        """Hang up on one that claims to be no agent.  On the acceptor's thread."""
+        self._acceptor.report(self._host, self.origin, reason)
+        self._part()
+
+    def waits_for(self, what: str) -> None:
+        """Note what it waits for, for as long as its time lasts.  Any thread."""
+        self._awaited = what
+
+    def drop(self) -> None:
+        """Hang up without a word.  Any thread."""
+        self._loop.call_soon(lambda: None if self.gone else self.hang_up())
 
     def welcome(self, greeting: bytes, then: Callable[[int, Secrets], None]) -> None:
         """Answer it and end TLS; ``then`` gets the connection, on the acceptor's thread.  Any
@@ -267,19 +303,42 @@ class PendingConnection:
             self.hang_up()
 
     def _too_late(self) -> None:
-        self.refuse(f"it did not prove itself within {_DEADLINE:g} s")
+        if self._awaited:  # by one that has proved itself: no number of strangers suppresses that
+            self.report_proven(f"{self._awaited}, and it was waited for {_DEADLINE:g} s")
+            self.hang_up()
+        else:
+            self.refuse(f"it did not prove itself within {_DEADLINE:g} s")
 
 
 def _listen(address: str) -> socket.socket:
-    host, port = addresses.parse(address)
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    host, _, ports = address.rpartition(":")
+    first, _, last = ports.partition("-")
+    # The last error is raised: what is wrong with the host is wrong at each port.
+    for port in range(int(first), int(last)) if last else ():
+        with contextlib.suppress(LinkError):
+            return _listen_at(address, host.strip("[]"), port)
+    return _listen_at(address, *addresses.parse(f"{host}:{last or first}"))
+
+
+def _listen_at(address: str, host: str, port: int) -> socket.socket:
     try:
-        listener = socket.create_server((host, port), family=family, backlog=_BACKLOG)
+        families = [found[0] for found in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
+        family = socket.AF_INET if socket.AF_INET in families else socket.AF_INET6
+        both = host == "::" and socket.has_dualstack_ipv6()
+        listener = socket.create_server(
+            (host, port), family=family, backlog=_BACKLOG, dualstack_ipv6=both
+        )
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise LinkError(
-                f"cannot listen on {address}: another program uses that port. Stop it, or choose "
-                "another port; port 0 takes a free one."
+                f"cannot listen on {address}: another program uses that port, or all of "
+                "several. Stop it, or choose another port; port 0 takes a free one."
+            ) from error
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise LinkError(
+                f"cannot listen on {address}: this machine does not have that address. Set "
+                "listen_host to an address of this machine. Where agents dial another one, as "
+                "behind NAT or port forwarding, set advertised_host to that."
             ) from error
         if error.errno in (errno.EMFILE, errno.ENFILE):
             raise TooManyOpenFiles(f"listening on {address}") from error

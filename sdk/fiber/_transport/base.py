@@ -85,9 +85,31 @@ class SharedChannel(Channel, Protocol):
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
 
+    def recv_counting(self, counter: Any, *, wait: bool) -> Message | None:
+        """Receive a message and raise a ``SharedCounter`` of the same host; None if there is none.
+
+        Neither an interrupt nor the death of this process comes in between.
+        """
+
+
+class Claimant(Protocol):
+    """Notes how many places of a counter a process has."""
+
+    def add(self) -> None:
+        """Note one more."""
+
+    def drop(self) -> None:
+        """Note one less."""
+
 
 class SharedCounter(Counter, Protocol):
     """A counter whose every change can be waited for."""
+
+    def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
+        """As ``take``, and note it in ``claims``.
+
+        A process that dies meanwhile has taken nothing, or has a claim.
+        """
 
     def changed(self, since: int, timeout: float | None) -> bool:
         """Wait until the count is not ``since``; False when ``timeout`` is over."""

@@ -1,65 +1,63 @@
-"""Who may talk to whom: a certificate authority per run, one certificate for each side.
+"""What a master and an agent prove each other by.
 
-An agent checks the master's name in its certificate, not its address, so one certificate serves a
-master behind any address.
+A master has the pool's key and a certificate that it signed itself, new for each run of a program.
+An agent has a key of its own, which the master derives again from the agent's name and uid.  So the
+master keeps nothing about agents, and an agent can prove to be no other.
 """
 
 from __future__ import annotations
 
 import datetime
+import hashlib
 import json
 import os
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 
-from fiber.errors import AuthenticationError, ConfigError
-from fiber_api.certificates import RUN_VALIDITY, Certificates, make_certificates
-from fiber_api.names import InvalidName
+from fiber._transport import credentials_file
+from fiber.errors import ConfigError
+from fiber_api import identity
 
-_FILES = {
-    "server_name": "server-name",
-    "authority": "ca.crt",
-    "certificate": "tls.crt",
-    "key": "tls.key",
-}
-"""The three of them that Kubernetes knows have the names that they have there."""
+_VALIDITY = datetime.timedelta(days=3650)
+"""No side reads it: agents compare the certificate with what the master proves."""
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """What one side needs: the authority that it trusts, its own certificate and key, all PEM."""
+    """What an agent has."""
 
-    server_name: str
-    """The name that the master's certificate bears."""
-    authority: str = field(repr=False)
-    certificate: str = field(repr=False)
+    name: str
+    uid: str
     key: str = field(repr=False)
-
-    def to_directory(self, directory: str | os.PathLike[str]) -> None:
-        """Write them to a new directory (mode 0700) as files that only this user can read."""
-        folder = Path(directory)
-        folder.mkdir(mode=0o700)
-        for name, file in _FILES.items():
-            _write_private(folder / file, getattr(self, name))
+    """The agent's own, derived from the pool's."""
+    master: str = ""
+    """The fingerprint of the only master that this agent may have; empty where masters follow one
+    another."""
+    epoch: int = 0
+    """The latest master that this agent has served.  An earlier one is refused."""
 
     @classmethod
-    def from_directory(cls, directory: str | os.PathLike[str]) -> Credentials:
-        """Read what ``to_directory`` wrote, or a mounted Secret of the same files."""
-        values = {}
-        for name, file in _FILES.items():
-            path = Path(directory) / file
-            try:
-                values[name] = path.read_text().strip()
-            except (OSError, UnicodeDecodeError) as error:
-                raise ConfigError(
-                    f"no credentials can be read from {path}: {error}. The directory must hold "
-                    f"{', '.join(_FILES.values())}."
-                ) from error
-        return cls(**values)
+    def from_file(cls, path: str | os.PathLike[str]) -> Credentials:
+        """Read what a pod's init container wrote, and remove the file."""
+        try:
+            return cls._read(credentials_file.take(os.fspath(path)))
+        except OSError as error:
+            raise cls._unreadable(path, str(error.strerror or error).lower()) from None
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise cls._unreadable(path, "its content is not Fiber's, or cut short") from None
+
+    @staticmethod
+    def _unreadable(path: str | os.PathLike[str], why: str) -> ConfigError:
+        return ConfigError(
+            f"no credentials can be read from {os.fspath(path)} and removed: {why}. The init "
+            "container of this pod writes them, and the agent removes them when it begins. Let the "
+            "agent be the only process of the pod that reads them, as the init container's user, "
+            "from a volume that can be written to."
+        )
 
     def to_descriptor(self) -> int:
-        """A descriptor from which they can be read once, by whoever inherits it."""
-        values = json.dumps({name: getattr(self, name) for name in _FILES}).encode()
+        """Return a descriptor from which the process that inherits it can read them once."""
+        values = json.dumps(asdict(self)).encode()
         reader, writer = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         try:
             if os.write(writer, values) < len(values):
@@ -76,68 +74,87 @@ class Credentials:
         """Read what ``to_descriptor`` wrote, and close it.  The error does not repeat anything."""
         try:
             with open(descriptor, "rb") as file:
-                values = json.loads(file.read())
-            return cls(**{name: str(values[name]) for name in _FILES})
-        except (OSError, OverflowError, ValueError, KeyError, TypeError):
+                return cls._read(file.read())
+        except (OSError, OverflowError, ValueError, KeyError, TypeError, AttributeError):
             # Whatever else a descriptor may bring.
             raise ConfigError(
                 f"the credentials on descriptor {descriptor} cannot be read: it is not open, or "
                 "brings what is cut short or not Fiber's. Hand them over as the master made them."
             ) from None
 
-    def expires(self) -> datetime.datetime:
-        """When the certificate ends to be valid."""
-        from cryptography import x509
-
-        try:
-            certificate = x509.load_pem_x509_certificate(self.certificate.encode())
-        except ValueError as error:
-            raise AuthenticationError(
-                f"the certificate for {self.server_name} is not a PEM certificate: {error}"
-            ) from None
-        return certificate.not_valid_after_utc
+    @classmethod
+    def _read(cls, data: bytes) -> Credentials:
+        values = json.loads(data)
+        return cls(
+            str(values["name"]),
+            str(values["uid"]),
+            identity.check_key(values["key"]),
+            str(values.get("master", "")),
+            int(values.get("epoch", 0)),
+        )
 
 
 @dataclass(frozen=True)
-class MasterCredentials(Credentials):
-    """The master's half, and the agents' that it hands on."""
+class MasterCredentials:
+    """What a master has: the pool's key, its own certificate, and the key to that, in PEM."""
 
-    agent: Credentials = field(repr=False)
+    pool_key: str = field(repr=False)
+    certificate: str = field(repr=False)
+    key: str = field(repr=False)
+    only: bool = True
+    """Whether the pool never has another master, so that agents may be told the fingerprint."""
 
-    @classmethod
-    def of(cls, made: Certificates) -> MasterCredentials:
-        """The credentials that these certificates are."""
-        agent = Credentials(
-            made.server_name, made.authority, made.agent.certificate, made.agent.key
-        )
-        return cls(
-            made.server_name, made.authority, made.master.certificate, made.master.key, agent=agent
-        )
+    @cached_property
+    def certificate_hash(self) -> bytes:
+        """The SHA-256 of the certificate."""
+        import ssl
 
-    def agent_half(self) -> Credentials:
-        """What an agent gets: nothing in it lets its holder pose as the master."""
-        return self.agent
+        return hashlib.sha256(ssl.PEM_cert_to_DER_cert(self.certificate)).digest()
 
+    @property
+    def fingerprint(self) -> str:
+        """What agents compare the certificate with; empty where another master may follow."""
+        return self.certificate_hash.hex() if self.only else ""
 
-def make_credentials(pool: str) -> MasterCredentials:
-    """New credentials for the master and the agents of ``pool``, related to no others.
+    def agent_key(self, name: str, uid: str) -> str:
+        """Derive the key of an agent."""
+        return identity.agent_key(self.pool_key, name, uid)
 
-    They are valid for ``fiber_api.certificates.RUN_VALIDITY``: a run that lasts longer cannot take
-    new agents.
-    """
-    try:
-        made = make_certificates(
-            f"master.{pool}.fiber", f"agent.{pool}.fiber", valid_for=RUN_VALIDITY
-        )
-    except InvalidName:
-        raise ConfigError(
-            f"{pool!r} cannot be the name of a pool: use up to 240 lower-case letters, digits, '-' "
-            "and '.', with a letter or digit at both ends of each part"
-        ) from None
-    return MasterCredentials.of(made)
+    def agent(self, name: str, uid: str) -> Credentials:
+        """Return the credentials of an agent: with them it can prove to be no other."""
+        return Credentials(name, uid, self.agent_key(name, uid), self.fingerprint)
 
 
-def _write_private(path: Path, text: str) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        file.write(text + "\n")
+def make_credentials(pool_key: str | None = None) -> MasterCredentials:
+    """Make a certificate, and a key too if the pool has none yet.  Takes a millisecond."""
+    certificate, key = _self_signed()
+    return MasterCredentials(
+        pool_key or identity.new_key(), certificate, key, only=pool_key is None
+    )
+
+
+def _self_signed() -> tuple[str, str]:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import NameOID
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Fiber")])
+    now = datetime.datetime.now(datetime.UTC)
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + _VALIDITY)
+        .sign(key, hashes.SHA256())
+    )
+    pem = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    return certificate.public_bytes(serialization.Encoding.PEM).decode(), pem.decode()

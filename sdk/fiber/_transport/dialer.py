@@ -15,6 +15,7 @@ from collections.abc import Callable
 from fiber._exceptions import fresh
 from fiber._transport import address as addresses
 from fiber._transport import handshake, tls
+from fiber._transport.connecting import connect
 from fiber._transport.credentials import Credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
 from fiber._transport.link import Keepalive, Link, SelectorEventLoop, Wire
@@ -47,7 +48,7 @@ class Unreachable(Exception):
 
 class AgentDialer:
     """An agent's end: dials the master at ``host:port`` until it answers or ``timeout`` is over
-    (None: for as long as it takes).
+    (None: for as long as it takes).  A master with several addresses has commas between them.
 
     Calls back once, on the loop's thread: ``on_link`` with the link, or ``on_failed`` with an
     AuthenticationError, VersionMismatch or LinkError.  A link that breaks later is dialled again
@@ -66,11 +67,11 @@ class AgentDialer:
         timeout: float | None = 30.0,
         connect: Callable[[str], socket.socket] | None = None,
     ) -> None:
-        addresses.parse(address)
+        addresses.parse_list(address)
         self._loop = loop
         self._address = address
         self._credentials = credentials
-        self._context = tls.context_of(credentials, listens=False)
+        self._context = tls.agent_context()
         self._identity = identity
         self._on_link = on_link
         self._on_failed = on_failed
@@ -79,6 +80,8 @@ class AgentDialer:
         self._name = secrets.token_hex(16)
         self._link: ResumableLink | None = None
         self._obstacle = "nothing was tried"
+        self.epoch = credentials.epoch
+        """That of the master, once there is a link."""
         self.lost_grace: float | None = None
         """What the master says of its loss, once there is a link."""
         self._over = threading.Event()
@@ -140,12 +143,14 @@ class AgentDialer:
     def _meet(self, hello: bytes) -> tuple[bytes, int, Secrets]:
         """The master's answer, and the connection without TLS."""
         sock = self._connect(self._address)
-        tls_handshake = tls.Handshake(sock, self._context, self._credentials.server_name)
+        tls_handshake = tls.AgentHandshake(sock, self._context)
         try:
             with self._lock:
                 self._sock = tls_handshake.sock
             deadline = time.monotonic() + _GREET
-            answer = self._finish(tls_handshake, tls_handshake.ask(hello), deadline)
+            answer = self._finish(
+                tls_handshake, tls_handshake.ask(self._credentials, hello), deadline
+            )
             return answer, *self._finish(tls_handshake, tls_handshake.end(), deadline)
         finally:
             with self._lock:
@@ -153,7 +158,7 @@ class AgentDialer:
             tls_handshake.close()
 
     def _finish(
-        self, tls_handshake: tls.Handshake, steps: tls.Steps[tls._T], deadline: float
+        self, tls_handshake: tls.AgentHandshake, steps: tls.Steps[tls._T], deadline: float
     ) -> tls._T:
         """Take the steps, waiting before each until it can be taken."""
         poller = select.poll()
@@ -190,6 +195,12 @@ class AgentDialer:
         if mismatch is not None:
             raise fresh(mismatch)
         if isinstance(greeting, Welcome):
+            if greeting.epoch < self.epoch:
+                raise LinkError(
+                    f"the master at {self._address} is that of epoch {greeting.epoch}, and this "
+                    f"agent has served the one of epoch {self.epoch} since: another program has "
+                    "taken the pool. End the earlier one"
+                )
             return greeting
         reason = greeting.reason if isinstance(greeting, Refusal) else "it is an agent itself"
         raise LinkError(f"the master at {self._address} refused this agent: {reason}")
@@ -212,7 +223,7 @@ class AgentDialer:
             self._obstacle = str(error)
             self._start(_PAUSE_MAX)
             return
-        self.lost_grace = welcome.lost_grace
+        self.lost_grace, self.epoch = welcome.lost_grace, welcome.epoch
         link.connected(connection, welcome.arrived)
         if self._link is None:
             self._cancel_deadline()
@@ -242,10 +253,9 @@ class AgentDialer:
         self._fail(
             AuthenticationError(
                 f"this agent and what answers at {self._address} do not trust each other: "
-                f"{self._obstacle}. The credentials are those of another run, or expired (this "
-                f"agent's are for {self._credentials.server_name} until "
-                f"{self._credentials.expires():%Y-%m-%d %H:%M} UTC), or it is no master. Give the "
-                "agent the credentials that this master made."
+                f"{self._obstacle}. The agent's credentials come from another run's key or another "
+                "pool's, or it is no master. Give the agent the credentials that this master made; "
+                "in a pool, delete the pod."
             )
         )
 
@@ -275,7 +285,7 @@ class AgentDialer:
 def _connect(address: str) -> socket.socket:
     """A connection; Unreachable, soon, if none can be made at this moment."""
     try:
-        sock = socket.create_connection(addresses.parse(address), _CONNECT)
+        sock = connect(addresses.parse_list(address), _CONNECT)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     except TimeoutError as error:
         raise Unreachable(f"no answer within {_CONNECT:g} s") from error

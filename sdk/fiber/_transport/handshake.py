@@ -26,6 +26,9 @@ from fiber.errors import VersionMismatch
 
 _HELLO, _WELCOME, _REFUSAL = 0x10, 0x11, 0x12
 
+_LONGEST_NAME = 253
+"""Characters of the longest name that a pod can have.  Logs repeat what a stranger claims to be."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Identity:
@@ -36,11 +39,13 @@ class Identity:
     python: str
     fiber: str
     facts: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    uid: str = ""
+    """The pod's, in an agent's.  An agent has proved to have this name and uid."""
 
     @classmethod
-    def of_this_process(cls, name: str, **facts: str) -> Identity:
+    def of_this_process(cls, name: str, uid: str = "", **facts: str) -> Identity:
         """This interpreter and this Fiber, called ``name``."""
-        return cls(name, PROTOCOL, platform.python_version(), _fiber_version(), facts)
+        return cls(name, PROTOCOL, platform.python_version(), _fiber_version(), facts, uid)
 
 
 class Hello(NamedTuple):
@@ -73,6 +78,8 @@ class Welcome(NamedTuple):
     lost_grace: float | None = None
     """Seconds for which the agent shall wait for another master if this one is lost; None: it knows
     better, or waits for none."""
+    epoch: int = 0
+    """Counts the masters that follow one another in a pool."""
 
     def encode(self) -> bytes:
         """The datagram."""
@@ -151,12 +158,22 @@ def _encode(kind: int, greeting: Greeting) -> bytes:
 def _identity(fields: Mapping[str, Any]) -> Identity:
     facts = {str(key): str(value) for key, value in fields["facts"].items()}
     return Identity(
-        str(fields["name"]),
+        _name(fields["name"]),
         int(fields["protocol"]),
         str(fields["python"]),
         str(fields["fiber"]),
         facts,
+        _name(fields.get("uid", "")),
     )
+
+
+def _name(value: object) -> str:
+    """Return a name or uid; ValueError if it is too long or cannot be encoded."""
+    name = str(value)
+    if len(name) > _LONGEST_NAME:
+        raise ValueError(f"a name of {len(name)} characters")
+    name.encode()
+    return name
 
 
 def _read_hello(identity: Identity, fields: Mapping[str, Any]) -> Hello:
@@ -174,6 +191,7 @@ def _read_welcome(identity: Identity, fields: Mapping[str, Any]) -> Welcome:
         suspect_after=float(fields["suspect_after"]),
         lost_after=float(fields["lost_after"]),
         lost_grace=None if grace is None else float(grace),
+        epoch=int(fields.get("epoch", 0)),
     )
 
 

@@ -6,9 +6,9 @@ import os
 import socket
 from collections.abc import Callable
 
-from fiber._transport import handshake, tls
+from fiber._transport import handshake
 from fiber._transport.acceptor import Acceptor, PendingConnection
-from fiber._transport.credentials import Credentials
+from fiber._transport.credentials import MasterCredentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
 from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, Link, SelectorEventLoop
 from fiber._transport.nng import Connection
@@ -24,7 +24,9 @@ class MasterListener:
     ``address`` is ``host:port``; port 0 takes a free one, and ``address`` then says which.  The
     callbacks run on the loop's thread: ``on_agent`` attaches an observer to the new link, or
     returns why it does not want it; ``on_refused`` hears who was turned away and why;
-    ``on_proven`` hears of each connection that proved by certificate that it is the pool's.
+    ``on_proven`` hears of each connection that proved to be an agent of the pool.  ``objection``
+    says why an agent that has proved its name and uid is not taken, "" if it is, and None as long
+    as that is not known: then it waits until ``look_again`` is called, for some seconds at most.
     ``lost_grace`` is told to the agents: for so many seconds they wait for another master if this
     one is lost.
     """
@@ -33,17 +35,23 @@ class MasterListener:
         self,
         loop: SelectorEventLoop,
         address: str,
-        credentials: Credentials,
+        credentials: MasterCredentials,
         *,
         on_agent: Callable[[Link], str | None],
         on_refused: Callable[[str], None],
         on_proven: Callable[[], None] = lambda: None,
+        objection: Callable[[Identity], str | None] = lambda identity: "",
         keepalive: Keepalive = DEFAULT_KEEPALIVE,
         lost_grace: float | None = None,
     ) -> None:
         self._loop = loop
         self._on_agent = on_agent
         self._on_proven = on_proven
+        self._knows = objection
+        self.epoch = 0
+        """Counts the masters of a pool.  On the loop's thread."""
+        self._waiting: dict[tuple[str, str], tuple[PendingConnection, Hello]] = {}
+        self._by_peer: dict[tuple[str, str], ResumableLink] = {}
         self._keepalive = keepalive
         self._lost_grace = lost_grace
         self._identity = Identity.of_this_process("the master")
@@ -51,8 +59,8 @@ class MasterListener:
         self._closing: list[Callable[[], None]] | None = None
         self._acceptor = Acceptor(
             address,
-            tls.context_of(credentials, listens=True),
-            on_hello=lambda pending, words: loop.call_soon(self._greet, pending, words),
+            credentials,
+            on_hello=self._hear,
             on_refused=lambda reason: loop.call_soon(on_refused, reason),
         )
         self.address = self._acceptor.address
@@ -89,24 +97,47 @@ class MasterListener:
             for then in finished:
                 then()
 
-    def _greet(self, pending: PendingConnection, words: bytes) -> None:
-        """Somebody with the right credentials has said its first words."""
-        self._on_proven()
+    def look_again(self) -> None:
+        """Decide about the agents that wait.  On the loop's thread."""
+        waiting, self._waiting = self._waiting, {}
+        for pending, hello in waiting.values():
+            if not pending.gone:
+                self._greet(pending, hello)
+
+    def _hear(self, pending: PendingConnection, words: bytes) -> None:
+        """Somebody has said its first words.  On the acceptor's thread."""
         try:
             hello = handshake.decode(words)
         except ProtocolError as error:
-            self._refuse(pending, f"someone connected who is no agent of Fiber: {error}")
+            pending.distrust(f"it is no agent of Fiber: {error}")
             return
         if not isinstance(hello, Hello):
-            self._refuse(pending, f"{hello.identity.name!r} connected and is no agent")
-            return
+            pending.distrust(f"{hello.identity.name!r} is no agent")
+        elif pending.trust(hello.identity):
+            self._loop.call_soon(self._proven, pending, hello)
+
+    def _proven(self, pending: PendingConnection, hello: Hello) -> None:
+        self._on_proven()
+        self._greet(pending, hello)
+
+    def _greet(self, pending: PendingConnection, hello: Hello) -> None:
+        """An agent has proved its name and uid."""
         reason = self._objection(hello)
-        if reason:
+        if reason is None:
+            self._let_wait(pending, hello)
+        elif reason:
             self._refuse(pending, reason)
         else:
             self._welcome(pending, hello)
 
-    def _objection(self, hello: Hello) -> str:
+    def _let_wait(self, pending: PendingConnection, hello: Hello) -> None:
+        peer = _peer(hello.identity)
+        if before := self._waiting.pop(peer, None):
+            before[0].drop()  # the same agent has dialled again
+        pending.waits_for(f"there is no pod {hello.identity.name!r} yet")
+        self._waiting[peer] = pending, hello
+
+    def _objection(self, hello: Hello) -> str | None:
         error = handshake.mismatch(self._identity, hello.identity)
         if error is not None:
             return str(error)
@@ -117,7 +148,16 @@ class MasterListener:
                 f"the link of {hello.identity.name!r} is not known here: this master began "
                 "after it, or had given that agent up as lost"
             )
-        return ""
+        if (link := self._links.get(hello.link)) is not None:
+            if _peer(link.peer) == _peer(hello.identity):
+                return ""
+            return f"{hello.identity.name!r} wants to go on with the link of {link.peer.name!r}"
+        if (link := self._by_peer.get(_peer(hello.identity))) is not None and link.is_connected:
+            return (
+                f"{hello.identity.name!r} has a link already, and a pod has one. End the process "
+                "that is not its agent"
+            )
+        return self._knows(hello.identity)
 
     def _refuse(self, pending: PendingConnection, reason: str) -> None:
         pending.turn_away(Refusal(self._identity, reason).encode(), reason)
@@ -129,7 +169,7 @@ class MasterListener:
             # much has.
             link.disconnect()
         arrived = link.arrived if link else 0
-        welcome = Welcome(self._identity, arrived, *self._keepalive, self._lost_grace)
+        welcome = Welcome(self._identity, arrived, *self._keepalive, self._lost_grace, self.epoch)
         pending.welcome(
             welcome.encode(),
             lambda descriptor, secrets: self._loop.call_soon(
@@ -150,11 +190,16 @@ class MasterListener:
         if self._closing is not None or (link.arrived if link else 0) != arrived:
             os.close(descriptor)  # this master ends, or the agent has come by another connection
             return
+        before = self._by_peer.get(_peer(hello.identity))
+        if link is None and before is not None and before.is_connected:
+            os.close(descriptor)  # it has come by another connection, as another link
+            return
         new = link is None
         if link is None:
             link = ResumableLink(
                 self._loop, hello.identity, self._keepalive, lambda _: self._forget(hello.link)
             )
+            self._by_peer[_peer(hello.identity)] = link
         try:
             connection = Connection(
                 self._loop,
@@ -173,5 +218,11 @@ class MasterListener:
             pending.report_proven(unwanted)
 
     def _forget(self, link: str) -> None:
-        self._links.pop(link, None)
+        ended = self._links.pop(link, None)
+        if ended is not None and self._by_peer.get(_peer(ended.peer)) is ended:
+            del self._by_peer[_peer(ended.peer)]
         self._finish_closing()
+
+
+def _peer(identity: Identity) -> tuple[str, str]:
+    return identity.name, identity.uid

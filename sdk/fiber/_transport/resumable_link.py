@@ -76,6 +76,11 @@ class ResumableLink:
         return self._stream.arrived
 
     @property
+    def is_connected(self) -> bool:
+        """Whether there is a connection now."""
+        return self._wire is not None
+
+    @property
     def heard(self) -> bool:
         """Whether the peer has ever said anything."""
         return self._stream.heard

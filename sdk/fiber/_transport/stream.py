@@ -31,7 +31,7 @@ from typing import NamedTuple, TypeAlias
 
 from fiber._transport.turns import FIRST, LAST, LENGTH, SIZE, SLOT_SHIFT, SLOTS, WORD, Lane, Turns
 from fiber._wire.assembly import Assembly
-from fiber._wire.messages import BytesLike, ProtocolError
+from fiber._wire.messages import BytesLike, ProtocolError, is_passed_on
 
 Frame: TypeAlias = bytes | bytearray | memoryview
 
@@ -338,8 +338,9 @@ class ResumableStream:
         try:
             if assembly is None:
                 (size,) = SIZE.unpack_from(piece)
-                assembly = self._assemblies[slot] = Assembly(size)
                 piece = piece[SIZE.size :]
+                assembly = Assembly(size, passed_on=is_passed_on(piece))
+                self._assemblies[slot] = assembly
             assembly.add(piece)
             if not word & LAST:
                 return []

@@ -1,17 +1,23 @@
 """From a connected socket to a proven peer and fresh secrets.
 
     agent                                      master
-      │  TLS 1.3, both with certificates         │
+      │  TLS 1.3                                 │
       ├─────────────────────────────────────────►│
       │◄─────────────────────────────────────────┤
-      │  32 random bytes, Hello                  │
-      ├─────────────────────────────────────────►│  takes it or not
+      │                          32 random bytes │
       │◄─────────────────────────────────────────┤
-      │             32 random bytes, Welcome or Refusal
+      │  32 random bytes, Hello, proof           │
+      ├─────────────────────────────────────────►│  believes it or not, takes it or not
+      │◄─────────────────────────────────────────┤
+      │               Welcome or Refusal, proof  │
       │  end of TLS                              │
       ├─────────────────────────────────────────►│
       │◄─────────────────────────────────────────┤
       ▼  the same connection, without TLS        ▼
+
+A proof is an HMAC with the agent's own key, which the master derives, over the random bytes of
+both sides, the certificate that TLS has shown, and the words beside it.  So it is good for one
+connection with one master: who shows another certificate, in the middle say, passes no proof on.
 
 Nothing here blocks or knows where its socket comes from: each side is a generator that yields the
 event (``select.POLLIN`` or ``POLLOUT``) for which it has to wait.  TLS works on the socket itself
@@ -20,6 +26,8 @@ and not on buffers in memory, because what follows the end of TLS must stay in t
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import os
 import select
 import socket
@@ -28,7 +36,7 @@ import struct
 from collections.abc import Callable, Generator
 from typing import Any, TypeAlias, TypeVar
 
-from fiber._transport.credentials import Credentials
+from fiber._transport.credentials import Credentials, MasterCredentials
 from fiber._transport.sealing import SECRET_SIZE, Secrets, derive
 from fiber._wire.messages import ProtocolError
 from fiber.errors import AuthenticationError
@@ -38,6 +46,7 @@ Steps: TypeAlias = Generator[int, None, _T]
 
 LARGEST_GREETING = 1 << 16
 _LENGTH = struct.Struct(">I")
+_PROOF_SIZE = 32
 
 
 class Untrusted(Exception):
@@ -57,26 +66,34 @@ class _TakenSocket(ssl.SSLSocket):
         """Nobody asks any more."""
 
 
-def context_of(credentials: Credentials, *, listens: bool) -> ssl.SSLContext:
-    """What one side demands and shows; AuthenticationError if ``credentials`` cannot be used."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if listens else ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
-    context.sslsocket_class = _TakenSocket
-    context.verify_mode = ssl.CERT_REQUIRED
-    if listens:
-        context.num_tickets = 0  # nobody resumes, and nothing must follow the handshake
+def master_context(credentials: MasterCredentials) -> ssl.SSLContext:
+    """What a master shows; AuthenticationError if ``credentials`` cannot be used."""
+    context = _context(ssl.PROTOCOL_TLS_SERVER)
+    context.num_tickets = 0  # nobody resumes, and nothing must follow the handshake
     try:
-        context.load_verify_locations(cadata=credentials.authority)
         _load_own(context, credentials)
     except (ssl.SSLError, ValueError) as error:
         raise AuthenticationError(
-            f"the credentials for {credentials.server_name} cannot be used: "
-            f"{_words(error)}. They are cut short or not PEM."
+            f"the master's certificate cannot be used: {_words(error)}. It is cut short or not PEM."
         ) from error
     return context
 
 
-def _load_own(context: ssl.SSLContext, credentials: Credentials) -> None:
+def agent_context() -> ssl.SSLContext:
+    """What an agent demands of TLS: the master's certificate is part of what both sides prove."""
+    return _context(ssl.PROTOCOL_TLS_CLIENT)
+
+
+def _context(protocol: int) -> ssl.SSLContext:
+    context = ssl.SSLContext(protocol)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.sslsocket_class = _TakenSocket
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    return context
+
+
+def _load_own(context: ssl.SSLContext, credentials: MasterCredentials) -> None:
     # The ssl module takes them from a file only; this one is in memory and has no name.
     file = os.memfd_create("credentials")
     try:
@@ -87,18 +104,14 @@ def _load_own(context: ssl.SSLContext, credentials: Credentials) -> None:
         os.close(file)
 
 
-class Handshake:
+class _Handshake:
     """One side's part on ``sock``, which it makes non-blocking and takes over; HungUp if that is
     broken already.
     """
 
-    def __init__(
-        self, sock: socket.socket, context: ssl.SSLContext, server_name: str | None = None
-    ) -> None:
-        """``server_name`` is what the other side's certificate must bear; None on the master's
-        side, whose agents all bear the same.
-        """
-        self._for_master = server_name is None
+    _for_master: bool
+
+    def __init__(self, sock: socket.socket, context: ssl.SSLContext) -> None:
         self._ours = os.urandom(SECRET_SIZE)
         self._theirs = b""
         try:
@@ -107,7 +120,6 @@ class Handshake:
             self.sock = context.wrap_socket(
                 sock,
                 server_side=self._for_master,
-                server_hostname=server_name,
                 do_handshake_on_connect=False,
                 suppress_ragged_eofs=False,
             )
@@ -115,40 +127,35 @@ class Handshake:
             sock.close()
             raise HungUp(_words(error)) from error
 
-    def ask(self, hello: bytes) -> Steps[bytes]:
-        """The agent's part: prove each other, say ``hello``, and return the answer."""
-        yield from self._when_ready(self.sock.do_handshake)
-        yield from self._write(hello)
-        return (yield from self._read())
-
-    def listen(self) -> Steps[bytes]:
-        """The master's part: prove each other and return the agent's hello."""
-        yield from self._when_ready(self.sock.do_handshake)
-        return (yield from self._read())
-
-    def answer(self, greeting: bytes) -> Steps[None]:
-        """The master's answer."""
-        yield from self._write(greeting)
-
     def end(self) -> Steps[tuple[int, Secrets]]:
         """End TLS in order: the bare connection's descriptor, now the caller's, and the secrets."""
         yield from self._when_ready(self.sock.unwrap)
-        agent, master = self._ours, self._theirs
-        if self._for_master:
-            agent, master = master, agent
-        return self.sock.detach(), derive(agent, master, for_master=self._for_master)
+        return self.sock.detach(), derive(*self._nonces, for_master=self._for_master)
 
     def close(self) -> None:
         """Hang up."""
         self.sock.close()
 
-    def _write(self, greeting: bytes) -> Steps[None]:
-        rest = memoryview(self._ours + _LENGTH.pack(len(greeting)) + greeting)
+    @property
+    def _nonces(self) -> tuple[bytes, bytes]:
+        """The random bytes of the agent and of the master."""
+        if self._for_master:
+            return self._theirs, self._ours
+        return self._ours, self._theirs
+
+    def _proof(self, side: bytes, key: str, certificate: bytes, words: bytes) -> bytes:
+        """Compute what ``side`` proves, while it says ``words``."""
+        agent, master = self._nonces
+        said = b"fiber " + side + agent + master + certificate + words
+        return hmac.digest(bytes.fromhex(key), said, "sha256")
+
+    def _write(self, data: bytes) -> Steps[None]:
+        rest = memoryview(data)
         while rest:
             rest = rest[(yield from self._when_ready(self.sock.send, rest)) :]
 
     def _read(self) -> Steps[bytes]:
-        self._theirs = yield from self._read_exactly(SECRET_SIZE)
+        """Read a greeting."""
         (size,) = _LENGTH.unpack((yield from self._read_exactly(_LENGTH.size)))
         if size > LARGEST_GREETING:
             raise ProtocolError(f"its greeting of {size} bytes is too long")
@@ -180,9 +187,70 @@ class Handshake:
                 raise HungUp(_words(error)) from error
 
 
+class AgentHandshake(_Handshake):
+    """The agent's part."""
+
+    _for_master = False
+
+    def ask(self, credentials: Credentials, hello: bytes) -> Steps[bytes]:
+        """Prove each other, say ``hello``, and return the answer."""
+        yield from self._when_ready(self.sock.do_handshake)
+        seen = hashlib.sha256(self.sock.getpeercert(binary_form=True) or b"").digest()
+        if credentials.master and seen.hex() != credentials.master:
+            raise Untrusted("its certificate is refused: it is not that of this agent's master")
+        self._theirs = yield from self._read_exactly(SECRET_SIZE)
+        proof = self._proof(b"agent", credentials.key, seen, hello)
+        yield from self._write(self._ours + _LENGTH.pack(len(hello)) + hello + proof)
+        answer = yield from self._read()
+        proof = yield from self._read_exactly(_PROOF_SIZE)
+        if not answer:
+            raise Untrusted("the master does not believe that this agent is the pod it says")
+        if not hmac.compare_digest(proof, self._proof(b"master", credentials.key, seen, answer)):
+            raise Untrusted("it cannot prove that it is this pool's master")
+        return answer
+
+
+class MasterHandshake(_Handshake):
+    """The master's part."""
+
+    _for_master = True
+
+    def __init__(
+        self, sock: socket.socket, context: ssl.SSLContext, credentials: MasterCredentials
+    ) -> None:
+        super().__init__(sock, context)
+        self._certificate = credentials.certificate_hash
+        self._key = ""
+        self._words = self._said = b""
+
+    def listen(self) -> Steps[bytes]:
+        """Return the agent's hello, which is not proved yet."""
+        yield from self._when_ready(self.sock.do_handshake)
+        yield from self._write(self._ours)
+        self._theirs = yield from self._read_exactly(SECRET_SIZE)
+        self._words = yield from self._read()
+        self._said = yield from self._read_exactly(_PROOF_SIZE)
+        return self._words
+
+    def believes(self, key: str) -> bool:
+        """Return whether the agent has ``key``; with this key the master proves itself then."""
+        proof = self._proof(b"agent", key, self._certificate, self._words)
+        if not hmac.compare_digest(proof, self._said):
+            return False
+        self._key = key
+        return True
+
+    def answer(self, greeting: bytes) -> Steps[None]:
+        """Answer an agent that is believed, and prove to be its master."""
+        proof = self._proof(b"master", self._key, self._certificate, greeting)
+        yield from self._write(_LENGTH.pack(len(greeting)) + greeting + proof)
+
+    def disbelieve(self) -> Steps[None]:
+        """Answer one that is not."""
+        yield from self._write(_LENGTH.pack(0) + bytes(_PROOF_SIZE))
+
+
 def _words(error: Exception) -> str:
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is refused: {error.verify_message}"
     if isinstance(error, ssl.SSLError) and error.reason:
         return error.reason.lower().replace("_", " ")
     if isinstance(error, OSError) and error.strerror:

@@ -26,7 +26,7 @@ def reachable_address(api: Api, listen_host: str | None, *, pool: str, namespace
     is the pod's.  FiberPoolError if all are.
     """
     if listen_host is not None and not _is_unspecified(listen_host):
-        return _resolved(listen_host)
+        return resolved("listen_host", listen_host)
     for target in _targets(api):
         found = _local_address(target)
         if found is not None and _is_reachable(found):
@@ -34,8 +34,8 @@ def reachable_address(api: Api, listen_host: str | None, *, pool: str, namespace
     raise FiberPoolError(
         f"pods cannot reach this program: the only address of this machine on the way to the "
         f"cluster at {api.server} is a loopback. Set listen_host (fiber.init(listen_host=) or "
-        "FIBER_LISTEN_HOST) to an address of this machine that pods can reach, or run the program "
-        "in a pod",
+        "FIBER_LISTEN_HOST) to an address of this machine that pods can reach, run the program in "
+        "a pod, or set advertised_host too where pods reach this machine at another address",
         pool=pool,
         namespace=namespace,
         reason="NoAddress",
@@ -71,20 +71,22 @@ def _local_address(target: str) -> str | None:
         return None  # no such name, or no way there
 
 
-def _resolved(host: str) -> str:
+def resolved(key: str, host: str) -> str:
+    """Return the IP address of ``host``, the value of the configuration's ``key``, for pods."""
     try:
         found = str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
     except OSError as error:
-        raise _useless(host, f"has no address ({error})") from error
+        raise _useless(key, host, f"has no address ({error})") from error
     if not _is_reachable(found):
-        raise _useless(host, f"is {found}, which is another machine in each pod")
+        raise _useless(key, host, f"is {found}, which is another machine in each pod")
     return found
 
 
-def _useless(host: str, why: str) -> ConfigError:
+def _useless(key: str, host: str, why: str) -> ConfigError:
     return ConfigError(
-        f"pods cannot reach this program: listen_host {host!r} {why}. Set it to an address of this "
-        "machine that pods can reach, or leave it out"
+        f"pods cannot reach this program: {key} {host!r} {why}. Set it to an address of this "
+        "machine that pods can reach, or leave it out. Behind NAT or port forwarding, set "
+        "advertised_host to the address that pods dial"
     )
 
 

@@ -155,6 +155,12 @@ def _advice(error: ApiError, namespace: str, server: str) -> tuple[str, str]:
                 f"The API server {server} does not accept this program's login, and a renewed one "
                 "neither: look with `kubectl auth whoami` and log in again"
             )
+        case Forbidden() | Invalid() if "ValidatingAdmissionPolicy" in error.message:
+            return "Refused", (
+                "A policy of the cluster refuses it: change what the policy names with "
+                "fiber.init(template=) or in the pod of this program, or ask an administrator for "
+                "an exception"
+            )
         case Forbidden() if "quota" in error.message:
             return "QuotaExceeded", (
                 f"Look with `kubectl get resourcequota -n {namespace}`, and delete what is not "

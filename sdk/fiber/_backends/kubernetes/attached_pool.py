@@ -59,7 +59,7 @@ class AttachedPool:
         self._api = api
         self._kept_by_others = kept_by_others
         self.master = master
-        self._epoch = epoch
+        self.epoch = epoch
         metadata = found["metadata"]
         self.name = str(metadata["name"])
         self.namespace = str(metadata["namespace"])
@@ -100,7 +100,7 @@ class AttachedPool:
         if names_to_release := list(release):
             spec["scaleDown"] = {"release": names_to_release}
         if master:
-            spec["master"] = self.master.spec(self.name, self._epoch)
+            spec["master"] = self.master.spec(self.name, self.epoch)
         body = {
             "apiVersion": names.API_VERSION,
             "kind": names.KIND,
@@ -173,12 +173,17 @@ class AttachedPool:
             "kind": LEASES.kind,
             "metadata": {
                 "name": names.master_lease_name(self.name),
-                "labels": self._lease_labels,
+                "labels": self.labels,
                 "ownerReferences": [self.owner],
             },
             "spec": {**self._lease_spec(now), "acquireTime": now},
         }
         self._api.create(LEASES.path(self.namespace), body, **how)
+
+    def has_lease(self, **how: Any) -> bool:
+        """Return whether the Lease that is there is this master's."""
+        spec = self._api.get(self._lease_path, **how).get("spec") or {}
+        return spec.get("holderIdentity") == self.master.identity
 
     def free_lease(self, **how: Any) -> None:
         """Let whoever comes next find that nobody holds it."""
@@ -187,12 +192,15 @@ class AttachedPool:
             self._patch_lease({"holderIdentity": ""}, **how)
 
     def _patch_lease(self, spec: Body, **how: Any) -> None:
-        patch = {"metadata": {"labels": self._lease_labels}, "spec": spec}
+        patch = {"metadata": {"labels": self.labels}, "spec": spec}
         self._api.merge_patch(self._lease_path, patch, **how)
 
     @property
-    def _lease_labels(self) -> dict[str, str]:
-        """By the first the operator hears of renewals: it watches such Leases alone."""
+    def labels(self) -> dict[str, str]:
+        """Labels of the objects that belong to the pool.
+
+        The operator watches only Leases that have the first.
+        """
         return {names.LABEL_POOL_UID: self.uid, names.LABEL_POOL: self.name}
 
     def _lease_spec(self, now: str) -> Body:

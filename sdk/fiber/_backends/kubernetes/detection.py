@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import logging
+import time
 
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body
+from fiber._backends.kubernetes.api_errors import ApiError, Body, NotFound
+from fiber._backends.kubernetes.resources import LEASES
 from fiber.errors import ConfigError
 from fiber_api import names
+from fiber_api.times import parse_time
 
 _REVIEWS = "/apis/authorization.k8s.io/v1/selfsubjectaccessreviews"
 
@@ -15,14 +19,60 @@ _TIMEOUT = 5.0
 """Seconds that a program may wait for an answer before it goes on without a cluster."""
 
 
-def may_make_pools(namespace: str | None) -> bool:
-    """Whether the account of the pod that this is may make FiberPools."""
+def serves_pools(namespace: str | None) -> bool:
+    """Return whether this pod's account may make FiberPools that somebody serves.
+
+    A right without FiberPools, or without an operator, is told by one warning.
+    """
     try:
         with contextlib.closing(Api.connect()) as api:
-            answer = api.create(_REVIEWS, _review(namespace or api.namespace), timeout=_TIMEOUT)
+            return _serves(api, namespace or api.namespace)
     except (ConfigError, ApiError):  # no account, no client, no answer
         return False
-    return bool(answer.get("status", {}).get("allowed"))
+
+
+def _serves(api: Api, namespace: str) -> bool:
+    answer = api.create(_REVIEWS, _review(namespace), timeout=_TIMEOUT)
+    if not answer.get("status", {}).get("allowed"):
+        return False
+    try:
+        api.get(f"/apis/{names.API_VERSION}", timeout=_TIMEOUT)
+    except NotFound:
+        return _on_this_machine("the cluster knows no FiberPools. Install the operator's chart")
+    if _has_expired(_claim(api, namespace)):
+        return _on_this_machine(
+            f"the operator that served the namespace {namespace!r} is gone. Start it again"
+        )
+    return True
+
+
+def _on_this_machine(why: str) -> bool:
+    logging.getLogger("fiber").warning(
+        "processes run on this machine and not in pods: %s, or set backend='local' "
+        "(FIBER_BACKEND=local) to have no such warning",
+        why,
+    )
+    return False
+
+
+def _claim(api: Api, namespace: str) -> Body:
+    """Return the Lease of the operator in the namespace; empty where it cannot be read."""
+    try:
+        lease = api.get(LEASES.path(namespace, names.CRD_NAME), timeout=_TIMEOUT)
+    except ApiError:
+        return {}  # an operator claims a namespace when it sees the first pool there
+    return lease.get("spec") or {}
+
+
+def _has_expired(claim: Body) -> bool:
+    """Return whether the operator neither renewed its Lease nor gave it back."""
+    if not claim.get("holderIdentity"):
+        return False
+    try:
+        renewed = parse_time(str(claim.get("renewTime")))
+    except ValueError:
+        return False
+    return renewed + int(claim.get("leaseDurationSeconds") or 0) < time.time()
 
 
 def _review(namespace: str) -> Body:

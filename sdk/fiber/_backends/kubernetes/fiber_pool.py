@@ -57,7 +57,7 @@ class Attachment(Protocol):
 class Observer(Protocol):
     """Who is told, on the loop's thread."""
 
-    def on_attached(self) -> None:
+    def on_attached(self, epoch: int) -> None:
         """Once: the pool is there, with this program as its master."""
 
     def on_status(self, status: Body) -> None:
@@ -202,7 +202,7 @@ class FiberPoolClient:
             on_fault=self._reporter.fault,
         )
         self._followers = [renewer, pool, pods]
-        self._loop.call_soon(self._observer.on_attached)
+        self._loop.call_soon(self._observer.on_attached, attached.epoch)
         for follower in self._followers:
             follower.start()
         return attached

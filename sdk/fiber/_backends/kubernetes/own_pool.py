@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import Body, Conflict, NotFound, Transient
+from fiber._backends.kubernetes.api_errors import Body, Conflict, Forbidden, NotFound, Transient
 from fiber._backends.kubernetes.attached_pool import AttachedPool, Master, identity_in
 from fiber._backends.kubernetes.resources import POOLS, SECRETS
 from fiber._backends.kubernetes.secret import secret_body
@@ -52,15 +52,13 @@ class OwnPool:
         pool whose master's Lease is absent or gets old, and that the operator deletes.
         """
         self._attached = AttachedPool(self._api, self._create(cancel), self._master, _EPOCH)
-        secret = secret_body(names.secret_name(self.name), self._credentials, self._attached.owner)
-        try:
-            self._api.create(SECRETS.path(self.namespace), secret, cancel=cancel)
-        except Conflict:
-            pass  # made by an attempt whose answer was lost: no other pool had this name
+        self._make_secret(self._attached, cancel)
         try:
             self._attached.make_lease(cancel=cancel)
         except Conflict:
-            pass  # likewise
+            if not self._attached.has_lease(cancel=cancel):
+                raise
+            # It was made by an attempt whose answer was lost.
         return self._attached
 
     def detach(self, timeout: float) -> None:
@@ -72,6 +70,20 @@ class OwnPool:
             self._api.delete(POOLS.path(self.namespace, self.name), uid=uid, timeout=timeout)
         except (NotFound, Conflict):
             pass  # it is gone, or even its name is another's
+
+    def _make_secret(self, pool: AttachedPool, cancel: threading.Event) -> None:
+        name = names.secret_name(self.name)
+        secret = secret_body(name, self._credentials, pool.owner, pool.labels)
+        try:
+            self._api.create(SECRETS.path(self.namespace), secret, cancel=cancel)
+        except Conflict:
+            try:
+                found = self._api.get(SECRETS.path(self.namespace, name), cancel=cancel)
+            except Forbidden:
+                return  # fiber-user reads no Secret. With another's keys no agent could join
+            if found.get("data") != secret["data"]:
+                raise
+            # It was made by an attempt whose answer was lost.
 
     def _create(self, cancel: threading.Event) -> Body:
         metadata = dict(self._body["metadata"])

@@ -18,6 +18,8 @@ class PodEnd(NamedTuple):
     """Empty if it never had one."""
     exitcode: int | None = None
     """As multiprocessing has it; None if no program of it ended, or nobody knows how."""
+    disrupted: bool = False
+    """Whether that was the cluster's doing, and not its programs'."""
 
 
 def pod_end(pod: Mapping[str, Any], container: str = names.WORKER_CONTAINER) -> PodEnd | None:
@@ -27,13 +29,12 @@ def pod_end(pod: Mapping[str, Any], container: str = names.WORKER_CONTAINER) -> 
     """
     status = pod.get("status") or {}
     worker = _ended(status, container)
-    reason = (
-        _out_of_memory(pod, worker, container)
-        or _disruption(pod)
-        or _deletion(pod)
-        or _own_end(status, worker)
-    )
-    return None if reason is None else PodEnd(reason, node_of(pod), _exitcode(worker))
+    own = _out_of_memory(pod, worker, container)
+    disruption = None if own else _disruption(pod) or _deletion(pod) or _lost_container(worker)
+    reason = own or disruption or _own_end(status, worker)
+    if reason is None:
+        return None
+    return PodEnd(reason, node_of(pod), _exitcode(worker), disruption is not None)
 
 
 def node_of(pod: Mapping[str, Any]) -> str:
@@ -96,11 +97,14 @@ def _deletion(pod: Mapping[str, Any]) -> str | None:
     return "Deleted: somebody deleted the pod"
 
 
+def _lost_container(worker: Mapping[str, Any]) -> str | None:
+    lost = worker.get("reason") in _LOST_CONTAINERS
+    return "NodeLost: its node lost sight of it" if lost else None
+
+
 def _own_end(status: Mapping[str, Any], worker: Mapping[str, Any]) -> str | None:
     reason, message = str(status.get("reason") or ""), str(status.get("message") or "")
     exitcode = _exitcode(worker)
-    if worker.get("reason") in _LOST_CONTAINERS:
-        return "NodeLost: its node lost sight of it"
     if exitcode is not None:
         word = reason or str(worker.get("reason") or "Error")
         return _sentence(word, f"its agent {_ending(exitcode)}")

@@ -21,6 +21,7 @@ from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.demand import Demand
 from fiber._engine.placement import Placement
 from fiber._hub.hub import Hub
+from fiber._transport.handshake import Identity
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop, Timer
 from fiber.config import Config
@@ -193,13 +194,24 @@ class Pods:
         if not self._closing.is_set():  # else that is how it is to be
             self._output.write("fiber", f"an agent was refused: {why}")
 
+    def objection(self, identity: Identity) -> str | None:
+        """Why this agent is not wanted; None until the watch has its pod."""
+        name = identity.name
+        if name in self._given_up:
+            return f"{name}, which had been given up"
+        if (pod := self._pods.get(name)) is None:
+            return None
+        if pod["metadata"]["uid"] != identity.uid:
+            return f"{name}, which says that its pod has the uid {identity.uid!r}; it has another"
+        if pod_end(pod) is not None:
+            return f"{name}, whose pod is about to go"
+        return ""
+
     def on_agent(self, link: Link) -> str | None:
         """An agent has dialled; why it is not wanted, if it is not."""
         name = link.peer.name
-        if name in self._given_up:
-            return f"{name}, which had been given up"
-        if (pod := self._pods.get(name)) is not None and pod_end(pod) is not None:
-            return f"{name}, whose pod is about to go"
+        if (reason := self.objection(link.peer)) != "":  # it was welcome a moment ago
+            return reason or f"{name}, whose pod is gone"
         if (before := self.agents.agents.get(name)) is not None:
             # It had given this program up, ended its children, and is back: after a program was
             # stopped for a while, say.
@@ -228,6 +240,7 @@ class Pods:
         end = pod_end(pod)
         agent.node = node_of(pod)
         agent.ending = end.reason if end is not None else ""
+        agent.disrupted = end is not None and end.disrupted
         made_from = pod["metadata"]["labels"].get(names.LABEL_TEMPLATE_HASH)
         if self._waiting.status.get("templateHash", made_from) != made_from:
             self._retire(agent)
@@ -246,13 +259,18 @@ class Pods:
             self._pods.pop(name, None)
             self._given_up.discard(name)
             if agent is not None:
-                agent.lose("its pod is gone")
+                agent.lose("its pod is gone", disrupted=not agent.ending)
             return
+        is_new = name not in self._pods
         self._pods[name] = pod
+        if is_new and self._prepared is not None:
+            self._prepared.listener.look_again()
         if agent is not None:
             self._tell(agent)
             if (pod.get("status") or {}).get("phase") in _ENDED:
                 agent.lose("its pod has ended")
+            elif pod["metadata"].get("deletionTimestamp"):
+                agent.leave(agent.ending)  # its SIGTERM may be late: a preStop hook comes before it
             else:
                 self.agents.withhold(agent, bool(agent.ending), "ending")
 
@@ -268,10 +286,11 @@ class Pods:
                 self._tell(agent)
         self._changed()
 
-    def on_attached(self) -> None:
+    def on_attached(self, epoch: int) -> None:
         """The pool is there, with this program as its master."""
         self._waiting.attached = True
         if (prepared := self._prepared) is not None:
+            prepared.listener.epoch = epoch
             self._waiting.way = Way(prepared.address, prepared.attachment.displaced)
 
     def on_warning(self, message: str) -> None:

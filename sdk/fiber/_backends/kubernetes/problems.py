@@ -51,6 +51,7 @@ class Way(NamedTuple):
             "Pods cannot connect to that address: it is behind NAT, or a firewall or a "
             "NetworkPolicy is in between. Run the program in a pod of the cluster, or set "
             "listen_host (FIBER_LISTEN_HOST) to an address of this machine that pods reach, or "
+            "advertised_host (FIBER_ADVERTISED_HOST) to one that is forwarded to it, or "
             f"allow the connection{others}"
         )
 
@@ -78,6 +79,7 @@ _WAITS_FOR_SOMEBODY = frozenset(
         Reason.FORBIDDEN,
         Reason.IMAGE_PULL_ERROR,
         Reason.QUOTA_EXCEEDED,
+        Reason.REQUESTS_MISSING,
         Reason.UNSCHEDULABLE,
     }
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import secrets
@@ -10,18 +11,24 @@ import sys
 import threading
 from typing import NamedTuple, Protocol
 
-from fiber._backends.kubernetes.address import reachable_address
+from fiber._backends.kubernetes.address import reachable_address, resolved
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.api_errors import ApiError, Body, NotFound, explain
 from fiber._backends.kubernetes.attached_pool import Master
+from fiber._backends.kubernetes.claims import Claims, look_up, without_claims
 from fiber._backends.kubernetes.fiber_pool import Attachment
 from fiber._backends.kubernetes.own_pool import OwnPool
 from fiber._backends.kubernetes.resources import PODS, POOLS
-from fiber._backends.kubernetes.secret import make_credentials
 from fiber._backends.kubernetes.shape import Shape, pool_name, program_name
-from fiber._backends.kubernetes.template import fiber_pool_body, own_container, pod_template
+from fiber._backends.kubernetes.template import (
+    fiber_pool_body,
+    own_container,
+    pod_template,
+    secrets_left_out,
+)
 from fiber._backends.kubernetes.warm_pool import WarmPool, read_credentials
-from fiber._transport.credentials import MasterCredentials
+from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.handshake import Identity
 from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
@@ -31,6 +38,9 @@ from fiber_api import names
 
 _SUFFIX_BYTES = 4
 
+_LONGEST_HOST_NAME = 63
+"""Characters of a host name that Kubernetes gives a pod, at most."""
+
 
 class ListenerObserver(Protocol):
     """Hears of agents that dial in, on the loop's thread."""
@@ -38,8 +48,11 @@ class ListenerObserver(Protocol):
     def on_agent(self, link: Link) -> str | None:
         """One with the pool's credentials; why it is not wanted, if it is not."""
 
+    def objection(self, identity: Identity) -> str | None:
+        """Why an agent with this name and uid is not taken; "" if it is, None if not known yet."""
+
     def on_proven(self) -> None:
-        """One has proved by certificate that it is the pool's, whether or not it is wanted."""
+        """One has proved that it is the pool's, whether or not it is wanted."""
 
     def on_refused(self, why: str) -> None:
         """Somebody was turned away."""
@@ -85,10 +98,16 @@ class Program:
         number = next(self._numbers)
         suffix = self._suffix if not number else f"{self._suffix}-{number}"
         name = pool_name(self._name, shape, suffix)
-        credentials = make_credentials(name, self.namespace)
+        credentials = make_credentials()
         own = self._find_own_pod(cancel)
         container = own_container(own, _mountinfo()) if own is not None else ""
-        template = pod_template(shape, own, container, sys.executable)
+        claims = self._claims(own, container, cancel) if own is not None else Claims()
+        model = without_claims(own, claims.one_node) if own is not None else None
+        template = pod_template(shape, model, container, sys.executable)
+        if own is not None and number == 0:
+            _say_what_stays_behind(secrets_left_out(own, container))
+            for line in claims.warnings(template):
+                _say(line)
         body = fiber_pool_body(name, template, self._config)
         # Last: whatever fails before leaves nothing open.
         master, listener = self._listen(name, credentials, loop, observer)
@@ -121,16 +140,17 @@ class Program:
         self, pool: str, credentials: MasterCredentials, loop: Loop, observer: ListenerObserver
     ) -> tuple[Master, MasterListener]:
         config = self._config
-        host = reachable_address(self._api, config.listen_host, pool=pool, namespace=self.namespace)
+        bound, host = self._addresses(pool)
         patience = config.heartbeat_interval, config.suspect_after, config.lost_after
         try:
             listener = MasterListener(
                 loop,
-                names.address_of(config.listen_host or host, config.listen_port),
+                names.address_of(bound, config.listen_port),
                 credentials,
                 on_agent=observer.on_agent,
                 on_refused=observer.on_refused,
                 on_proven=observer.on_proven,
+                objection=observer.objection,
                 keepalive=Keepalive(*patience),
                 lost_grace=Master.lost_grace,
             )
@@ -138,13 +158,23 @@ class Program:
             if not (config.listen_port and self._listens):
                 raise
             raise ConfigError(
-                f"listen_port={config.listen_port} is one port, and each FiberPool of a program "
-                "needs one of its own: this program uses several, for functions with different "
-                "wishes for instance. Leave listen_port out, so that free ones are taken, or give "
-                "all functions the same fiber.meta"
+                f"listen_port={config.listen_port} has no port left, and each FiberPool of a "
+                "program needs one of its own: this program uses several, for functions with "
+                "different wishes for instance. Give a range, as in listen_port='9000-9009', leave "
+                "it out, so that free ones are taken, or give all functions the same fiber.meta"
             ) from error
         self._listens = True
         return self._master(host, listener), listener
+
+    def _addresses(self, pool: str) -> tuple[str, str]:
+        """Return the address to listen at and the one that pods dial."""
+        listen, advertised = self._config.listen_host, self._config.advertised_host
+        if advertised is not None:
+            advertised = resolved("advertised_host", advertised)
+            if listen is not None:
+                return listen, advertised
+        found = reachable_address(self._api, listen, pool=pool, namespace=self.namespace)
+        return listen or found, advertised or found
 
     def _master(self, host: str, listener: MasterListener) -> Master:
         port = int(listener.address.rpartition(":")[2])
@@ -166,14 +196,22 @@ class Program:
         try:
             return self._api.get(PODS.path(namespace, name), cancel=cancel)
         except NotFound as error:
+            why = "with hostNetwork, or with spec.hostname, a pod's host name is not its name"
+            if len(name) >= _LONGEST_HOST_NAME:
+                why = f"a pod's host name is cut after {_LONGEST_HOST_NAME} characters"
             raise ConfigError(
-                f"there is no pod {name!r} in namespace {namespace!r}, which this program seems to "
-                "run in: with hostNetwork, or a hostname of its own, a pod does not know its name. "
-                "Set the variable HOSTNAME in its manifest by valueFrom.fieldRef, fieldPath "
-                "metadata.name"
+                f"there is no pod {name!r} in namespace {namespace!r}, where this program seems to "
+                f"run: {why}. Set the variable HOSTNAME in the pod's manifest by "
+                "valueFrom.fieldRef, fieldPath metadata.name"
             ) from error
         except ApiError as error:
             raise self._explained(error, f"read this program's pod {name!r}", "") from error
+
+    def _claims(self, own: Body, container: str, cancel: threading.Event) -> Claims:
+        try:
+            return look_up(self._api, self.namespace, own, container, cancel)
+        except ApiError as error:
+            raise self._explained(error, "read the claims of this program's pod", "") from error
 
     def _explained(self, error: ApiError, doing: str, pool: str) -> FiberPoolError:
         return explain(error, doing, pool=pool, namespace=self.namespace, server=self._api.server)
@@ -189,6 +227,20 @@ class Program:
             "name": metadata["name"],
             "uid": metadata["uid"],
         }
+
+
+def _say_what_stays_behind(variables: list[str]) -> None:
+    if variables:
+        _say(
+            f"workers do not get the variables {', '.join(variables)}: they look like "
+            "secrets, and everybody who may read FiberPools could read their values there. Take "
+            "them from a Secret (valueFrom.secretKeyRef) in the manifest of this program"
+        )
+
+
+def _say(line: str) -> None:
+    with contextlib.suppress(Exception):  # stderr may be closed
+        sys.stderr.write(f"fiber: {line}\n")
 
 
 def _mountinfo() -> str:

@@ -24,5 +24,6 @@ class Resource(NamedTuple):
 POOLS = Resource(names.API_VERSION, names.KIND, names.PLURAL)
 PODS = Resource("v1", "Pod", "pods")
 NODES = Resource("v1", "Node", "nodes")
+CLAIMS = Resource("v1", "PersistentVolumeClaim", "persistentvolumeclaims")
 SECRETS = Resource("v1", "Secret", "secrets")
 LEASES = Resource("coordination.k8s.io/v1", "Lease", "leases")

@@ -11,7 +11,7 @@ from typing import Any
 
 from fiber.config import Config
 from fiber.errors import ConfigError
-from fiber.resources import Resources
+from fiber.resources import Resources, merged, wished
 from fiber_api import names
 
 
@@ -26,6 +26,12 @@ class Shape:
     template: str = field(default="{}", repr=False)
     """The configured pod template, as JSON with sorted keys."""
     processes_per_pod: int = 1
+    cpu_request: float = 0
+    """CPUs to request for a process whose function wishes none."""
+    memory_request: int = 0
+    """MiB, likewise."""
+    shm: int | None = None
+    """MiB of memory at /dev/shm; None: what a container has by itself."""
 
     @classmethod
     def of(cls, config: Config) -> Shape:
@@ -40,11 +46,20 @@ class Shape:
                 f"bad value for 'template': {error}. A template holds what JSON can say: write a "
                 "text that looks like a date in quotes."
             ) from error
-        return cls(config.image, template=text, processes_per_pod=config.processes_per_pod)
+        selector, tolerations = config.node_selector, config.tolerations
+        return cls(
+            config.image,
+            wished("fiber.init", node_selector=selector, tolerations=tolerations),
+            text,
+            config.processes_per_pod,
+            config.cpu_request,
+            config.memory_request,
+            config.shm,
+        )
 
     def with_resources(self, resources: Resources) -> Shape:
-        """The same for a function with these wishes."""
-        return replace(self, resources=resources)
+        """The same for a function with these wishes, which win over those that are there."""
+        return replace(self, resources=merged(self.resources, resources))
 
 
 # ---- the configured template ----------------------------------------------------------------

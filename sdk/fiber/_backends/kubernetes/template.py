@@ -17,6 +17,7 @@ from typing import Any
 import fiber
 from fiber._backends.kubernetes.merge import merge_template
 from fiber._backends.kubernetes.shape import Shape, quantity
+from fiber._wishes import GPU
 from fiber.config import Config
 from fiber.resources import Resources
 from fiber_api import names
@@ -26,7 +27,8 @@ Document = dict[str, Any]
 WORKER_IMAGE = f"fiber-worker:{fiber.__version__}"
 """What workers run where nothing else is said: as charts and manifests name it."""
 
-GPU = "nvidia.com/gpu"
+_SHM = "/dev/shm"
+_SHM_VOLUME = "fiber-shm"
 
 _AGENT = ("-m", "fiber.agent")
 
@@ -48,9 +50,13 @@ def pod_template(
     if shape.image is not None and shape.image != worker["image"]:
         worker["image"] = shape.image
         worker.pop("imagePullPolicy", None)  # it was said of the other
-    _ask_for(worker, shape.resources, shape.processes_per_pod)
+    _ask_for(worker, shape)
+    _place(spec, shape.resources)
+    if shape.shm is not None:
+        _give_shm(spec, worker, shape.shm)
     template = merge_template({"spec": spec}, json.loads(shape.template))
     for worker in _workers(template):
+        _request_the_rest(worker, shape)
         if not ("command" in worker or "args" in worker):
             # What the image runs by itself may be the program, and that must not start anew.
             interpreter = python if worker.get("image") == own_image else "python"
@@ -68,18 +74,54 @@ def _workers(template: Document) -> Iterator[Document]:
             yield container
 
 
-def _ask_for(worker: Document, resources: Resources, processes: int) -> None:
-    """Guarantee what ``processes`` processes need: requests and limits alike."""
-    wishes = {
-        "cpu": None if resources.cpu is None else quantity(resources.cpu * processes),
-        "memory": None if resources.memory is None else f"{resources.memory * processes}Mi",
-    }
-    requests = {kind: amount for kind, amount in wishes.items() if amount is not None}
+def _ask_for(worker: Document, shape: Shape) -> None:
+    """Guarantee what functions wish for each of the pod's processes: requests and limits alike."""
+    wishes, processes, requests = shape.resources, shape.processes_per_pod, {}
+    if wishes.cpu is not None:
+        requests["cpu"] = quantity(wishes.cpu * processes)
+    if wishes.memory is not None:  # what is written to /dev/shm counts to it
+        requests["memory"] = f"{wishes.memory * processes + (shape.shm or 0)}Mi"
     limits = dict(requests)
-    if resources.gpu:
-        limits[GPU] = str(resources.gpu * processes)  # which is its request too
+    for name, amount in ((GPU, wishes.gpu or 0), *wishes.extended):
+        if amount:
+            limits[name] = str(amount * processes)  # which is its request too
     if limits:
         worker["resources"] = {"limits": limits, **({"requests": requests} if requests else {})}
+
+
+def _request_the_rest(worker: Document, shape: Shape) -> None:
+    """Request what the configuration says, of what neither a function nor the template speaks."""
+    resources = worker.get("resources") or {}
+    memory = shape.memory_request * shape.processes_per_pod + (shape.shm or 0)
+    requests = {
+        "cpu": quantity(shape.cpu_request * shape.processes_per_pod) if shape.cpu_request else "",
+        "memory": f"{memory}Mi" if memory else "",
+    }
+    # A limit is the request, too, if there is no other.
+    said = {*(resources.get("requests") or ()), *(resources.get("limits") or ())}
+    added = {kind: amount for kind, amount in requests.items() if amount and kind not in said}
+    if added:
+        asked = {**(resources.get("requests") or {}), **added}
+        worker["resources"] = {**resources, "requests": asked}
+
+
+def _place(spec: Document, wishes: Resources) -> None:
+    """Add the nodes that functions wish to those that the program's pod wishes."""
+    if wishes.node_selector:
+        spec["nodeSelector"] = {**(spec.get("nodeSelector") or {}), **dict(wishes.node_selector)}
+    there = spec.get("tolerations") or []
+    added = [dict(one) for one in wishes.tolerations]
+    _set(spec, "tolerations", [*there, *(one for one in added if one not in there)])
+
+
+def _give_shm(spec: Document, worker: Document, size: int) -> None:
+    """Mount memory of ``size`` MiB at /dev/shm, in place of what the program has there."""
+    mounts = [m for m in worker.get("volumeMounts") or () if m["mountPath"].rstrip("/") != _SHM]
+    used = {m["name"] for m in (*mounts, *(worker.get("volumeDevices") or ()))}
+    volumes = [v for v in spec.get("volumes") or () if v["name"] in used]
+    memory = {"medium": "Memory", "sizeLimit": f"{size}Mi"}
+    spec["volumes"] = [*volumes, {"name": _SHM_VOLUME, "emptyDir": memory}]
+    worker["volumeMounts"] = [*mounts, {"name": _SHM_VOLUME, "mountPath": _SHM}]
 
 
 # ---- like the program's own pod -------------------------------------------------------------
@@ -91,11 +133,14 @@ _OF_THE_POD = (
     "hostAliases",
     "imagePullSecrets",
     "nodeSelector",
+    "priorityClassName",
     "runtimeClassName",
     "schedulerName",
     "securityContext",
     "serviceAccountName",
+    "terminationGracePeriodSeconds",
     "tolerations",
+    "topologySpreadConstraints",
 )
 """What a worker's pod has of the program's.  Not its name and labels, by which others select it;
 not its other containers; not what it asks for, since the program is no worker."""
@@ -119,15 +164,38 @@ def _like(pod: Mapping[str, Any], container: str) -> Document:
     own = copy.deepcopy(dict(pod["spec"]))
     found = next(c for c in own["containers"] if c["name"] == container)
     worker = {"name": names.WORKER_CONTAINER, **_given(found, _OF_THE_CONTAINER)}
-    _set(worker, "env", [v for v in found.get("env") or () if not v["name"].startswith("FIBER_")])
+    variables = [v for v in found.get("env") or () if not v["name"].startswith("FIBER_")]
+    _set(worker, "env", [v for v in variables if not _is_secret(v)])
     mounts = [m for m in found.get("volumeMounts") or () if not _is_the_pods(m)]
     _set(worker, "volumeMounts", mounts)
     spec = {**_given(own, _OF_THE_POD), "containers": [worker]}
     used = {m["name"] for m in (*mounts, *(found.get("volumeDevices") or ()))}
     _set(spec, "volumes", [v for v in own.get("volumes") or () if v["name"] in used])
     _set(spec, "tolerations", [t for t in own.get("tolerations") or () if not _is_default(t)])
+    spread = spec.get("topologySpreadConstraints") or ()
+    _set(spec, "topologySpreadConstraints", [_among_workers(constraint) for constraint in spread])
     _rename(spec, container)
     return spec
+
+
+def secrets_left_out(pod: Mapping[str, Any], container: str) -> list[str]:
+    """Names of the container's variables that workers do not get, because they look like secrets.
+
+    Everybody who may read FiberPools would read them there.
+    """
+    found = next(c for c in pod["spec"]["containers"] if c["name"] == container)
+    return [v["name"] for v in found.get("env") or () if _is_secret(v)]
+
+
+_SECRET = re.compile(
+    r"(^|_)(SECRET|TOKEN|PASSWORD|PASSWD|PASSPHRASE|CREDENTIALS?|(API|ACCESS|PRIVATE)_?KEY)(_|$)",
+    re.IGNORECASE,
+)
+
+
+def _is_secret(variable: Mapping[str, Any]) -> bool:
+    """Whether the value stands in the manifest itself and the name is that of a secret."""
+    return bool(variable.get("value")) and _SECRET.search(variable["name"]) is not None
 
 
 def _given(document: Document, fields: tuple[str, ...]) -> Document:
@@ -150,6 +218,13 @@ def _is_default(toleration: Mapping[str, Any]) -> bool:
     """
     key = str(toleration.get("key"))
     return toleration.get("tolerationSeconds") == 300 and key.startswith("node.kubernetes.io/")
+
+
+def _among_workers(constraint: Mapping[str, Any]) -> Document:
+    """Return the constraint with the pool's workers as the pods that are spread."""
+    # Its own selector finds pods by labels of the program, which workers do not have.
+    workers = {"matchExpressions": [{"key": names.LABEL_POOL_UID, "operator": "Exists"}]}
+    return {**constraint, "labelSelector": workers, "matchLabelKeys": [names.LABEL_POOL_UID]}
 
 
 def _rename(document: object, container: str) -> None:

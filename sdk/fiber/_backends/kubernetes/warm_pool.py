@@ -14,7 +14,7 @@ from fiber._backends.kubernetes.secret import credentials_of
 from fiber._transport.credentials import MasterCredentials
 from fiber.errors import FiberPoolError
 from fiber_api import names
-from fiber_api.certificates import InvalidCertificates
+from fiber_api.identity import InvalidKey
 from fiber_api.names import ConditionType
 
 _PAUSE = 0.05
@@ -31,8 +31,8 @@ def read_credentials(
     what = f"the Secret {name!r} of the FiberPool {pool!r} in namespace {namespace!r}"
     try:
         secret = api.get(SECRETS.path(namespace, name), cancel=cancel)
-        return credentials_of(secret, pool, namespace)
-    except InvalidCertificates as error:
+        return credentials_of(secret)
+    except InvalidKey as error:
         raise FiberPoolError(
             f"{what} cannot serve: {error}. If the operator made it, delete it: it makes a new "
             "one; then delete the pool's pods, which hold the old one",

@@ -1,0 +1,59 @@
+"""The file with an agent's credentials: a pod's first init container writes it for the agent.
+
+Only the init container mounts the pool's key.  It derives the agent's key, writes it to a volume in
+memory, and ends.  It imports the standard library alone, because each pod waits for it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from fiber_api import identity, names
+
+
+def write(environment: Mapping[str, str]) -> int:
+    """Write the credentials of this pod's agent; return the exit status."""
+    try:
+        folder = Path(environment[names.ENV_KEY])
+        name, uid = environment[names.ENV_NAME], environment[names.ENV_UID]
+        key = identity.check_key((folder / names.KEY_POOL).read_text())
+        pin = folder / names.KEY_MASTER
+        values = {
+            "name": name,
+            "uid": uid,
+            "key": identity.agent_key(key, name, uid),
+            "master": pin.read_text().strip() if pin.exists() else "",
+        }
+        _write(environment[names.ENV_CREDENTIALS], json.dumps(values).encode())
+    except KeyError as error:
+        return _fail(f"the variable {error} is not set")
+    except (OSError, ValueError) as error:
+        return _fail(str(error))
+    return 0
+
+
+def take(path: str) -> bytes:
+    """Read the file and remove it."""
+    data = Path(path).read_bytes()
+    os.unlink(path)
+    return data
+
+
+def _write(path: str, data: bytes) -> None:
+    # The init container may run a second time, if the node fails between the first and the agent.
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(data)
+
+
+def _fail(why: str) -> int:
+    print(
+        f"fiber agent: the credentials of this pod cannot be written: {why}. The operator sets "
+        "this container up: see the template of the FiberPool for what stands in its way.",
+        file=sys.stderr,
+    )
+    return 1

@@ -1,0 +1,168 @@
+"""What is sent of the program to workers on other machines, and what is not.
+
+    print(fiber.shipping.listing())
+
+docs/shipping.md has the rules.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing import spawn
+
+from fiber._backends import program_files
+from fiber._backends.ignore_rules import INCLUDING
+from fiber._backends.program_files import Entry, Why
+from fiber._backends.program_layout import LOOSE, Layout, find_layout
+
+__all__ = ["LeftOut", "Listing", "Sent", "listing"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """A file or link that is sent."""
+
+    path: str
+    """The path here."""
+    name: str
+    """The path in the folder that workers have of the program."""
+    size: int
+    """Bytes."""
+    reason: str
+    """Why it is sent."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A file, folder or link that is not sent."""
+
+    path: str
+    """The path here."""
+    size: int | None
+    """Bytes, of a folder with all that is in it; None if those are too many files to count."""
+    reason: str
+    """Why it is left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """What a program's workers get, and what they do not get.  ``str()`` is a table of it."""
+
+    sent: tuple[Sent, ...]
+    left_out: tuple[LeftOut, ...]
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files that are sent, before they are compressed."""
+        return sum(file.size for file in self.sent)
+
+    @property
+    def too_large(self) -> bool:
+        """Whether a pool would refuse to send that much, with ``ProgramTooLarge``."""
+        return self.size > program_files.LIMIT or len(self.sent) > program_files.MOST_FILES
+
+    def __repr__(self) -> str:
+        return (
+            f"<Listing: {_counted(len(self.sent), 'file')} of {_readable(self.size)} sent, "
+            f"{len(self.left_out)} left out>"
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"sent to workers: {_counted(len(self.sent), 'file')}, {_readable(self.size)}"
+        if self.too_large:
+            yield (
+                f"that is too much: at most {program_files.MOST_FILES:,} files and "
+                f"{_readable(program_files.LIMIT)} are sent"
+            )
+        for file in self.sent:
+            yield f"{_readable(file.size):>12}  {file.path}  ({file.reason})"
+        yield f"left out: {len(self.left_out)}"
+        for left in self.left_out:
+            yield f"{_readable(left.size):>12}  {left.path}  ({left.reason})"
+
+
+def listing() -> Listing:
+    """Return what a pool that is made now would send of this program to workers elsewhere.
+
+    It is the same for every backend, also for one whose workers need nothing sent.  Nothing is sent
+    and no process is started.
+    """
+    # pdb leaves its program a main module without one.
+    vars(sys.modules["__main__"]).setdefault("__spec__", None)
+    layout = find_layout(spawn.get_preparation_data(""), frozenset())
+    files, left_out = program_files.select(layout, bounded=False)
+    sent = frozenset(entry.path for entry in files.values())
+    entries = [(left.path, _REASONS[left.why].format(left.detail)) for left in left_out]
+    entries += [(tree, _REASONS[Why.PATH]) for tree in layout.trees]
+    return Listing(
+        tuple(sorted(_sent(layout, files), key=lambda file: file.path)),
+        tuple(LeftOut(path, _size_of(path, sent), reason) for path, reason in sorted(set(entries))),
+    )
+
+
+_REASONS = {
+    Why.IGNORED: "{}",
+    Why.SECRET: "looks like a secret: {}",
+    Why.LINK: "a link that leads out of its folder, to {}",
+    Why.PATH: "on sys.path; what the program imported from it is sent",
+}
+
+
+def _sent(layout: Layout, files: dict[str, Entry]) -> Iterator[Sent]:
+    imported = frozenset(layout.files)
+    for name, entry in files.items():
+        if not stat.S_ISDIR(entry.mode):
+            yield Sent(entry.path, name, entry.size, _reason(layout, entry.path, imported))
+
+
+def _reason(layout: Layout, path: str, imported: frozenset[str]) -> str:
+    place = layout.places.place_of(path) or ""
+    if place == layout.program:
+        where = "working directory" if place in layout.session else "program's folder"
+        return f"in the {where}" + ", imported" * (path in imported)
+    if path in imported:
+        return "imported"
+    package = layout.places[place].startswith(f"{LOOSE}/")
+    return "in a package that was imported" if package else f"in a folder with a {INCLUDING}"
+
+
+def _size_of(path: str, sent: frozenset[str]) -> int | None:
+    """Bytes of what is at ``path``, without what is sent of it, links and bytecode."""
+    if os.path.islink(path) or not os.path.isdir(path):
+        return _bytes_of(path)
+    total = count = 0
+    for folder, folders, names in os.walk(path):
+        folders[:] = [each for each in folders if each != "__pycache__"]
+        count += len(names) + 1
+        if count > program_files.MOST_FILES:
+            return None
+        files = (os.path.join(folder, name) for name in names)
+        total += sum(_bytes_of(file) for file in files if file not in sent)
+    return total
+
+
+def _bytes_of(path: str) -> int:
+    try:
+        return os.lstat(path).st_size
+    except OSError:
+        return 0
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+
+
+def _readable(size: int | None) -> str:
+    if size is None:
+        return "many files"
+    for unit, bytes_in_it in (("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)):
+        if size >= bytes_in_it:
+            return f"{size / bytes_in_it:.1f} {unit}"
+    return f"{size} B"
