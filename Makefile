@@ -15,7 +15,10 @@ ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback
 	process queues reduction synchronize worker exit_functions futures) tests/faults/test_children.py \
 	tests/conformance/test_executors.py
 OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
-PARTS = test-prepare test-modules $(addprefix test-python-,$(OTHER_PYTHONS)) test-programs test-on-cluster
+PARTS = test-prepare test-modules $(addprefix test-python-,$(OTHER_PYTHONS)) test-programs \
+	test-conformance test-on-cluster
+# The tests start hundreds of interpreters. Without bytecode each compiles all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
@@ -35,7 +38,7 @@ test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV
 	for part in $(PARTS); do $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; done; \
 	[ -z "$$failed" ] || { echo "make test: failed:$$failed (each is a target of make)" >&2; exit 1; }
 
-.PHONY: test-prepare test-modules test-programs test-on-cluster
+.PHONY: test-prepare test-modules test-programs test-conformance test-on-cluster
 test-prepare:
 	$(CLUSTER) prepare
 
@@ -45,8 +48,12 @@ test-modules:
 test-programs:
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not long" $(WHOLE_PROGRAMS)
 
+test-conformance:
+	$(BIN)/python -m pytest -m "not long" tests/conformance
+
 test-on-cluster:
-	$(BIN)/python -m pytest -m "not long" $(addprefix --ignore=,$(FAST_TESTS) $(WHOLE_PROGRAMS))
+	$(BIN)/python -m pytest -m "not long" \
+		$(addprefix --ignore=,$(FAST_TESTS) $(WHOLE_PROGRAMS) tests/conformance)
 
 ## make test-fast     what to run at every save: style, unit, contract, simulation, but for the slowest
 test-fast: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3

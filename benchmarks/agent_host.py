@@ -29,9 +29,8 @@ class Order:
     """Which agents to be, and for which master."""
 
     address: str
-    credentials: dict[str, str]
-    """The fields of `Credentials`."""
-    names: list[str]
+    credentials: list[dict[str, Any]]
+    """The fields of `Credentials`, of each agent."""
     timeout: float
 
     def to_line(self) -> str:
@@ -64,20 +63,20 @@ class AgentHost:
     def __init__(self, loop: Loop, order: Order) -> None:
         self._loop = loop
         self._runner = TaskRunner()
-        self._left = len(order.names)
+        agents = [Credentials(**fields) for fields in order.credentials]
+        self._left = len(agents)
         self._services: list[AgentService] = []
-        credentials = Credentials(**order.credentials)
         self._dialers = [
             AgentDialer(
                 loop,
                 order.address,
                 credentials,
-                Identity.of_this_process(name),
+                Identity.of_this_process(credentials.name, credentials.uid),
                 on_link=self._joined,
                 on_failed=_give_up,
                 timeout=order.timeout,
             )
-            for name in order.names
+            for credentials in agents
         ]
 
     def _joined(self, link: Link) -> None:

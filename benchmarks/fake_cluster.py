@@ -62,12 +62,11 @@ class FakeCluster:
         self._missing = agents
         self._all_joined = threading.Event()
         self._problem = ""
-        credentials = make_credentials("fake")
-        self._credentials = asdict(credentials.agent_half())
+        self._credentials = make_credentials()
         self._listener = MasterListener(
             runtime.loop,
             "127.0.0.1:0",
-            credentials,
+            self._credentials,
             on_agent=self._link,
             on_refused=self._fail,
         )
@@ -79,8 +78,10 @@ class FakeCluster:
         before = self._memory()
         begin, used = time.perf_counter(), time.process_time()
         for number, host in enumerate(self._hosts):
-            share = names[number :: len(self._hosts)]
-            order = Order(self._listener.address, self._credentials, share, _PATIENCE)
+            share = [
+                asdict(self._credentials.agent(n, "")) for n in names[number :: len(self._hosts)]
+            ]
+            order = Order(self._listener.address, share, _PATIENCE)
             assert host.stdin is not None
             host.stdin.write(order.to_line())
             host.stdin.flush()

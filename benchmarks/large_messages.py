@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from benchmarks.model import MANY_ROUNDS, Case, Metric
 from benchmarks.samples import percentile
-from benchmarks.tasks import no_op
+from benchmarks.tasks import content, keep, kept, no_op
 
 if TYPE_CHECKING:
     from benchmarks.contender import Bench
@@ -19,9 +19,9 @@ TITLE = "Large messages"
 ABOUT = """\
 One message of so many bytes: as the argument of a task, as its result, through a `Pipe` and
 through a `Queue` from this process to another and back, of which half the time counts. All
-messages are `bytes`. Meanwhile a thread calls one no-op task after the other on another worker,
-which with loopback agents has the same agent, and so the same link. The time of such a task is
-that below which 95 % of them stayed."""
+messages are `bytes` that were there before. Meanwhile a thread calls one no-op task after the
+other on another worker, which with loopback agents has the same agent, and so the same link. The
+time of such a task is that below which 95 % of them stayed."""
 
 RATE = Metric("rate", "bytes a second", "B/s")
 BESIDE = Metric("beside", "small task beside it, p95", "s")
@@ -86,8 +86,9 @@ def run(bench: Bench, way: str, nbytes: int) -> dict[str, float]:
 
 def _in_a_task(pool: Any, way: str, nbytes: int, other: Any) -> tuple[float, list[float]]:
     if way == "result":
-        return _timed(lambda: pool.apply(bytes, (nbytes,)), other)
-    data = bytes(nbytes)
+        pool.apply(keep, (nbytes,))
+        return _timed(lambda: pool.apply(kept), other)
+    data = content(nbytes)
     return _timed(lambda: pool.apply(len, (data,)), other)
 
 
@@ -103,7 +104,7 @@ def _there_and_back(processes: Any, way: str, nbytes: int, other: Any) -> tuple[
     child.start()
     send(b"ready")
     receive()
-    data = bytes(nbytes)
+    data = content(nbytes)
 
     def trip() -> None:
         send(data)

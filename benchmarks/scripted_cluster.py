@@ -28,7 +28,7 @@ from benchmarks.fake_cluster import Host, agent_hosts
 from fakes.kubernetes_api import KubernetesApi
 from fakes.store import Store
 from fiber._transport.credentials import Credentials
-from fiber_api import names
+from fiber_api import identity, names
 
 Body = dict[str, Any]
 
@@ -112,19 +112,23 @@ class Pool:
         """The agents of all pods begin."""
         secret, master = self._secret(body["spec"]), body["spec"]["master"]
         assert secret is not None
-        texts = {key: base64.b64decode(value).decode() for key, value in secret["data"].items()}
-        credentials = Credentials(
-            texts[names.KEY_SERVER_NAME],
-            texts[names.KEY_AUTHORITY],
-            texts[names.KEY_AGENT_CERTIFICATE],
-            texts[names.KEY_AGENT_KEY],
-        )
+        key = identity.key_in(secret["data"])
+        pin = base64.b64decode(secret["data"][names.KEY_MASTER]).decode()
         address = names.address_of(master["host"], master["port"])
         for number, host in enumerate(self._hosts):
-            share = self._running[number :: len(self._hosts)]
+            mine = self._running[number :: len(self._hosts)]
+            share = [asdict(agent) for agent in self._agents_of(key, pin, mine)]
             assert host.stdin is not None
-            host.stdin.write(Order(address, asdict(credentials), share, _DIALS).to_line())
+            host.stdin.write(Order(address, share, _DIALS).to_line())
             host.stdin.flush()
+
+    def _agents_of(self, key: str, pin: str, pods: list[str]) -> list[Credentials]:
+        """What the init container of each pod writes."""
+        uids = {name: pod["metadata"]["uid"] for name, pod in self._pods().items()}
+        return [
+            Credentials(name, uids[name], identity.agent_key(key, name, uids[name]), pin)
+            for name in pods
+        ]
 
     def _new_pod(self, body: Body, name: str) -> tuple[str, Body]:
         labels = {

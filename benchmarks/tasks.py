@@ -24,6 +24,25 @@ def ones(nbytes: int) -> Any:
     return np.ones(nbytes, np.uint8)
 
 
+_kept = b""
+
+
+def content(nbytes: int) -> bytes:
+    """Bytes in memory that was written to, as all data is that a program computed."""
+    return b"x" * nbytes
+
+
+def keep(nbytes: int) -> None:
+    """Make the result of ``kept``."""
+    global _kept
+    _kept = content(nbytes)
+
+
+def kept() -> bytes:
+    """Give a large result that was there before."""
+    return _kept
+
+
 def announce(path: str) -> None:
     """Pool initializer: tell the owner of the named pipe that this worker is up."""
     fd = os.open(path, os.O_WRONLY)

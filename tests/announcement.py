@@ -15,7 +15,7 @@ from cluster.ability import Choice
 
 SUPPORTED = ("3.11", "3.12", "3.13")
 # Minutes on two processors with nothing else to do; to be corrected where they are far off.
-_FAST, _OTHER_PYTHON, _REST, _CLUSTER = 4, 1, 10, 16
+_MODULES, _OTHER_PYTHON, _PROGRAMS, _CONFORMANCE, _CLUSTER = 6, 2, 7, 9, 17
 
 
 def announcement(others: Sequence[str], environment: Mapping[str, str]) -> str:
@@ -34,13 +34,14 @@ def announcement(others: Sequence[str], environment: Mapping[str, str]) -> str:
 
 
 def _parts(others: Sequence[str], environment: Mapping[str, str]) -> Iterator[tuple[str, int]]:
-    yield f"style, unit, contract and simulation tests, on Python {_own()}", _FAST
+    yield f"style, unit, contract and simulation tests, on Python {_own()}", _MODULES
     for version in others:
         yield f"the essential ones again, on Python {version}", _OTHER_PYTHON
     choice, _ = ability.choose(environment)
     if choice is Choice.OWN and build.missing("kubernetes"):
         yield "building Kubernetes for the operator's scenarios, this time only", build.minutes()
-    yield "faults, conformance, examples, the chart", _REST
+    yield "faults, examples, the chart", _PROGRAMS
+    yield "conformance with each backend", _CONFORMANCE
     if choice is not Choice.NONE:
         yield f"the operator's scenarios and programs on pods, on {choice.value}", _CLUSTER
 

@@ -13,6 +13,10 @@ import time
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+Identity = tuple[int, int]
+"""Number of a process, and the inode of its folder in /proc: a later process with the same number
+has another inode."""
+
 
 class Found(NamedTuple):
     """A process seen in /proc."""
@@ -47,9 +51,19 @@ def everything() -> list[Found]:
     return [found for pid in pids if (found := read(pid)) is not None]
 
 
-def started_by(pid: int, marker: str) -> list[Found]:
-    """The processes below `pid`, and those executed with `marker` (``NAME=value``)."""
-    seen = everything()
+def identities() -> frozenset[Identity]:
+    """Return the identity of every process that this user can see."""
+    with os.scandir("/proc") as entries:
+        return frozenset((int(e.name), e.inode()) for e in entries if e.name.isdigit())
+
+
+def started_by(pid: int, marker: str, strangers: frozenset[Identity] = frozenset()) -> list[Found]:
+    """The processes below `pid`, and those executed with `marker` (``NAME=value``).
+
+    `strangers` are known to be neither, which saves reading them.
+    """
+    found_now = (read(number) for number, _ in identities() - strangers)
+    seen = [found for found in found_now if found is not None]
     family = {pid}
     grown = True
     while grown:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
@@ -45,6 +46,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if item.get_closest_marker("timeout") is None:
             conformance = item.path.is_relative_to(root / "conformance")
             item.add_marker(pytest.mark.timeout(CONFORMANCE_LIMIT if conformance else LIMIT))
+
+
+def pytest_collection_finish() -> None:
+    # What was imported stays. A collection of garbage, of which the checks below make many, does
+    # not go through it again.
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -42,6 +42,7 @@ class Lasting(NamedTuple):
     """What outlives a test by design and holds files open."""
 
     runtime: object | None
+    address: object | None
     processes: frozenset[int]
     nng: bool
 
@@ -60,13 +61,17 @@ class Watch:
     """Looks at this process, what it started, and its folder for temporary files."""
 
     def __init__(self, marker: str, folder: Path) -> None:
+        self._strangers: frozenset[census.Identity] = frozenset()
         self._marker = marker
         self._folder = folder
+        present = census.identities()
+        mine = {found.pid for found in self._started()}
+        self._strangers = frozenset(each for each in present if each[0] not in mine)
 
     def look(self) -> Snapshot:
         started = self._started()
         return Snapshot(
-            lasting=Lasting(_runtime(), _excused(started), _nng_runs()),
+            lasting=Lasting(_runtime(), _address(), _excused(started), _nng_runs()),
             processes=frozenset(found.pid for found in started),
             threads=frozenset(threading.enumerate()),
             descriptors=frozenset(_descriptors()),
@@ -109,7 +114,7 @@ class Watch:
         return left
 
     def _started(self) -> list[census.Found]:
-        return census.started_by(os.getpid(), self._marker)
+        return census.started_by(os.getpid(), self._marker, self._strangers)
 
 
 def shut_down_runtime() -> None:
@@ -129,6 +134,12 @@ def _excused(started: list[census.Found]) -> frozenset[int]:
 
 def _runtime() -> object | None:
     return getattr(sys.modules.get("fiber._runtime.state"), "_runtime", None)
+
+
+def _address() -> object | None:
+    """Return where the hub of the runtime listens, once it does."""
+    hub = getattr(sys.modules.get("fiber._hub.client"), "_local_hub", None)
+    return getattr(hub, "known_address", None)
 
 
 def _nng_runs() -> bool:

@@ -116,6 +116,21 @@ class Faulty(gymnasium.Env[Any, Any]):
             os._exit(4)
 
 
+class Telling(Faulty):
+    """Observes the same as text; what cannot be pickled is in the observation."""
+
+    observation_space: Any = spaces.Text(10)
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        super().reset(**options)
+        return "none", {}
+
+    def step(self, action: Any) -> Step:
+        _, *rest, info = super().step(action)
+        observation = threading.Lock() if info else f"{self.steps:.0f}"
+        return (observation, *rest, {})  # type: ignore[return-value]
+
+
 class Noticing(Sampling):
     """Counts how often any of its kind was looked at, in the process."""
 

@@ -97,6 +97,7 @@ if TYPE_CHECKING:
     from fiber import ring as ring
     from fiber import shared_memory as shared_memory
     from fiber import sharedctypes as sharedctypes
+    from fiber import shipping as shipping
     from fiber import spawn as spawn
     from fiber import synchronize as synchronize
     from fiber import util as util
@@ -179,6 +180,7 @@ _SUBMODULES = frozenset(
         "ring",
         "shared_memory",
         "sharedctypes",
+        "shipping",
         "spawn",
         "synchronize",
         "util",

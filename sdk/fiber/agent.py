@@ -2,16 +2,21 @@
 
 It takes everything from its environment, nothing from its command line (but ``--help``):
 
-``FIBER_AGENT_ADDRESS``      ``host:port`` of the master
-``FIBER_AGENT_CREDENTIALS``  the directory that holds the agent's half of the credentials, or
-                           ``fd:N`` for an inherited descriptor that brings it.  The environment
+``FIBER_AGENT_ADDRESS``      ``host:port`` of the master, or several with commas between: the first
+                           that answers counts
+``FIBER_AGENT_CREDENTIALS``  the file with the agent's credentials, which the agent removes, or
+                           ``fd:N`` for an inherited descriptor that brings them.  The environment
                            of a process is open to those that it starts: no secret is in it
-``FIBER_AGENT_NAME``         what the master calls it
+``FIBER_AGENT_KEY``          optional: the folder with the pool's key.  Write the credentials of the
+                           pod ``FIBER_AGENT_NAME``, ``FIBER_AGENT_UID`` to that file, and end
 ``FIBER_AGENT_PARENT``       optional: the pid of a process on this host to end with
 ``FIBER_AGENT_INHERITS``     optional: a directory of that process, to be removed if it is killed
 ``FIBER_AGENT_LOST_GRACE``   optional: serve one master after the other.  Wait for the first for as
                            long as it takes, and after one that was lost for so many seconds,
                            unless that master had said for how many
+``FIBER_AGENT_TERMINATION_GRACE``  optional: seconds from SIGTERM to the end by force.  After
+                           SIGTERM the agent takes no new work; what runs may end in that time,
+                           less what cleaning up takes
 ``FIBER_START_TIMEOUT``      seconds to find the master, as for every Fiber process
 
 Exit status 0: the master ended it, or the grace for a lost one is over.  1: it could not join, or
@@ -20,6 +25,7 @@ lost the master; stderr says why.  2: it was given arguments.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -36,6 +42,10 @@ def _run(arguments: Sequence[str]) -> int:
             file=sys.stderr,
         )
         return 2
+    if "FIBER_AGENT_KEY" in os.environ:
+        from fiber._transport import credentials_file
+
+        return credentials_file.write(os.environ)
     # As process 1 of a container it does not get a SIGTERM that it has no handler for: the kernel
     # drops it, and a pod that is deleted just then ends by force, after its grace period.  One that
     # is blocked waits.  So this comes before the imports, which take most of the time.

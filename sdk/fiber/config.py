@@ -18,12 +18,12 @@ import os
 import pickle
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict, Unpack, get_args
 
-from fiber import _original, inherited
+from fiber import _original, _wishes, inherited
 from fiber.errors import ConfigError
 
 __all__ = ["Config", "current", "guard", "init", "install", "load", "use"]
@@ -59,6 +59,19 @@ def _whole(low: int, high: int | None = None) -> _Rule:
 
     reach = f"of at least {low}" if high is None else f"from {low} to {high}"
     return _Rule(f"a whole number {reach}", check, from_text=int)
+
+
+def _ports() -> _Rule:
+    def check(value: object) -> int | str:
+        numbers = re.fullmatch(r"(\d{1,5})(?:-(\d{1,5}))?", str(value).strip())
+        if numbers is None or isinstance(value, bool):
+            raise ValueError
+        first, last = int(numbers[1]), int(numbers[2] or numbers[1])
+        if not (min(1, last) <= first <= last <= 65535):
+            raise ValueError
+        return first if first == last else f"{first}-{last}"
+
+    return _Rule("a whole number from 0 to 65535, or a range of ports such as '9000-9009'", check)
 
 
 def _seconds() -> _Rule:
@@ -105,6 +118,31 @@ def _template() -> _Rule:
     return _Rule(expects, check, is_path=True)
 
 
+def _amount(expects: str, read: Callable[[object], object], *, or_none: bool) -> _Rule:
+    def check(value: object) -> object:
+        nothing = or_none and not isinstance(value, bool) and value in (0, "0")
+        return 0 if nothing else read(value)
+
+    def from_text(text: str) -> object:
+        return int(text) if text.strip().isdecimal() else text.strip()
+
+    return _Rule(expects, check, from_text=from_text)
+
+
+def _node_selector() -> _Rule:
+    def check(value: object) -> dict[str, str]:
+        return dict(_wishes.node_selector(value))
+
+    return _Rule("a dict of the labels of nodes, or a text as 'disk=ssd,zone=a'", check)
+
+
+def _tolerations() -> _Rule:
+    def check(value: object) -> tuple[dict[str, Any], ...]:
+        return tuple(dict(one) for one in _wishes.tolerations(value))
+
+    return _Rule("a list of tolerations, or a text as 'spot,team=a:NoSchedule'", check)
+
+
 def _directory() -> _Rule:
     def check(value: object) -> str:
         if not isinstance(value, str | os.PathLike):
@@ -144,7 +182,8 @@ class Config:
         program. "loopback" does the same through agents, separate processes that reach the
         program over encrypted nng links, as they would on other machines. "kubernetes" runs
         them in pods, which Fiber's operator makes. "auto" is "kubernetes" in a pod whose
-        service account may create FiberPools, and "local" everywhere else.
+        service account may create FiberPools, if the cluster knows these and the operator of
+        the namespace is not gone, and "local" everywhere else.
     agents*: how many agents the loopback backend starts.
     processes_per_agent*: how many processes one agent runs at most, a further one being a
         StartError when all agents are full; 0 means no limit.
@@ -161,6 +200,14 @@ class Config:
     pool*: the name of a FiberPool that is there already, to use instead of making one.
     processes_per_pod*: how many processes one pod runs; it asks for as many times what
         `fiber.meta` says that each needs.
+    cpu_request*: CPUs that one process requests if `fiber.meta` says nothing about them, as
+        there: 0.5 or "500m"; 0 requests none.
+    memory_request*: memory, likewise: 512 or "512Mi"; 0 requests none.
+    shm*: the size of /dev/shm in each pod, as 2048 or "2Gi". It is memory of the pod: the
+        pod's request and limit of memory are larger by it. None means what the container
+        runtime gives, mostly 64 MiB.
+    node_selector*: labels of the nodes of all pods, as in `fiber.meta`, which adds to them.
+    tolerations*: taints that these nodes may have, likewise.
     max_pods*: how many pods one FiberPool of the program may have at most.
     pod_timeout*: seconds that the first pod may take to come, its image included; then the wait
         for it is an error.
@@ -168,13 +215,18 @@ class Config:
     listen_host*: the address at which the program listens for agents; None means the loopback
         address for agents on this machine, and for pods the one that they reach it at, which
         is found.
-    listen_port*: the port for it; 0 takes one that is free.
+    listen_port*: the port for it; 0 takes one that is free. Each FiberPool of a program needs one:
+        of a range such as "9000-9009" it takes the first that is free.
+    advertised_host*: the address that pods dial where it is not the one above, as behind NAT or
+        port forwarding; the port is the same. None means the address that is listened at.
     start_timeout: seconds that a process or an agent may take to start.
     heartbeat_interval*: seconds between two signs of life of an agent.
     suspect_after*: seconds of silence after which an agent gets no new work.
     lost_after*: seconds of silence after which an agent counts as lost, and its tasks run
         elsewhere.
     retries: how many times a task runs again after its worker died.
+    disruptions: how many times a task runs again after the cluster ended its worker, as by a drain
+        or an eviction; that uses up no retry.  Where `retries` is 0 no task runs twice.
     log_level: the least severe records that are shown on stderr, in children too, as by
         `fiber.log_to_stderr()`. "DEBUG" shows workers, processes, agents and links come and go.
     runtime_directory*: where Fiber makes its private directory for sockets and credentials;
@@ -190,16 +242,31 @@ class Config:
     template: str | Mapping[str, Any] | None = _key(None, _template(), fixed=True)
     pool: str | None = _key(None, _pool(), fixed=True)
     processes_per_pod: int = _key(1, _whole(1, 1024), fixed=True)
+    cpu_request: float = _key(
+        0.05, _amount("CPUs, as 0.5 or '500m'", _wishes.cpus, or_none=True), fixed=True
+    )
+    memory_request: int = _key(
+        64, _amount("MiB, or a text as '512Mi'", _wishes.mebibytes, or_none=True), fixed=True
+    )
+    shm: int | None = _key(
+        None,
+        _amount("MiB above 0, or a text as '2Gi'", _wishes.mebibytes, or_none=False),
+        fixed=True,
+    )
+    node_selector: Mapping[str, str] | None = _key(None, _node_selector(), fixed=True)
+    tolerations: Sequence[str | Mapping[str, Any]] | None = _key(None, _tolerations(), fixed=True)
     max_pods: int = _key(1000, _whole(1, 100_000), fixed=True)
     pod_timeout: float = _key(600.0, _seconds(), fixed=True)
     idle_timeout: float = _key(60.0, _seconds(), fixed=True)
     listen_host: str | None = _key(None, _word("a host name or address"), fixed=True)
-    listen_port: int = _key(0, _whole(0, 65535), fixed=True)
+    listen_port: int | str = _key(0, _ports(), fixed=True)
+    advertised_host: str | None = _key(None, _word("a host name or address"), fixed=True)
     start_timeout: float = _key(60.0, _seconds())
     heartbeat_interval: float = _key(1.0, _seconds(), fixed=True)
     suspect_after: float = _key(5.0, _seconds(), fixed=True)
     lost_after: float = _key(15.0, _seconds(), fixed=True)
     retries: int = _key(3, _whole(0))
+    disruptions: int = _key(20, _whole(0))
     log_level: LogLevel = _key("WARNING", _choice(*get_args(LogLevel)))  # noqa: RUF009 - a field
     runtime_directory: str | None = _key(None, _directory(), fixed=True)
 
@@ -220,16 +287,23 @@ if TYPE_CHECKING:
         template: str | os.PathLike[str] | Mapping[str, Any] | None
         pool: str | None
         processes_per_pod: int
+        cpu_request: float | str
+        memory_request: int | str
+        shm: int | str | None
+        node_selector: Mapping[str, str] | None
+        tolerations: Sequence[str | Mapping[str, Any]] | None
         max_pods: int
         pod_timeout: float
         idle_timeout: float
         listen_host: str | None
-        listen_port: int
+        listen_port: int | str
+        advertised_host: str | None
         start_timeout: float
         heartbeat_interval: float
         suspect_after: float
         lost_after: float
         retries: int
+        disruptions: int
         log_level: LogLevel
         runtime_directory: str | os.PathLike[str] | None
 
@@ -422,9 +496,11 @@ AGENT_VARIABLES = frozenset(
         "FIBER_AGENT_ADDRESS",
         "FIBER_AGENT_CREDENTIALS",
         "FIBER_AGENT_INHERITS",
+        "FIBER_AGENT_KEY",
         "FIBER_AGENT_LOST_GRACE",
         "FIBER_AGENT_NAME",
         "FIBER_AGENT_NAMESPACE",
+        "FIBER_AGENT_TERMINATION_GRACE",
         "FIBER_AGENT_WAITS_UNTIL",
         "FIBER_AGENT_PARENT",
         "FIBER_AGENT_POOL",

@@ -81,6 +81,9 @@ _LAST_MOMENT = 0.05
 _NEWS = 2.0
 """Seconds that news of an end may take on a busy machine."""
 
+_PF_EXITING = 0x4
+"""Bit of the flags in /proc/PID/stat, from Linux's ``include/linux/sched.h``."""
+
 
 class Connection(Generic[_Sent_contra, _Received_co]):
     """One end of a pipe.  EOFError when the last holder of the other end has closed it or died."""
@@ -275,19 +278,26 @@ def how_it_ended(process: Any) -> str | None:
     popen = getattr(process, "_popen", None)
     if popen is None:
         return None
-    # The kernel closes what a process held moments before its parent hears of its death.
-    if popen.wait(_LAST_MOMENT) is None and _is_dead(popen.pid):
+    # The parent hears of a death moments after the kernel has closed what the process held.
+    if popen.wait(_LAST_MOMENT) is None and _is_exiting(popen.pid):
         popen.wait(_NEWS)
     return None if popen.report is None else popen.report.describe()
 
 
-def _is_dead(pid: int | None) -> bool:
-    """Whether a process of this host has ended, heard of or not."""
+def _is_exiting(pid: int | None) -> bool:
+    """Return whether a process of this host is gone, a zombie, or inside the kernel's exit.
+
+    The kernel sets PF_EXITING before it closes the descriptors of a process.  On a busy machine the
+    process becomes a zombie long after that.
+    """
     try:
-        with open(f"/proc/{pid}/stat", "rb") as stat:
-            return stat.read().rpartition(b")")[2].split()[0] in (b"Z", b"X")
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            # The name before these fields may contain any character.
+            fields = file.read().rpartition(b")")[2].split()
     except OSError:
         return True
+    state, flags = fields[0], int(fields[6])
+    return state in (b"Z", b"X") or bool(flags & _PF_EXITING)
 
 
 def _as_bytes(message: Message) -> bytes:

@@ -274,9 +274,10 @@ class WorkerDied(FiberError):
     The attributes are the last attempt's: `task` and `worker` are names, `exitcode` follows
     multiprocessing (negative: the signal; None: unknown), `log` holds the last lines that
     the worker wrote, `stack` the Python stacks of its threads if native code crashed,
-    `attempts` counts how often the task was tried. On Kubernetes `pod` and
-    `node` are the names of the worker's pod and of the pod's node, elsewhere None, and `reason`
-    begins with Kubernetes' word where the pod has ended ("OOMKilled: ...").
+    `attempts` counts the runs of the task in which its worker died, `disruptions` those that
+    the cluster ended: by a drain, an eviction, a preemption, a lost node. On Kubernetes `pod`
+    and `node` are the names of the worker's pod and of the pod's node, elsewhere None, and
+    `reason` begins with Kubernetes' word where the pod has ended ("OOMKilled: ...").
     """
 
     def __init__(
@@ -291,6 +292,7 @@ class WorkerDied(FiberError):
         log: Sequence[str] = (),
         stack: str = "",
         attempts: int = 1,
+        disruptions: int = 0,
         pod: str | None = None,
         node: str | None = None,
     ) -> None:
@@ -303,6 +305,7 @@ class WorkerDied(FiberError):
         self.log = tuple(log)
         self.stack = stack
         self.attempts = attempts
+        self.disruptions = disruptions
         self.pod = pod
         self.node = node
         super().__init__(self._message())
@@ -312,7 +315,12 @@ class WorkerDied(FiberError):
             f"worker {self.worker!r} died while it ran {self.task}",
             f"Why: {self.reason} ({self._place()}).",
         ]
-        if self.attempts > 1:
+        if self.disruptions:
+            lines.append(
+                f"The task was tried {self.attempts + self.disruptions} times: its worker died "
+                f"{_times(self.attempts)}, and the cluster ended it {_times(self.disruptions)}."
+            )
+        elif self.attempts > 1:
             lines.append(f"The task was tried {self.attempts} times; each time its worker died.")
         lines.append(f"What to do: {_advice(self.exitcode, self.reason, self.stack)}")
         if self.stack:
@@ -328,18 +336,27 @@ class WorkerDied(FiberError):
         return place + ("" if self.pid is None else f", pid {self.pid}")
 
 
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
 _CRASHES = frozenset({signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFPE, signal.SIGABRT})
 
 
 _ADVICE_BY_WORD = {
-    "Deleted": "find out who deletes the pods; allow more attempts (retries) if that is as it is.",
+    "Deleted": "find out who deletes the pods; if that is as it is, let tasks be shorter, or allow "
+    "more disruptions (disruptions=).",
+    "Drained": "what ended its host gave it no more time. Let tasks be shorter, or allow more "
+    "disruptions (disruptions=); on Kubernetes a pod may have a longer "
+    "terminationGracePeriodSeconds.",
     "Evicted": "its node ran short of what the pod used beyond its share, or is drained. Ask for "
-    "what a task needs with @fiber.meta(memory=, cpu=), or allow more attempts (retries).",
-    "NodeLost": "look at the node; if nodes come and go, allow more attempts (retries).",
+    "what a task needs with @fiber.meta(memory=, cpu=), or allow more disruptions (disruptions=).",
+    "NodeLost": "look at the node; if nodes come and go, allow more disruptions (disruptions=).",
     "OOMKilled": "give each process more memory than that with @fiber.meta(memory=), or let a task "
     "hold less.",
     "Preempted": "pods of a higher priority took its place. Give these a priorityClassName in the "
-    "template of fiber.init(), let tasks be shorter, or allow more attempts (retries).",
+    "template of fiber.init(), let tasks be shorter, or allow more disruptions "
+    "(disruptions=).",
     "WrongAnswer": "only Fiber itself writes to the channel of a worker. Look for code in the task "
     "or its libraries that does so, or that writes to descriptors which are not its own.",
 }

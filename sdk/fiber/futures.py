@@ -9,7 +9,7 @@ from __future__ import annotations
 import concurrent.futures
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     ALL_COMPLETED,
     FIRST_COMPLETED,
@@ -78,7 +78,9 @@ class Executor(concurrent.futures.Executor):
 
     * A task whose worker dies runs again elsewhere, at most ``retries`` times (None: as
       configured), then it raises ``WorkerDied``, which is a BrokenProcessPool; other tasks never
-      notice.  The executor is broken only when no worker starts.
+      notice.  The executor is broken only when no worker starts.  A worker that the cluster ends
+      (drained, evicted, preempted, its node lost) uses up no retry: its task runs again at most
+      ``disruptions`` times (None: as configured, and with ``retries=0`` never).
     * A task that raises one of ``retry_exceptions`` runs again, too, before the exception counts.
     * A worker that has had nothing to do for ``idle_timeout`` seconds (None: for ever) leaves.
     * On Kubernetes workers have what ``fiber.meta`` or ``options`` says that their tasks need;
@@ -96,6 +98,7 @@ class Executor(concurrent.futures.Executor):
         *,
         max_tasks_per_child: int | None = None,
         retries: int | None = None,
+        disruptions: int | None = None,
         retry_exceptions: type[BaseException] | Sequence[type[BaseException]] = (),
         idle_timeout: float | None = options.IDLE_TIMEOUT,
         pool: str | None = None,
@@ -104,6 +107,7 @@ class Executor(concurrent.futures.Executor):
             raise TypeError("initializer must be a callable")
         self._max_workers = options.positive("max_workers", max_workers) or cpu.cpu_count()
         like = process_type(methods.settle()) if mp_context is None else _process(mp_context)
+        limits = options.limits(retries, disruptions)
         self._group = ExecutorGroup(
             PoolOptions(
                 new_process=partial(PoolProcess, like=like),
@@ -112,7 +116,7 @@ class Executor(concurrent.futures.Executor):
                 minimum=0,
                 maximum=self._max_workers,
                 max_tasks=options.positive("max_tasks_per_child", max_tasks_per_child),
-                retries=options.retries(retries),
+                limits=limits,
                 retryable=options.exceptions(retry_exceptions),
                 idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
                 resources=Resources(pool=pool),
@@ -122,7 +126,9 @@ class Executor(concurrent.futures.Executor):
             runtime(),
         )
         self._wishes = Resources()
-        self._retries: int | None = None
+        self._retries = retries
+        self._disruptions = disruptions
+        self._limits = limits
         self._timeout: float | None = None
         self._queues: dict[Engine, CallQueue] = {}
 
@@ -132,22 +138,36 @@ class Executor(concurrent.futures.Executor):
         cpu: float | str | None = None,
         memory: int | str | None = None,
         gpu: int | None = None,
+        resources: Mapping[str, int] | None = None,
+        node_selector: Mapping[str, str] | None = None,
+        tolerations: Sequence[str | Mapping[str, Any]] | None = None,
         retries: int | None = None,
+        disruptions: int | None = None,
         timeout: float | None = None,
     ) -> Executor:
         """This executor, with options for what is submitted through what this returns.
 
-        ``executor.options(memory="8Gi", retries=0).submit(f)``, as Ray spells it.  ``cpu``,
-        ``memory`` and ``gpu`` are wishes as in ``fiber.meta``; tasks with different wishes have
-        different workers, ``max_workers`` of each kind.  A task that runs for longer than
+        ``executor.options(memory="8Gi", retries=0).submit(f)``, as Ray spells it.  The options
+        from ``cpu`` to ``tolerations`` are wishes as in ``fiber.meta``; tasks with different wishes
+        have different workers, ``max_workers`` of each kind.  A task that runs for longer than
         ``timeout`` seconds raises ``fiber.TimeoutError``, and its worker is replaced.  What is left
         out is as it was.  To shut down either is to shut down both.
         """
         other = object.__new__(type(self))
         vars(other).update(vars(self))
-        other._wishes = merged(self._wishes, wished("Executor.options", cpu, memory, gpu))
-        if retries is not None:
-            other._retries = options.retries(retries)
+        wishes = wished(
+            "Executor.options",
+            cpu,
+            memory,
+            gpu,
+            resources=resources,
+            node_selector=node_selector,
+            tolerations=tolerations,
+        )
+        other._wishes = merged(self._wishes, wishes)
+        other._retries = self._retries if retries is None else retries
+        other._disruptions = self._disruptions if disruptions is None else disruptions
+        other._limits = options.limits(other._retries, other._disruptions)
         if timeout is not None:
             other._timeout = options.seconds("timeout", timeout)
         other._queues = {}
@@ -196,7 +216,7 @@ class Executor(concurrent.futures.Executor):
                 unit=unit,
                 exact=unit == 1,
                 timeout=self._timeout,
-                retries=self._retries,
+                limits=self._limits,
             )
         except Exception as error:  # it does not pickle
             engine.reject(results._buffer, error)
@@ -227,7 +247,7 @@ class Executor(concurrent.futures.Executor):
         raise NotImplementedError("executors cannot be passed between processes or pickled")
 
     def _queue(self, engine: Engine) -> CallQueue:
-        queue = CallQueue(retries=self._retries, timeout=self._timeout, cancellable=True)
+        queue = CallQueue(limits=self._limits, timeout=self._timeout, cancellable=True)
         return self._queues.setdefault(engine, queue)  # another thread may be here as well
 
     # What libraries look at

@@ -74,7 +74,9 @@ class Pool:
       ``processes``, make the pool follow the work.  A worker above ``min_workers`` that has had
       nothing to do for ``idle_timeout`` seconds (None: for ever) leaves.
     * A task whose worker dies runs again elsewhere, at most ``retries`` times (None: as
-      configured), then it raises ``WorkerDied``; other tasks never notice.
+      configured), then it raises ``WorkerDied``; other tasks never notice.  A worker that the
+      cluster ends (drained, evicted, preempted, its node lost) uses up no retry: its task runs
+      again at most ``disruptions`` times (None: as configured, and with ``retries=0`` never).
     * A task that raises one of ``retry_exceptions`` (with ``error_handling=True`` any Exception)
       runs again, too, before the exception counts.
     * A task that runs for longer than ``task_timeout`` seconds, or the ``timeout=`` of its call,
@@ -97,6 +99,7 @@ class Pool:
         min_workers: int | None = None,
         max_workers: int | None = None,
         retries: int | None = None,
+        disruptions: int | None = None,
         retry_exceptions: type[BaseException] | Sequence[type[BaseException]] = (),
         error_handling: bool = False,
         task_timeout: float | None = None,
@@ -119,7 +122,7 @@ class Pool:
                 minimum=minimum,
                 maximum=maximum,
                 max_tasks=self._maxtasksperchild,
-                retries=options.retries(retries),
+                limits=options.limits(retries, disruptions),
                 retryable=(Exception,) if error_handling else options.exceptions(retry_exceptions),
                 idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
                 resources=Resources(pool=pool),

@@ -115,18 +115,12 @@ class Queue(Generic[_T]):
             raise ValueError(f"Queue {self!r} is closed")
         if not block:
             timeout = 0
-        message = None
-        try:
-            message = self._inbox.recv() if timeout is None else self._receive_within(timeout)
-        finally:
-            if message is not None:
-                self._slots.free()
-        item: _T = packet.loads(message)
+        item: _T = packet.loads(self._receive_within(timeout))
         return item
 
-    def _receive_within(self, timeout: float) -> Message:
-        deadline = time.monotonic() + timeout
-        while (message := self._inbox.try_recv()) is None:
+    def _receive_within(self, timeout: float | None) -> Message:
+        deadline = 0.0 if timeout is None else time.monotonic() + timeout
+        while (message := self._slots.receive(self._inbox, wait=timeout is None)) is None:
             left = deadline - time.monotonic()
             if left <= 0 or not self._inbox.poll(left):
                 raise Empty

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-import math
-import re
 import sys
 import types
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
+
+from fiber import _wishes
 
 __all__ = ["Resources", "largest", "merged", "meta", "resources_of", "wished", "with_resources"]
 
@@ -17,6 +17,8 @@ _ATTRIBUTE = "__fiber_meta__"
 _RUN_BY_A_MANAGER = "_run_server"
 """What a manager's class has in multiprocessing: the function that is run in its process."""
 _F = TypeVar("_F", bound=Callable[..., Any])
+_N = TypeVar("_N", int, float)
+_V = TypeVar("_V", int, str)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +33,12 @@ class Resources:
     """GPUs."""
     pool: str | None = None
     """The FiberPool whose pods are meant; None: one of the program's own."""
+    extended: _wishes.Counts = ()
+    """Extended resources and how many of each."""
+    node_selector: _wishes.Pairs = ()
+    """Labels that the node must have."""
+    tolerations: tuple[_wishes.Toleration, ...] = ()
+    """Taints that the node may have."""
 
 
 def meta(
@@ -38,11 +46,19 @@ def meta(
     cpu: float | str | None = None,
     memory: int | str | None = None,
     gpu: int | None = None,
+    resources: Mapping[str, int] | None = None,
+    node_selector: Mapping[str, str] | None = None,
+    tolerations: Sequence[str | Mapping[str, Any]] | None = None,
 ) -> Callable[[_F], _F]:
     """Give a function wishes for resources, heeded by backends that can grant them.
 
     `cpu` counts CPUs (2, 0.5, "500m"), `memory` is in MiB or has a unit (512, "512Mi",
-    "2Gi"), `gpu` counts GPUs. The wishes are the returned function's alone: the one that was
+    "2Gi"), `gpu` counts GPUs of NVIDIA. `resources` counts any other extended resource of
+    Kubernetes, as `{"amd.com/gpu": 1}`. `node_selector` has the labels of the nodes that may
+    run it, as `{"disk": "ssd"}`. `tolerations` has the taints that these nodes may have, as
+    kubectl writes them (`["spot", "team=a:NoSchedule"]`) or as dicts of a pod's spec.
+
+    The wishes are the returned function's alone: the one that was
     passed in stays as it was, so `small = fiber.meta(cpu=1)(f)` and `large =
     fiber.meta(cpu=8)(f)` may be used side by side. Wishes for a function that has some are
     added to them, the outer ones winning. What is returned behaves and pickles like the
@@ -50,9 +66,13 @@ def meta(
 
     A manager's class may be given wishes too: they are those of the process that serves it.
     """
-    wishes = wished("fiber.meta", cpu, memory, gpu)
+    placement = {"resources": resources, "node_selector": node_selector, "tolerations": tolerations}
+    wishes = wished("fiber.meta", cpu, memory, gpu, **placement)
     if wishes == Resources():
-        raise TypeError("fiber.meta() needs at least one of cpu=, memory= and gpu=")
+        raise TypeError(
+            "fiber.meta() needs at least one of cpu=, memory=, gpu=, resources=, node_selector= "
+            "and tolerations="
+        )
 
     def decorate(function: _F) -> _F:
         if isinstance(function, type) and hasattr(function, _RUN_BY_A_MANAGER):
@@ -72,10 +92,33 @@ def meta(
 
 
 def wished(
-    where: str, cpu: float | str | None, memory: int | str | None, gpu: int | None
+    where: str,
+    cpu: float | str | None = None,
+    memory: int | str | None = None,
+    gpu: int | None = None,
+    *,
+    resources: object = None,
+    node_selector: object = None,
+    tolerations: object = None,
 ) -> Resources:
     """Wishes as a person spells them, see ``meta``; ``where`` is what errors call the place."""
-    return Resources(cpu=_cpu(cpu, where), memory=_memory(memory, where), gpu=_gpu(gpu, where))
+
+    def read(name: str, value: object, reader: Callable[[object], Any], default: Any) -> Any:
+        if value is None:
+            return default
+        try:
+            return reader(value)
+        except ValueError as error:
+            raise ValueError(f"{where}({name}={value!r}): {error}") from None
+
+    return Resources(
+        cpu=read("cpu", cpu, _wishes.cpus, None),
+        memory=read("memory", memory, _wishes.mebibytes, None),
+        gpu=read("gpu", gpu, _wishes.count, None),
+        extended=read("resources", resources, _wishes.extended_resources, ()),
+        node_selector=read("node_selector", node_selector, _wishes.node_selector, ()),
+        tolerations=read("tolerations", tolerations, _wishes.tolerations, ()),
+    )
 
 
 def resources_of(function: Callable[..., Any]) -> Resources:
@@ -93,19 +136,52 @@ def with_resources(function: _F, wishes: Resources) -> _F:
 
 
 def largest(wishes: Iterable[Resources]) -> Resources:
-    """Of each the most that any of them wishes; they have no pool."""
-    most: dict[str, Any] = {}
+    """Of each resource the most that any of them wishes, and the nodes that suit them all.
+
+    They have no pool. ValueError if two wish different values of one label of a node.
+    """
+    total = Resources()
     for one in wishes:
-        for name in ("cpu", "memory", "gpu"):
-            asked = [wish for wish in (most.get(name), getattr(one, name)) if wish is not None]
-            most[name] = max(asked, default=None)
-    return Resources(**most)
+        labels = dict(total.node_selector)
+        for key, value in one.node_selector:
+            if labels.setdefault(key, value) != value:
+                raise ValueError(
+                    f"one worker cannot be on a node with {key}={labels[key]} and with "
+                    f"{key}={value}, which its parts wish. Give them the same node_selector"
+                )
+        both = dict(total.extended)
+        total = replace(
+            merged(total, one),
+            cpu=_most(total.cpu, one.cpu),
+            memory=_most(total.memory, one.memory),
+            gpu=_most(total.gpu, one.gpu),
+            extended=_merged(both.items(), ((k, max(n, both.get(k, 0))) for k, n in one.extended)),
+            pool=None,
+        )
+    return total
 
 
 def merged(inner: Resources, outer: Resources) -> Resources:
     """What ``inner`` wishes and ``outer`` adds or wishes otherwise."""
-    given = {f.name: getattr(outer, f.name) for f in fields(outer)}
-    return replace(inner, **{name: wish for name, wish in given.items() if wish is not None})
+    return Resources(
+        cpu=inner.cpu if outer.cpu is None else outer.cpu,
+        memory=inner.memory if outer.memory is None else outer.memory,
+        gpu=inner.gpu if outer.gpu is None else outer.gpu,
+        pool=inner.pool if outer.pool is None else outer.pool,
+        extended=_merged(inner.extended, outer.extended),
+        node_selector=_merged(inner.node_selector, outer.node_selector),
+        tolerations=tuple(dict.fromkeys(inner.tolerations + outer.tolerations)),
+    )
+
+
+def _most(one: _N | None, other: _N | None) -> _N | None:
+    return max((wish for wish in (one, other) if wish is not None), default=None)
+
+
+def _merged(
+    inner: Iterable[tuple[str, _V]], outer: Iterable[tuple[str, _V]]
+) -> tuple[tuple[str, _V], ...]:
+    return tuple(sorted({**dict(inner), **dict(outer)}.items()))
 
 
 # ---- attaching ------------------------------------------------------------------------------
@@ -178,43 +254,3 @@ class _FunctionWithWishes:
         if name and self.__module__ != "__main__" and _is_bound_to_its_name(self):
             return name
         return _FunctionWithWishes, (self._function, resources_of(self))
-
-
-# ---- reading --------------------------------------------------------------------------------
-
-
-def _cpu(value: float | str | None, where: str) -> float | None:
-    if value is None:
-        return None
-    number: object = value
-    if isinstance(value, str) and (match := re.fullmatch(r"(\d+(?:\.\d+)?)(m?)", value)):
-        number = float(match[1]) / (1000 if match[2] else 1)
-    if isinstance(number, int | float) and not isinstance(number, bool) and 0 < number < math.inf:
-        return float(number)
-    raise ValueError(f"{where}(cpu={value!r}): expected CPUs above 0, as 2, 0.5 or '500m'")
-
-
-_MIB_PER_UNIT = {"Mi": 1, "Gi": 1024, "Ti": 1024 * 1024}
-
-
-def _memory(value: int | str | None, where: str) -> int | None:
-    if value is None:
-        return None
-    number: object = value
-    if isinstance(value, str) and (match := re.fullmatch(r"(\d+(?:\.\d+)?)(Mi|Gi|Ti)", value)):
-        number = math.ceil(float(match[1]) * _MIB_PER_UNIT[match[2]])
-    if isinstance(number, int) and not isinstance(number, bool) and number > 0:
-        return number
-    raise ValueError(
-        f"{where}(memory={value!r}): expected MiB above 0 as a whole number, "
-        "or a text with unit Mi, Gi or Ti, as '512Mi' or '2Gi'"
-    )
-
-
-def _gpu(value: int | None, where: str) -> int | None:
-    if value is None:
-        return None
-    number: object = value
-    if isinstance(number, int) and not isinstance(number, bool) and number >= 0:
-        return number
-    raise ValueError(f"{where}(gpu={value!r}): expected a whole number, 0 or more")

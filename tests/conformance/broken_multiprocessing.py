@@ -23,6 +23,8 @@ class SimpleQueue(multiprocessing.queues.SimpleQueue):  # type: ignore[no-redef,
     def close(self) -> None:
         match os.environ["BROKEN"]:
             case "hang":
+                for lock in (self._rlock, self._wlock):  # type: ignore[attr-defined]
+                    print("semaphore", lock._semlock.name, flush=True)
                 threading.Event().wait()
             case "crash":
                 os._exit(3)

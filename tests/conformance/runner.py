@@ -29,6 +29,7 @@ import census
 TESTS = Path(__file__).resolve().parents[1]
 WORKER = (sys.executable, "-m", "conformance.cpython_suite.worker")
 MARKER = "CONFORMANCE_GROUP"
+TRACKER = "multiprocessing.resource_tracker import main"
 EXIT_LIMIT = 10.0  # seconds for an interpreter to end after its last test
 GONE_LIMIT = 5.0  # seconds for the processes of an ended interpreter to be gone
 TAIL = 6000  # characters of output kept for a failure
@@ -225,11 +226,11 @@ class _Interpreter:
     def _conclude(self, process: subprocess.Popen[bytes], output: IO[bytes], hung: bool) -> None:
         if hung:
             self._dump_stacks(process)
-        left = [] if hung else self._left_behind(process)
-        census.kill(self._started(process))
-        if hung:
+            census.kill(self._started(process, trackers=False))
             process.kill()
             process.wait()
+        left = self._left_behind(process)
+        census.kill(left)
         output.seek(0)
         tail = output.read().decode(errors="replace")[-TAIL:]
         if hung:
@@ -259,7 +260,7 @@ class _Interpreter:
 
     def _dump_stacks(self, process: subprocess.Popen[bytes]) -> None:
         """SIGABRT makes faulthandler print the stacks of all threads of a process."""
-        for pid in (process.pid, *(found.pid for found in self._started(process))):
+        for pid in (process.pid, *(found.pid for found in self._started(process, trackers=False))):
             try:
                 os.kill(pid, signal.SIGABRT)
             except ProcessLookupError:
@@ -270,8 +271,12 @@ class _Interpreter:
         census.wait_until(lambda: not self._started(process), GONE_LIMIT)
         return self._started(process)
 
-    def _started(self, process: subprocess.Popen[bytes]) -> list[census.Found]:
-        return census.started_by(process.pid, f"{MARKER}={self._marker}")
+    def _started(
+        self, process: subprocess.Popen[bytes], *, trackers: bool = True
+    ) -> list[census.Found]:
+        """Find its processes.  Resource trackers remove what others made, and end after them."""
+        found = census.started_by(process.pid, f"{MARKER}={self._marker}")
+        return [one for one in found if trackers or TRACKER not in one.command]
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,9 @@ def test_a_hang_is_named_with_its_stack_and_the_rest_runs() -> None:
     assert "broken_multiprocessing.py" in detail
     assert "in close" in detail
     assert "Alone in an interpreter: hang." in detail
+    names = re.findall(r"^semaphore /(.+)$", detail, re.MULTILINE)
+    assert len(names) == 2
+    assert not [name for name in names if Path(f"/dev/shm/sem.{name}").exists()]
 
 
 def test_a_crash_is_named_with_its_status_and_the_rest_runs() -> None:

@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from fakes.store import Body, Failure, Store
+from fiber._transport import credentials_file
 from fiber_api import names
+from patience import PATIENCE
 
-GRACE = 5.0
-"""Seconds that an agent has to end once its pod is deleted."""
+GRACE = "4"
+"""Seconds that agents believe they have to end, once their pod is deleted."""
 
 
 class AgentKubelet:
@@ -95,19 +97,20 @@ class AgentKubelet:
             if self._is_deleted(namespace, name):
                 return None
             pod = self._store.get("pods", namespace, name)
-            mounted = _credentials(pod)
+            mounted = _secret(pod)
             secrets = self._store.list("secrets", namespace)
-            secret = next((s for s in secrets if s["metadata"]["name"] == mounted["name"]), None)
+            secret = next((s for s in secrets if s["metadata"]["name"] == mounted), None)
             address = self._address(namespace, pod["metadata"]["labels"][names.LABEL_POOL])
             if secret is not None and address is not None and self.fails_with is None:
                 break
             await self._store.changed()
-        folder = self._mount(name, mounted["items"], secret["data"])
+        folder = self._mount(name, pod["metadata"]["uid"], secret["data"])
         environment = {
             **{key: value for key, value in os.environ.items() if not key.startswith("FIBER_")},
             **_environment(pod),
             names.ENV_ADDRESS: address,
-            names.ENV_CREDENTIALS: str(folder),
+            names.ENV_CREDENTIALS: str(folder / names.CREDENTIALS_FILE),
+            names.ENV_TERMINATION_GRACE: GRACE,
             "TMPDIR": str(folder),
         }
         process = await asyncio.create_subprocess_exec(
@@ -126,10 +129,19 @@ class AgentKubelet:
         master = self._store.get("fiberpools", namespace, pool)["spec"].get("master")
         return None if master is None else names.address_of(master["host"], master["port"])
 
-    def _mount(self, pod: str, items: list[Body], data: Body) -> Path:
+    def _mount(self, pod: str, uid: str, data: Body) -> Path:
+        """The worker's files, after its init container."""
         folder = self._folders[pod] = Path(tempfile.mkdtemp(prefix="pod-"))
-        for item in items:
-            (folder / item["path"]).write_bytes(base64.b64decode(data[item["key"]]))
+        with tempfile.TemporaryDirectory() as key:
+            for name, value in data.items():
+                (Path(key) / name).write_bytes(base64.b64decode(value))
+            environment = {
+                names.ENV_KEY: key,
+                names.ENV_NAME: pod,
+                names.ENV_UID: uid,
+                names.ENV_CREDENTIALS: str(folder / names.CREDENTIALS_FILE),
+            }
+            assert credentials_file.write(environment) == 0
         return folder
 
     async def _watch(self, namespace: str, name: str, process: asyncio.subprocess.Process) -> None:
@@ -155,7 +167,7 @@ class AgentKubelet:
             change.cancel()
         if not ended.done():
             process.terminate()
-            await asyncio.wait([ended], timeout=GRACE)
+            await asyncio.wait([ended], timeout=PATIENCE)
             if not ended.done():
                 self.forced.append(name)
 
@@ -187,12 +199,10 @@ class AgentKubelet:
         self._store.set_status("pods", namespace, name, status)
 
 
-def _credentials(pod: Body) -> Body:
-    """The Secret that it mounts, and what of it."""
-    volumes = pod["spec"]["volumes"]
-    volume = next(v for v in volumes if v["name"] == names.CREDENTIALS_VOLUME)
-    found: Body = volume["projected"]["sources"][0]["secret"]
-    return found
+def _secret(pod: Body) -> str:
+    """The Secret that its init container mounts."""
+    volume = next(v for v in pod["spec"]["volumes"] if v["name"] == names.KEY_VOLUME)
+    return str(volume["secret"]["secretName"])
 
 
 def _environment(pod: Body) -> dict[str, str]:

@@ -86,6 +86,8 @@ class KubernetesApi:
         """How many objects a list has at most though nobody asks for pages; 0: all."""
         self.watch_delay = 0.0
         """Seconds between a change and its event."""
+        self.largest_answer = 0
+        """Bytes of the largest list, or event of a watch, that was sent."""
         self.silent = False
         """Watches that are open bring nothing any more, not even bookmarks, and do not end."""
         self.down = False
@@ -160,14 +162,21 @@ class KubernetesApi:
     async def _carry_out(self, request: web.Request, call: Call) -> web.StreamResponse:
         body = json.loads(await request.read() or b"{}")
         try:
-            return web.json_response(self._perform(request, call, body))
+            answer = web.json_response(self._perform(request, call, body))
         except Failure as failure:
             return _refused(failure)
+        if call.verb == "list":
+            self._sent(answer.body)
+        return answer
+
+    def _sent(self, data: object) -> None:
+        if isinstance(data, bytes):
+            self.largest_answer = max(self.largest_answer, len(data))
 
     def _perform(self, request: web.Request, call: Call, body: Body) -> Body:
         where = (call.plural, call.namespace or "", call.name)
         if call.verb == "list":
-            return self._list(request, call)
+            return _list_as_asked(request, self._list(request, call))
         if call.verb == "get":
             return self.store.get(*where)
         if call.verb == "create":
@@ -242,7 +251,9 @@ class KubernetesApi:
                     and matches(found, selector)
                     and has_fields(found, fields)
                 ):
-                    await response.write(line(change.type, change.object))
+                    data = line(change.type, _as_asked(request, found))
+                    self._sent(data)
+                    await response.write(data)
             if self.store.changes and self.store.changes[-1].version > seen:
                 continue  # it came while the last ones were written
             try:
@@ -312,6 +323,23 @@ def _group(version: str) -> Body:
     name, short = version.split("/")
     entry = {"groupVersion": version, "version": short}
     return {"name": name, "versions": [entry], "preferredVersion": entry}
+
+
+def _as_asked(request: web.Request, body: Body) -> Body:
+    """The object, or its metadata alone where the client asks for that."""
+    if "as=PartialObjectMetadata" not in request.headers.get("Accept", ""):
+        return body
+    about = {"apiVersion": "meta.k8s.io/v1", "kind": "PartialObjectMetadata"}
+    return {**about, "metadata": body["metadata"]}
+
+
+def _list_as_asked(request: web.Request, found: Body) -> Body:
+    if "as=PartialObjectMetadataList" not in request.headers.get("Accept", ""):
+        return found
+    about = {"apiVersion": "meta.k8s.io/v1", "kind": "PartialObjectMetadataList"}
+    # As the API server does it, an empty list of metadata has null for its items.
+    items = [_as_asked(request, item) for item in found["items"]] or None
+    return {**found, **about, "items": items}
 
 
 def _refused(failure: Failure) -> web.Response:

@@ -22,8 +22,10 @@ KINDS = {
     "services": ("v1", "Service"),
     "secrets": ("v1", "Secret"),
     "events": ("v1", "Event"),
+    "persistentvolumeclaims": ("v1", "PersistentVolumeClaim"),
     "namespaces": ("v1", "Namespace"),
     "endpointslices": ("discovery.k8s.io/v1", "EndpointSlice"),
+    "poddisruptionbudgets": ("policy/v1", "PodDisruptionBudget"),
     "leases": ("coordination.k8s.io/v1", "Lease"),
     "customresourcedefinitions": ("apiextensions.k8s.io/v1", "CustomResourceDefinition"),
 }
@@ -70,6 +72,8 @@ class Store:
         self._objects: dict[Place, Body] = {}
         self._version = 100
         self._addresses = 0
+        self.dual_stack = False
+        """Whether Services may have addresses of both IP families."""
         self._bell = asyncio.Event()
         self.changes: list[Change] = []
         self.oldest = 0
@@ -135,7 +139,11 @@ class Store:
             body["status"] = {"phase": "Pending"}
         if plural == "services":
             self._addresses += 1
-            body["spec"] = {"clusterIP": f"10.96.0.{self._addresses}", **body.get("spec", {})}
+            spec = {"clusterIP": f"10.96.0.{self._addresses}", **body.get("spec", {})}
+            if self.dual_stack and spec.get("ipFamilyPolicy") == "PreferDualStack":
+                both = [spec["clusterIP"], f"fd00:96::{self._addresses}"]
+                spec = {"clusterIPs": both, **spec}
+            body["spec"] = spec
         self._put("ADDED", (plural, namespace, name), body)
         self.created(plural, body)
         return self.get(plural, namespace, name)

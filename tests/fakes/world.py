@@ -14,12 +14,12 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from typing import Any
 
 from fakes import virtual_time
+from fakes.certificates import make_certificates
 from fakes.kubelet import Kubelet
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.memory_connector import MemoryConnector
 from fakes.store import Body, Failure, Store
 from fiber_api import names
-from fiber_api.certificates import make_pool_certificates
 from fiber_operator.cluster import Configuration
 from fiber_operator.program import Program
 from fiber_operator.settings import Settings
@@ -34,7 +34,7 @@ TEMPLATE = {"spec": {"containers": [{"name": "worker", "image": "registry/worker
 @functools.cache
 def _any_authority() -> str:
     # Loading the system's authorities takes longer than a test.
-    return make_pool_certificates("any", "any").authority
+    return make_certificates("any", "any").authority
 
 
 def configuration(api: KubernetesApi) -> Configuration:

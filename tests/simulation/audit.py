@@ -132,7 +132,7 @@ class Audit:
 
     def _check_tasks(self, batch: Batch, job: Job) -> None:
         require(1 <= len(batch.items) <= LIMIT, f"a batch has {len(batch.items)} tasks")
-        if job.alone or batch.pin or not job.retries:
+        if job.alone or batch.pin or not job.charges.limits.retries:
             require(len(batch.items) == 1, "tasks that travel alone share a batch")
             require(batch.alone, "a task that travels alone is not marked")
         account = self._names.account(job)
@@ -198,7 +198,11 @@ class Audit:
         self._real.put_back(worker, seqs, now)
 
     def _lose(
-        self, worker: Worker, unread: Iterable[int], running: tuple[int, int] | None
+        self,
+        worker: Worker,
+        unread: Iterable[int],
+        running: tuple[int, int] | None,
+        disrupted: bool = False,
     ) -> list[Loss]:
         held = [
             (
@@ -206,22 +210,24 @@ class Audit:
                 batch.seq,
                 at,
                 batch.start + at,
-                batch.job.attempts.get(batch.start + at, 0),
+                _charged(batch.job, batch.start + at),
                 batch.items[at],
             )
             for batch in worker.queue
             if batch.job is not None
             for at in range(batch.received, len(batch.items))
         ]
-        losses: list[Loss] = self._real.lose(worker, unread, running)
+        losses: list[Loss] = self._real.lose(worker, unread, running, disrupted)
         given_up = {(loss.job, loss.task): loss for loss in losses}
         for job, seq, offset, index, attempts, item in held:
             ref = self._names.ref(job, index, item)
             loss = given_up.get((job, index))
-            now = loss.attempts if loss is not None else job.attempts.get(index, 0)
+            now = sum(loss.counts) if loss is not None else _charged(job, index)
             require(attempts <= now <= attempts + 1, f"{ref} goes from {attempts} to {now}")
             require(loss is None or loss.item is item, "a loss names another task")
-            self._check_charge(self._names.child(worker), seq, offset, ref, now > attempts)
+            self._check_charge(
+                self._names.child(worker), seq, offset, ref, now > attempts, disrupted
+            )
             if loss is not None:
                 self._world.note("%s is given up", ref)
         return losses
@@ -250,9 +256,11 @@ class Audit:
         require(worker in self._ledger.workers, "a worker is returned that is gone")
         self._lent.discard(worker)
 
-    def _check_charge(self, child: Child, seq: int, offset: int, ref: Ref, charged: bool) -> None:
+    def _check_charge(
+        self, child: Child, seq: int, offset: int, ref: Ref, charged: bool, disrupted: bool
+    ) -> None:
         if charged:
-            self._world.oracle.blamed(child, seq, offset, ref)
+            self._world.oracle.blamed(child, seq, offset, ref, disrupted)
         else:
             self._world.oracle.spared(child, ref)
 
@@ -375,3 +383,8 @@ def _check_places(job: Job, account: Account, places: list[tuple[str, int, int]]
         raise Violation(f"tasks {account.everything & ~seen:b} of job {number} are nowhere")
     done = account.delivered.bit_count()
     require(job.done == done, f"job {number} counts {job.done}, not {done}, as done")
+
+
+def _charged(job: Job, index: int) -> int:
+    charges = job.charges
+    return charges.deaths.get(index, 0) + charges.disruptions.get(index, 0)

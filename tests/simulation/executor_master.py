@@ -22,7 +22,7 @@ from fiber.errors import StartError
 from fiber.process import ForkProcess, PoolProcess
 from simulation.agents import Child
 from simulation.audit import Audit
-from simulation.oracle import Account, Violation, require
+from simulation.oracle import Account, Violation, limits_of, require
 from simulation.outcomes import HEARD, BrokenInput, Outcomes
 from simulation.pool_audit import PoolAudit, Reading
 from simulation.schedule import Act, Job, Schedule, Task
@@ -450,7 +450,7 @@ def _options(schedule: Schedule) -> PoolOptions:
         minimum=schedule.min_workers,
         maximum=schedule.max_workers,
         max_tasks=schedule.left,
-        retries=schedule.jobs[0].retries,
+        limits=limits_of(schedule.jobs[0]),
         retryable=(Again,) if _retries(schedule) else (),
         idle_timeout=60.0 if schedule.linger is None else schedule.linger + 1e-3,
     )

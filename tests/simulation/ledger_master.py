@@ -14,7 +14,7 @@ from fiber._engine.chunks import Pace
 from fiber._engine.ledger import Ledger, WrongAnswer
 from simulation.agents import Child
 from simulation.audit import Audit
-from simulation.oracle import Account, Violation, require
+from simulation.oracle import Account, Violation, limits_of, require
 from simulation.schedule import Act, Famine, Schedule
 from simulation.workers import NO_OP, Ready, Ref, Results, Unreadable, Work, Worker
 from simulation.world import World
@@ -64,6 +64,9 @@ class Member:
     def recalled(self, seqs: list[int]) -> None:
         """It did not read these."""
         self._master.recalled(self, seqs)
+
+    def draining(self) -> None:
+        """Its host is about to go."""
 
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
@@ -141,7 +144,7 @@ class LedgerMaster:
         # Every other job runs a function that is known already.
         pace = self._pace if account.number % 2 else None
         job = self.ledger.open(
-            account, pace=pace, retries=plan.retries, unit=plan.unit, alone=plan.alone
+            account, pace=pace, limits=limits_of(plan), unit=plan.unit, alone=plan.alone
         )
         self._pace = Pace(job.pace)
         self.jobs[account.number] = job
@@ -284,11 +287,11 @@ class LedgerMaster:
         self._settle()
 
     def _lose(self, worker: engine.Worker, report: ExitReport) -> None:
-        losses = self.ledger.lose(worker, report.unread, report.running)
+        losses = self.ledger.lose(worker, report.unread, report.running, report.disrupted)
         self._direct.pop(worker, None)
         losses = [loss for loss in losses if loss.item != NO_OP]
         for loss in losses:
-            self.world.oracle.died(loss.item, loss.attempts)
+            self.world.oracle.died(loss.item, *loss.counts)
         for job in {loss.job for loss in losses}:
             self._look(job)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
+from fiber._engine.charges import Limits
 from simulation.schedule import Act, Job, Schedule
 from simulation.workers import NO_OP, Ref, Worker
 
@@ -23,6 +24,11 @@ def require(condition: bool, otherwise: str) -> None:
     """Violation unless ``condition`` holds."""
     if not condition:
         raise Violation(otherwise)
+
+
+def limits_of(plan: Job) -> Limits:
+    """Return how often a task of a job may run again; few disruptions, so that all are used up."""
+    return Limits(plan.retries, 2 if plan.retries else 0)
 
 
 class Account:
@@ -45,6 +51,7 @@ class Account:
         self.forgiven: dict[int, int] = defaultdict(int)
         """Runs of a task that ended in an error which the pool was told to retry."""
         self.charges: dict[int, int] = defaultdict(int)
+        self.disruptions: dict[int, int] = defaultdict(int)
 
     @property
     def everything(self) -> int:
@@ -117,13 +124,17 @@ class Oracle:
         if outcome is Act.RETRIED and self._tries(account, ref) < account.plan.retries:
             raise Violation(f"{ref} fails, though it could have been tried again")
 
-    def died(self, ref: Ref, attempts: int) -> None:
-        """The user hears that a task killed its last worker."""
+    def died(self, ref: Ref, deaths: int, disruptions: int) -> None:
+        """The user hears that a task has lost its last worker."""
         account = self.accounts[ref.job]
-        if attempts != account.plan.retries + 1:
-            raise Violation(f"{ref} is given up after {attempts} of {account.plan.retries} retries")
-        if self._tries(account, ref) < attempts:
-            raise Violation(f"{ref} is blamed for {attempts} losses that it was no part of")
+        limits = limits_of(account.plan)
+        used_up = deaths == limits.retries + 1, disruptions == limits.disruptions + 1
+        if sum(used_up) != 1 or deaths > limits.retries + 1:
+            raise Violation(f"{ref} is given up after {deaths}, {disruptions} of {limits}")
+        if disruptions > limits.disruptions + 1:
+            raise Violation(f"{ref} is given up after {disruptions} disruptions")
+        if self._tries(account, ref) < deaths or account.disruptions[ref.task] < disruptions:
+            raise Violation(f"{ref} is blamed for losses that it was no part of")
         self.delivered(ref, "died")
 
     def tried_again(self, ref: Ref) -> None:
@@ -151,11 +162,12 @@ class Oracle:
 
     # Who is to blame
 
-    def blamed(self, child: Child, seq: int, offset: int, ref: Ref) -> None:
+    def blamed(self, child: Child, seq: int, offset: int, ref: Ref, disrupted: bool) -> None:
         """A task is charged for the end of the worker that held it."""
         if not child.agent.lost and not self._is_suspect(child.worker, seq, offset):
             raise Violation(f"{ref} is blamed for the end of {child.name}, which was not in it")
-        self.accounts[ref.job].charges[ref.task] += 1
+        account = self.accounts[ref.job]
+        (account.disruptions if disrupted else account.charges)[ref.task] += 1
 
     def spared(self, child: Child, ref: Ref) -> None:
         """A task that a lost worker held is not charged."""

@@ -74,7 +74,7 @@ class Outcomes:
             if job is None or ref.task != job.fed:
                 raise Violation(f"the error of the input takes the place of {ref}")
         elif isinstance(error, WorkerDied):
-            self._oracle.died(ref, error.attempts)
+            self._oracle.died(ref, error.attempts, error.disruptions)
         elif isinstance(error, TimeoutError):
             self._oracle.delivered(ref, "too late")
         elif error is not None:

@@ -154,6 +154,10 @@ class Seen:
         """It did not read these."""
         self._observer.recalled(seqs)
 
+    def draining(self) -> None:
+        """Its host is about to go."""
+        self._observer.draining()
+
     def exited(self, report: ExitReport) -> None:
         """It is gone."""
         self.gone = True

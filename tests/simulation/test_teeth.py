@@ -21,19 +21,23 @@ SEEDS = range(600)
 
 
 class ForgetsLostBatches(Ledger):
-    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+    def lose(
+        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+    ) -> list[Loss]:
         for batch in worker.queue:
             del self.batches[batch.seq]
         worker.queue.clear()
-        return super().lose(worker, unread, running)
+        return super().lose(worker, unread, running, disrupted)
 
 
 class KeepsLostBatches(Ledger):
     """Late results of a lost worker count."""
 
-    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+    def lose(
+        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+    ) -> list[Loss]:
         batches = dict(self.batches)
-        losses = super().lose(worker, unread, running)
+        losses = super().lose(worker, unread, running, disrupted)
         self.batches = batches
         return losses
 
@@ -58,30 +62,37 @@ class IgnoresWrongAnswers(Ledger):
 
 
 class ChargesUnread(Ledger):
-    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+    def lose(
+        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+    ) -> list[Loss]:
         return super().lose(worker, (), running)
 
 
 class ChargesAllThatWasRead(Ledger):
-    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+    def lose(
+        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+    ) -> list[Loss]:
         return super().lose(worker, unread, None)
 
 
 class ChargesNobody(Ledger):
-    def lose(self, worker: Worker, unread: Iterable[int], running: Any) -> list[Loss]:
+    def lose(
+        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+    ) -> list[Loss]:
         return super().lose(worker, [batch.seq for batch in worker.queue], running)
 
 
 class GivesUpTooEarly(Ledger):
     def open(self, owner: Any = None, **options: Any) -> Job:
         job = super().open(owner, **options)
-        job.retries = max(0, job.retries - 1)
+        retries = max(0, job.charges.limits.retries - 1)
+        job.charges.limits = job.charges.limits._replace(retries=retries)
         return job
 
 
 class RetriesForEver(Ledger):
     def retry(self, receipt: Receipt, index: int) -> bool:
-        receipt.job.attempts.pop(index, None)
+        receipt.job.charges.deaths.pop(index, None)
         return super().retry(receipt, index)
 
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 import os
 import pickle
 import threading
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 from fiber._agent import child
 from fiber._agent.interface import ExitReport
-from fiber._wire import packet
+from fiber._transport.link import LinkObserver
+from fiber._transport.turns import Lane
+from fiber._wire import messages, packet
+from fiber._wire.messages import BytesLike
 from patience import PATIENCE
 
 
@@ -35,6 +39,9 @@ class Recorder:
     def recalled(self, seqs: list[int]) -> None:
         self.unread = seqs
         self._note("taken back")
+
+    def draining(self) -> None:
+        self._note("draining")
 
     def exited(self, report: ExitReport) -> None:
         self.report = report
@@ -118,3 +125,20 @@ class Handle:
 def write_own_index(fds: list[int]) -> None:
     for index, fd in enumerate(fds):
         os.write(fd, str(index).encode())
+
+
+class ReadLink:
+    """A link whose frames leave at once, and are kept for the test to read."""
+
+    def __init__(self) -> None:
+        self.sent: list[messages.Message] = []
+
+    def attach(self, observer: LinkObserver) -> None:
+        pass
+
+    def send(
+        self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
+    ) -> None:
+        self.sent.append(messages.decode(b"".join(frame)))
+        if on_left is not None:
+            on_left()

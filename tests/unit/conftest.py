@@ -31,7 +31,7 @@ module_loop = pytest.fixture(_running_loop, scope="module", name="module_loop")
 
 @pytest.fixture(scope="module")
 def credentials() -> MasterCredentials:
-    return make_credentials("test")
+    return make_credentials()
 
 
 @pytest.fixture

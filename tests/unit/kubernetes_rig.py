@@ -18,8 +18,8 @@ from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import Master
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._backends.kubernetes.own_pool import OwnPool
-from fiber._backends.kubernetes.secret import make_credentials
 from fiber._backends.kubernetes.warm_pool import WarmPool
+from fiber._transport.credentials import make_credentials
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
 from fiber_api import names
@@ -73,7 +73,7 @@ class Told:
     ended: bool = False
     _changed: threading.Condition = field(default_factory=threading.Condition)
 
-    def on_attached(self) -> None:
+    def on_attached(self, epoch: int) -> None:
         self._note(self.attached, True)
 
     def on_status(self, status: Body) -> None:
@@ -142,7 +142,7 @@ class Rig:
 
     def own(self, told: Told, name: str = "es-1", owner: Body | None = None) -> FiberPoolClient:
         """A client that makes a pool."""
-        credentials = make_credentials(name, NAMESPACE)
+        credentials = make_credentials()
         attachment = OwnPool(self.api, NAMESPACE, pool_body(name), credentials, MASTER, owner)
         return self._client(attachment, told)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import select
 import socket
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any, TypeVar
 
 import pynng
@@ -88,6 +90,7 @@ class Site:
         self.loop = Loop()
         self.loop.start_thread("test-io")
         self._closing: list[Callable[[], None]] = []
+        self._names = (f"agent-{number}" for number in itertools.count(1))
 
     def listener(
         self, address: str = "127.0.0.1:0", keepalive: Keepalive = SHORT
@@ -115,11 +118,13 @@ class Site:
         connect: Callable[[str], socket.socket] | None = None,
     ) -> tuple[AgentDialer, Notes]:
         notes = Notes()
+        if identity is None:
+            identity = Identity.of_this_process(next(self._names), "uid", host="here")
         dialling = AgentDialer(
             self.loop,
             address,
-            credentials or self.credentials.agent_half(),
-            identity or Identity.of_this_process("agent-1", host="here"),
+            credentials or self.credentials.agent(identity.name, identity.uid),
+            identity,
             on_link=notes.on_link,
             on_failed=notes.on_failed,
             timeout=timeout,
@@ -157,6 +162,17 @@ class Site:
         self.loop.stop()
 
 
+@contextlib.contextmanager
+def black_hole() -> Iterator[str]:
+    """An address that answers nothing: what comes in waits for a queue that stays full."""
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as queue:
+        for _ in range(2):
+            waiting = queue.enter_context(socket.socket())
+            waiting.setblocking(False)
+            waiting.connect_ex(full.getsockname())
+        yield f"127.0.0.1:{full.getsockname()[1]}"
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -186,16 +202,14 @@ def vanish(listener: MasterListener) -> None:
 def say(address: str, credentials: Credentials, words: bytes) -> bytes:
     """What a master answers to the first words of somebody with the right credentials."""
     sock = socket.create_connection(("127.0.0.1", port_of(address)))
-    handshake = tls.Handshake(
-        sock, tls.context_of(credentials, listens=False), credentials.server_name
-    )
+    handshake = tls.AgentHandshake(sock, tls.agent_context())
     try:
-        return complete(handshake, handshake.ask(words))
+        return complete(handshake, handshake.ask(credentials, words))
     finally:
         handshake.close()
 
 
-def complete(handshake: tls.Handshake, steps: Generator[int, None, T]) -> T:
+def complete(handshake: tls._Handshake, steps: Generator[int, None, T]) -> T:
     poller = select.poll()
     while True:
         try:

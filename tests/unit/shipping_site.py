@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from fiber._agent import program_folder
-from fiber._backends.program_archive import Entry, list_files, pack
+from fiber._backends.program_archive import pack
+from fiber._backends.program_files import Entry, select
 from fiber._backends.program_layout import Layout, Places
 from fiber._wire.blob import Blob
 
@@ -17,18 +18,20 @@ NOWHERE = program_folder.ProgramPaths((), (), "", None)
 def layout(*folders: Path, program: Path | None = None, files: tuple[Path, ...] = ()) -> Layout:
     """Of a program that has these folders."""
     places = Places({str(folder): folder.name for folder in folders})
-    return Layout(places, str(program or folders[0]), tuple(map(str, files)), frozenset(), NOWHERE)
+    return Layout(
+        places, str(program or folders[0]), tuple(map(str, files)), (), frozenset(), NOWHERE
+    )
 
 
 def files(*folders: Path, **options: Any) -> dict[str, Entry]:
     """What is sent of them."""
-    return list_files(layout(*folders, **options))
+    return select(layout(*folders, **options)).files
 
 
 def packed(*folders: Path, **options: Any) -> bytes:
     """The archive of them."""
     there = layout(*folders, **options)
-    return pack(there, list_files(there))
+    return pack(there, select(there).files)
 
 
 def unpacked(archive: bytes, target: Path) -> Path:

@@ -6,51 +6,48 @@ import contextlib
 import errno
 import os
 import socket
-import ssl
 import threading
 from typing import Any
 
 import pytest
 
+from faults.program import wait_for
 from fiber._transport import acceptor, admission, refusals, tls
 from fiber._transport.admission import Admission
-from fiber._transport.credentials import make_credentials
 from fiber._transport.handshake import Hello, Identity
+from fiber._transport.listener import MasterListener
+from fiber._transport.loop import Loop
 from patience import PATIENCE
 from unit.link_site import Notes, Site, complete, port_of, say
 
-SOON = 0.3
 HELLO = Hello(Identity.of_this_process("stranger"), "0" * 32, 0, False).encode()
 
 
 @pytest.fixture(autouse=True)
-def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(acceptor, "_DEADLINE", SOON)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(acceptor, "_DEADLINE", PATIENCE)
 
 
 class Visitor:
     """Goes as far as told, with an agent's credentials."""
 
     def __init__(self, site: Site, address: str) -> None:
-        half = site.credentials.agent_half()
+        self._credentials = site.credentials.agent("stranger", "")
         self.sock = socket.create_connection(("127.0.0.1", port_of(address)), PATIENCE)
-        self.handshake = tls.Handshake(
-            self.sock, tls.context_of(half, listens=False), half.server_name
-        )
+        self.handshake = tls.AgentHandshake(self.sock, tls.agent_context())
 
     def go(self, state: str) -> None:
         """Up to ``state``, and not a step further."""
         if state == "connected":
             return
         if state == "hello of TLS sent":
-            next(self.handshake.ask(HELLO))
-            return
-        complete(self.handshake, self.handshake._when_ready(self.handshake.sock.do_handshake))
-        if state == "half of its first words":
-            self.handshake.sock.send(self.handshake._ours + (100).to_bytes(4, "big") + b"half")
+            next(self.handshake._when_ready(self.handshake.sock.do_handshake), None)
         elif state == "welcome":
-            complete(self.handshake, self.handshake._write(HELLO))
-            complete(self.handshake, self.handshake._read())
+            complete(self.handshake, self.handshake.ask(self._credentials, HELLO))
+        else:
+            complete(self.handshake, self.handshake._when_ready(self.handshake.sock.do_handshake))
+            if state == "half of its first words":
+                self.handshake.sock.send(self.handshake._ours + (100).to_bytes(4, "big") + b"half")
 
     def rest(self) -> bytes:
         """All that still comes, up to the end."""
@@ -72,6 +69,13 @@ class Visitor:
         self.handshake.close()
 
 
+def pass_time(listener: MasterListener, seconds: float) -> None:
+    """Let the acceptor's clock go forward by ``seconds``."""
+    loop = listener._acceptor.loop
+    loop.now = lambda: Loop.now() + seconds
+    loop.call_soon(lambda: None)  # the loop looks at its clock when it wakes up
+
+
 STATES = (
     "connected",
     "hello of TLS sent",
@@ -91,12 +95,13 @@ def test_who_stops_in_the_middle_is_turned_away_in_time_and_told_once(
         visitor.go(state)
     _, agent = site.dialer(listener.address)
     assert agent.link is not master.link  # they hold up nobody
+    pass_time(listener, PATIENCE)
     for visitor in visitors:
         visitor.rest()
     master.wait(lambda: master.refusals)
     (told,) = master.refusals
     assert told.startswith("127.0.0.1:")
-    assert told.endswith(f"was turned away: it did not prove itself within {SOON:g} s")
+    assert told.endswith(f"was turned away: it did not prove itself within {PATIENCE:g} s")
     assert len(master.links) == 1
 
 
@@ -125,27 +130,32 @@ def test_a_greeting_without_end_is_turned_away(site: Site) -> None:
     assert "its greeting of 4294967295 bytes is too long" in master.refusals[0]
 
 
-def test_a_certificate_of_another_pool_is_told_with_its_fault(site: Site) -> None:
+def test_a_proof_that_is_none_is_told_with_the_name_that_it_claims(site: Site) -> None:
     listener, master = site.listener()
-    half = make_credentials("test").agent_half()
-    context = tls.context_of(half, listens=False)
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    with socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE) as sock:
-        stranger = context.wrap_socket(sock)
-        with pytest.raises(ssl.SSLError, match=r"(?i)unknown.ca|decrypt"):
-            stranger.recv(1)  # it hears why, though the master has nothing to say to it
-        stranger.close()
+    forged = site.credentials.agent("another", "")
+    with pytest.raises(tls.Untrusted, match="does not believe"):
+        say(listener.address, forged, HELLO)
     master.wait(lambda: master.refusals)
-    assert "its certificate is refused" in master.refusals[0]
+    assert "it cannot prove that it is 'stranger'" in master.refusals[0]
     assert master.proofs == []
+
+
+def test_a_proven_agent_takes_no_strangers_place(site: Site) -> None:
+    """Agents that wait for the watch of pods are as many as there are pods."""
+    listener, master = site.listener()
+    listener._knows = lambda identity: None
+    visitor = Visitor(site, listener.address)
+    waiting = visitor.handshake.ask(visitor._credentials, HELLO)
+    while not master.proofs:
+        next(waiting)
+    assert len(listener._acceptor._admission) == 0
+    visitor.close()
 
 
 def test_a_crowd_from_one_address_is_bounded_and_keeps_nobody_out(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(acceptor, "_MOST", 8)
-    monkeypatch.setattr(acceptor, "_DEADLINE", 60.0)
     monkeypatch.setattr(admission, "_FAIR_CHANCE", 60.0)
     listener, master = site.listener()
     crowd = [Visitor(site, listener.address) for _ in range(20)]
@@ -219,8 +229,8 @@ def test_one_that_breaks_as_it_is_taken_stays_open_nowhere(site: Site) -> None:
         accepted, _ = server.accept()
     taken = _BreaksAfterTheCheck(fileno=accepted.detach())
     taken.other = other
-    context = tls.context_of(site.credentials, listens=True)
-    with contextlib.closing(tls.Handshake(taken, context).sock) as secured:
+    context = tls.master_context(site.credentials)
+    with contextlib.closing(tls.MasterHandshake(taken, context, site.credentials).sock) as secured:
         fd = secured.fileno()
         assert fd >= 0, "whoever goes on with it has it to close"
     with pytest.raises(OSError, match="Bad file descriptor"):
@@ -241,25 +251,57 @@ def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:
         assert not end.is_alive()
 
 
-def test_who_has_a_certificate_and_is_refused_is_told_once(site: Site) -> None:
+def test_nonsense_in_place_of_a_greeting_is_told_once(site: Site) -> None:
     listener, master = site.listener()
     for _ in range(3):
-        say(listener.address, site.credentials.agent_half(), b"GET / HTTP/1.1")
+        with pytest.raises(tls.HungUp):
+            say(listener.address, site.credentials.agent("a", ""), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
     site.on_loop(lambda: None)
     (told,) = [told for told in master.refusals if "no agent of Fiber" in told]
-    assert "(127.0.0.1:" in told
+    assert told.startswith("127.0.0.1:")
+
+
+@pytest.mark.parametrize("name", ["\ud800", "a" * 60_000])
+def test_a_name_that_no_pod_can_have_is_not_repeated(
+    site: Site, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    listener, master = site.listener()
+    hello = Hello(Identity.of_this_process(name), "0" * 32, 0, False)
+    with pytest.raises(tls.HungUp):
+        say(listener.address, site.credentials.agent("a", ""), hello.encode())
+    master.wait(lambda: master.refusals)
+    assert len(master.refusals[0]) < 500
+    assert capfd.readouterr().err == ""  # no traceback for each that comes
 
 
 def test_an_agent_that_nobody_wants_hears_why_and_is_told_once(site: Site) -> None:
     listener, master = site.listener()
     listener._on_agent = lambda link: f"{link.peer.name} is not wanted"
+    identity = Identity.of_this_process("agent-1", "uid")
     for _ in range(2):
-        _, agent = site.dialer(listener.address)
+        _, agent = site.dialer(listener.address, identity=identity)
         agent.wait(lambda agent=agent: agent.events == ["lost: agent-1 is not wanted"])
+        wait_for(lambda: site.on_loop(lambda: not listener._links))
     master.wait(lambda: master.refusals)
     (told,) = master.refusals
     assert told.startswith("agent-1 is not wanted (127.0.0.1:")
+
+
+def test_an_agent_without_a_pod_is_told_of_whatever_strangers_do(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refusals, "_MOST", 1)
+    listener, master = site.listener()
+    listener._knows = lambda identity: None
+    told = listener._acceptor._refusals
+    told._strangers["192.0.2.1", "it is a stranger"] = told._next_summary = float("inf")
+    site.dialer(listener.address)
+    master.wait(lambda: master.proofs)
+    site.on_loop(lambda: None)  # the agent waits for its pod now
+    pass_time(listener, PATIENCE)
+    master.wait(lambda: master.refusals)
+    assert master.refusals[0].startswith("there is no pod 'agent-1' yet, and it was waited for")
 
 
 def test_a_crowd_is_told_of_once_from_wherever_it_comes(

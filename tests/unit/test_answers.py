@@ -38,10 +38,17 @@ def _say_of_own(*words: Any) -> Callable[[Rig, WorkerHandle, WorkerHandle], None
     return say
 
 
+def _say_unknown_of_own(rig: Rig, liar: WorkerHandle, other: WorkerHandle) -> None:
+    """Without end, the task would run again and again, and no run would count."""
+    assert liar.worker is not None
+    rig.say(liar, work.UNKNOWN, liar.worker.queue[0].seq)
+
+
 @pytest.mark.parametrize(
     "lie",
     [
         _say_for_another,
+        _say_unknown_of_own,
         _say_bytes(b"no pickle"),
         _say_bytes(pickle.dumps(7)),
         _say_bytes(pickle.dumps([work.READY])),
@@ -60,6 +67,7 @@ def _say_of_own(*words: Any) -> Callable[[Rig, WorkerHandle, WorkerHandle], None
         _say_of_own(0, None, math.nan, [1], []),
         _say_of_own(0, None, -1.0, [1], []),
         _say_of_own(0, "all", 1e-3, [1], []),
+        _say_of_own(0, 0, 1e-3, [], []),
         _say_of_own(0, None, 1e-3, "ab", []),
         _say_of_own(0, None, 1e-3, [1], [(1, work.VALUE, b"", 0)]),
         _say_of_own(0, None, 1e-3, [1], [(0, work.VALUE, b"", 1)]),
@@ -130,7 +138,7 @@ def test_an_exit_report_blames_and_spares_only_the_tasks_of_its_own_worker(rig: 
     first, one, second, other = two_calls(rig)
     jobs = [batch.job for batch in rig.ledger.batches.values()]
     rig.lose(other, unread=(number_of(one),), running=(number_of(one), 0))
-    assert [job.attempts for job in jobs if job is not None] == [{}, {0: 1}]
+    assert [job.charges.deaths for job in jobs if job is not None] == [{}, {0: 1}]
     rig.answer(one, number_of(one), [9])
     rig.background.run()
     rig.all_ready()

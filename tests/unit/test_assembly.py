@@ -11,7 +11,7 @@ import pytest
 
 from fiber._wire import assembly, packet
 from fiber._wire.assembly import IN_FILE, Assembly, pass_on
-from fiber._wire.messages import Deliver, decode
+from fiber._wire.messages import Deliver, FromChild, TunnelData, decode, is_passed_on
 from fiber._wire.packet import INLINE_LIMIT
 
 SIZES = (INLINE_LIMIT + 1, IN_FILE, packet.RETAINED_LIMIT + 1)
@@ -96,6 +96,21 @@ def test_a_process_that_may_write_no_file_keeps_a_frame_in_its_own_memory(pair: 
     pass_on(buffer)
     packet.send(one, b"payload", [buffer])
     assert packet.receive(other).buffers == [buffer]
+
+
+def test_a_frame_that_is_not_passed_on_takes_no_descriptor() -> None:
+    frame = os.urandom(IN_FILE)
+    before = os.listdir("/proc/self/fd")
+    whole = Assembly(len(frame), passed_on=False)
+    whole.add(memoryview(frame))
+    assert os.listdir("/proc/self/fd") == before
+    assert whole.frame() == frame
+
+
+def test_the_master_keeps_what_children_send_it_and_passes_on_the_rest() -> None:
+    assert not is_passed_on(FromChild(1, b"result").encode())
+    assert is_passed_on(Deliver(1, 2, b"task").encode())
+    assert is_passed_on(TunnelData(1, b"item").encode())
 
 
 @pytest.mark.parametrize("size", [0, 10, IN_FILE])

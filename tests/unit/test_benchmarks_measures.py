@@ -188,6 +188,9 @@ class Heard:
     def recalled(self, seqs: list[int]) -> None:
         self.words.append(seqs)
 
+    def draining(self) -> None:
+        self.words.append("draining")
+
     def exited(self, report: ExitReport) -> None:
         self.words.append((report.exitcode, report.host))
 
@@ -253,7 +256,7 @@ def test_the_floor_of_a_link_is_measured() -> None:
 
 
 def test_an_order_survives_its_line() -> None:
-    order = Order("127.0.0.1:1", {"key": "secret"}, ["a", "b"], 3.0)
+    order = Order("127.0.0.1:1", [{"name": "a"}, {"name": "b"}], 3.0)
     assert Order.from_line(order.to_line()) == order
 
 

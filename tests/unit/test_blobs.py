@@ -6,7 +6,7 @@ import contextlib
 import gc
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -35,10 +35,23 @@ class Sent:
     def __init__(self) -> None:
         self.loop = SimulatedLoop()
         self.messages: list[Any] = []
-        self.parcels = BlobSender(
-            self.loop,  # type: ignore[arg-type]
-            lambda frame: self.messages.append(messages.decode(frame)),
-        )
+        self.leaving: list[Callable[[], None] | None] = []
+        self.ready: list[str] = []
+        """Callers whose blobs have left."""
+        self.parcels = BlobSender(self.loop, self.send)  # type: ignore[arg-type]
+
+    def send(self, message: messages.Message, on_left: Callable[[], None] | None = None) -> None:
+        self.messages.append(message)
+        self.leaving.append(on_left)
+
+    def need(self, *blobs: Blob, caller: str = "") -> None:
+        self.parcels.send_missing(blobs, lambda: self.ready.append(caller))
+
+    def leave(self) -> None:
+        """The oldest message is on its way."""
+        on_left = self.leaving.pop(0)
+        assert on_left is not None
+        on_left()
 
     def kinds(self) -> list[str]:
         """What has been sent since this was asked last."""
@@ -53,22 +66,22 @@ def name(blob: Blob) -> str:
 
 def test_a_blob_is_sent_once_and_forgotten_with_its_last_holder() -> None:
     sent, one, other = Sent(), Blob(b"one"), Blob(b"other")
-    sent.parcels.send_missing([one, other])
-    sent.parcels.send_missing([other, one])
+    sent.need(one, other)
+    sent.need(other, one)
     known, gone = name(one), name(other)
     assert sent.kinds() == [f"Blob {known}", f"Blob {gone}"]
     del other
     assert sent.kinds() == [f"Forget {gone}"]
-    sent.parcels.send_missing([one, Blob(b"other")])
+    sent.need(one, Blob(b"other"))
     assert sent.kinds()[0] == f"Blob {gone}"
 
 
 def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
     sent, first = Sent(), Blob(b"content")
-    sent.parcels.send_missing([first])
+    sent.need(first)
     del first  # the loop is told and has not looked yet
     second = Blob(b"content")
-    sent.parcels.send_missing([second])
+    sent.need(second)
     assert sent.kinds() == [f"Blob {name(second)}"]
     del second
     assert len(sent.kinds()) == 1
@@ -76,17 +89,43 @@ def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
 
 def test_what_an_agent_could_not_keep_is_sent_again() -> None:
     sent, blob = Sent(), Blob(b"content")
-    sent.parcels.send_missing([blob])
+    sent.need(blob)
     sent.parcels.lost(blob.digest)
-    sent.parcels.send_missing([blob])
+    sent.need(blob)
     assert sent.kinds() == [f"Blob {name(blob)}"] * 2
 
 
-def test_all_agents_are_sent_one_frame() -> None:
-    blob = Blob(b"content")
-    assert blob.frame is blob.frame
-    assert messages.decode(blob.frame) == messages.Blob(blob.digest, b"content")
-    assert bytes(contents(blob.fileno())) == b"content"
+def test_no_agent_costs_a_copy_of_the_content() -> None:
+    content = b"content"
+    blob = Blob(content)
+    assert messages.decode(blob.message.encode()) == blob.message
+    assert messages.pieces(blob.message)[-1] is content
+    assert bytes(contents(blob.fileno())) == content
+
+
+def test_a_caller_waits_for_the_blobs_that_it_needs_and_for_no_others() -> None:
+    sent, one, other = Sent(), Blob(b"one"), Blob(b"other")
+    sent.need(one, caller="first")
+    sent.need(one, other, caller="second")
+    sent.need(other, caller="third")
+    assert sent.ready == []
+    sent.leave()
+    assert sent.ready == ["first"]
+    sent.leave()
+    assert sent.ready == ["first", "second", "third"]
+    sent.need(other, one, caller="fourth")
+    assert sent.ready[3:] == ["fourth"]
+
+
+def test_a_blob_that_is_sent_again_has_left_when_both_have() -> None:
+    sent, blob = Sent(), Blob(b"content")
+    sent.need(blob)
+    sent.parcels.lost(blob.digest)
+    sent.need(blob, caller="again")
+    sent.leave()
+    assert sent.ready == []
+    sent.leave()
+    assert sent.ready == ["", "again"]
 
 
 @pytest.mark.parametrize("data", [b"", b"content"])
@@ -222,7 +261,7 @@ def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: An
     assert blob is not None
     assert census.wait_until(lambda: "loopback-0" in backend.agents.agents, PATIENCE)
     agent = backend.agents.agents["loopback-0"]
-    backend._loop.call_soon(agent._blobs.send_missing, [blob])
+    backend._loop.call_soon(agent._blobs.send_missing, [blob], lambda: None)
     agent.send(messages.Forget(blob.digest))
     with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
         assert pool.apply(size_of_kept) == LARGE

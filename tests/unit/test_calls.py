@@ -6,6 +6,7 @@ from concurrent.futures import CancelledError
 
 import pytest
 
+from fiber._engine.charges import Limits
 from fiber._runtime.call_future import CallFuture
 from fiber._runtime.calls import CallQueue
 from fiber.errors import FiberError
@@ -59,10 +60,10 @@ def test_a_queue_that_is_closed_leaves_no_job(rig: Rig) -> None:
 
 
 def test_options_are_those_of_the_queue(rig: Rig) -> None:
-    once, again = CallQueue(retries=0), CallQueue(retries=5)
+    once, again = CallQueue(limits=Limits(0)), CallQueue(limits=Limits(5))
     called(rig, once, 1)
     called(rig, again, 1)
-    assert {job.retries for job in rig.ledger.jobs} == {0, 5}
+    assert {job.charges.limits.retries for job in rig.ledger.jobs} == {0, 5}
 
 
 def test_who_waits_at_the_end_hears_of_it(rig: Rig) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import pickle
 import signal
@@ -255,6 +256,29 @@ def test_the_end_says_how_the_other_process_died() -> None:
     assert ready.wait(PATIENCE)
     assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
+    with pytest.raises(ConnectionClosed, match=f"{process.name}.*SIGKILL"):
+        one.recv()
+    process.join(PATIENCE)
+
+
+def close_and_stay(connection: Connection) -> None:
+    connection.close()
+    signal.pause()
+
+
+def test_the_end_says_how_a_process_died_that_is_still_exiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one, other = Pipe()
+    process = start(close_and_stay, other)
+    other.close()
+
+    def stat_of_an_exiting_process(path: str, mode: str) -> io.BytesIO:
+        process.kill()
+        return io.BytesIO(b"7 (a name) R 1) R 1 7 7 0 -1 4194628 0 0 0 0 0 0 0 0 20 0 1 0 5")
+
+    monkeypatch.setattr(connection, "open", stat_of_an_exiting_process, raising=False)
+    monkeypatch.setattr(connection, "_NEWS", PATIENCE)
     with pytest.raises(ConnectionClosed, match=f"{process.name}.*SIGKILL"):
         one.recv()
     process.join(PATIENCE)

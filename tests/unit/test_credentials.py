@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import json
 import os
 import stat
@@ -11,101 +10,124 @@ import sys
 from pathlib import Path
 
 import pytest
-from cryptography import x509
-from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID
 
-from fiber._transport.credentials import (
-    Credentials,
-    MasterCredentials,
-    make_credentials,
-)
-from fiber.errors import AuthenticationError, ConfigError
-from fiber_api.certificates import CLOCK_SKEW
+from fiber._transport import credentials_file
+from fiber._transport.credentials import Credentials, MasterCredentials, make_credentials
+from fiber.errors import ConfigError
+from fiber_api import identity, names
 
 
 @pytest.fixture(scope="module")
 def credentials() -> MasterCredentials:
-    return make_credentials("walkers-1")
+    return make_credentials()
 
 
-def certificate_of(half: Credentials) -> x509.Certificate:
-    return x509.load_pem_x509_certificate(half.certificate.encode())
+def test_each_agent_has_a_key_of_its_own(credentials: MasterCredentials) -> None:
+    pods = [("a", "1"), ("a", "2"), ("b", "1"), ("a1", ""), ("a 1", "2"), ("a", "1 2")]
+    keys = {credentials.agent(*pod).key for pod in pods}
+    assert len(keys) == len(pods)
+    assert credentials.pool_key not in keys
+    assert credentials.agent("a", "1") == credentials.agent("a", "1")
 
 
-def test_both_certificates_are_signed_by_the_authority(credentials: MasterCredentials) -> None:
-    authority = x509.load_pem_x509_certificate(credentials.authority.encode())
-    for half in (credentials, credentials.agent_half()):
-        certificate_of(half).verify_directly_issued_by(authority)
+def test_each_run_has_its_own_key_and_certificate(credentials: MasterCredentials) -> None:
+    other = make_credentials()
+    assert other.pool_key != credentials.pool_key
+    assert other.certificate != credentials.certificate
 
 
-def test_only_the_master_bears_the_servers_name(credentials: MasterCredentials) -> None:
-    def names(half: Credentials) -> list[str]:
-        extension = certificate_of(half).extensions.get_extension_for_oid(
-            ExtensionOID.SUBJECT_ALTERNATIVE_NAME
-        )
-        assert isinstance(extension.value, x509.SubjectAlternativeName)
-        return extension.value.get_values_for_type(x509.DNSName)
-
-    def usage(half: Credentials) -> list[x509.ObjectIdentifier]:
-        extension = certificate_of(half).extensions.get_extension_for_class(x509.ExtendedKeyUsage)
-        return list(extension.value)
-
-    agent = credentials.agent_half()
-    assert names(credentials) == ["master.walkers-1.fiber"] == [agent.server_name]
-    assert names(agent) == ["agent.walkers-1.fiber"]
-    assert usage(credentials) == [ExtendedKeyUsageOID.SERVER_AUTH]
-    assert usage(agent) == [ExtendedKeyUsageOID.CLIENT_AUTH]
+def test_the_next_master_of_a_pool_has_another_certificate(credentials: MasterCredentials) -> None:
+    first, second = (make_credentials(credentials.pool_key) for _ in range(2))
+    assert first.certificate_hash != second.certificate_hash
+    assert first.agent("a", "1") == second.agent("a", "1")
+    assert first.fingerprint == ""
 
 
-def test_the_agents_half_holds_nothing_of_the_masters(credentials: MasterCredentials) -> None:
-    agent = credentials.agent_half()
-    descriptor = agent.to_descriptor()
-    with open(descriptor) as file:
-        handed_over = file.read()
-    assert json.dumps(agent.key)[1:-1] in handed_over
-    assert json.dumps(credentials.key)[1:-1] not in handed_over
-    assert credentials.key not in repr(vars(agent))
-    assert type(agent) is Credentials
+def mounted(folder: Path, credentials: MasterCredentials) -> dict[str, str]:
+    """The environment of an init container that mounts the Secret of a program's own pool."""
+    (folder / names.KEY_POOL).write_text(credentials.pool_key + "\n")
+    (folder / names.KEY_MASTER).write_text(credentials.fingerprint)
+    return {
+        names.ENV_KEY: str(folder),
+        names.ENV_NAME: "es-1",
+        names.ENV_UID: "77",
+        names.ENV_CREDENTIALS: str(folder / "agent.json"),
+    }
 
 
-def test_each_run_has_its_own_authority(credentials: MasterCredentials) -> None:
-    other = make_credentials("walkers-1")
-    assert other.authority != credentials.authority
-    assert other.key != credentials.key
-
-
-def test_a_clock_that_is_behind_does_not_matter(credentials: MasterCredentials) -> None:
-    now = datetime.datetime.now(datetime.UTC)
-    for half in (credentials, credentials.agent_half()):
-        certificate = certificate_of(half)
-        assert certificate.not_valid_before_utc < now - CLOCK_SKEW / 2
-        assert half.expires() == certificate.not_valid_after_utc > now
-
-
-def test_a_directory_of_private_files(credentials: MasterCredentials, tmp_path: Path) -> None:
-    agent = credentials.agent_half()
+def test_what_the_init_container_writes_the_agent_reads_once(
+    credentials: MasterCredentials, tmp_path: Path
+) -> None:
+    environment = mounted(tmp_path, credentials)
     before = os.umask(0)
     try:
-        agent.to_directory(tmp_path / "agent")
+        assert credentials_file.write(environment) == 0
+        assert credentials_file.write(environment) == 0, "a node may fail between the two"
     finally:
         os.umask(before)
-    modes = {
-        path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "agent").iterdir()
-    }
-    assert modes == dict.fromkeys(("ca.crt", "tls.crt", "tls.key", "server-name"), 0o600)
-    assert stat.S_IMODE((tmp_path / "agent").stat().st_mode) == 0o700
-    assert Credentials.from_directory(tmp_path / "agent") == agent
-    with pytest.raises(FileExistsError):
-        agent.to_directory(tmp_path / "agent")
+    file = tmp_path / "agent.json"
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert credentials.pool_key not in file.read_text()
+    assert Credentials.from_file(file) == credentials.agent("es-1", "77")
+    assert not file.exists()
 
 
-def test_a_directory_without_credentials_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no credentials can be read from .*server-name"):
-        Credentials.from_directory(tmp_path)
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        (lambda told, _: told.pop(names.ENV_UID), "'FIBER_AGENT_UID' is not set"),
+        (lambda _, folder: (folder / names.KEY_POOL).unlink(), "No such file"),
+        (lambda _, folder: (folder / names.KEY_POOL).write_text("secret"), "64 hexadecimal digits"),
+    ],
+)
+def test_an_init_container_that_cannot_write_says_why(
+    credentials: MasterCredentials, tmp_path: Path, fault: object, said: str
+) -> None:
+    environment = mounted(tmp_path, credentials)
+    assert callable(fault)
+    fault(environment, tmp_path)
+    command = [sys.executable, "-m", "fiber.agent"]
+    done = subprocess.run(
+        command, env={**os.environ, **environment}, capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "secret" not in done.stderr.replace("Secret", "")
+    assert not (tmp_path / "agent.json").exists()
+
+
+def test_the_init_container_imports_the_standard_library_alone(
+    credentials: MasterCredentials, tmp_path: Path
+) -> None:
+    statement = (
+        "import sys, runpy; sys.argv = ['agent']\n"
+        "try: runpy.run_module('fiber.agent', run_name='__main__')\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "print(sorted(m for m in sys.modules if m.partition('.')[0] in "
+        "('cryptography', 'pynng', 'cloudpickle', 'ssl', 'socket')))"
+    )
+    environment = {**os.environ, **mounted(tmp_path, credentials)}
+    command = [sys.executable, "-c", statement]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [(None, "no such file or directory"), ("{}", "its content is not Fiber's, or cut short")],
+)
+def test_a_file_that_cannot_be_read_is_named_with_the_reason(
+    tmp_path: Path, content: str | None, why: str
+) -> None:
+    if content is not None:
+        (tmp_path / "agent.json").write_text(content)
+    said = rf"no credentials can be read from .*agent\.json and removed: {why}\."
+    with pytest.raises(ConfigError, match=said):
+        Credentials.from_file(tmp_path / "agent.json")
 
 
 def test_a_descriptor_brings_them_once(credentials: MasterCredentials) -> None:
-    agent = credentials.agent_half()
+    agent = credentials.agent("a", "1")
     descriptor = agent.to_descriptor()
     assert not os.get_inheritable(descriptor)
     again = os.dup(descriptor)
@@ -137,24 +159,14 @@ def test_a_descriptor_that_is_none_is_named(descriptor: int) -> None:
 
 
 def test_no_secret_in_a_repr(credentials: MasterCredentials) -> None:
-    assert repr(credentials) == "MasterCredentials(server_name='master.walkers-1.fiber')"
-    assert repr(credentials.agent_half()) == "Credentials(server_name='master.walkers-1.fiber')"
+    assert repr(credentials) == "MasterCredentials(only=True)"
+    assert credentials.agent("a", "1").key not in repr(credentials.agent("a", "1"))
 
 
-def test_a_certificate_that_is_none_is_named() -> None:
-    with pytest.raises(AuthenticationError, match=r"master.x.fiber is not a PEM certificate"):
-        Credentials("master.x.fiber", "", "nonsense", "").expires()
-
-
-@pytest.mark.parametrize("pool", ["", "Walkers", "a_b", "-a", "a.", "a" * 241, "a/b", "ä"])
-def test_a_name_that_no_certificate_can_bear_is_refused(pool: str) -> None:
-    with pytest.raises(ConfigError, match="cannot be the name of a pool"):
-        make_credentials(pool)
-
-
-def test_a_long_name_and_a_namespace_are_fine() -> None:
-    pool = f"{'p' * 51}.{'n' * 50}"
-    assert make_credentials(pool).server_name == f"master.{pool}.fiber"
+@pytest.mark.parametrize("data", [{}, {"key": ""}, {"key": "%"}, {"key": "bm9uZQ=="}, {"key": 7}])
+def test_a_secret_that_cannot_serve_is_named(data: dict[str, object]) -> None:
+    with pytest.raises(identity.InvalidKey, match=r"^key "):
+        identity.key_in(data)
 
 
 def test_importing_the_module_does_not_import_cryptography() -> None:

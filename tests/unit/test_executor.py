@@ -314,7 +314,7 @@ def test_what_was_assigned_and_not_sent_is_not_held_against_its_tasks(
     rig.map([tasks.Tattling(n) for n in range(2)])
     (job,) = rig.maps
     rig.lose(rig.handles[0])
-    assert job.attempts == {}
+    assert job.charges.deaths == {}
     assert rig.ledger.demand() == 2
 
 
@@ -324,7 +324,7 @@ def test_a_packet_that_nobody_took_is_not_held_against_its_tasks(rig: Rig) -> No
     (job,) = rig.maps
     rig.lose(rig.handles[0])
     rig.lose(rig.handles[1])
-    assert job.attempts == {}
+    assert job.charges.deaths == {}
 
 
 def test_what_ran_when_its_worker_died_is_charged_an_attempt(rig: Rig) -> None:
@@ -333,7 +333,7 @@ def test_what_ran_when_its_worker_died_is_charged_an_attempt(rig: Rig) -> None:
     job = batch.job
     assert job is not None
     rig.lose(batch.worker.key, running=(batch.seq, 0))
-    assert job.attempts == {0: 1}
+    assert job.charges.deaths == {0: 1}
     assert not results.done
     assert len(rig.loop.timers) == 1, "its deadline counts from its next start"
 

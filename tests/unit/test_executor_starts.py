@@ -180,6 +180,6 @@ def test_of_a_call_that_was_tried_again_nothing_is_kept(rig: Rig) -> None:
     (handle,) = rig.busy
     rig.lose(handle, running=(rig.child(handle).packets[0][0], 0))
     (job,) = rig.ledger.jobs
-    assert list(job.attempts.values()) == [1]
+    assert list(job.charges.deaths.values()) == [1]
     rig.answer_all()
-    assert (results.done, job.attempts) == (1, {})
+    assert (results.done, job.charges.deaths) == (1, {})

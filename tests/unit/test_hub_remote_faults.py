@@ -63,6 +63,68 @@ def lost_soul(hosts: Hosts, far: Far) -> Iterator[Callable[..., Any]]:
         process.close()
 
 
+def use_queue_from_afar(own: HubAddress, data: bytes, put: bool, report: Connection) -> None:
+    client.set_hub_address(own)
+    queue = pickle.loads(data)
+    report.send("ready")
+    queue.put("lost") if put else queue.get()
+
+
+@pytest.mark.parametrize("put", [True, False])
+def test_who_dies_before_it_hears_what_it_got_takes_no_place(
+    put: bool, hosts: Hosts, far: Far, wires: tuple[Wire, Wire]
+) -> None:
+    queue: Any = fiber.Queue(1)
+    free = queue._slots._free
+    if put:
+        queue.put("first")
+    with hosts.at("a"):
+        data = pickle.dumps(queue)
+    ours, theirs = fiber.Pipe()
+    arguments = (hosts["b"].address, data, put, theirs)
+    process = fiber.Process(target=use_queue_from_afar, args=arguments, daemon=True)
+    process.start()
+    assert ours.recv() == "ready"
+
+    def asks() -> bool:
+        kept = hosts["a"].registry._users.values()
+        served = [users[0].hosted for users in list(kept)]
+        return any(getattr(each, "_takers" if put else "_receivers", ()) for each in served)
+
+    assert wait_until(asks, PATIENCE)
+    _, down = wires
+    done = threading.Event()
+    hosts.on_loop(lambda: (down.hold(), done.set()))
+    assert done.wait(PATIENCE)
+    if put:
+        assert queue.get() == "first"
+    else:
+        queue.put("lost")
+    assert wait_until(lambda: bool(down.held), PATIENCE)  # the answer is on its way
+    process.kill()
+    process.join(PATIENCE)
+    hosts.on_loop(down.let_go)
+    assert wait_until(lambda: free.value() == 1, PATIENCE)
+    assert queue.empty()
+    ours.close()
+    theirs.close()
+
+
+def test_what_an_interrupted_take_did_not_get_is_not_given_back(
+    far: Far, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    remote = far(LocalCounter.create())
+    with monkeypatch.context() as ctrl_c:
+        ctrl_c.setattr(client.HubStream, "_reply", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            remote.take(None)
+    assert remote.value() == 0
+    remote.close()
+
+
 def test_a_far_receiver_killed_while_waiting_takes_nothing(
     hosts: Hosts, lost_soul: Callable[..., Any]
 ) -> None:

@@ -434,6 +434,7 @@ def descriptors() -> int:
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
 def test_whatever_interrupts_making_or_dropping_something_no_descriptor_is_left(
     make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes import address
-from fiber._backends.kubernetes.address import reachable_address
+from fiber._backends.kubernetes.address import reachable_address, resolved
 from fiber._backends.kubernetes.api_errors import Forbidden
 from fiber.errors import ConfigError, FiberPoolError
 
@@ -73,6 +73,11 @@ def test_a_configured_name_that_nobody_has(
 def test_a_configured_loopback(cluster: Cluster, loopback: str) -> None:
     with pytest.raises(ConfigError, match="another machine in each pod"):
         cluster.found(loopback)
+
+
+def test_an_advertised_loopback_is_an_error_that_names_the_key() -> None:
+    with pytest.raises(ConfigError, match=r"advertised_host '127\.0\.0\.1' is 127\.0\.0\.1"):
+        resolved("advertised_host", "127.0.0.1")
 
 
 def nobody(*_: object, **__: object) -> None:

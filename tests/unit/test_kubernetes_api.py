@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from kubernetes.config import incluster_config
 
+from fakes.certificates import RUN_VALIDITY, Certificates, make_certificates
 from fakes.kubernetes_api import Fault
 from fakes.served import Served, served
 from fiber._backends.kubernetes import session
@@ -37,7 +38,6 @@ from fiber._backends.kubernetes.api_errors import (
 )
 from fiber._backends.kubernetes.resources import LEASES, NODES, PODS, POOLS
 from fiber.errors import ConfigError
-from fiber_api.certificates import RUN_VALIDITY, Certificates, make_certificates
 from patience import PATIENCE
 from unit.kubernetes_rig import NAMESPACE, kubeconfig
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes import detection
-from fiber._backends.kubernetes.api_errors import Forbidden, Unreachable
+from fiber._backends.kubernetes.api_errors import Forbidden, NotFound, Unreachable
 from fiber._runtime.state import _is_on_cluster
 from fiber.config import Config
 from fiber.errors import ConfigError
@@ -23,6 +23,8 @@ class Account:
 
     def __init__(self, answer: dict[str, Any] | Exception) -> None:
         self._answer = answer
+        self.served = True
+        self.claim: dict[str, Any] | None = None
         self.asked: list[dict[str, Any]] = []
         self.closed = False
 
@@ -38,6 +40,14 @@ class Account:
         if isinstance(self._answer, Exception):
             raise self._answer
         return self._answer
+
+    def get(self, path: str, *, timeout: float) -> dict[str, Any]:
+        assert timeout <= 5.0
+        if path == "/apis/fiber.dev/v1alpha1" and self.served:
+            return {}
+        if path.endswith("/leases/fiberpools.fiber.dev") and self.claim is not None:
+            return {"spec": self.claim}
+        raise NotFound("404 page not found", status=404)
 
     def close(self) -> None:
         self.closed = True
@@ -98,3 +108,38 @@ def test_outside_of_pods_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.delenv("KUBERNETES_SERVICE_HOST")
     assert not _is_on_cluster(Config())
     assert account.asked == []
+
+
+def test_without_fiber_pools_processes_run_here_with_a_warning(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    account = in_a_pod(monkeypatch, ALLOWED)
+    account.served = False
+    assert not _is_on_cluster(Config())
+    assert "the cluster knows no FiberPools" in caplog.text
+
+
+RELEASE = {"holderIdentity": "fiber-system/fiber-operator", "leaseDurationSeconds": 900}
+FRESH, OLD = "9000-01-01T00:00:00Z", "2020-01-01T00:00:00Z"
+
+
+@pytest.mark.parametrize(
+    ("claim", "taken"),
+    [
+        (None, True),  # a namespace that has had no pool yet
+        ({**RELEASE, "renewTime": FRESH}, True),
+        ({**RELEASE, "renewTime": OLD}, False),
+        ({**RELEASE, "renewTime": OLD, "holderIdentity": ""}, True),  # it was given back
+    ],
+    ids=["absent", "fresh", "old", "free"],
+)
+def test_an_operator_that_is_gone_makes_no_pods(
+    claim: dict[str, Any] | None,
+    taken: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    account = in_a_pod(monkeypatch, ALLOWED)
+    account.claim = claim
+    assert _is_on_cluster(Config()) == taken
+    assert ("is gone" in caplog.text) != taken

@@ -17,8 +17,7 @@ from fakes.kubernetes_api import Call, Fault
 from fakes.store import Failure
 from fiber._backends.kubernetes import fiber_pool, informer, scaling
 from fiber._backends.kubernetes.api_errors import Forbidden
-from fiber._transport.credentials import MasterCredentials
-from fiber_api import names
+from fiber_api import identity, names
 from patience import PATIENCE
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told
 from unit.kubernetes_rig import rig as make_rig
@@ -104,13 +103,46 @@ def test_what_belongs_to_a_pool_goes_with_it(rig: Rig, told: Told) -> None:
         }
 
 
-def test_the_secret_holds_the_agents_half_alone(rig: Rig, told: Told) -> None:
+@pytest.mark.parametrize("plural", ["secrets", "leases"])
+def test_an_object_of_somebody_else_is_not_taken_for_the_pools(
+    rig: Rig, told: Told, plural: str
+) -> None:
+    name = names.secret_name("es-1") if plural == "secrets" else names.master_lease_name("es-1")
+    other = {"metadata": {"name": name}, "data": {}, "spec": {"holderIdentity": "other"}}
+    rig.server.do(rig.server.store.create, plural, NAMESPACE, other)
+    client = rig.own(told)
+    assert told.error().reason == "AlreadyExists"
+    client.close()
+    assert not rig.server.objects(names.PLURAL)
+
+
+def test_a_secret_that_may_not_be_read_is_taken_for_the_pools(rig: Rig, told: Told) -> None:
+    rig.server.api.faults += [
+        Fault("create", "secrets", carried_out=True),
+        Fault("get", "secrets", 403, reason="Forbidden"),
+    ]
+    rig.own(told).demand(1)
+    replicas_become(rig, told, 1)
+    assert not told.errors
+
+
+@pytest.mark.parametrize("plural", ["secrets", "leases"])
+def test_what_belongs_to_a_pool_has_its_labels(rig: Rig, told: Told, plural: str) -> None:
+    rig.own(told).demand(1)
+    replicas_become(rig, told, 1)
+    name = names.secret_name("es-1") if plural == "secrets" else names.master_lease_name("es-1")
+    labels = rig.get(plural, name)["metadata"]["labels"]
+    assert labels[names.LABEL_POOL] == "es-1"
+    assert labels[names.LABEL_POOL_UID] == rig.pool()["metadata"]["uid"]
+
+
+def test_the_secret_makes_nobody_the_master(rig: Rig, told: Told) -> None:
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     data = rig.get("secrets", names.secret_name("es-1"))["data"]
-    assert set(data) == set(names.AGENT_FILES)
-    server = base64.b64decode(data[names.KEY_SERVER_NAME]).decode()
-    assert server == names.server_name("es-1", NAMESPACE)
+    assert set(data) == {names.KEY_POOL, names.KEY_MASTER}
+    assert identity.key_in(data)
+    assert len(base64.b64decode(data[names.KEY_MASTER])) == 64, "its certificate's fingerprint"
 
 
 def test_in_a_pod_the_pool_is_owned_by_it(rig: Rig, told: Told) -> None:
@@ -268,6 +300,11 @@ def test_each_right_that_is_missing_is_spoken_of(rig: Rig, told: Told) -> None:
             Fault(status=403, reason="Forbidden", message="cannot create resource fiberpools"),
             "Forbidden",
             "kubectl create rolebinding .* -n lab --clusterrole=fiber-user",
+        ),
+        (
+            Fault(status=422, reason="Invalid", message="ValidatingAdmissionPolicy 'p' denied: no"),
+            "Refused",
+            "ask an administrator",
         ),
         (
             Fault(status=403, reason="Forbidden", message="exceeded quota: small"),
@@ -452,15 +489,6 @@ def test_one_that_is_interrupted_says_what_stays_too(
     said = capsys.readouterr().err
     assert "stays behind: the program was interrupted" in said
     assert "kubectl delete fiberpool es-1 -n lab" in said
-
-
-def test_the_certificates_are_the_pools(rig: Rig) -> None:
-    from fiber._backends.kubernetes.secret import make_credentials
-
-    made = make_credentials("es-1", NAMESPACE)
-    assert isinstance(made, MasterCredentials)
-    assert made.server_name == names.server_name("es-1", NAMESPACE)
-    assert made.agent_half().server_name == made.server_name
 
 
 def test_no_fault_of_ours_leaves_anybody_waiting(

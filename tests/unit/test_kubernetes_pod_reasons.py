@@ -116,7 +116,9 @@ KILLED = {"exitCode": 137, "reason": "OOMKilled"}
 def test_a_pod_that_ended_says_why(
     document: dict[str, Any], reason: str, exitcode: int | None
 ) -> None:
-    assert pod_end(document) == PodEnd(reason, "node-2", exitcode)
+    word = reason.partition(":")[0]
+    disrupted = word in ("Deleted", "Evicted", "NodeLost", "Preempted")
+    assert pod_end(document) == PodEnd(reason, "node-2", exitcode, disrupted)
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,12 @@ from fiber._backends.kubernetes.pods import Pods
 from fiber._backends.kubernetes.program import PreparedPool
 from fiber._backends.kubernetes.shape import Shape
 from fiber._backends.remote import RemoteChild
+from fiber._transport.handshake import Identity
 from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import FiberError, FiberPoolError
 from patience import PATIENCE
+from unit.agent_children import ReadLink
 from unit.kubernetes_rig import kubeconfig
 
 DAMAGED = "the loop is to fail in this test"
@@ -191,9 +193,14 @@ def test_what_ends_the_wait_ends_that_of_who_comes_later_too(site: Site) -> None
 
 def test_an_agent_whose_pod_is_about_to_go_is_not_let_in(site: Site) -> None:
     pods = site.pods(until_the_end)
-    metadata = {"name": "a", "labels": {}, "deletionTimestamp": "2026-01-01T00:00:00Z"}
+    metadata = {
+        "name": "a",
+        "uid": "uid",
+        "labels": {},
+        "deletionTimestamp": "2026-01-01T00:00:00Z",
+    }
     pods.on_pod("a", {"metadata": metadata})
-    link: Any = SimpleNamespace(peer=SimpleNamespace(name="a"))
+    link: Any = SimpleNamespace(peer=SimpleNamespace(name="a", uid="uid"))
     assert pods.on_agent(link) == "a, whose pod is about to go"
     assert not pods.agents.agents
     pods.close()
@@ -268,12 +275,18 @@ def test_what_fails_while_a_pool_is_opened_leaves_nothing_that_listens(
     ours.api.close()
 
 
-class Dialled(SimpleNamespace):
+RUNNING: Any = {
+    "metadata": {"name": "es-1-a", "uid": "uid", "labels": {}},
+    "status": {"phase": "Running"},
+}
+
+
+class Dialled(ReadLink):
     """The link of an agent that has dialled in."""
 
     def __init__(self, name: str) -> None:
-        nothing = lambda *_: None  # noqa: E731
-        super().__init__(peer=SimpleNamespace(name=name), attach=nothing, send=nothing)
+        super().__init__()
+        self.peer = SimpleNamespace(name=name, uid="uid")
 
 
 def test_only_agents_of_the_pool_show_that_pods_reach_the_program(
@@ -293,7 +306,10 @@ def test_only_agents_of_the_pool_show_that_pods_reach_the_program(
 def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> None:
     """After this program was stopped for so long that its agents gave it up."""
     pods = site.pods(lambda cancel: pytest.fail("nothing is to be opened"))
-    pod: Any = {"metadata": {"name": "es-1-a", "labels": {}}, "status": {"phase": "Running"}}
+    pod: Any = {
+        "metadata": {"name": "es-1-a", "uid": "uid", "labels": {}},
+        "status": {"phase": "Running"},
+    }
     first, second = Dialled("es-1-a"), Dialled("es-1-a")
     done = threading.Event()
     told: list[str | None] = []
@@ -332,8 +348,9 @@ def test_a_process_that_waits_for_one_more_pod_is_told_what_for(
     status = {"observedGeneration": 1, "desiredReplicas": 2, "readyReplicas": 1}
 
     def begin() -> None:
+        pods.on_pod("es-1-a", RUNNING)
         pods.on_agent(Dialled("es-1-a"))  # type: ignore[arg-type]
-        pods.on_attached()
+        pods.on_attached(1)
         pods.on_status({**status, "problems": [full]})
 
     site.loop.call_soon(begin)
@@ -348,6 +365,19 @@ def lost(reason: str) -> FiberPoolError:
     return FiberPoolError("it is gone", pool="es-1", namespace="lab", reason=reason)
 
 
+def identity(name: str, uid: str) -> Identity:
+    return Identity.of_this_process(name, uid)
+
+
+def test_an_agent_with_another_uid_is_not_let_in(site: Site) -> None:
+    pods = site.pods(until_the_end)
+    assert pods.objection(identity("es-1-a", "uid")) is None, "the watch has no such pod yet"
+    pods.on_pod("es-1-a", RUNNING)
+    assert pods.objection(identity("es-1-a", "uid")) == ""
+    assert "has the uid 'forged'" in (pods.objection(identity("es-1-a", "forged")) or "")
+    pods.close()
+
+
 def lose_pool(site: Site, pods: Pods, error: FiberPoolError, *, used: bool) -> tuple[Any, Owner]:
     """A child waits for a pool whose agent has gone, if it was ``used``, and which is lost now."""
     owner: Any = Owner(site.said)
@@ -357,6 +387,7 @@ def lose_pool(site: Site, pods: Pods, error: FiberPoolError, *, used: bool) -> t
 
     def lose() -> None:
         if used:
+            pods.on_pod("es-1-a", RUNNING)
             pods.on_agent(Dialled("es-1-a"))  # type: ignore[arg-type]
             pods.agents.agents["es-1-a"].lose("its pod is gone")
         child.start()

@@ -17,6 +17,7 @@ from fiber._backends.kubernetes.template import (
     fiber_pool_body,
     own_container,
     pod_template,
+    secrets_left_out,
 )
 from fiber.config import Config
 from fiber.resources import Resources
@@ -152,11 +153,53 @@ class TestInAPod:
         assert not {"ports", "livenessProbe", "resources", "args"} & set(worker_of(template))
         assert template["spec"]["tolerations"] == [{"key": "spot", "operator": "Exists"}]
 
+    def test_priority_and_grace_are_the_programs(self) -> None:
+        settings = {"priorityClassName": "batch", "terminationGracePeriodSeconds": 600}
+        spec = like(pod={**POD, "spec": {**POD["spec"], **settings}})["spec"]
+        assert {name: spec[name] for name in settings} == settings
+
+    def test_workers_are_spread_among_themselves(self) -> None:
+        zones = {"maxSkew": 1, "topologyKey": "zone", "whenUnsatisfiable": "ScheduleAnyway"}
+        app = {"labelSelector": {"matchLabels": {"app": "train"}}, "matchLabelKeys": ["version"]}
+        spec = {**POD["spec"], "topologySpreadConstraints": [{**zones, **app}]}
+        (constraint,) = like(pod={**POD, "spec": spec})["spec"]["topologySpreadConstraints"]
+        assert constraint == {
+            **zones,
+            "labelSelector": {
+                "matchExpressions": [{"key": names.LABEL_POOL_UID, "operator": "Exists"}]
+            },
+            "matchLabelKeys": [names.LABEL_POOL_UID],
+        }
+
     def test_its_environment_is_the_programs_without_fibers(self) -> None:
         variables = worker_of(like())["env"]
         assert [variable["name"] for variable in variables] == ["SEED", "CPUS"]
         reference = variables[1]["valueFrom"]["resourceFieldRef"]
         assert reference["containerName"] == "worker"
+
+    @pytest.mark.parametrize(
+        "name", ["WANDB_API_KEY", "GITHUB_TOKEN", "DB_PASSWORD", "AWS_SECRET_ACCESS_KEY", "secret"]
+    )
+    def test_a_secret_in_its_manifest_stays_behind(self, name: str) -> None:
+        pod = copy.deepcopy(POD)
+        main = pod["spec"]["containers"][1]
+        main["env"] = [{"name": name, "value": "hunter2"}, {"name": "SEED", "value": "1"}]
+        assert worker_of(like(pod=pod))["env"] == [{"name": "SEED", "value": "1"}]
+        assert secrets_left_out(pod, "main") == [name]
+
+    @pytest.mark.parametrize("name", ["TOKENIZERS_PARALLELISM", "MAX_TOKENS", "MONKEY", "KEYBOARD"])
+    def test_a_name_that_only_resembles_a_secrets_goes_along(self, name: str) -> None:
+        pod = copy.deepcopy(POD)
+        pod["spec"]["containers"][1]["env"] = variables = [{"name": name, "value": "1"}]
+        assert worker_of(like(pod=pod))["env"] == variables
+
+    def test_a_reference_to_a_secret_goes_along(self) -> None:
+        pod = copy.deepcopy(POD)
+        reference = {"secretKeyRef": {"name": "keys", "key": "token"}}
+        variables = [{"name": "GITHUB_TOKEN", "valueFrom": reference}]
+        pod["spec"]["containers"][1]["env"] = variables
+        assert worker_of(like(pod=pod))["env"] == variables
+        assert secrets_left_out(pod, "main") == []
 
     def test_it_runs_the_agent_with_the_programs_interpreter(self) -> None:
         assert worker_of(like())["command"] == [PYTHON, "-m", "fiber.agent"]
@@ -200,6 +243,61 @@ class TestResources:
             "limits": {"cpu": "1200m", "memory": "400Mi", "nvidia.com/gpu": "8"},
         }
 
+    def test_requests_of_the_configuration_are_for_functions_without_wishes(self) -> None:
+        config = Config(cpu_request=0.1, memory_request=64, processes_per_pod=2)
+        assert worker_of(like(Shape.of(config)))["resources"] == {
+            "requests": {"cpu": "200m", "memory": "128Mi"}
+        }
+        wishing = Shape.of(config).with_resources(Resources(cpu=1))
+        assert worker_of(like(wishing))["resources"] == {
+            "requests": {"cpu": "2", "memory": "128Mi"},
+            "limits": {"cpu": "2"},
+        }
+
+    def test_a_request_of_nothing_is_left_out(self) -> None:
+        shape = Shape.of(Config(cpu_request=0, memory_request=0))
+        assert "resources" not in worker_of(like(shape))
+
+    def test_a_template_that_limits_a_resource_has_requested_it(self) -> None:
+        worker = {"name": "worker", "resources": {"limits": {"memory": "32Mi"}}}
+        shape = Shape.of(Config(template={"spec": {"containers": [worker]}}))
+        assert worker_of(like(shape))["resources"] == {
+            "limits": {"memory": "32Mi"},
+            "requests": {"cpu": "50m"},
+        }
+
+    def test_extended_resources_are_limits(self) -> None:
+        wishes = Resources(extended=(("amd.com/gpu", 1),))
+        shape = Shape(processes_per_pod=2).with_resources(wishes)
+        assert worker_of(like(shape))["resources"] == {"limits": {"amd.com/gpu": "2"}}
+
+    def test_nodes_are_those_of_program_configuration_and_function(self) -> None:
+        config = Config(node_selector={"disk": "ssd"}, tolerations=({"key": "spot"},))
+        wishes = Resources(node_selector=(("zone", "b"),), tolerations=((("key", "gpu"),),))
+        spec = like(Shape.of(config).with_resources(wishes))["spec"]
+        assert spec["nodeSelector"] == {"zone": "b", "disk": "ssd"}
+        spot = {"key": "spot", "operator": "Exists"}
+        assert spec["tolerations"] == [spot, {"key": "spot"}, {"key": "gpu"}]
+
+    def test_shared_memory_counts_to_the_memory(self) -> None:
+        shape = Shape.of(Config(shm=2048, processes_per_pod=2))
+        template = like(shape.with_resources(Resources(memory=100)))
+        worker = worker_of(template)
+        assert worker["resources"]["limits"] == {"memory": "2248Mi"}
+        assert worker["resources"]["requests"] == {"memory": "2248Mi", "cpu": "100m"}
+        assert worker["volumeMounts"][-1] == {"name": "fiber-shm", "mountPath": "/dev/shm"}
+        memory = {"medium": "Memory", "sizeLimit": "2048Mi"}
+        assert template["spec"]["volumes"][-1] == {"name": "fiber-shm", "emptyDir": memory}
+
+    def test_shared_memory_takes_the_place_of_the_programs(self) -> None:
+        pod = copy.deepcopy(POD)
+        pod["spec"]["volumes"].append({"name": "shm", "emptyDir": {"medium": "Memory"}})
+        mounts = pod["spec"]["containers"][1]["volumeMounts"]
+        mounts.append({"name": "shm", "mountPath": "/dev/shm"})
+        spec = like(Shape.of(Config(shm=64, cpu_request=0)), pod)["spec"]
+        assert [v["name"] for v in spec["volumes"]] == ["data", "fiber-shm"]
+        assert worker_of({"spec": spec})["resources"] == {"requests": {"memory": "128Mi"}}
+
     def test_no_gpu_is_nothing_to_ask_for(self) -> None:
         assert "resources" not in worker_of(like(Shape().with_resources(Resources(gpu=0))))
 
@@ -218,7 +316,8 @@ class TestTheUsersTemplate:
         template = self.template(spec, memory=512)
         assert template["spec"]["nodeSelector"] == {"zone": "b"}
         worker = worker_of(template)
-        assert worker["resources"] == {"limits": {"memory": "1Gi"}}
+        assert worker["resources"]["limits"] == {"memory": "1Gi"}
+        assert worker["resources"]["requests"] == {"cpu": "50m"}
         assert (worker["image"], worker["command"]) == ("mine:1", AGENT)
 
     @pytest.mark.parametrize("field", ["command", "args"])

@@ -13,7 +13,6 @@ from fiber._backends.kubernetes.warm_pool import read_credentials
 from fiber._transport.credentials import MasterCredentials
 from fiber.errors import FiberPoolError
 from fiber_api import names
-from fiber_api.certificates import make_pool_certificates
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
 from unit.kubernetes_rig import rig as make_rig
 
@@ -241,7 +240,7 @@ def test_what_stays_behind_is_said_with_the_command_that_detaches(
 
 
 def make_secret(rig: Rig, name: str = names.secret_name("warm"), **changed: str) -> None:
-    texts = make_pool_certificates("warm", NAMESPACE).texts() | changed
+    texts = {names.KEY_POOL: "ab" * 32} | changed
     data = {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()}
     body = {"metadata": {"name": name}, "data": data}
     rig.server.do(rig.server.store.create, "secrets", NAMESPACE, body)
@@ -254,13 +253,13 @@ def credentials(rig: Rig) -> MasterCredentials:
 def test_the_credentials_that_the_operator_made_are_read(rig: Rig) -> None:
     make_secret(rig)
     read = credentials(rig)
-    assert read.server_name == names.server_name("warm", NAMESPACE)
-    assert read.key != read.agent_half().key
+    assert read.pool_key == "ab" * 32
+    assert read.fingerprint == "", "the next master has another certificate"
 
 
 def test_credentials_that_cannot_serve(rig: Rig) -> None:
-    make_secret(rig, **{names.KEY_MASTER_KEY: "damaged"})
-    with pytest.raises(FiberPoolError, match=r"master\.key.*delete it") as caught:
+    make_secret(rig, **{names.KEY_POOL: "damaged"})
+    with pytest.raises(FiberPoolError, match=r"key does not hold.*delete it") as caught:
         credentials(rig)
     assert caught.value.reason == "InvalidCredentials"
     assert "damaged" not in str(caught.value)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from fiber._engine.charges import Limits
 from fiber._engine.chunks import SLOW
 from fiber._engine.ledger import WrongAnswer
 from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, run_to_end
@@ -130,7 +131,7 @@ def test_the_worker_that_was_busy_last_is_given_work_first() -> None:
 # Alone, pinned, limited
 
 
-@pytest.mark.parametrize("options", [{"alone": True}, {"retries": 0}])
+@pytest.mark.parametrize("options", [{"alone": True}, {"limits": Limits(0)}])
 def test_tasks_that_travel_alone_go_to_idle_workers_only(options: dict[str, Any]) -> None:
     ledger, workers = ledger_with(2)
     job_of(ledger, range(10), pace=known(1e-6), **options)
@@ -346,7 +347,7 @@ def test_a_worker_answers_for_nothing_but_its_own_next_tasks(
     assert job.done == 2
     ledger.retire(own.worker)
     ledger.lose(own.worker, (), (2, 2))
-    assert job.attempts == {7: 1}, "the task that it ran is not charged, as for a death"
+    assert job.charges.deaths == {7: 1}, "the task that it ran is not charged, as for a death"
     assert sorted([5, 6, *run_to_end(ledger)]) == list(range(10))
     assert job.finished
 
@@ -377,7 +378,7 @@ def test_giving_back_without_results() -> None:
 
 def test_retry_runs_a_task_again_until_it_had_its_tries() -> None:
     ledger, _ = ledger_with(1)
-    job = job_of(ledger, ["a", "b"], pace=known(1e-6), retries=2)
+    job = job_of(ledger, ["a", "b"], pace=known(1e-6), limits=Limits(2))
     for attempt in range(3):
         (batch,) = assign_all(ledger)
         assert "b" in batch.items

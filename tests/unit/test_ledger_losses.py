@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from fiber._engine.charges import Limits
 from fiber._engine.chunks import SLOW
 from fiber._engine.ledger import PATIENCE
 from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, run_to_end
@@ -169,7 +170,7 @@ def test_only_the_running_task_is_charged() -> None:
     assert len(batch.items) > 4
     ledger.receive(batch.worker, batch.seq, 0, 2, 0.0)
     ledger.lose(worker, [other.seq for other in unread], (batch.seq, 3))
-    assert job.attempts == {3: 1}
+    assert job.charges.deaths == {3: 1}
     ledger.add("next", 0.0)
     spans = []
     while len(spans) < 3:
@@ -188,7 +189,7 @@ def test_of_very_short_tasks_a_stride_is_suspect() -> None:
     batch, _ = assign_all(ledger)
     assert batch.stride > 1
     ledger.lose(worker, (), (batch.seq, batch.stride))
-    assert sorted(job.attempts) == list(range(batch.stride, 2 * batch.stride))
+    assert sorted(job.charges.deaths) == list(range(batch.stride, 2 * batch.stride))
 
 
 def test_results_that_came_clear_of_suspicion() -> None:
@@ -197,7 +198,7 @@ def test_results_that_came_clear_of_suspicion() -> None:
     batch = assign_all(ledger)[0]
     ledger.receive(batch.worker, batch.seq, 0, 2, 0.0)
     ledger.lose(worker, (), (batch.seq, 0))
-    assert job.attempts == {}
+    assert job.charges.deaths == {}
 
 
 @pytest.mark.parametrize("running", [None, (10**6, 0)])
@@ -208,14 +209,14 @@ def test_without_a_note_all_tasks_of_the_batch_are_suspect(
     job = job_of(ledger, range(10), pace=known(1e-4))
     batch, queued = assign_all(ledger)
     ledger.lose(worker, (), running)
-    assert job.attempts == dict.fromkeys(range(len(batch.items)), 1)
+    assert job.charges.deaths == dict.fromkeys(range(len(batch.items)), 1)
     assert len(job.waiting) == 10
     assert len(queued.items) > 0
 
 
 def test_a_task_that_kills_every_worker_has_its_tries_and_no_more() -> None:
     ledger, _ = ledger_with(0)
-    job = job_of(ledger, ["good", "bad", "good"], retries=2)
+    job = job_of(ledger, ["good", "bad", "good"], limits=Limits(2))
     deaths = 0
     losses = []
     while not job.finished:
@@ -231,15 +232,15 @@ def test_a_task_that_kills_every_worker_has_its_tries_and_no_more() -> None:
         unread = [b.seq for b in list(worker.queue)[1:]]
         losses += ledger.lose(worker, unread, (batch.seq, list(batch.items).index("bad")))
     assert deaths == 3
-    assert [(loss.task, loss.attempts, loss.item) for loss in losses] == [(1, 3, "bad")]
+    assert [(loss.task, loss.counts.deaths, loss.item) for loss in losses] == [(1, 3, "bad")]
 
 
 def test_without_retries_a_task_runs_once() -> None:
     ledger, (worker,) = ledger_with(1)
-    job = job_of(ledger, ["a", "b"], retries=0)
+    job = job_of(ledger, ["a", "b"], limits=Limits(0))
     (batch,) = assign_all(ledger)
     (loss,) = ledger.lose(worker, (), (batch.seq, 0))
-    assert (loss.task, loss.attempts) == (0, 1)
+    assert (loss.task, loss.counts.deaths) == (0, 1)
     assert len(job.waiting) == 1
 
 

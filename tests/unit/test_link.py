@@ -64,7 +64,7 @@ def test_any_thread_may_send(site: Site) -> None:
 
 def test_each_side_learns_who_the_other_is(site: Site) -> None:
     master, agent = site.pair()
-    assert master.link.peer == Identity.of_this_process("agent-1", host="here")
+    assert master.link.peer == Identity.of_this_process("agent-1", "uid", host="here")
     assert agent.link.peer.name == "the master"
 
 
@@ -212,7 +212,7 @@ def remote_agent(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """An agent in a process of its own that sends back what it gets."""
     path = os.pathsep.join(entry for entry in sys.path if entry)
-    descriptor = credentials.agent_half().to_descriptor()
+    descriptor = credentials.agent("echo", "").to_descriptor()
     process = subprocess.Popen(
         [sys.executable, "-c", ECHO, listener.address],
         env={**os.environ, "CREDENTIALS": str(descriptor), "PYTHONPATH": path},
@@ -234,7 +234,7 @@ from fiber._transport.loop import Loop
 
 loop = Loop()
 loop.start_thread("io")
-credentials = make_credentials("test")
+credentials = make_credentials()
 listener = MasterListener(
     loop, "127.0.0.1:0", credentials, on_agent=print, on_refused=print
 )

@@ -9,17 +9,19 @@ import socket
 import ssl
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from fiber._transport import tls
+from fiber._transport.credentials import make_credentials
 from fiber._transport.handshake import Hello, Identity, Refusal, decode
 from fiber._transport.listener import MasterListener
 from fiber.errors import AuthenticationError, LinkError
 from patience import PATIENCE
 from unit.attacker import CUT, DOWN, MESSAGE, TLS, UP, Path, Unit
-from unit.link_site import Notes, Site, port_of, say
+from unit.link_site import Notes, Site, complete, port_of, say
 
 FRAMES = [b"%d " % number * 50 for number in range(30)]
 HOPS = 8 + 4
@@ -215,11 +217,13 @@ def test_a_stolen_agents_key_opens_no_other_agents_link(site: Site, claims: str)
     _, agent = site.dialer(listener.address)
     agent.link.send(b"mine")
     master.wait(lambda: master.frames)
-    known = Identity.of_this_process("agent-1", host="here")
-    guess = "0" * 32  # the name of a link is as long as a key, and travels in TLS only
-    hello = Hello(known, guess, 0, claims == "to go on with a link")
-    answer = decode(say(listener.address, site.credentials.agent_half(), hello.encode()))
-    assert isinstance(answer, Refusal) == hello.welcomed
+    thief = Identity.of_this_process("agent-2", "uid", host="here")
+    (name,) = listener._links  # even if the thief knew it
+    hello = Hello(thief, name, 0, claims == "to go on with a link")
+    stolen = site.credentials.agent("agent-2", "uid")
+    answer = decode(say(listener.address, stolen, hello.encode()))
+    assert isinstance(answer, Refusal)
+    assert "the link of 'agent-1'" in answer.reason
     agent.link.send(b"still mine")
     master.wait(lambda: len(master.frames) == 2)
     assert master.events == agent.events == []
@@ -227,19 +231,34 @@ def test_a_stolen_agents_key_opens_no_other_agents_link(site: Site, claims: str)
 
 def test_the_path_with_a_stolen_agents_key_is_no_master(site: Site) -> None:
     """Nor can who has such a key sit in the middle: an agent expects the master's name."""
-    half = site.credentials.agent_half()
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_verify_locations(cadata=half.authority)
-    tls._load_own(context, half)
-    with socket.create_server(("127.0.0.1", 0)) as door:
-        _, agent = site.dialer(f"127.0.0.1:{door.getsockname()[1]}")
-        sock, _ = door.accept()
-        with pytest.raises(ssl.SSLError), context.wrap_socket(sock, server_side=True):
-            pass
-        sock.close()
+    stolen = replace(make_credentials("ab" * 32), pool_key=site.credentials.agent("b", "uid").key)
+    middle = Site(stolen)
+    try:
+        listener, _ = middle.listener()
+        victim = replace(site.credentials.agent("agent-1", "uid"), master="")  # of a warm pool
+        _, agent = site.dialer(listener.address, credentials=victim)
         agent.wait(lambda: agent.errors)
+    finally:
+        middle.end()
     assert isinstance(agent.errors[0], AuthenticationError)
-    assert "certificate is refused" in str(agent.errors[0])
+
+
+def test_a_proof_is_good_for_one_master_alone(site: Site) -> None:
+    """Who shows another certificate in the middle cannot pass an agent's proof on."""
+    pool_key = site.credentials.pool_key
+    listener, master = site.listener()
+    middle = tls.agent_context()
+    credentials = make_credentials(pool_key).agent("agent-1", "uid")
+    hello = Hello(Identity.of_this_process("agent-1", "uid"), "0" * 32, 0, False).encode()
+    sock = socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE)
+    handshake = tls.AgentHandshake(sock, middle)
+    handshake.sock.getpeercert = lambda binary_form=False: b"what the one in the middle shows"
+    try:
+        with pytest.raises(tls.Untrusted, match="does not believe"):
+            complete(handshake, handshake.ask(credentials, hello))
+    finally:
+        handshake.close()
+    assert master.links == []
 
 
 @pytest.mark.filterwarnings("ignore:ssl.TLSVersion:DeprecationWarning")
@@ -247,15 +266,14 @@ def test_the_path_with_a_stolen_agents_key_is_no_master(site: Site) -> None:
 def test_nobody_is_talked_into_an_older_tls(
     site: Site, monkeypatch: pytest.MonkeyPatch, who: str
 ) -> None:
-    def older(credentials: Any, *, listens: bool) -> ssl.SSLContext:
-        context = made(credentials, listens=listens)
-        if listens == (who == "master"):
-            context.minimum_version = ssl.TLSVersion.TLSv1_2
-            context.maximum_version = ssl.TLSVersion.TLSv1_2
+    def older(*credentials: Any) -> ssl.SSLContext:
+        context: ssl.SSLContext = made(*credentials)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.maximum_version = ssl.TLSVersion.TLSv1_2
         return context
 
-    made = tls.context_of
-    monkeypatch.setattr(tls, "context_of", older)
+    made: Any = getattr(tls, f"{who}_context")
+    monkeypatch.setattr(tls, f"{who}_context", older)
     listener, master = site.listener()
     _, agent = site.dialer(listener.address)
     agent.wait(lambda: agent.errors)

@@ -5,19 +5,20 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pynng
 import pytest
 
-from fiber._transport import dialer
-from fiber._transport.credentials import make_credentials
+from faults.program import wait_for
+from fiber._transport import dialer, tls
+from fiber._transport.credentials import Credentials, make_credentials
 from fiber._transport.handshake import Hello, Identity
 from fiber._transport.link import Keepalive
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
-from unit.link_site import Site, free_port, port_of, say, vanish
+from unit.link_site import Site, black_hole, free_port, port_of, say, vanish
 
 
 def test_a_port_in_use_is_named(site: Site) -> None:
@@ -91,17 +92,6 @@ def test_what_takes_connections_and_says_nothing_is_given_up(site: Site) -> None
     assert "no master answered" in str(agent.errors[0])
 
 
-@contextlib.contextmanager
-def black_hole() -> Iterator[str]:
-    """An address that answers nothing: what comes in waits for a queue that stays full."""
-    with socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as queue:
-        for _ in range(2):
-            waiting = queue.enter_context(socket.socket())
-            waiting.setblocking(False)
-            waiting.connect_ex(full.getsockname())
-        yield f"127.0.0.1:{full.getsockname()[1]}"
-
-
 def test_an_address_without_an_answer_is_soon_asked_again(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,40 +148,119 @@ def test_without_descriptors_for_a_moment_both_sides_go_on_to_try(
     assert refusals == []
 
 
-@pytest.mark.parametrize("wrong", ["other run", "other name", "the agent's certificate"])
+WRONG: dict[str, Callable[[Site], Credentials]] = {
+    "another run's": lambda _: make_credentials().agent("agent-1", "uid"),
+    "another pool's key": lambda site: replace(
+        make_credentials().agent("agent-1", "uid"), master=site.credentials.fingerprint
+    ),
+    "another pod's": lambda site: site.credentials.agent("agent-2", "uid"),
+    "another uid": lambda site: site.credentials.agent("agent-1", "another uid"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
 def test_wrong_credentials_are_an_error_at_once(site: Site, wrong: str) -> None:
-    listener, _ = site.listener()
-    agent_half = site.credentials.agent_half()
-    if wrong == "other run":
-        agent_half = make_credentials("test").agent_half()
-    elif wrong == "other name":
-        agent_half = replace(agent_half, server_name="master.other.fiber")
-    else:
-        foreign = make_credentials("test").agent_half()
-        agent_half = replace(agent_half, certificate=foreign.certificate, key=foreign.key)
-    _, agent = site.dialer(listener.address, credentials=agent_half)
+    listener, master = site.listener()
+    credentials = WRONG[wrong](site)
+    _, agent = site.dialer(listener.address, credentials=credentials)
     agent.wait(lambda: agent.errors)
     assert isinstance(agent.errors[0], AuthenticationError)
     assert listener.address in str(agent.errors[0])
-    assert "PRIVATE" not in str(agent.errors[0])
+    assert credentials.key not in str(agent.errors[0])
+    assert master.links == master.proofs == []
 
 
-def test_an_agent_cannot_pose_as_the_master(site: Site) -> None:
-    half = site.credentials.agent_half()
-    impostor = Site(replace(site.credentials, certificate=half.certificate, key=half.key))
+def test_one_who_knows_the_key_of_a_pool_cannot_pose_as_its_only_master(site: Site) -> None:
+    impostor = Site(replace(make_credentials(), pool_key=site.credentials.pool_key))
     try:
         listener, _ = impostor.listener()
-        _, agent = site.dialer(listener.address, timeout=1)
+        _, agent = site.dialer(
+            listener.address, credentials=site.credentials.agent("agent-1", "uid")
+        )
         agent.wait(lambda: agent.errors)
-        assert agent.links == []
+        assert "not that of this agent's master" in str(agent.errors[0])
     finally:
         impostor.end()
 
 
-def test_credentials_that_are_no_pem_are_named(site: Site) -> None:
-    broken = replace(site.credentials.agent_half(), key="nonsense")
-    with pytest.raises(AuthenticationError, match=r"credentials for master.test.fiber cannot be"):
-        site.dialer("127.0.0.1:1", credentials=broken)
+def test_a_master_without_the_key_of_the_pool_gets_no_agent(site: Site) -> None:
+    """In a warm pool, where any certificate may be the next master's."""
+    listener, _ = site.listener()
+    warm = make_credentials("ab" * 32).agent("agent-1", "uid")
+    _, agent = site.dialer(listener.address, credentials=warm)
+    agent.wait(lambda: agent.errors)
+    assert isinstance(agent.errors[0], AuthenticationError)
+    assert agent.links == []
+
+
+def test_a_certificate_that_is_no_pem_is_named(site: Site) -> None:
+    broken = Site(replace(site.credentials, key="nonsense"))
+    try:
+        with pytest.raises(AuthenticationError, match="master's certificate cannot be used"):
+            broken.listener()
+    finally:
+        broken.end()
+
+
+def test_a_second_link_of_a_pod_is_refused_while_the_first_lives(site: Site) -> None:
+    listener, master = site.listener()
+    identity = Identity.of_this_process("agent-1", "uid")
+    _, first = site.dialer(listener.address, identity=identity)
+    first.link.send(b"first")
+    master.wait(lambda: master.frames)
+    _, second = site.dialer(listener.address, identity=identity)
+    second.wait(lambda: second.errors)
+    assert "'agent-1' has a link already" in str(second.errors[0])
+    first.link.send(b"still there")
+    master.wait(lambda: master.frames == [b"first", b"still there"])
+    assert first.events == []
+    assert len(master.links) == 1
+
+
+def test_a_pod_whose_link_broke_may_begin_another(site: Site) -> None:
+    """Its agent has given this master up, and begins anew."""
+    listener, master = site.listener(keepalive=Keepalive())
+    identity = Identity.of_this_process("agent-1", "uid")
+    dialling, first = site.dialer(listener.address, identity=identity)
+    assert first.link is not master.link
+    dialling.close()
+    link: Any = master.links[0]
+    wait_for(lambda: site.on_loop(lambda: not link.is_connected))
+    _, second = site.dialer(listener.address, identity=identity)
+    assert second.link is not master.links[-1]
+    master.wait(lambda: len(master.links) == 2)
+
+
+def test_an_agent_that_comes_before_its_pod_is_known_waits_for_it(site: Site) -> None:
+    listener, master = site.listener()
+    known: list[str] = []
+    listener._knows = lambda identity: "" if identity.name in known else None
+    _, agent = site.dialer(listener.address)
+    master.wait(lambda: master.proofs)
+    assert agent.links == agent.errors == []
+    site.on_loop(listener.look_again)
+    assert agent.links == agent.errors == []
+    known.append("agent-1")
+    site.on_loop(listener.look_again)
+    assert agent.link is not master.link
+
+
+def test_an_agent_that_is_not_the_pod_that_it_says_hears_why(site: Site) -> None:
+    listener, master = site.listener()
+    listener._knows = lambda identity: f"{identity.uid!r} is no pod"
+    _, agent = site.dialer(listener.address)
+    agent.wait(lambda: agent.errors)
+    assert "'uid' is no pod" in str(agent.errors[0])
+    assert master.links == []
+
+
+def test_a_master_of_an_earlier_epoch_is_refused(site: Site) -> None:
+    listener, _ = site.listener()
+    site.on_loop(lambda: setattr(listener, "epoch", 3))
+    served = replace(site.credentials.agent("agent-1", "uid"), epoch=4)
+    _, agent = site.dialer(listener.address, credentials=served)
+    agent.wait(lambda: agent.errors)
+    assert "that of epoch 3, and this agent has served the one of epoch 4" in str(agent.errors[0])
 
 
 @pytest.mark.parametrize(
@@ -205,7 +274,7 @@ def test_another_version_is_refused_and_both_sides_hear_both(
     site: Site, change: dict[str, Any], what: str, theirs: str
 ) -> None:
     listener, master = site.listener()
-    ours = Identity.of_this_process("agent-1")
+    ours = Identity.of_this_process("agent-1", "uid")
     _, agent = site.dialer(listener.address, identity=replace(ours, **change))
     agent.wait(lambda: agent.errors)
     assert isinstance(agent.errors[0], VersionMismatch)
@@ -221,7 +290,7 @@ def test_another_version_is_refused_and_both_sides_hear_both(
 
 def test_another_patch_level_of_python_will_do(site: Site) -> None:
     listener, master = site.listener()
-    ours = Identity.of_this_process("agent-1")
+    ours = Identity.of_this_process("agent-1", "uid")
     minor = ".".join(ours.python.split(".")[:2])
     _, agent = site.dialer(listener.address, identity=replace(ours, python=f"{minor}.99"))
     assert agent.link is not master.link
@@ -229,11 +298,12 @@ def test_another_patch_level_of_python_will_do(site: Site) -> None:
 
 def test_who_is_no_agent_is_refused(site: Site) -> None:
     listener, master = site.listener()
-    say(listener.address, site.credentials.agent_half(), b"GET / HTTP/1.1")
+    with pytest.raises(tls.HungUp):
+        say(listener.address, site.credentials.agent("a", "uid"), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
     assert "no agent of Fiber" in master.refusals[0]
 
 
 def test_a_greeting_carries_nothing_but_who_and_where() -> None:
-    hello = Hello(Identity.of_this_process("agent-1"), "session", 3, True)
+    hello = Hello(Identity.of_this_process("agent-1", "uid"), "session", 3, True)
     assert b"PRIVATE" not in hello.encode()

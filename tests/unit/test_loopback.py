@@ -17,6 +17,7 @@ from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
+import pynng
 import pytest
 
 import census
@@ -34,7 +35,7 @@ from fiber._wire import messages
 from fiber.errors import LinkError, StartError
 from memory_link import SimulatedLoop
 from patience import PATIENCE
-from unit.agent_children import Recorder, run_forever
+from unit.agent_children import ReadLink, Recorder, run_forever
 
 
 @contextlib.contextmanager
@@ -118,13 +119,13 @@ def credentials_in_reach() -> list[str]:
     for pid in family:
         for name in ("environ", "cmdline"):
             with contextlib.suppress(OSError), open(f"/proc/{pid}/{name}", "rb") as file:
-                if b"PRIVATE KEY" in (data := file.read()) or b"FIBER_AGENT_CREDENTIALS=ey" in data:
+                if b'"key"' in file.read():
                     found.append(f"{name} of {pid}")
     for fd in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):
             if os.readlink(f"/proc/self/fd/{fd}").startswith(("pipe:", "/memfd:credentials")):
                 os.set_blocking(int(fd), False)
-                if b"PRIVATE" in os.read(int(fd), 1 << 16):
+                if b'"key"' in os.read(int(fd), 1 << 16):
                     found.append(f"descriptor {fd}")
     return found
 
@@ -181,6 +182,7 @@ def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() ->
         stop(another)
 
 
+@pytest.mark.slow
 def test_agents_that_die_before_they_join_are_an_error_until_one_joins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -203,6 +205,7 @@ def test_agents_that_die_before_they_join_are_an_error_until_one_joins(
             assert pool.map(abs, range(3)) == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_agents_that_are_killed_while_they_start_cost_a_pool_nothing_but_time() -> None:
     with running() as backend, fiber.Pool(1) as pool:
         assert pool.map(abs, range(3)) == [0, 1, 2]
@@ -239,6 +242,7 @@ def loads(backend: loopback.LoopbackBackend) -> list[int]:
 def test_a_pool_that_starts_before_its_agents_is_spread_over_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(loopback, "_EXPECTED_FOR", PATIENCE)
     goes_on = gate_second_agent(monkeypatch)
     with running(agents=2) as backend, fiber.Pool(4) as pool:
         assert census.wait_until(lambda: loads(backend) == [2], PATIENCE)
@@ -369,7 +373,10 @@ def test_a_port_in_use_is_named_and_leaves_nothing() -> None:
 
 
 def test_an_address_that_is_not_ours_is_named() -> None:
-    with pytest.raises(LinkError, match=r"203\.0\.113\.7"), running(listen_host="203.0.113.7"):
+    with (
+        pytest.raises(LinkError, match=r"203\.0\.113\.7:0: this machine"),
+        running(listen_host="203.0.113.7"),
+    ):
         pass
 
 
@@ -418,6 +425,8 @@ def test_who_hangs_up_while_it_ends_is_not_reported(
 
 @pytest.mark.slow
 def test_the_runtime_can_be_shut_down_and_made_again() -> None:
+    with pynng.Pair1():
+        pass  # nng's poller, made at the first use in a process, stays until the process ends
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(2):
         with running():
@@ -428,11 +437,11 @@ def test_the_runtime_can_be_shut_down_and_made_again() -> None:
 # The master's side of one agent, without its process
 
 
-class Silent:
+class Silent(ReadLink):
     """A hub, and a link, that a test can do without."""
 
     def __init__(self) -> None:
-        self.sent: list[Any] = []
+        super().__init__()
         self.access = HubAddress("local", "nowhere", b"")
 
     def link(self, *_: Any, **__: Any) -> Silent:
@@ -443,12 +452,6 @@ class Silent:
 
     def flush(self) -> None:
         pass
-
-    def attach(self, _observer: Any) -> None:
-        pass
-
-    def send(self, *frame: Any, **_: Any) -> None:
-        self.sent.append(messages.decode(b"".join(frame)))
 
 
 @pytest.fixture
@@ -491,3 +494,12 @@ def test_a_child_whose_agent_is_lost_before_it_starts_is_lost_with_it(remote: An
     assert observer.events == ["exited"]
     assert observer.wait_for_exit().reason == "agent far lost: silence"
     assert len(link.sent) == sent
+
+
+def test_an_agent_that_is_about_to_end_is_not_killed() -> None:
+    """A drained agent without a link may still remove its directory."""
+    process = mock.Mock()
+    with running() as backend:
+        backend._departing["gone"] = SimpleNamespace(name="gone", process=process)  # type: ignore[assignment]
+    assert process.terminate.called
+    assert not process.kill.called

@@ -19,6 +19,7 @@ from fiber._wire.messages import (
     Forget,
     FromChild,
     Lacking,
+    Leave,
     Message,
     Output,
     ProtocolError,
@@ -32,6 +33,7 @@ from fiber._wire.messages import (
     TunnelData,
     TunnelOpen,
     decode,
+    lane,
 )
 
 SECRET = "the user's own"
@@ -48,6 +50,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Start, ids, data, data),
     st.builds(Blob, digests, data),
     st.builds(Forget, digests),
+    st.builds(Leave, st.floats(allow_nan=False), any_text),
     st.builds(Lacking, digests),
     st.builds(Started, ids, numbers),
     st.builds(Signal, ids, numbers),
@@ -200,3 +203,12 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
 def test_a_repr_shows_no_data_of_the_user(message: Message, shown: str) -> None:
     assert repr(message) == shown
     assert str(message) == shown
+
+
+def test_only_messages_about_the_same_child_or_blob_wait_for_a_large_one() -> None:
+    start, blob = Start(1, b"", b""), Blob(bytes(DIGEST_BYTES), b"")
+    assert lane(start) == lane(Deliver(1, 2, b"")) == lane(Recall(1))
+    assert lane(blob) == lane(Forget(blob.digest))
+    lanes = [lane(start), lane(blob), lane(Start(2, b"", b"")), lane(TunnelData(1, b""))]
+    assert len({*lanes, None}) == 5
+    assert lane(Signal(1, 15)) is None, "it does not wait for what the child was sent"

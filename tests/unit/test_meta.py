@@ -16,7 +16,7 @@ from typing import Any
 import cloudpickle
 import pytest
 
-from fiber.resources import Resources, meta, resources_of
+from fiber.resources import Resources, largest, meta, resources_of
 
 LIBRARY = '''
 """A module as a user writes it."""
@@ -278,7 +278,7 @@ class TestValues:
             meta(disk=3)  # type: ignore[call-arg]
 
     def test_no_wish_at_all(self) -> None:
-        with pytest.raises(TypeError, match="at least one of cpu=, memory= and gpu="):
+        with pytest.raises(TypeError, match="at least one of cpu=, memory=, gpu="):
             meta()
 
     @pytest.mark.parametrize("thing", [3, int])
@@ -289,3 +289,52 @@ class TestValues:
     def test_resources_are_frozen(self) -> None:
         with pytest.raises(AttributeError):
             Resources().cpu = 1  # type: ignore[misc]
+
+
+class TestNodes:
+    def test_other_resources_and_nodes_are_wishes(self) -> None:
+        wishing = meta(
+            resources={"amd.com/gpu": 1},
+            node_selector={"disk": "ssd"},
+            tolerations=["spot=true:NoSchedule", {"key": "team", "operator": "Exists"}],
+        )(print)
+        spot = {"key": "spot", "operator": "Equal", "value": "true", "effect": "NoSchedule"}
+        found = resources_of(wishing)
+        assert found.extended == (("amd.com/gpu", 1),)
+        assert found.node_selector == (("disk", "ssd"),)
+        assert [dict(one) for one in found.tolerations] == [
+            spot,
+            {"key": "team", "operator": "Exists"},
+        ]
+        hash(found)
+
+    def test_outer_wishes_are_added(self) -> None:
+        inner = meta(resources={"a.b/c": 1}, node_selector={"x": "1", "y": "1"})(print)
+        found = resources_of(meta(resources={"a.b/c": 2}, node_selector={"y": "2"})(inner))
+        assert found.extended == (("a.b/c", 2),)
+        assert found.node_selector == (("x", "1"), ("y", "2"))
+
+    @pytest.mark.parametrize(
+        ("wishes", "why"),
+        [
+            ({"resources": {"cpu": 1}}, "CPUs and memory are cpu= and memory="),
+            ({"resources": {"nvidia.com/gpu": 1}}, "use that"),
+            ({"resources": {"amd.com/gpu": 0.5}}, "a whole number"),
+            ({"node_selector": {"disk": 1}}, "a dict of labels"),
+            ({"tolerations": ["spot:Never"]}, "is no toleration"),
+            ({"tolerations": [{"keys": "spot"}]}, "is no toleration"),
+        ],
+    )
+    def test_what_cannot_be_read_is_an_error(self, wishes: dict[str, Any], why: str) -> None:
+        with pytest.raises(ValueError, match=why):
+            meta(**wishes)
+
+    def test_a_worker_of_several_suits_them_all(self) -> None:
+        one = Resources(cpu=1, extended=(("a.b/c", 2),), node_selector=(("x", "1"),))
+        other = Resources(cpu=2, extended=(("a.b/c", 1), ("a.b/d", 1)))
+        found = largest([one, other])
+        assert found == Resources(
+            cpu=2, extended=(("a.b/c", 2), ("a.b/d", 1)), node_selector=(("x", "1"),)
+        )
+        with pytest.raises(ValueError, match="x=1 and with x=2"):
+            largest([one, Resources(node_selector=(("x", "2"),))])

@@ -16,9 +16,12 @@ from typing import Any
 import pytest
 
 import fiber
+import fiber.connection
 from census import wait_until
-from fiber._hub import one_way
+from fiber._hub import dealer, one_way
 from fiber._hub.backlog import AMBIGUOUS
+from fiber._hub.dealer import Dealer
+from fiber._hub.hosted import HostedReceiver
 from fiber._hub.local import LocalChannel
 from fiber._hub.one_way import Receiver, Sender
 from fiber._wire import packet
@@ -219,6 +222,48 @@ def test_a_receiver_that_slept_before_it_was_lost_wakes_all_the_same(ends: Ends)
     sender.backlog.put(memoryview(b"unannounced"))
     sleeper.join(PATIENCE)
     assert answers == [b"unannounced"]
+
+
+@pytest.mark.parametrize("sleep", ["recv", "poll", "wait"])
+def test_so_does_one_of_another_host(sleep: str, far: Far, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = fiber.Pipe(duplex=False)
+    there, sender = far(reader), writer._channel
+    answers: list[object] = []
+    ways: dict[str, Callable[[], object]] = {
+        "recv": there.recv_bytes,
+        "poll": lambda: there.poll(None) and there.recv_bytes(),
+        "wait": lambda: fiber.connection.wait([there]) and there.recv_bytes(),
+    }
+    asleep = threading.Event()
+    watch = HostedReceiver._watch
+
+    def watched(hosted: HostedReceiver) -> None:
+        watch(hosted)
+        if hosted._is_awaited():
+            asleep.set()
+
+    monkeypatch.setattr(HostedReceiver, "_watch", watched)
+    sleeper = background(lambda: answers.append(ways[sleep]()))
+    assert asleep.wait(PATIENCE)
+    sender.backlog.put(memoryview(b"unannounced"))
+    sleeper.join(PATIENCE)
+    assert answers == [b"unannounced"]
+    with reader, writer, there:
+        pass
+
+
+def test_so_does_the_dealer_of_a_queue() -> None:
+    inbox, outbox = one_way.pair()
+    arrivals, door = LocalChannel.pair()
+    Dealer(inbox, arrivals).start()
+    reader = dealer.arrive(door)
+    outbox.send(b"first")
+    assert reader.recv().tobytes() == b"first"  # it sleeps before it looks again
+    outbox.backlog.put(memoryview(b"unannounced"))
+    assert reader.poll(PATIENCE)
+    assert reader.recv().tobytes() == b"unannounced"
+    for channel in (reader, outbox, door):
+        channel.close()
 
 
 def test_the_end_comes_after_the_backlog(ends: Ends) -> None:

@@ -335,6 +335,39 @@ async def test_a_long_message_is_cut(api: KubernetesApi, door: Cluster) -> None:
 @played
 async def test_memory_of_events_is_bounded(api: KubernetesApi, door: Cluster) -> None:
     record = recorder(api, door)
-    record._posted.update({("uid", str(n), ""): None for n in range(event_recorder.REMEMBERED)})  # type: ignore[misc]
-    await record.record(ES, "uid", Event("Normal", "A", "a"))
-    assert len(record._posted) == event_recorder.REMEMBERED
+    for number in range(event_recorder.REMEMBERED + 10):
+        await record.record(ES, "uid", Event("Normal", "A", str(number)))
+    assert len(record._namespaces[ES.namespace].posted) == event_recorder.REMEMBERED
+
+
+@played
+async def test_a_namespace_without_recent_events_is_forgotten(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    record = recorder(api, door)
+    running = asyncio.ensure_future(record.run())
+    for number in range(100):
+        record.tell(Key(f"team-{number}", "es"), "uid", Event("Normal", "A", "a"))
+    await asyncio.sleep(2 * event_recorder.WINDOW)
+    for number in range(100):
+        record.tell(ES, "uid", Event("Normal", "A", str(number % 2)))
+        await asyncio.sleep(1)
+    assert set(record._namespaces) == {ES.namespace}
+    running.cancel()
+
+
+@played
+async def test_the_events_of_one_namespace_neither_delay_nor_displace_anothers(
+    api: KubernetesApi, door: Cluster
+) -> None:
+    record = recorder(api, door)
+    running = asyncio.ensure_future(record.run())
+    api.faults.append(Fault("create", "events", late=1.0, times=10**6))
+    record.tell(Key("well", "es"), "uid", Event("Normal", "A", "first"))
+    for number in range(10_000):
+        record.tell(ES, "uid", Event("Warning", "Broken", str(number)))
+    record.tell(Key("well", "es"), "uid", Event("Normal", "A", "second"))
+    await asyncio.sleep(2.5)
+    told = [event["message"] for event in api.store.list("events", "well")]
+    assert sorted(told) == ["first", "second"]
+    running.cancel()

@@ -14,12 +14,13 @@ from kubernetes.aio.client.configuration import Configuration
 from kubernetes.aio.config import incluster_config
 
 from fakes import virtual_time
+from fakes.certificates import make_certificates
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Store
 from fakes.world import configuration
-from fiber_api.certificates import make_pool_certificates
 from fiber_operator import cluster
-from fiber_operator.cluster import PODS, SECRETS, Cluster
+from fiber_operator.cluster import PAGE, PODS, POOLS, SECRETS, Cluster
+from fiber_operator.watch_session import open_watch_session
 
 
 @contextlib.asynccontextmanager
@@ -78,6 +79,30 @@ def test_a_list_has_every_page_and_only_what_is_selected() -> None:
         assert here == [f"p{number}" for number in range(8)]
         assert len(await door.list(PODS, None, names_of)) == 10
         assert api.count("list", "pods") == 3 + 4
+
+    with_api(test)
+
+
+@pytest.mark.parametrize("expired", [False, True])
+def test_metadata_come_in_pages_and_all_at_once_if_a_page_was_asked_for_too_late(
+    expired: bool,
+) -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        for number in range(PAGE + 3):
+            api.store.create("fiberpools", "here", {**pod(f"p{number:03}"), "spec": {"big": 1}})
+        if expired:
+            api.faults.append(Fault("list", "fiberpools", 410, reason="Expired", skip=1))
+        found = await door.list_metadata(POOLS, "here", lambda body: (names_of(body), len(body)))
+        # Of each its version, its kind and its metadata.
+        assert found == [(f"p{number:03}", 3) for number in range(PAGE + 3)]
+        assert api.count("list", "fiberpools") == 2 + expired
+
+    with_api(test)
+
+
+def test_an_empty_list_of_metadata_is_empty() -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        assert await door.list_metadata(POOLS, None, names_of) == []
 
     with_api(test)
 
@@ -309,7 +334,7 @@ def test_a_pod_logs_in_with_its_own_account(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "token").write_text("first")
-    (tmp_path / "ca.crt").write_text(make_pool_certificates("any", "any").authority)
+    (tmp_path / "ca.crt").write_text(make_certificates("any", "any").authority)
     monkeypatch.setattr(incluster_config, "SERVICE_TOKEN_FILENAME", str(tmp_path / "token"))
     monkeypatch.setattr(incluster_config, "SERVICE_CERT_FILENAME", str(tmp_path / "ca.crt"))
     monkeypatch.delenv("KUBECONFIG", raising=False)
@@ -319,7 +344,7 @@ def test_a_pod_logs_in_with_its_own_account(
     async def main() -> None:
         configuration = await cluster.load_configuration()
         assert configuration.host == "https://[fd00::1]:443"
-        async with await cluster.open_session(configuration, aiohttp.TraceConfig()) as session:
+        async with await open_watch_session(configuration, aiohttp.TraceConfig()) as session:
             assert session.headers["Authorization"] == "bearer first"
 
     asyncio.run(main())

@@ -336,14 +336,14 @@ async def test_a_service_that_was_changed_is_mended(world: World) -> None:
 def test_an_object_of_somebody_else_is_not_touched(plural: str) -> None:
     @played()
     async def test(world: World) -> None:
-        name = "es-fiber-tls" if plural == "secrets" else "es-fiber"
+        name = "es-fiber-key" if plural == "secrets" else "es-fiber"
         theirs = world.store.create(plural, NAMESPACE, {"metadata": {"name": name}, "data": {}})
         world.make_pool(replicas=2)
         assert await world.until(lambda: "NameTaken" in world.reasons()) < 2
         problem = world.status()["problems"][0]
         assert problem["terminal"]
         assert name in problem["message"]
-        secret = None if plural == "secrets" else "es-fiber-tls"
+        secret = None if plural == "secrets" else "es-fiber-key"
         assert world.status().get("credentialsSecret") == secret
         await world.settled(120)
         assert world.store.get(plural, NAMESPACE, name) == theirs
@@ -376,11 +376,11 @@ async def test_a_pool_made_anew_waits_for_what_the_old_one_left(world: World) ->
 async def test_damaged_credentials_are_told(world: World) -> None:
     world.make_pool(replicas=1)
     await world.ready(1)
-    world.store.merge("secrets", NAMESPACE, "es-fiber-tls", {"data": {"ca.crt": "bm9uc2Vuc2U="}})
+    world.store.merge("secrets", NAMESPACE, "es-fiber-key", {"data": {"key": "bm9uc2Vuc2U="}})
     await world.until(lambda: "InvalidCredentials" in world.reasons(), 125)
     assert "Delete it" in world.status()["problems"][0]["message"]
     assert world.status().get("credentialsSecret") is None
-    world.store.delete("secrets", NAMESPACE, "es-fiber-tls")
+    world.store.delete("secrets", NAMESPACE, "es-fiber-key")
     await world.until(lambda: world.reasons() == [], 125)
 
 

@@ -37,6 +37,35 @@ async def test_a_service_that_was_deleted_comes_back_with_its_address(world: Wor
     assert (world.reasons(), len(world.created())) == ([], 2)
 
 
+@played
+async def test_workers_dial_both_families_of_the_service(world: World) -> None:
+    world.store.dual_stack = True
+    world.make_pool(replicas=1, master={**MASTER, "host": "fd00::7"})
+    await world.ready(1)
+    assert dialled(world) == {"10.96.0.1:7070,[fd00:96::1]:7070"}
+    assert world.reasons() == []
+    world.store.delete("services", NAMESPACE, "es-fiber")
+    await world.until(lambda: world.store.list("services") != [], within=125)
+    await world.settled()
+    (service,) = world.store.list("services")
+    assert service["spec"]["clusterIPs"] == ["10.96.0.1", "fd00:96::1"]
+    assert (world.reasons(), len(world.created())) == ([], 1)
+
+
+@played
+async def test_a_service_of_one_family_that_is_deleted_gets_the_other_for_its_master(
+    world: World,
+) -> None:
+    world.make_pool()
+    await world.until(lambda: "endpoint" in world.status())
+    world.store.dual_stack = True
+    world.edit(master={**MASTER, "host": "fd00::7"})
+    await world.until(lambda: world.reasons() == ["InvalidSpec"])
+    world.store.delete("services", NAMESPACE, "es-fiber")
+    await world.until(lambda: world.reasons() == [], within=125)
+    assert "[fd00:96::2]:7070" in world.status()["endpoint"]
+
+
 @pytest.mark.parametrize(
     ("endpoint", "address"),
     [
@@ -125,7 +154,7 @@ async def test_workers_without_a_master_that_hold_old_credentials_are_replaced(
     await world.ready(8)
     await world.settled()
     before = world.names()
-    world.store.delete("secrets", NAMESPACE, "es-fiber-tls")
+    world.store.delete("secrets", NAMESPACE, "es-fiber-key")
     await world.until(lambda: "CredentialsChanged" in world.reasons(), 125)
     await world.until(lambda: not {*before} & {*world.names()})
     await world.ready(8)
@@ -140,7 +169,7 @@ async def test_workers_of_a_master_that_hold_old_credentials_stay_and_are_told(
     await world.ready(3)
     await world.settled()
     before = world.names()
-    world.store.delete("secrets", NAMESPACE, "es-fiber-tls")
+    world.store.delete("secrets", NAMESPACE, "es-fiber-key")
     await world.until(lambda: "CredentialsChanged" in world.reasons(), 125)
     await world.settled(120)
     assert world.names() == before

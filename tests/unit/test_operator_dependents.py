@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
+import pytest
+
+from fakes.kubernetes_api import Fault
 from fakes.world import NAMESPACE, World, played
 from unit.operator_objects import MASTER
 
@@ -11,15 +15,36 @@ LABELS = {"fiber.dev/pool": "es", "fiber.dev/pool-uid": "1"}
 
 
 @played
-async def test_a_secret_that_the_pool_names_is_neither_made_nor_read(world: World) -> None:
+async def test_a_secret_that_the_pool_names_is_not_made(world: World) -> None:
     world.make_pool(replicas=2, credentialsSecretName="mine")
     await world.ready(2)
     await world.settled(120)
-    assert [call for call in world.api.calls if call.plural == "secrets"] == []
+    calls = {call.verb for call in world.api.calls if call.plural == "secrets"}
+    assert calls == {"get"}, "to see that it is no other pool's"
     assert world.status()["credentialsSecret"] == "mine"
     for pod in world.pods():
-        (volume,) = pod["spec"]["volumes"]
-        assert volume["projected"]["sources"][0]["secret"]["name"] == "mine"
+        assert pod["spec"]["volumes"][0]["secret"]["secretName"] == "mine"
+
+
+@pytest.mark.parametrize("by", ["owner", "label"])
+def test_a_secret_of_another_pool_is_refused(by: str) -> None:
+    @played
+    async def test(world: World) -> None:
+        owner = {"kind": "FiberPool", "name": "theirs", "uid": "77", "controller": True}
+        metadata: dict[str, Any] = {"name": "theirs-fiber-key"}
+        if by == "owner":
+            metadata["ownerReferences"] = [owner]
+        else:
+            metadata["labels"] = {"fiber.dev/pool": "theirs"}
+        world.store.create("secrets", NAMESPACE, {"metadata": metadata, "data": {}})
+        world.make_pool(replicas=2, credentialsSecretName="theirs-fiber-key")
+        await world.until(lambda: "InvalidCredentials" in world.reasons(), 30)
+        assert world.pods() == []
+        message = world.status()["problems"][0]["message"]
+        assert "which is the Secret of the FiberPool theirs" in message
+        assert "Leave credentialsSecretName out" in message
+
+    test()
 
 
 @played
@@ -30,7 +55,7 @@ async def test_names_are_the_pools_and_fibers(world: World) -> None:
     world.make_pool(replicas=1)
     await world.ready(1)
     assert world.reasons() == []
-    assert world.status()["credentialsSecret"] == "es-fiber-tls"
+    assert world.status()["credentialsSecret"] == "es-fiber-key"
     assert world.store.get("services", NAMESPACE, "es-fiber")["spec"]["clusterIP"]
 
 
@@ -53,7 +78,7 @@ async def test_the_lease_of_a_master_is_watched(world: World) -> None:
 async def test_a_program_that_dies_before_it_makes_its_lease_leaves_no_pool(world: World) -> None:
     master = {**MASTER, "leaseName": "fiber-es", "leaseDurationSeconds": 30, "lostGraceSeconds": 60}
     world.make_pool(master=master, onLost="Delete")
-    await world.until(lambda: "LeaseNotFound" in world.reasons(), within=5)
+    await world.until(lambda: "LeaseNotFound" in world.reasons(), within=10)
     assert 90 <= await world.until(lambda: not world.store.list("fiberpools"), within=120) <= 105
     for plural in ("secrets", "services", "endpointslices", "pods"):
         assert world.store.list(plural, NAMESPACE) == []
@@ -62,3 +87,53 @@ async def test_a_program_that_dies_before_it_makes_its_lease_leaves_no_pool(worl
 def alive(world: World) -> str:
     (found,) = (c for c in world.status()["conditions"] if c["type"] == "MasterAlive")
     return str(found["status"])
+
+
+def budgets(world: World) -> list[int]:
+    return [b["spec"]["minAvailable"] for b in world.store.list("poddisruptionbudgets", NAMESPACE)]
+
+
+@played
+async def test_a_disruption_budget_follows_its_field(world: World) -> None:
+    world.make_pool(minReplicas=3, minAvailable=1)
+    await world.ready(3)
+    (budget,) = world.store.list("poddisruptionbudgets", NAMESPACE)
+    assert budget["metadata"]["name"] == "es-fiber"
+    (pod, *_) = world.pods()
+    assert budget["spec"]["selector"]["matchLabels"].items() <= pod["metadata"]["labels"].items()
+    world.edit(minAvailable=2)
+    await world.until(lambda: budgets(world) == [2], 5)
+    await world.stop()
+    world.start()
+    world.edit(minAvailable=None)
+    await world.until(lambda: budgets(world) == [], 60)
+    world.edit(minAvailable=2)
+    await world.until(lambda: budgets(world) == [2], 5)
+    world.store.delete("fiberpools", NAMESPACE, "es", {})
+    assert budgets(world) == []
+
+
+@played
+async def test_a_budget_that_is_not_the_pools_is_left_alone(world: World) -> None:
+    foreign = {"metadata": {"name": "es-fiber"}, "spec": {"minAvailable": 9}}
+    world.store.create("poddisruptionbudgets", NAMESPACE, foreign)
+    world.make_pool(minReplicas=2)
+    await world.ready(2)
+    world.edit(minAvailable=1)
+    await world.until(lambda: "NameTaken" in world.reasons(), 30)
+    world.edit(minAvailable=None)
+    await world.until(lambda: world.reasons() == [], 60)
+    assert budgets(world) == [9]
+
+
+@played
+async def test_without_rights_on_budgets_pools_without_one_go_on(world: World) -> None:
+    world.make_pool(minReplicas=1)
+    await world.ready(1)
+    refuse = Fault("", "poddisruptionbudgets", status=403, reason="Forbidden", times=10**6)
+    world.api.faults.append(refuse)
+    await world.stop()
+    world.start()
+    world.edit(minReplicas=2)
+    await world.ready(2)
+    assert world.reasons() == []

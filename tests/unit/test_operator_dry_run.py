@@ -14,6 +14,7 @@ from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, World, played
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
+from fiber_operator.planning import wording
 from fiber_operator.planning.plans import Refusal
 from fiber_operator.planning.podspec import pod
 from unit.operator_objects import MASTER, NOW, make_pool
@@ -133,6 +134,7 @@ WEBHOOK = 'admission webhook "images.example" denied the request: not signed yet
         (422, "spec.containers: Required value", True, Reason.INVALID_TEMPLATE),
         (422, "spec.containers: Required value", False, Reason.INVALID_TEMPLATE),
         (403, "exceeded quota: q", True, Reason.QUOTA_EXCEEDED),
+        (403, "failed quota: q: must specify cpu for: x", True, Reason.REQUESTS_MISSING),
         (403, "exceeded quota: q", False, Reason.QUOTA_EXCEEDED),
         (403, "no right", True, Reason.FORBIDDEN),
     ],
@@ -141,6 +143,38 @@ def test_400_blames_the_template_in_a_dry_run_alone(
     status: int, message: str, dry_run: bool, reason: Reason
 ) -> None:
     assert Refusal("hash", status, message, NOW, dry_run=dry_run).reason == reason
+
+
+@pytest.mark.parametrize(
+    ("status", "message"),
+    [
+        (
+            422,
+            'Pod "es-1" is invalid: spec.containers[0].resources.requests: Invalid value: "64Mi": '
+            "must be less than or equal to memory limit of 32Mi",
+        ),
+        (
+            403,
+            'pods "es-1" is forbidden: minimum cpu usage per Container is 100m, but request is 50m',
+        ),
+        (
+            403,
+            'pods "es-1" is forbidden: cpu max limit to request ratio per Container is 2, but '
+            "provided ratio is 10.000000",
+        ),
+    ],
+)
+def test_a_limit_range_is_told_with_what_to_do(status: int, message: str) -> None:
+    refused = Refusal("hash", status, message, NOW, dry_run=True)
+    told = wording.refusal(refused.reason, refused)
+    assert message.partition(": ")[2] in told
+    assert "kubectl get limitranges" in told
+    assert "fiber.init(cpu_request=0, memory_request=0)" in told
+
+
+def test_a_refusal_for_something_else_speaks_of_no_limit_range() -> None:
+    refused = Refusal("hash", 403, "no right", NOW)
+    assert "limitranges" not in wording.refusal(refused.reason, refused)
 
 
 @played

@@ -70,6 +70,22 @@ async def loses_its_master(world: World) -> None:
     world.edit(master=LOST, onLost="Delete")
 
 
+async def gets_a_budget(world: World) -> None:
+    world.edit(minReplicas=3, minAvailable=1)
+
+
+async def changes_its_budget(world: World) -> None:
+    await gets_a_budget(world)
+    await world.until(lambda: world.store.list("poddisruptionbudgets") != [], within=60)
+    world.edit(minAvailable=2)
+
+
+async def gives_up_its_budget(world: World) -> None:
+    await gets_a_budget(world)
+    await world.until(lambda: world.store.list("poddisruptionbudgets") != [], within=60)
+    world.edit(minAvailable=None)
+
+
 async def is_made_anew(world: World) -> None:
     world.store.delete("fiberpools", NAMESPACE, "es")
     world.make_pool(replicas=2)
@@ -88,6 +104,10 @@ LIVES: dict[Right, Callable[[World], Awaitable[None]]] = {
     ("get", "endpointslices"): gets_another_master,
     ("patch", "endpointslices"): gets_another_master,
     ("delete", "endpointslices"): gets_a_master_of_another_family,
+    ("create", "poddisruptionbudgets"): gets_a_budget,
+    ("get", "poddisruptionbudgets"): gets_a_budget,
+    ("patch", "poddisruptionbudgets"): changes_its_budget,
+    ("delete", "poddisruptionbudgets"): gives_up_its_budget,
     ("get", "leases"): loses_its_master,
     ("delete", "fiberpools"): loses_its_master,
 }

@@ -130,6 +130,18 @@ async def test_pools_and_their_pods_are_told(kopf: Watching) -> None:
 
 
 @played()
+async def test_lists_and_watches_ask_for_metadata_alone(kopf: Watching) -> None:
+    large = {"template": {"big": "\N{GRINNING FACE}" * 100_000}}
+    body = {"metadata": {"name": "es"}, "spec": large}
+    kopf.store.create("fiberpools", NAMESPACE, body)
+    await kopf.told(ES)
+    await kopf.watched()
+    kopf.store.merge("fiberpools", NAMESPACE, "es", {"spec": {"replicas": 2}})
+    await kopf.told(ES)
+    assert kopf.api.largest_answer < 10_000
+
+
+@played()
 async def test_what_was_there_before_is_told(kopf: Watching) -> None:
     kopf.world.make_pool()
     kopf.pod("a", pool="another")

@@ -14,7 +14,7 @@ from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Store
 from fakes.world import configuration
 from fiber_operator.cluster import Cluster
-from fiber_operator.lease_monitor import LeaseMonitor, MasterLease
+from fiber_operator.lease_monitor import MISSING_AFTER, LeaseMonitor, MasterLease
 from fiber_operator.planning.plans import LeaseVerdict
 from fiber_operator.workqueue import Key
 
@@ -135,11 +135,21 @@ async def test_a_lease_that_was_made_after_its_master_was_seen_is_alive_at_once(
     watch: Watch,
 ) -> None:
     watch.monitor.follow(ES, LEASE)
-    await asyncio.sleep(5)
+    await asyncio.sleep(6)
     assert watch.monitor.follow(ES, LEASE) == LeaseVerdict(missing=True)
     watch.write()
     await asyncio.sleep(1)
     assert watch.monitor.follow(ES, LEASE) == LeaseVerdict(alive=True)
+
+
+@played
+async def test_a_lease_that_comes_soon_after_its_pool_is_not_missed(watch: Watch) -> None:
+    """As at every start of a program, whose Lease belongs to its pool."""
+    watch.monitor.follow(ES, LEASE)
+    await asyncio.sleep(MISSING_AFTER / 2)
+    watch.renew()
+    await asyncio.sleep(20)
+    assert [verdict for _, verdict in watch.told] == [LeaseVerdict(alive=True)]
 
 
 @played

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import tracemalloc
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -10,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fiber_operator.api_errors import Unavailable
-from fiber_operator.listing import Listing
+from fiber_operator.listing import PIECE, Listing
 
 Json = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -20,9 +23,17 @@ Json = st.recursive(
 OBJECTS = st.lists(st.dictionaries(st.text(), Json, max_size=4), max_size=5)
 
 
-def read(data: bytes) -> tuple[list[Any], str]:
-    listing = Listing(data, "list pods")
-    return list(listing), listing.more()
+async def pieces(data: bytes, size: int) -> AsyncIterator[bytes]:
+    for start in range(0, len(data), size):
+        yield data[start : start + size]
+
+
+def read(data: bytes, size: int = 7) -> tuple[list[Any], str]:
+    async def main() -> tuple[list[Any], str]:
+        listing = Listing(pieces(data, size), "list pods")
+        return [item async for item in listing], listing.more()
+
+    return asyncio.run(main())
 
 
 def a_list(items: Any, **metadata: Any) -> dict[str, Any]:
@@ -30,12 +41,14 @@ def a_list(items: Any, **metadata: Any) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@given(OBJECTS, st.booleans(), st.sampled_from([None, 1]), st.randoms())
-def test_a_list_is_read_whole(items: Any, plain: bool, indent: int | None, random: Any) -> None:
+@given(OBJECTS, st.booleans(), st.sampled_from([None, 1]), st.integers(1, 99), st.randoms())
+def test_a_list_is_read_whole(
+    items: Any, plain: bool, indent: int | None, size: int, random: Any
+) -> None:
     members = list(a_list(items, **{"continue": "next"}).items())
     random.shuffle(members)
     data = json.dumps(dict(members), ensure_ascii=plain, indent=indent)
-    assert read(data.encode()) == (items, "next")
+    assert read(data.encode(), size) == (items, "next")
 
 
 def test_the_last_part_has_no_more() -> None:
@@ -78,6 +91,36 @@ def test_what_is_no_list_of_objects_is_refused(document: Any) -> None:
 def test_what_is_no_document_is_refused(data: bytes) -> None:
     with pytest.raises(Unavailable, match="list pods"):
         read(data)
+
+
+def test_an_empty_list_of_metadata_has_null_for_its_items() -> None:
+    document = {"kind": "PartialObjectMetadataList", "metadata": {}, "items": None}
+    assert read(json.dumps(document).encode()) == ([], "")
+
+
+def test_one_object_at_a_time_is_in_memory() -> None:
+    item = json.dumps({"large": "\N{GRINNING FACE}" + "x" * 500_000}, ensure_ascii=False).encode()
+    count = 40
+
+    async def answer() -> AsyncIterator[bytes]:
+        yield b'{"kind": "PodList", "metadata": {}, "items": ['
+        for number in range(count):
+            for start in range(0, len(item), PIECE):
+                yield item[start : start + PIECE]
+            yield b"," if number < count - 1 else b"]}"
+
+    async def main() -> int:
+        seen = 0
+        async for found in Listing(answer(), "list pods"):
+            seen += len(found["large"]) > 500_000
+        return seen
+
+    tracemalloc.start()
+    try:
+        assert asyncio.run(main()) == count
+        assert tracemalloc.get_traced_memory()[1] < 20 * len(item)
+    finally:
+        tracemalloc.stop()
 
 
 def test_an_answer_that_goes_on_after_its_end_is_refused() -> None:

@@ -41,7 +41,7 @@ def test_an_object_of_an_earlier_pool_or_of_nobody_is_not_ours() -> None:
 def test_the_service_selects_nothing() -> None:
     spec = manifests.service(make_pool())["spec"]
     assert "selector" not in spec
-    assert spec["type"] == "ClusterIP"
+    assert (spec["type"], spec["ipFamilyPolicy"]) == ("ClusterIP", "PreferDualStack")
     assert [(port["name"], port["port"]) for port in spec["ports"]] == [("fiber", 7070)]
 
 
@@ -96,7 +96,7 @@ def test_a_slice_is_replaced_when_the_address_family_changes() -> None:
 
 def test_the_secret_holds_what_it_is_given() -> None:
     body = manifests.secret(make_pool(), {"ca.crt": "PEM"})
-    assert body["metadata"]["name"] == "es-fiber-tls"
+    assert body["metadata"]["name"] == "es-fiber-key"
     assert base64.b64decode(body["data"]["ca.crt"]) == b"PEM"
 
 

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fiber_api import names
+from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.planning.podspec import NODE_LOST_SECONDS, pod
 from fiber_operator.planning.revisions import spec_hash, template_hash
-from unit.operator_objects import MASTER, UID, make_pool
+from unit.operator_objects import MASTER, UID, make_pool, pool_document
 from unit.test_operator_pods import ANYTHING
 
 Json = dict[str, Any]
@@ -45,16 +46,23 @@ def test_a_worker_knows_who_and_where_it_is() -> None:
     assert environment(worker) == {
         "FIBER_AGENT_NAME": "es-0000000001",
         "FIBER_AGENT_ADDRESS": "10.96.1.2:7070",
-        "FIBER_AGENT_CREDENTIALS": names.CREDENTIALS_DIRECTORY,
+        "FIBER_AGENT_CREDENTIALS": "/etc/fiber/credentials/agent.json",
         "FIBER_AGENT_POOL": "es",
         "FIBER_AGENT_NAMESPACE": "team",
         "FIBER_AGENT_PROCESSES": "8",
         "FIBER_AGENT_LOST_GRACE": "90",
+        "FIBER_AGENT_TERMINATION_GRACE": "30",
         "FIBER_AGENT_TEMPLATE_HASH": template_hash(pool),
         "FIBER_AGENT_UID": "",
     }
     (uid,) = (v for v in worker["env"] if v["name"] == "FIBER_AGENT_UID")
     assert uid["valueFrom"]["fieldRef"]["fieldPath"] == "metadata.uid"
+
+
+@pytest.mark.parametrize(("seconds", "told"), [(None, "30"), (0, "0"), (90, "90")])
+def test_a_worker_knows_how_long_its_pod_has_after_sigterm(seconds: Any, told: str) -> None:
+    worker = worker_of(terminationGracePeriodSeconds=seconds)
+    assert environment(worker)["FIBER_AGENT_TERMINATION_GRACE"] == told
 
 
 def test_the_users_environment_wins_and_comes_last() -> None:
@@ -83,27 +91,79 @@ def test_autoscalers_leave_a_node_with_workers_alone_unless_the_template_says_ot
     assert found == {evict: "true", disrupt: "true", "note": "n"}
 
 
-def test_a_pod_mounts_the_agents_half_of_the_secret_that_the_pool_names() -> None:
-    (volume,) = body_of(credentialsSecretName="mine")["spec"]["volumes"]
-    (source,) = volume["projected"]["sources"]
-    assert source["secret"]["name"] == "mine"
-    assert {item["key"]: item["path"] for item in source["secret"]["items"]} == names.AGENT_FILES
+def test_a_pod_mounts_the_secret_that_its_pool_names() -> None:
+    key, _ = body_of(credentialsSecretName="mine")["spec"]["volumes"]
+    assert key["secret"]["secretName"] == "mine"
 
 
-def test_only_the_worker_gets_the_credentials_and_only_the_agents_half() -> None:
+def test_only_the_init_container_gets_the_pools_key() -> None:
     body = body_of({"containers": [{"name": "x", "image": "i"}, {"name": "worker", "image": "i"}]})
     other, worker = body["spec"]["containers"]
+    (first,) = body["spec"]["initContainers"]
     assert "volumeMounts" not in other
     assert "env" not in other
-    assert worker["volumeMounts"] == [
-        {"name": "fiber-credentials", "mountPath": "/etc/fiber/credentials", "readOnly": True}
+    written = {"name": "fiber-credentials", "mountPath": "/etc/fiber/credentials"}
+    key = {"name": "fiber-key", "mountPath": "/etc/fiber/key", "readOnly": True}
+    assert worker["volumeMounts"] == [written]
+    assert first["volumeMounts"] == [written, key]
+    secret, memory = body["spec"]["volumes"]
+    assert secret["secret"]["secretName"] == "es-fiber-key"
+    assert memory["emptyDir"]["medium"] == "Memory"
+
+
+def first_of(container: Json, **spec: Any) -> Json:
+    """The pod's first init container, of which the template's worker says this."""
+    worker = {"name": "worker", "image": "i", **container}
+    found: Json = body_of({"containers": [worker], **spec})["spec"]["initContainers"][0]
+    return found
+
+
+def test_the_init_container_names_the_pod_whatever_the_template_says() -> None:
+    own = [
+        {"name": "FIBER_AGENT_NAME", "value": "another"},
+        {"name": "FIBER_AGENT_UID", "value": "7"},
+        {"name": "PYTHONPATH", "value": "/code"},
     ]
-    (volume,) = body["spec"]["volumes"]
-    (source,) = volume["projected"]["sources"]
-    assert source["secret"]["name"] == "es-fiber-tls"
-    items = {item["key"]: item["path"] for item in source["secret"]["items"]}
-    assert items == names.AGENT_FILES
-    assert not any("master" in key for key in items)
+    env = {v["name"]: v for v in first_of({"env": own})["env"]}
+    fields = {
+        n: v["valueFrom"]["fieldRef"]["fieldPath"] for n, v in env.items() if "valueFrom" in v
+    }
+    assert fields == {"FIBER_AGENT_NAME": "metadata.name", "FIBER_AGENT_UID": "metadata.uid"}
+    assert env["PYTHONPATH"]["value"] == "/code"
+    assert env["FIBER_AGENT_KEY"]["value"] == "/etc/fiber/key"
+
+
+@pytest.mark.parametrize(
+    ("said", "command"),
+    [
+        ({}, None),
+        ({"command": ["/opt/python", "-m", "fiber.agent"]}, ["/opt/python", "-m", "fiber.agent"]),
+        ({"command": ["sh", "-c", "exec python -m fiber.agent"]}, None),
+        ({"command": ["sleep", "9"], "args": ["x"]}, ["python", "-m", "fiber.agent"]),
+    ],
+)
+def test_the_init_container_runs_what_the_worker_does_if_that_is_an_agent(
+    said: Json, command: list[str] | None
+) -> None:
+    first = first_of(said)
+    assert first.get("command") == (command or said.get("command"))
+    assert "args" not in first
+
+
+def test_the_init_container_asks_for_no_more_than_the_worker() -> None:
+    asked = {"cpu": "2", "memory": "1Gi"}
+    devices = {**asked, "nvidia.com/gpu": "1"}
+    first = first_of({"resources": {"limits": devices, "requests": asked}, "ports": [{}]})
+    assert first["resources"] == {"limits": asked, "requests": asked}
+    assert "ports" not in first
+    assert "resources" not in first_of({})
+
+
+def test_the_init_container_comes_before_those_of_the_template() -> None:
+    own = {"name": "mine", "image": "x"}
+    body = body_of({"initContainers": [own]})["spec"]
+    assert [c["name"] for c in body["initContainers"]] == ["fiber-identity", "mine"]
+    assert [v["name"] for v in body["volumes"]] == ["fiber-key", "fiber-credentials"]
 
 
 def test_a_mount_of_the_users_own_replaces_the_credentials() -> None:
@@ -111,6 +171,7 @@ def test_a_mount_of_the_users_own_replaces_the_credentials() -> None:
     body = body_of({"containers": [{"name": "worker", "image": "i", "volumeMounts": mounts}]})
     assert body["spec"]["containers"][0]["volumeMounts"] == mounts
     assert "volumes" not in body["spec"]
+    assert "initContainers" not in body["spec"]
 
 
 def test_a_read_only_root_gets_a_writable_tmp_and_another_does_not() -> None:
@@ -237,8 +298,9 @@ def test_null_is_the_same_as_nothing_said() -> None:
     container = {"name": "worker", "image": "i", "env": None, "securityContext": None}
     nulls, silent = body_of({**spec, "containers": [container]})["spec"], body_of()["spec"]
     for body in (nulls, silent):  # the hash is of the template as it is written
-        env = body["containers"][0]["env"]
-        env[:] = [variable for variable in env if variable["name"] != names.ENV_TEMPLATE_HASH]
+        for container in (*body["initContainers"], *body["containers"]):
+            env = container["env"]
+            env[:] = [variable for variable in env if variable["name"] != names.ENV_TEMPLATE_HASH]
     assert nulls == silent
 
 
@@ -275,3 +337,39 @@ def test_what_the_sdk_writes_starts_no_new_attempt() -> None:
     assert spec_hash(make_pool(replicas=2, scaleDown=release, maxReplicas=9)) == first
     for change in ({"suspend": True}, {"processesPerPod": 2}, {"master": MASTER}):
         assert spec_hash(make_pool(**change)) != first
+
+
+# -- Requests that nothing speaks of
+
+REQUESTS = {"cpu": "50m", "memory": "64Mi"}
+
+
+@pytest.mark.parametrize(
+    ("resources", "of_the_pod", "requested"),
+    [
+        (None, {}, REQUESTS),
+        ({"requests": None}, {}, REQUESTS),
+        ({"requests": {"cpu": "2"}}, {}, {"cpu": "2", "memory": "64Mi"}),
+        ({"limits": {"memory": "1Gi"}}, {}, {"cpu": "50m"}),
+        ({"limits": {"nvidia.com/gpu": "1"}}, {}, REQUESTS),
+        ({}, {"limits": {"cpu": "1", "memory": "1Gi"}}, {}),
+    ],
+)
+def test_a_worker_requests_what_its_template_says_nothing_of(
+    resources: Json | None, of_the_pod: Json, requested: Json
+) -> None:
+    worker = {"name": "worker", "image": "i", "resources": resources}
+    others = [{"name": "other", "image": "x"}]
+    spec = {"containers": [worker, *others], "resources": of_the_pod}
+    made = pod(make_pool(template={"spec": spec}), "es-0000000001", "a:1", REQUESTS)["spec"]
+    container, other = made["containers"]
+    assert container["resources"].get("requests", {}) == requested
+    assert container["resources"].get("limits") == (resources or {}).get("limits")
+    assert "resources" not in other
+
+
+def test_the_pool_of_a_program_has_settings_of_the_program() -> None:
+    document = pool_document()
+    document["metadata"]["labels"] = {names.LABEL_MANAGED_BY: names.SDK_MANAGER}
+    made = pod(FiberPool.read(document), "es-0000000001", "a:1", REQUESTS)
+    assert not made["spec"]["containers"][0].get("resources", {}).get("requests")

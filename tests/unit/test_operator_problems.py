@@ -385,6 +385,14 @@ def test_a_master_of_the_other_address_family_is_told() -> None:
     found = problem(pool, running(1))
     assert (found.reason, found.terminal) == ("InvalidSpec", True)
     assert "fd00::7" in found.message
+    assert "delete the Service es-fiber" in found.message
+
+
+def test_a_master_of_either_family_of_the_service_is_right() -> None:
+    memory = "10.96.1.2:7070,[fd00:96::2]:7070"
+    for host in ("10.0.3.7", "fd00::7"):
+        pool = make_pool(replicas=1, master={**MASTER, "host": host})
+        assert status_of(pool, running(1), address=memory).problems == ()
 
 
 def test_names_that_are_no_workers_are_told() -> None:

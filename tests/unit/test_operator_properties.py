@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
 from hypothesis import Phase, assume, example, given, settings
 from hypothesis import strategies as st
 
@@ -259,6 +260,7 @@ def nothing_is_planned_twice(
     assert not any(event.reason == "ScaledUp" for event in second.events)
 
 
+@pytest.mark.slow
 @settings(max_examples=250, deadline=None)
 @given(cases())
 def test_what_holds_of_every_plan(case: Case) -> None:
@@ -297,6 +299,7 @@ def test_a_ready_worker_of_a_master_goes_only_when_released(case: Case) -> None:
     assert not made.delete_pool
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None, phases=NO_SHRINKING)
 @given(cases())
 def test_every_state_settles(case: Case) -> None:
@@ -419,6 +422,7 @@ def test_a_template_that_fails_comes_to_an_end(replicas: int, limit: int) -> Non
     assert (failures.consecutive, failures.waves, failures.waiting) == (0, 0, 0)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(replicas=st.integers(1, 12))
 def test_workers_that_end_well_for_ever_come_back_ever_more_slowly(replicas: int) -> None:

@@ -40,6 +40,8 @@ def test_everything_can_be_set() -> None:
         RESYNC_SECONDS="120",
         CONCURRENCY="4",
         CONNECTIONS="16",
+        CPU_REQUEST="0.1",
+        MEMORY_REQUEST="",
         LOG_LEVEL="debug",
         LOG_FORMAT="TEXT",
     )
@@ -54,6 +56,8 @@ def test_everything_can_be_set() -> None:
         resync_seconds=120,
         concurrency=4,
         connections=16,
+        cpu_request="0.1",
+        memory_request="",
         log_level="DEBUG",
         log_format="text",
     )
@@ -72,6 +76,8 @@ def test_everything_can_be_set() -> None:
         ("RESYNC_SECONDS", "0"),
         ("CONCURRENCY", "-1"),
         ("CONNECTIONS", "٣٢"),
+        ("CPU_REQUEST", "much"),
+        ("MEMORY_REQUEST", "64MiB"),
         ("LOG_LEVEL", "LOUD"),
         ("LOG_FORMAT", "xml"),
     ],

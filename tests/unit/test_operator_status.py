@@ -54,7 +54,7 @@ def test_what_a_person_and_the_scale_subresource_read() -> None:
     assert status.selector == f"fiber.dev/pool-uid={UID}"
     assert status.endpoint == "tls+tcp://10.96.1.2:7070"
     assert (status.master, status.master_epoch) == ("10.0.3.7:41337", 3)
-    assert status.credentials_secret == "es-fiber-tls"
+    assert status.credentials_secret == "es-fiber-key"
     assert status.template_hash == template_hash(pool)
 
 
@@ -179,9 +179,9 @@ def test_time_alone_changes_nothing() -> None:
 def test_the_secret_is_named_once_it_is_seen_to_be_the_pools() -> None:
     pool = make_pool()
     seen = with_plan(pool, plan_of(pool))
-    assert seen.status.credentials_secret == "es-fiber-tls"
+    assert seen.status.credentials_secret == "es-fiber-key"
     assert status_of(pool, credentials=None).credentials_secret is None
-    assert status_of(seen, credentials=None).credentials_secret == "es-fiber-tls"
+    assert status_of(seen, credentials=None).credentials_secret == "es-fiber-key"
     assert status_of(seen, credentials=False).credentials_secret is None
 
 

@@ -391,3 +391,50 @@ async def test_an_end_in_the_middle_of_a_turn_leaves_nothing(
 
 def test_the_longest_backoff_is_bounded() -> None:
     assert FIRST_BACKOFF * 2**10 > LONGEST_BACKOFF
+
+
+class Flood(Reconciler):
+    """Reconciler of pools in the namespace ``flood`` and in others; each takes a second."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lasts = 1.0
+
+    def delay(self, key: Key, since: float) -> float:
+        return self.times(key)[0] - since
+
+
+@pytest.mark.parametrize("result", [Result(), Result(failed=True), Result(requeue_after=0.0)])
+@pytest.mark.parametrize("concurrency", [1, 8])
+def test_the_pools_of_one_namespace_do_not_delay_those_of_another(
+    concurrency: int, result: Result
+) -> None:
+    async def main() -> None:
+        reconciler = Flood()
+        reconciler.result = result
+        queue = Queue(reconciler, concurrency=concurrency)
+        task = asyncio.ensure_future(queue.run())
+        for number in range(1000):
+            queue.add(Key("flood", str(number)), urgent=True)
+        await asyncio.sleep(20.5)
+        began = asyncio.get_running_loop().time()
+        for name in "abc":
+            queue.add(Key(name, "well"))
+        await asyncio.sleep(10)
+        # They begin at once, or as soon as one of those that work has ended.
+        delays = [reconciler.delay(Key(name, "well"), began) for name in "abc"]
+        assert max(delays) <= (2.0 if concurrency == 1 else 0.01)
+        task.cancel()
+        await asyncio.wait([task])
+
+    virtual_time.run(main())
+
+
+@played(concurrency=2)
+async def test_namespaces_take_turns(queue: Queue, reconciler: Reconciler) -> None:
+    reconciler.lasts = 1.0
+    for name in "ab":
+        for number in range(4):
+            queue.add(Key(name, str(number)))
+    await asyncio.sleep(10)
+    assert [key.namespace for _, key in reconciler.begun] == ["a", "b"] * 4

@@ -16,8 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fiber._wire import packet, raw_memory
+from fiber._wire import arena, packet, raw_memory
 from fiber._wire.arena import RETAINED_LIMIT
+from fiber._wire.descriptor import opened
 from fiber._wire.packet import BULK, INLINE_LIMIT
 from fiber.errors import TooManyOpenFiles
 from patience import PATIENCE
@@ -319,3 +320,16 @@ def test_a_copy_that_other_threads_can_run_beside_is_one(size: int) -> None:
     assert type(made) is bytes
     assert made == source
     assert hash(made) == hash(bytes(source))
+
+
+def test_a_copy_of_a_mapped_message_is_read_from_its_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = 33 << 20
+    file = opened(os.memfd_create, "message")
+    os.pwrite(file.fileno(), b"header" + os.urandom(size), 0)
+    mapped = arena.mapping(file, 6 + size)
+    expected = bytes(mapped[6:])
+    monkeypatch.setattr(raw_memory.ctypes, "memmove", None)  # it would fault at every page
+    assert raw_memory.copy(memoryview(mapped)[6:]) == expected
+    os.ftruncate(file.fileno(), size)
+    with pytest.raises(ValueError, match=f"ends after {size - 6} of {size} bytes"):
+        raw_memory.copy(memoryview(mapped)[6:])

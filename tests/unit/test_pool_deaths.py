@@ -68,6 +68,7 @@ def test_sys_exit_ends_the_worker_and_is_not_tried_again(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["local", "loopback"])
 @pytest.mark.parametrize("call", ["pool.apply(leave, (7,))", "executor.submit(leave, 7).result()"])
 def test_a_program_that_a_tasks_sys_exit_ends_says_which_task(backend: str, call: str) -> None:

@@ -145,6 +145,7 @@ def _signals_raise() -> Iterator[None]:
     signal.signal(signal.SIGUSR1, before)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_signals_raise")
 @each_call
 def test_a_handler_that_raises_at_any_line_loses_this_call_only(

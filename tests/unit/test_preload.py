@@ -78,6 +78,7 @@ def test_threads_that_no_fork_finds_do_no_harm(
     assert Program(tmp_path, progress_table, main=text).ask()[0] == zygote.STARTED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "name"),
     [(PYTHON_THREAD, "waits for ever"), (NATIVE_THREAD, "a helper")],

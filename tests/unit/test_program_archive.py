@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from fiber._backends import program_archive
+from fiber._backends import program_archive, program_files
+from fiber._backends.program_files import Why
 from fiber.errors import ProgramTooLarge
 from unit.shipping_site import files, layout, packed, tree, unpacked, write
 
@@ -157,18 +158,91 @@ def test_links_within_the_folder_stay_links(folder: Path, tmp_path: Path) -> Non
     assert (there / "es/data/up.py").read_text() == "import es"
 
 
-def test_what_links_to_elsewhere_lead_to_is_sent_in_their_place(
+def test_links_to_elsewhere_are_left_out_unless_they_are_asked_for(
     folder: Path, tmp_path: Path
 ) -> None:
-    shared = write(tmp_path / "shared", tool_py="x", deep__y_py="y")
+    shared = write(tmp_path / "shared", tool_py="x", deep__y_py="y", deep__server_key="key")
     (shared / "deep/again").symlink_to(shared)
+    (shared / "deep/on").symlink_to(tmp_path)
     (folder / "shared").symlink_to(shared)
     (folder / "one.py").symlink_to(shared / "tool.py")
     (folder / "gone").symlink_to(tmp_path / "nothing")
+    assert set(reasons(folder)) == {"shared", "one.py"}
+    assert names(folder) == {"main.py", "data/weights.npy"}
+    (folder / ".fiberignore").write_text("!/shared\n!one.py\n")
+    assert set(reasons(folder)) == {"shared/deep/on", "shared/deep/server.key"}
     there = tree(unpacked(packed(folder), tmp_path / "there"))
     assert there["es/one.py"] == there["es/shared/tool.py"] == b"x"
     assert there["es/shared/deep/y.py"] == b"y"
     assert not [name for name in there if "gone" in name or "again" in name]
+
+
+def test_a_package_behind_a_link_is_sent_once_it_is_imported(folder: Path, tmp_path: Path) -> None:
+    shared = write(tmp_path / "shared", tool_py="x", later_py="y")
+    (folder / "shared").symlink_to(shared)
+    there = unpacked(packed(folder, files=(folder / "shared/tool.py",)), tmp_path / "there")
+    assert (there / "es/shared/later.py").read_text() == "y"
+
+
+# Secrets
+
+
+def reasons(folder: Path, *others: Path) -> dict[str, tuple[Why, str]]:
+    """What is left out, and why."""
+    return {
+        os.path.relpath(left.path, folder): (left.why, left.detail)
+        for left in program_files.select(layout(folder, *others)).left_out
+    }
+
+
+def test_secrets_are_left_out_and_named(folder: Path) -> None:
+    (folder / ".aws").mkdir()
+    (folder / ".aws/credentials").write_text("x")
+    (folder / "server.pem").write_text("x")
+    (folder / "data/.env").write_text("x")
+    assert reasons(folder) == {
+        ".aws": (Why.SECRET, "credentials of AWS"),
+        "server.pem": (Why.SECRET, "private keys"),
+        "data/.env": (Why.SECRET, "environment variables"),
+    }
+    assert names(folder) == {"main.py", "data/weights.npy"}
+
+
+def test_secrets_that_somebody_asks_for_by_name_are_sent(folder: Path) -> None:
+    for name in (".env", "data/.env", "a.pem", "b.pem"):
+        (folder / name).write_text("x")
+    (folder / ".kube").mkdir()
+    (folder / ".kube/config").write_text("kind: Config\nusers: [{user: {token: x}}]")
+    (folder / ".fiberignore").write_text("!data/\n!/.env\n!*.pem\n!.kube/\n")
+    assert set(reasons(folder)) == {"data/.env"}  # not by the name of a folder around it
+    (folder / "data/.gitignore").write_text("!.env\n")
+    assert set(reasons(folder)) == {"data/.env"}  # what git has is not what workers need
+
+
+def test_secrets_that_are_ignored_are_no_news(folder: Path) -> None:
+    (folder / ".env").write_text("x")
+    (folder / ".gitignore").write_text(".env\n")
+    assert reasons(folder) == {".env": (Why.IGNORED, f"'.env' in {folder}/.gitignore")}
+
+
+def test_a_secret_that_a_link_with_another_name_leads_to_is_left_out(
+    folder: Path, tmp_path: Path
+) -> None:
+    home = write(tmp_path / "home", keys__id_rsa="x")
+    (home / "keys").rename(home / ".ssh")
+    (home / ".ssh/id.rsa").rename(home / ".ssh/id_rsa")
+    (folder / "notes").symlink_to(home)
+    (folder / ".fiberignore").write_text("!notes\n")
+    assert reasons(folder) == {"notes/.ssh": (Why.SECRET, "private keys")}
+    (home / "plain").symlink_to(home / ".ssh")
+    assert set(reasons(folder)) == {"notes/.ssh", "notes/plain"}
+
+
+def test_a_secret_that_was_imported_is_code(folder: Path) -> None:
+    secret = write(folder, secrets_json="{}") / "secrets.json"
+    sent = program_files.select(layout(folder, files=(secret,)))
+    assert "es/secrets.json" in sent.files
+    assert sent.left_out == ()
 
 
 # Names and changes
@@ -217,7 +291,7 @@ def test_a_file_that_is_gone_when_it_is_read_is_left_out(folder: Path, tmp_path:
 def test_too_much_is_an_error_that_lists_the_largest_and_says_what_to_do(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(program_archive, "LIMIT", 3 << 20)
+    monkeypatch.setattr(program_files, "LIMIT", 3 << 20)
     write(folder, model_bin=bytes(2 << 20), data__more_npy=bytes(3 << 20))
     with pytest.raises(ProgramTooLarge) as caught:
         files(folder)
@@ -234,7 +308,7 @@ def test_too_much_is_an_error_that_lists_the_largest_and_says_what_to_do(
 def test_what_grows_beyond_the_bound_meanwhile_is_the_same_error(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(program_archive, "LIMIT", 1 << 20)
+    monkeypatch.setattr(program_files, "LIMIT", 1 << 20)
     found = files(folder)
     write(folder, main_py=bytes(2 << 20))
     with pytest.raises(ProgramTooLarge, match="files that are growing"):
@@ -242,7 +316,7 @@ def test_what_grows_beyond_the_bound_meanwhile_is_the_same_error(
 
 
 def test_too_many_files_are_not_even_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program_archive, "MOST_FILES", 3)
+    monkeypatch.setattr(program_files, "MOST_FILES", 3)
     with pytest.raises(ProgramTooLarge, match="more than 3 files"):
         files(folder)
 

@@ -89,9 +89,11 @@ def test_a_module_that_is_run_by_name_has_the_folder_of_its_package(machine: Mac
     assert (layout.program, layout.places) == (str(machine.es), {str(machine.es): "es"})
 
 
-def test_what_is_on_the_path_comes_along_in_its_order(machine: Machine) -> None:
+def test_folders_on_the_path_that_are_offered_come_along_in_their_order(machine: Machine) -> None:
     machine.runs(machine.es / "main.py")
     editable = write(machine.lib.parent / "src" / "lib", other_py="")
+    for folder in (machine.lib, editable):
+        (folder / ".fiberignore").touch()
     layout = machine.layout(machine.es, machine.lib, STDLIB, "/gone", editable)
     assert layout.places == {
         str(machine.es): "es",
@@ -102,7 +104,28 @@ def test_what_is_on_the_path_comes_along_in_its_order(machine: Machine) -> None:
     assert layout.paths.before_installed == ("lib-2",)
 
 
+def test_of_other_folders_on_the_path_what_was_imported_comes_along(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    write(machine.lib, big__data_npy="x", space__deep__tool_py="", single_py="", other_py="")
+    machine.has_imported("shared", machine.lib / "shared/init.py", machine.lib / "shared")
+    machine.has_imported("single", machine.lib / "single.py")
+    space: Any = ModuleType("space")
+    space.__path__ = [str(machine.lib / "space")]
+    machine.modules["space"] = space
+    machine.has_imported("space.deep.tool", machine.lib / "space/deep/tool.py")
+    layout = machine.layout(machine.es, machine.lib, STDLIB)
+    assert layout.places == {
+        str(machine.es): "es",
+        str(machine.lib / "shared"): "program/shared",
+        str(machine.lib / "single.py"): "program/single.py",
+        str(machine.lib / "space"): "program/space",
+    }
+    assert layout.paths.before_library == ("es", "program")
+    assert layout.trees == (str(machine.lib),)
+
+
 def test_folders_within_one_another_are_sent_once(machine: Machine) -> None:
+    (machine.es / ".fiberignore").touch()
     machine.runs(machine.es / "pkg/sub/tool.py")
     layout = machine.layout(machine.es / "pkg/sub", machine.es, STDLIB)
     assert layout.places == {str(machine.es): "es"}

@@ -20,8 +20,11 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
+from fiber._hub import feeder, local
 from fiber._hub.feeder import Feeder, ItemCount
+from fiber._wire import packet
 from patience import PATIENCE
+from unit.interrupting import INSTRUCTIONS, is_interrupted
 
 MORE_THAN_FITS = 3000
 """Items that no socket's buffer holds."""
@@ -90,6 +93,20 @@ def test_a_place_that_is_given_back_twice_is_removed() -> None:
     with pytest.raises(Full):
         queue.put_nowait(3)
     assert [queue.get(), queue.get()] == [1, 2]
+
+
+def test_an_interrupted_get_frees_the_place_of_its_item() -> None:
+    queue: Any = fiber.Queue(1)
+    files = {module.__file__ for module in (queues, feeder, local, packet)}
+    for stop in itertools.count():
+        queue.put(1)
+        interrupted = is_interrupted(queue.get, stop, files, steps=INSTRUCTIONS)
+        free = queue._slots._free.value()
+        assert free == int(queue.empty()), f"interrupted at step {stop}"
+        if not free:
+            queue.get()
+        if not interrupted:
+            break
 
 
 @pytest.mark.parametrize("maxsize", [0, -1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Callable
 from typing import Any
 from unittest import mock
 
@@ -9,14 +11,17 @@ import pytest
 
 from fiber._agent.interface import ChildSpec
 from fiber._backends.remote import RemoteAgent, RemoteChild
+from fiber._transport.turns import Lane
 from fiber._wire import messages
+from fiber._wire.messages import BytesLike
 from memory_link import SimulatedLoop
-from unit.agent_children import Recorder
+from unit.agent_children import ReadLink, Recorder
 
 
 def agent_with_children(host: str, count: int) -> tuple[RemoteAgent, list[Recorder]]:
     nothing: Any = mock.MagicMock()
-    agent = RemoteAgent(host, nothing, SimulatedLoop(), nothing, nothing, nothing)
+    link: Any = ReadLink()
+    agent = RemoteAgent(host, link, SimulatedLoop(), nothing, nothing, nothing)
     observers = [Recorder() for _ in range(count)]
     for number, observer in enumerate(observers):
         spec = ChildSpec(f"{host}-{number}", "fork", b"", b"", tasks=True)
@@ -53,3 +58,55 @@ def test_the_end_of_a_child_names_the_host_of_its_link() -> None:
     report = observer.report
     assert report is not None
     assert (report.host, report.pod, report.node) == ("far", "es-1", "node-2")
+
+
+class Large(ReadLink):
+    """A link on which blobs and starts are large: they leave when the test says so."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.leaving: list[Callable[[], None]] = []
+
+    def send(
+        self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
+    ) -> None:
+        super().send(*frame, lane=lane)
+        if on_left is not None:
+            self.leaving.append(on_left)
+
+    def kinds(self) -> list[str]:
+        return [type(message).__name__ for message in self.sent]
+
+
+@pytest.fixture
+def large() -> tuple[Large, SimulatedLoop, RemoteAgent, RemoteChild, Recorder]:
+    link, loop, observer = Large(), SimulatedLoop(), Recorder()
+    nothing: Any = mock.MagicMock()
+    agent = RemoteAgent("far", link, loop, nothing, nothing, nothing)  # type: ignore[arg-type]
+    child = RemoteChild(agent, ChildSpec("child", "fork", b"", b"", tasks=True), observer)
+    child.start()
+    child.signal(signal.SIGTERM)
+    child.deliver(5, b"task")
+    child.recall()
+    loop.run_for(0)
+    return link, loop, agent, child, observer
+
+
+def test_a_start_follows_its_blobs_and_a_signal_its_start(large: Any) -> None:
+    link, loop, _, child, _ = large
+    assert link.kinds() == ["Blob"]
+    link.leaving.pop(0)()
+    assert link.kinds() == ["Blob", "Start", "Deliver"]
+    link.leaving.pop(0)()
+    assert link.kinds() == ["Blob", "Start", "Deliver", "Signal", "Recall"]
+    child.signal(signal.SIGKILL)
+    loop.run_for(0)
+    assert link.kinds()[5:] == ["Signal"]
+
+
+def test_a_child_whose_agent_is_lost_before_its_start_has_read_nothing(large: Any) -> None:
+    link, _, agent, _, observer = large
+    agent.on_lost("silence")
+    assert observer.wait_for_exit().unread == (5,)
+    link.leaving.pop(0)()
+    assert link.kinds() == ["Blob"]

@@ -16,7 +16,7 @@ from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._wire import messages
 from fiber._wire.packet import Message
 from memory_link import SimulatedLoop
-from unit.agent_children import Recorder
+from unit.agent_children import ReadLink, Recorder
 
 FOREVER = 60.0
 
@@ -26,7 +26,7 @@ class Far:
 
     def __init__(self) -> None:
         self.loop = SimulatedLoop()
-        self.link: Any = mock.Mock()
+        self.link: Any = ReadLink()
         nothing: Any = mock.MagicMock()
         self.agent = RemoteAgent("far", self.link, self.loop, nothing, nothing, nothing)
         self.observer = Recorder()
@@ -37,8 +37,8 @@ class Far:
     def sent(self) -> list[int]:
         """The packets that the link was given."""
         self.loop.run_for(0)
-        frames = [messages.decode(b"".join(call.args)) for call in self.link.send.call_args_list]
-        return [frame.seq for frame in frames if isinstance(frame, messages.Deliver)]
+        sent = self.link.sent
+        return [message.seq for message in sent if isinstance(message, messages.Deliver)]
 
     def says(self, word: object) -> None:
         """The worker sends a packet."""

@@ -13,6 +13,7 @@ from weakref import WeakValueDictionary
 import pytest
 
 import fiber
+from census import wait_until
 from fiber._hub import shared_semaphores
 from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.protocol import Op, Status
@@ -138,7 +139,7 @@ def test_nothing_is_kept_for_nobody(far: Far, hosts: Hosts) -> None:
     assert objects_kept(hosts["a"]) == 1
     del there
     gc.collect()
-    assert objects_kept(hosts["a"]) == 0
+    assert wait_until(lambda: objects_kept(hosts["a"]) == 0, PATIENCE)
 
 
 # What goes wrong

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import pytest
+
 import fiber
 from fiber.queues import SimpleQueuePush
 from patience import PATIENCE
@@ -95,6 +97,7 @@ def itself(thing: Any) -> Any:
     return thing
 
 
+@pytest.mark.slow
 def test_from_the_program_to_a_worker_and_back() -> None:
     with running(agents=1), fiber.Pool(1) as pool:
         for name, kind in KINDS.items():
@@ -103,6 +106,7 @@ def test_from_the_program_to_a_worker_and_back() -> None:
             assert kind.see(thing), name
 
 
+@pytest.mark.slow
 def test_from_a_worker_to_the_program_and_to_another_worker_of_its_host() -> None:
     with running(agents=1), fiber.Pool(1) as pool, fiber.Pool(1) as other:
         for name, kind in KINDS.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from fiber._engine.charges import Limits
 from fiber._engine.ledger import PATIENCE, Job, Worker
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import FIRST_PAUSE, RAISED_PATIENCE, StartFailure
@@ -101,17 +102,17 @@ def test_who_is_gone_is_replaced_and_its_task_runs_elsewhere() -> None:
     assert scheduler.gone(members[0], 0.0, running=(batch.seq, 0)) == []
     decisions = scheduler.decide(0.0)
     assert (decisions.start, decisions.assign) == (1, [])
-    assert job.attempts == {0: 1}
+    assert job.charges.deaths == {0: 1}
     start(scheduler, decisions)
     assert len(scheduler.decide(0.0).assign) == 1
 
 
 def test_a_task_that_had_its_tries_is_a_loss() -> None:
     scheduler, members = pool(1)
-    job = job_of(scheduler, 1, retries=0)
+    job = job_of(scheduler, 1, limits=Limits(0))
     (batch,) = scheduler.decide(0.0).assign
     (loss,) = scheduler.gone(members[0], 0.0, running=(batch.seq, 0))
-    assert (loss.job, loss.task, loss.attempts) == (job, 0, 1)
+    assert (loss.job, loss.task, loss.counts.deaths) == (job, 0, 1)
     assert job.finished
 
 

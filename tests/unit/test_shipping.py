@@ -80,7 +80,7 @@ def look(_=None):
     assert sys.path[0] == here
     for module in (helper, lazy, generated, sys.modules["__main__"]):
         assert os.path.dirname(module.__file__) == here, module
-    assert os.path.dirname(elsewhere.__file__) == os.path.join(os.path.dirname(here), "lib")
+    assert os.path.dirname(elsewhere.__file__) == os.path.join(os.path.dirname(here), "program")
     assert not os.path.exists("notes.log")
     assert __name__ == "__mp_main__"
     return open("data.txt").read(), Local()
@@ -186,7 +186,7 @@ def test_a_session_has_its_working_directory(site: Site) -> None:
 
 def test_a_session_in_a_folder_that_is_too_large_goes_on_with_what_it_imported(site: Site) -> None:
     write(site.program, helper_py="", large_npy=bytes(2 << 20))
-    limit = "from fiber._backends import program_archive; program_archive.LIMIT = 1 << 20\n"
+    limit = "from fiber._backends import program_files; program_files.LIMIT = 1 << 20\n"
     done = site.run("-c", f"{limit}import helper\n{SESSION}")
     assert (done.returncode, done.stdout) == (0, "program True\n")
     assert done.stderr.count("RuntimeWarning") == 1
@@ -214,17 +214,72 @@ if __name__ == "__main__":
             print(pool.apply(look))
 """
     done = site.run(program=program)
-    assert done.stdout.splitlines() == ["['helper.py', 'main.py']"] * 2
+    assert done.stdout.splitlines() == ["['elsewhere.py', 'helper.py', 'main.py']"] * 2
     assert done.stderr.count("RuntimeWarning: the program is in") == 1
     assert "Put it into a folder of its own" in done.stderr
+
+
+def test_secrets_and_links_that_are_left_out_are_said_once(site: Site, tmp_path: Path) -> None:
+    write(site.program, server_key="x")
+    (site.program / "link").symlink_to(tmp_path / "lib")
+    program = """
+import os
+import elsewhere, fiber
+
+def look():
+    return sorted(name for name in os.listdir() if name != "__pycache__")
+
+if __name__ == "__main__":
+    elsewhere.begin()
+    for name in ("a.txt", ".env"):
+        open(name, "w").close()
+        with fiber.Pool(1) as pool:
+            print(pool.apply(look))
+"""
+    done = site.run(program=program)
+    assert done.stdout.splitlines() == ["['a.txt', 'main.py']"] * 2
+    for path in (
+        "server.key (private keys)",
+        ".env (environment variables)",
+        f"link ({site.library})",
+    ):
+        assert done.stderr.count(f"  {site.program}/{path}") == 1
+    assert f"write a line with its name into {site.program}/.fiberignore" in done.stderr
+    assert "for example '!/server.key'. The line '/server.key' leaves it out" in done.stderr
+
+
+def test_a_listing_shows_what_goes_and_what_does_not(site: Site) -> None:
+    write(site.program, server_key="key", notes_log="log", data_txt="text")
+    (site.program / ".gitignore").write_text("*.log\n")
+    program = """
+import elsewhere, fiber
+if __name__ == "__main__":
+    listing = fiber.shipping.listing()
+    print(repr(listing))
+    for file in (*listing.sent, *listing.left_out):
+        if "/crds" not in file.path and "/operator" not in file.path and ".py" not in file.path:
+            print(file.size, file.path, file.reason)
+    print(str(listing).count("\\n"), listing.too_large, listing.size)
+"""
+    first, *lines, last = site.prints(program=program)
+    size = len(program) + len(ELSEWHERE) + 10
+    assert first.startswith(f"<Listing: 4 files of {size} B sent, ")
+    assert lines == [
+        f"6 {site.program}/.gitignore in the program's folder",
+        f"4 {site.program}/data.txt in the program's folder",
+        f"3 {site.program}/notes.log '*.log' in {site.program}/.gitignore",
+        f"3 {site.program}/server.key looks like a secret: private keys",
+        f"0 {site.library} on sys.path; what the program imported from it is sent",
+    ]
+    assert last.endswith(f"False {size}")
 
 
 def test_a_script_whose_folder_is_too_large_is_told_at_once(site: Site) -> None:
     write(site.program, large_npy=bytes(2 << 20))
     program = """
 import elsewhere, fiber
-from fiber._backends import program_archive
-program_archive.LIMIT = 1 << 20
+from fiber._backends import program_files
+program_files.LIMIT = 1 << 20
 if __name__ == "__main__":
     elsewhere.begin()
     for start in (lambda: fiber.Pool(1), fiber.Process(target=print).start):

@@ -98,6 +98,23 @@ def test_groups_with_groups() -> None:
     assert (found.exceptions[1].step, diverged.step, diverged.loss) == (2, 1, 0.5)
 
 
+def test_a_group_keeps_the_others_of_one_that_cannot_be_made_again() -> None:
+    hopeless = kinds.Hopeless("no hope")
+    hopeless.step = 3  # type: ignore[attr-defined]
+    inner = kinds.Several([hopeless, kinds.Diverged(1, loss=0.5)], step=2)
+    found = travelled(ExceptionGroup("outer", [ValueError("plain"), inner]))
+    assert (found.message, found.__notes__) == ("outer", [])
+    plain, several = found.exceptions
+    assert (type(plain), type(several), several.step) == (ValueError, kinds.Several, 2)
+    lost, diverged = several.exceptions
+    assert type(lost) is MaybeEncodingError
+    assert "Hopeless('no hope')" in str(lost)
+    assert "its state cannot be set" in str(lost)
+    assert (type(diverged), diverged.step) == (kinds.Diverged, 1)
+    assert several.args[1][0] is lost
+    assert several.__notes__ == []
+
+
 def test_one_that_has_another_and_itself() -> None:
     found = travelled(kinds.Wraps(kinds.BadlyReduced(3, 0.5), step=2))
     assert (type(found.inner), found.inner.step, found.step) == (kinds.BadlyReduced, 3, 2)

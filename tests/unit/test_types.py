@@ -40,9 +40,27 @@ class Finding(NamedTuple):
     rule: str = ""
 
 
-def findings(checker: str, folder: Path, name: str) -> list[Finding]:
-    found = mypy(folder, name) if checker == "mypy" else pyright(folder, name)
-    return sorted(found)
+Findings = dict[str, list[Finding]]
+"""Findings by the name of the file."""
+
+
+@pytest.fixture(scope="module", params=["mypy", "pyright"])
+def findings(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Findings:
+    """Findings of one checker, which reads all programs in one run."""
+    folder = tmp_path_factory.mktemp("typed")
+    program = (TYPED / "program.py").read_text(encoding="utf-8")
+    texts = {
+        "ours.py": program,
+        "theirs.py": program.replace("fiber", "multiprocessing"),
+        "additions.py": (TYPED / "additions.py").read_text(encoding="utf-8"),
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    check = mypy if request.param == "mypy" else pyright
+    found: Findings = {name: [] for name in texts}
+    for name, finding in check(folder, *texts):
+        found[name].append(finding)
+    return {name: sorted(each) for name, each in found.items()}
 
 
 def run(*arguments: str, folder: Path, **environment: str) -> str:
@@ -55,25 +73,25 @@ def run(*arguments: str, folder: Path, **environment: str) -> str:
     return done.stdout
 
 
-def mypy(folder: Path, name: str) -> Iterator[Finding]:
+def mypy(folder: Path, *names: str) -> Iterator[tuple[str, Finding]]:
     cache = ROOT / ".mypy_cache" / "of_a_user"
     options = ("--strict", "--config-file=", f"--cache-dir={cache}")
-    for text in run("mypy", *options, name, folder=folder).splitlines():
-        if match := re.match(rf"{name}:(\d+): (note|error): (.*)", text):
-            if revealed := re.match(r'Revealed type is "(.*)"', match[3]):
-                yield Finding(int(match[1]), short(revealed[1]))
-            elif match[2] == "error":
-                yield Finding(int(match[1]), rule=match[3].rpartition("  ")[2])
+    for text in run("mypy", *options, *names, folder=folder).splitlines():
+        if match := re.match(r"(\w+\.py):(\d+): (note|error): (.*)", text):
+            if revealed := re.match(r'Revealed type is "(.*)"', match[4]):
+                yield match[1], Finding(int(match[2]), short(revealed[1]))
+            elif match[3] == "error":
+                yield match[1], Finding(int(match[2]), rule=match[4].rpartition("  ")[2])
 
 
-def pyright(folder: Path, name: str) -> Iterator[Finding]:
-    printed = run("pyright", "--pythonpath", sys.executable, "--outputjson", name, folder=folder)
+def pyright(folder: Path, *names: str) -> Iterator[tuple[str, Finding]]:
+    printed = run("pyright", "--pythonpath", sys.executable, "--outputjson", *names, folder=folder)
     for found in json.loads(printed)["generalDiagnostics"]:
-        line = found["range"]["start"]["line"] + 1
+        name, line = Path(found["file"]).name, found["range"]["start"]["line"] + 1
         if found["severity"] == "information":
-            yield Finding(line, short(found["message"].partition(" is ")[2].strip('"')))
+            yield name, Finding(line, short(found["message"].partition(" is ")[2].strip('"')))
         else:
-            yield Finding(line, rule=found["rule"])
+            yield name, Finding(line, rule=found["rule"])
 
 
 def short(type_: str) -> str:
@@ -83,27 +101,19 @@ def short(type_: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("checker", ["mypy", "pyright"])
-def test_a_users_program_has_the_types_that_it_has_with_multiprocessing(
-    checker: str, tmp_path: Path
-) -> None:
+def test_a_users_program_has_the_types_that_it_has_with_multiprocessing(findings: Findings) -> None:
     program = (TYPED / "program.py").read_text(encoding="utf-8")
-    (tmp_path / "ours.py").write_text(program, encoding="utf-8")
-    (tmp_path / "theirs.py").write_text(program.replace("fiber", "multiprocessing"), "utf-8")
-    ours = findings(checker, tmp_path, "ours.py")
-    assert ours == findings(checker, tmp_path, "theirs.py")
+    ours = findings["ours.py"]
+    assert ours == findings["theirs.py"]
     assert sum(bool(found.type) for found in ours) == program.count("reveal_type(")
     assert sum(bool(found.rule) for found in ours) > 5
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("checker", ["mypy", "pyright"])
-def test_what_fiber_adds_has_types_and_mistakes_are_errors(checker: str, tmp_path: Path) -> None:
-    program = (TYPED / "additions.py").read_text(encoding="utf-8")
-    (tmp_path / "program.py").write_text(program, encoding="utf-8")
-    found = findings(checker, tmp_path, "program.py")
-    lines = enumerate(program.splitlines(), 1)
+def test_what_fiber_adds_has_types_and_mistakes_are_errors(findings: Findings) -> None:
+    found = findings["additions.py"]
+    lines = enumerate((TYPED / "additions.py").read_text(encoding="utf-8").splitlines(), 1)
     said = {number: match[1] for number, line in lines if (match := re.search(r"  # (.+)", line))}
     types = {finding.line: finding.type for finding in found if finding.type}
     assert types == {number: words for number, words in said.items() if words != "error"}
@@ -165,4 +175,7 @@ def test_init_has_a_typed_keyword_for_each_key() -> None:
     narrowed["template"] = narrowed["template"].removesuffix(" | None")
     expected = {entry.name: str(entry.type) for entry in fields(Config)}
     expected["template"] = expected["template"].removesuffix(" | None")
+    # An amount may be given as text, such as "64Mi".
+    expected |= {"cpu_request": "float | str", "memory_request": "int | str"}
+    expected["shm"] = "int | str | None"
     assert narrowed == expected

@@ -51,6 +51,7 @@ def test_a_call_that_is_interrupted_anywhere(call: str, env: VectorEnv) -> None:
     assert stop > 20
 
 
+@pytest.mark.slow
 def test_an_end_that_is_interrupted_anywhere() -> None:
     stop, interrupted = 0, True
     while interrupted:

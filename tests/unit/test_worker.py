@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import pickle
+import queue
 import random
 import signal
 import sys
@@ -114,6 +115,32 @@ def impatient() -> Iterator[Rig]:
     rig = Rig()
     yield rig
     rig.worker.close()
+
+
+class Reluctant:
+    """A batch whose first task begins only after a while."""
+
+    seq, eager = 1, True
+
+    def __init__(self) -> None:
+        self.looks = 0
+        self.taken_apart_at: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def started(self) -> int:
+        self.looks += 1
+        return int(self.looks == 3)
+
+    def return_unstarted(self) -> None:
+        self.taken_apart_at.put(self.looks)
+
+
+def test_a_batch_is_taken_apart_once_its_first_task_has_begun() -> None:
+    batch: Any = Reluctant()
+    watchdog = Watchdog()
+    watchdog.begin(batch)
+    assert batch.taken_apart_at.get(timeout=PATIENCE) == 3
+    watchdog.end()
+    watchdog.stop()
 
 
 MODES = pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from fiber._hub.client import Unreachable
 from fiber._hub.shared_semaphores import AnySemaphore
 from fiber._hub.wait_lists import AnyWaitList
 from fiber._sync.semaphore import COUNTING
+from fiber._transport.base import SharedCounter
 
 _LOOK = 0.2
 """Seconds between two looks for dead processes."""
@@ -58,15 +59,15 @@ class Claims:
             return
         self._tell()
 
-    def recover(self) -> int:
-        """Return the number of places that dead processes had; each is told once."""
+    def recover(self, counter: SharedCounter) -> int:
+        """Give the places of dead processes back to ``counter``; return how many there were."""
         now = time.monotonic()
         if now < self._next_look:
             return 0
         self._next_look = now + _LOOK
         self._lock.acquire()
         try:
-            return int(self._table.reclaim())
+            return int(self._table.reclaim(counter))
         finally:
             self._lock.release()
 

@@ -244,8 +244,8 @@ class HubStream:
         self._send(ONE.pack(Op.SYNC, number, self._asked))
         late = None
         while (reply := self.receive()).number != number:
-            if reply.status is Status.OK and (reply.parts or operation is not Op.RECV):
-                late = late or reply
+            if reply.status is Status.OK and reply.number == self._asked:
+                late = reply
         self._unsettled = None
         return (operation, late) if late is not None else None
 

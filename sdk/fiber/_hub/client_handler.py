@@ -61,16 +61,21 @@ class RequestRefused(Exception):
 class PendingRequest:
     """One request; answered once."""
 
-    __slots__ = ("_handler", "_number")
+    __slots__ = ("_granted", "_handler", "_number")
 
-    def __init__(self, handler: ClientHandler, number: int) -> None:
+    def __init__(
+        self, handler: ClientHandler, number: int, granted: Callable[[], None] | None = None
+    ) -> None:
         self._handler = handler
         self._number = number
+        self._granted = granted
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
         """Send the reply."""
         if self._handler.waiting is self:
             self._handler.waiting = None
+        if self._granted is not None and status is Status.OK:
+            self._granted()
         self._handler.stream.send(ONE.pack(status, self._number, value), buffers)
 
     @property
@@ -95,6 +100,8 @@ class ClientHandler:
         self._granted_last: int | None = None
         """The number of the request that got a token last, if anybody may still give it up."""
         self._place: int | None = None
+        self._claimed = False
+        """Whether the counter was lowered for a client that has not said that it knows."""
         stream.handler = self
 
     def on_message(self, message: Message) -> None:
@@ -104,6 +111,8 @@ class ClientHandler:
             if not self._admitted:
                 self._admit(operation, message.payload)
             else:
+                if self._claimed and operation not in (Op.KEEP, Op.CANCEL):
+                    self._unclaim()
                 _OPERATIONS[operation](self, message)
         except RequestRefused as refusal:
             self._end(str(refusal))
@@ -121,8 +130,6 @@ class ClientHandler:
         if self._holder is not None:
             self._semaphore().abandon(self._holder)
             self._holder = None
-        if self._place is not None:
-            self._wait_list().places.lose(self._place)
         self._leave()
 
     def close(self, reason: str) -> None:
@@ -136,6 +143,10 @@ class ClientHandler:
     def _leave(self) -> None:
         self._cancel()
         self._give_back()
+        self._unclaim()
+        place, self._place = self._place, None
+        if place is not None:
+            self._wait_list().places.lose(place)
         attachment, self._attachment = self._attachment, None
         if attachment is not None:
             if isinstance(attachment.shared.hosted, HostedChannel):
@@ -155,10 +166,12 @@ class ClientHandler:
             self._hosted.withdraw(request)
         return request
 
-    def _request(self, message: Message) -> PendingRequest:
-        """A request to be answered later; ends the one before."""
+    def _request(
+        self, message: Message, granted: Callable[[], None] | None = None
+    ) -> PendingRequest:
+        """A request to be answered later; ends the one before.  ``granted`` is called before OK."""
         self._cancel()
-        self.waiting = PendingRequest(self, HEAD.unpack_from(message.payload)[1])
+        self.waiting = PendingRequest(self, HEAD.unpack_from(message.payload)[1], granted)
         return self.waiting
 
     # Getting in
@@ -294,6 +307,17 @@ class ClientHandler:
         """Receive a message if one is there."""
         self._channel().receive(self._request(message), wait=False)
 
+    def draw(self, message: Message) -> None:
+        """Receive a message and raise a counter."""
+        self._channel().receive(self._counting(message), wait=True)
+
+    def try_draw(self, message: Message) -> None:
+        """Do the same if a message is there."""
+        self._channel().receive(self._counting(message), wait=False)
+
+    def _counting(self, message: Message) -> PendingRequest:
+        return self._request(message, partial(self._counter_named_in(message).add, 1))
+
     def poll(self, message: Message) -> None:
         """Wait for a message."""
         self._channel().poll(self._request(message))
@@ -320,9 +344,15 @@ class ClientHandler:
     # A counter
 
     def _counter(self) -> HostedCounter:
-        hosted = self._hosted
+        return self._checked(self._hosted)
+
+    def _counter_named_in(self, message: Message) -> HostedCounter:
+        return self._checked(self._home.registry.hosted(SECRET.unpack(message.payload)[2]))
+
+    @staticmethod
+    def _checked(hosted: Hosted | None) -> HostedCounter:
         if not isinstance(hosted, HostedCounter):
-            raise RequestRefused("the stream is not attached to a counter")
+            raise RequestRefused("the request is not for a counter")
         return hosted
 
     def add(self, message: Message) -> None:
@@ -337,6 +367,22 @@ class ClientHandler:
     def take(self, message: Message) -> None:
         """Lower it."""
         self._counter().take(self._request(message))
+
+    def claim(self, message: Message) -> None:
+        """Lower it until the stream ends, unless that is to be kept."""
+        self._counter().take(self._request(message, self._on_claim))
+
+    def _on_claim(self) -> None:
+        self._claimed = True
+
+    def keep(self, message: Message) -> None:
+        """Let it stay lowered."""
+        self._claimed = False
+
+    def _unclaim(self) -> None:
+        if self._claimed:
+            self._claimed = False
+            self._counter().add(1)
 
     def clear(self, message: Message) -> None:
         """Zero it."""
@@ -448,8 +494,9 @@ class ClientHandler:
         self._request(message).answer(Status.OK, self._wait_list().places.held())
 
     def reclaim(self, message: Message) -> None:
-        """Tell how many things the dead had."""
-        self._request(message).answer(Status.OK, self._wait_list().places.reclaim())
+        """Give a counter back what the dead had."""
+        number = self._wait_list().places.reclaim(self._counter_named_in(message))
+        self._request(message).answer(Status.OK, number)
 
     def get(self, message: Message) -> None:
         """Tell a word."""

@@ -66,12 +66,14 @@ class Dealer:
     def _wait(self) -> None:
         poller = select.poll()
         poller.register(self._arrivals.fileno(), select.POLLIN)
+        timeout = None
         if self._item is None:
             poller.register(self._inbox.fileno(), select.POLLIN)
+            timeout = one_way.LOOK_AGAIN * 1000
         else:
             for reader in self._readers:
                 poller.register(reader.fileno(), reader.room_events)
-        poller.poll()
+        poller.poll(timeout)
 
     def _welcome(self) -> None:
         message = self._arrivals.try_recv()

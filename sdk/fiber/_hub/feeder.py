@@ -17,6 +17,7 @@ from fiber._hub.claims import Claims
 from fiber._hub.local import LocalCounter
 from fiber._transport.base import SharedChannel, SharedCounter
 from fiber._wire import packet
+from fiber._wire.packet import Message
 
 _LOOK_FOR_THE_DEAD = 1.0
 """Seconds that ``put`` waits at a time."""
@@ -51,8 +52,7 @@ class Slots:
         deadline = math.inf if timeout is None else now + timeout
         while True:
             left = deadline - time.monotonic()
-            if self._free.take(min(left, _LOOK_FOR_THE_DEAD), taken):
-                self._claims.add()
+            if self._free.claim(min(left, _LOOK_FOR_THE_DEAD), taken, self._claims):
                 return True
             if not self._recover() and left <= _LOOK_FOR_THE_DEAD:
                 return False
@@ -73,9 +73,9 @@ class Slots:
         """Note that the item was sent: its place is free once it is received."""
         self._claims.drop()
 
-    def free(self) -> None:
-        """An item was received."""
-        self._free.add(1)
+    def receive(self, inbox: SharedChannel, *, wait: bool) -> Message | None:
+        """Receive an item, whose place is free then; None if there is none."""
+        return inbox.recv_counting(self._free, wait=wait)
 
     def used(self, waiting: int) -> int:
         """How many items there are; so many of them wait in this process."""
@@ -87,9 +87,8 @@ class Slots:
 
     def _recover(self) -> bool:
         """Make the places of dead processes free; whether there were any."""
-        lost = self._claims.recover()
+        lost = self._claims.recover(self._free)
         if lost:
-            self._free.add(lost)
             self._next_count = 0.0
         return bool(lost)
 
@@ -129,9 +128,12 @@ class ItemCount:
     def sent(self) -> None:
         """Do nothing: ``sending`` has counted the item."""
 
-    def free(self) -> None:
-        """An item was received."""
-        self._sent.take(0)
+    def receive(self, inbox: SharedChannel, *, wait: bool) -> Message | None:
+        """Receive an item, which counts no longer; None if there is none."""
+        message = inbox.recv() if wait else inbox.try_recv()
+        if message is not None:
+            self._sent.take(0)
+        return message
 
     def used(self, waiting: int) -> int:
         """How many items there are; so many of them wait in this process."""

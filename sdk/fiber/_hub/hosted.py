@@ -11,8 +11,10 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.one_way import LOOK_AGAIN, Receiver
 from fiber._hub.poller import EDGE, IN, OUT, Poller
 from fiber._hub.protocol import Status
+from fiber._transport.loop import Loop
 from fiber._wire.packet import INLINE_LIMIT, Message
 
 
@@ -105,9 +107,13 @@ class HostedChannel:
         self._channel.close()
 
     def _watch(self) -> None:
-        wanted = self._receivers or self._pollers or self._watchers
-        mask = (IN if wanted else 0) | (self._channel.room_events if self._senders else 0)
+        mask = IN if self._is_awaited() else 0
+        if self._senders:
+            mask |= self._channel.room_events
         self._poller.watch(self._channel.fileno(), mask, self._event)
+
+    def _is_awaited(self) -> bool:
+        return bool(self._receivers or self._pollers or self._watchers)
 
     def _event(self, events: int) -> None:
         if self._senders:
@@ -156,6 +162,37 @@ class HostedChannel:
             watchers, self._watchers = self._watchers, set()
             for watcher in watchers:
                 watcher.ready()
+
+
+class HostedReceiver(HostedChannel):
+    """The receiving end of a one-way channel.
+
+    It looks at the backlog each second while somebody waits: a process of this host that dies with
+    the wake-up packet wakes nobody.
+    """
+
+    def __init__(self, loop: Loop, poller: Poller, channel: Receiver) -> None:
+        super().__init__(poller, channel)
+        self._loop = loop
+        self._is_looking = False
+
+    def close(self) -> None:
+        """Let go of the end."""
+        self._receivers.clear()
+        self._pollers.clear()
+        self._watchers.clear()
+        super().close()
+
+    def _watch(self) -> None:
+        super()._watch()
+        if self._is_awaited() and not self._is_looking:
+            self._is_looking = True
+            self._loop.call_later(LOOK_AGAIN, self._look)
+
+    def _look(self) -> None:
+        self._is_looking = False
+        if self._is_awaited():
+            self._event(IN)
 
 
 class HostedCounter:

@@ -26,12 +26,12 @@ from fiber._hub.client_handler import ClientHandler
 from fiber._hub.directory import remove_directory
 from fiber._hub.doorbell import Doorbell
 from fiber._hub.heap import block_of
-from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory
+from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory, HostedReceiver
 from fiber._hub.hosted_semaphore import HostedSemaphore
 from fiber._hub.hosted_wait_list import HostedWaitList
 from fiber._hub.hub_link import HubLink, Send
 from fiber._hub.local import LocalChannel, LocalCounter, QuietSocket, without_timeout
-from fiber._hub.one_way import ENDS
+from fiber._hub.one_way import ENDS, Receiver
 from fiber._hub.poller import Poller
 from fiber._hub.protocol import HubAddress, ObjectKind
 from fiber._hub.registry import Hosted, Registry, SharedObject
@@ -236,6 +236,8 @@ class Hub:
         if shared.kind in ENDS:
             (segment,) = beside
             end = ENDS[shared.kind](fd, Backlog(block_of(segment, *shared.extent)))
+            if isinstance(end, Receiver):
+                return HostedReceiver(self._loop, self._poller, end)
             return HostedChannel(self._poller, end)
         if shared.kind is ObjectKind.SEMAPHORE:
             return HostedSemaphore(self._loop, self.doorbell, block_of(fd, *shared.extent))

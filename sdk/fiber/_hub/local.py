@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import time
 from collections.abc import Sequence
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
+from fiber._transport.base import Claimant
 from fiber._transport.loop import LONGEST_POLL
 from fiber._transport.unix import UnixChannel, UnixCounter, grow
 from fiber._wire import packet
-from fiber._wire.packet import BytesLike
+from fiber._wire.descriptor import Descriptor
+from fiber._wire.packet import BytesLike, Message
 
 _Socket = TypeVar("_Socket", bound=socket.socket)
 
@@ -63,6 +67,13 @@ class LocalChannel(UnixChannel):
             return False
         return True
 
+    def recv_counting(self, counter: LocalCounter, *, wait: bool) -> Message | None:
+        """Receive a message, raising ``counter`` in the same step; None if there is none."""
+        try:
+            return packet.receive(self._sock, wait=wait, then=counter.raising)
+        except BlockingIOError:
+            return None
+
     @property
     def room_events(self) -> int:
         """Which event of ``fileno()`` says that ``try_send`` is worth another try."""
@@ -72,7 +83,28 @@ class LocalChannel(UnixChannel):
 class LocalCounter(UnixCounter):
     """A counter whose every change can be waited for."""
 
-    __slots__ = ()
+    __slots__ = ("raising",)
+
+    def __init__(self, owner: Descriptor) -> None:
+        super().__init__(owner)
+        self.raising = partial(os.eventfd_write, owner.fileno(), 1)
+        """``add``, as a function of C."""
+
+    def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
+        """As ``take``; the claim is noted as well."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while True:
+            claims.add()  # first: who dies in between has noted one too many, not one too few
+            try:
+                if self.take(0, taken):
+                    return True
+            finally:
+                if not taken:
+                    claims.drop()
+            left = None if deadline is None else deadline - time.monotonic()
+            if left is not None and left <= 0:
+                return False
+            self.wait(left)
 
     def changed(self, since: int, timeout: float | None) -> bool:
         """Wait until the count is not ``since``; False when ``timeout`` is over."""

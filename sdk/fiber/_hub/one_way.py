@@ -16,8 +16,8 @@ that is empty again.  Messages in the socket are older than those in the backlog
   notes that (``AMBIGUOUS``), and the next receiver moves the packet to the end.
 * A sender that finds the backlog full waits for a packet in the other direction.
 * A receiver that dies with the wake-up packet in its hands takes no message with it, but others
-  are not woken.  They look at the backlog each second, and the next sender finds the socket empty
-  and sends another wake-up packet.
+  are not woken.  They look at the backlog each second, as the hub and the dealer of a queue do for
+  their readers, and the next sender finds the socket empty and sends another wake-up packet.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import ConnectionClosed
 
-_LOOK_AGAIN = 1.0
+LOOK_AGAIN = 1.0
 """Seconds after which a receiver that sleeps looks at the backlog."""
 
 _DONTWAIT = int(socket.MSG_DONTWAIT)
@@ -196,8 +196,8 @@ class Receiver(OneWayEnd):
         """Tell whether ``recv`` would return or raise at once."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while not self.backlog:
-            left = _LOOK_AGAIN if deadline is None else deadline - time.monotonic()
-            if wait_readable(self.fileno(), max(0.0, min(left, _LOOK_AGAIN))):
+            left = LOOK_AGAIN if deadline is None else deadline - time.monotonic()
+            if wait_readable(self.fileno(), max(0.0, min(left, LOOK_AGAIN))):
                 return True
             if left <= 0:
                 return False
@@ -290,7 +290,7 @@ def pair() -> tuple[Receiver, Sender]:
     backlog = Backlog.create()  # first: an error in there must not keep the sockets open
     one, other = LocalChannel.pair()
     backlog.words[ROOM] = other.sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
-    limit = struct.pack("ll", int(_LOOK_AGAIN), 0)
+    limit = struct.pack("ll", int(LOOK_AGAIN), 0)
     one.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
     return Receiver(one.owner, backlog), Sender(other.owner, backlog)
 

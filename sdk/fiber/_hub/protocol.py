@@ -17,7 +17,7 @@ import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 2
+VERSION = 3
 KEY_BYTES = 32
 
 SECRET_BYTES = 16
@@ -94,6 +94,8 @@ class Op(IntEnum):
     POLL = 13
     WATCH = 14  # silent; the stream gets READY once the channel is readable
     CHECK = 15  # whether it is readable now; then as WATCH
+    DRAW = 16  # token of a counter -> as RECV; raises that counter by one
+    TRY_DRAW = 17  # the same -> as TRY_RECV
     # For an attached counter
     ADD = 20  # how much
     TAKE = 21
@@ -101,6 +103,8 @@ class Op(IntEnum):
     VALUE = 23  # -> count
     WAIT = 24
     CHANGED = 25  # since
+    CLAIM = 26  # as TAKE; taken back at the end of the stream or the next request, unless
+    KEEP = 27  # says before that it is to be kept; silent
     # For an attached semaphore
     ACQUIRE = 40  # the process's name beside it -> whether the stream keeps it; who died beside it
     POST = 41  # NO if there are as many tokens as there can be
@@ -115,7 +119,7 @@ class Op(IntEnum):
     GET = 56  # which -> the word
     SET = 57  # which, the word
     HOLD = 58  # how many things the stream's place has; silent
-    RECLAIM = 59  # -> how many things the dead had
+    RECLAIM = 59  # token of a counter, which is raised by -> how many things the dead had
     TALLY = 60  # how many things the stream's place has; the second word
     HELD = 61  # -> how many things all places have
 

@@ -193,6 +193,10 @@ class Registry:
         self._use(grant)
         return Attachment(shared, token)
 
+    def hosted(self, token: bytes) -> Hosted:
+        """Return what the user of this token is attached to."""
+        return self._used_by(token).hosted
+
     def look_up(self, token: bytes, grant: bytes) -> SharedObject:
         """What somebody is attached to, or is about to be by this grant."""
         return self._used_by(token) if token in self._users else self._granted(grant)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import struct
 import weakref
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,8 +17,10 @@ from typing import Any, TypeAlias
 
 from fiber._hub.client import HubStream, Reply, Unreachable
 from fiber._hub.protocol import (
+    HEAD,
     NO_SECRET,
     ONE,
+    SECRET,
     SECRET_BYTES,
     SECRETS,
     Extent,
@@ -26,6 +29,7 @@ from fiber._hub.protocol import (
     Op,
     Status,
 )
+from fiber._transport.base import Claimant
 from fiber._transport.unix import wait_readable
 from fiber._wire import packet
 from fiber._wire.packet import BytesLike, Message
@@ -86,6 +90,12 @@ class RemoteObject:
         if not any(stream.has_answered for stream in tuple(self._streams)):
             with suppress(OSError, Unreachable), self.stream() as stream:
                 stream.ask(Op.SYNC, 0, form=ONE)
+
+    def known(self) -> bytes:
+        """Return the token, once the hub knows it: other streams may name it."""
+        self._check()
+        self.confirm()
+        return self.token
 
     @contextmanager
     def stream(self) -> Iterator[HubStream]:
@@ -202,9 +212,15 @@ class RemoteChannel(RemoteObject):
         """The next message if one is there; EOFError at the end."""
         return self._receive(Op.TRY_RECV)
 
-    def _receive(self, operation: Op) -> Message | None:
+    def recv_counting(self, counter: RemoteCounter, *, wait: bool) -> Message | None:
+        """Receive a message, for which the hub raises ``counter``; None if there is none."""
+        return self._receive(Op.DRAW if wait else Op.TRY_DRAW, counter.known(), form=SECRET)
+
+    def _receive(self, operation: Op, *values: bytes, form: struct.Struct = HEAD) -> Message | None:
         with self.stream() as stream:
-            reply = self._late.popleft() if self._late else stream.ask(operation)
+            reply = (
+                self._late.popleft() if self._late else stream.ask(operation, *values, form=form)
+            )
         if reply.status is Status.EOF:
             raise ConnectionClosed()
         if reply.status is Status.NO:
@@ -286,6 +302,16 @@ class RemoteCounter(RemoteObject):
                 return False
             if taken is not None:
                 taken.append(1)
+            return True
+
+    def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
+        """As ``take``; if this process dies before it has the answer, the hub takes it back."""
+        with self.stream() as stream:
+            if stream.ask(Op.CLAIM, timeout=timeout).status is not Status.OK:
+                return False
+            taken.append(1)
+            claims.add()
+            stream.say(Op.KEEP)
             return True
 
     def clear(self) -> int:

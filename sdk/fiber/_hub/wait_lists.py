@@ -15,8 +15,8 @@ from fiber._hub.handles import (
     handle_for_remote_block,
     ring,
 )
-from fiber._hub.protocol import ONE, TWO, Extent, ObjectKind, Op, Status
-from fiber._hub.remote import RemoteObject
+from fiber._hub.protocol import ONE, SECRET, TWO, Extent, ObjectKind, Op, Status
+from fiber._hub.remote import RemoteCounter, RemoteObject
 from fiber._sync.wait_list import SIZE, WaitList
 
 
@@ -81,9 +81,11 @@ class RemoteWaitList(RemoteObject):
         """How many things all owners of places have."""
         return self._ask(Op.HELD, 0)
 
-    def reclaim(self) -> int:
-        """Free the places of dead processes, and return how many things they had."""
-        return self._ask(Op.RECLAIM, 0)
+    def reclaim(self, counter: RemoteCounter) -> int:
+        """Free the places of dead processes; give ``counter`` what they had and return it."""
+        with self.stream() as stream:
+            value: int = stream.ask(Op.RECLAIM, counter.known(), form=SECRET).values[0]
+        return value
 
     def get(self, number: int) -> int:
         """One of the user's two words."""

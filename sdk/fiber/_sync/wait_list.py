@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from itertools import filterfalse, islice
+from typing import Protocol
 
 from fiber._sync import identity
 from fiber._sync.semaphore import SLICE, Block, make_semaphore, semaphore_at
@@ -33,6 +34,13 @@ _CAME = 2
 _HELD = 3  # what ``hold`` was told
 _BELL = 4
 _WAITS, _WAITS_AFAR, _LOST, _NOTIFIED = range(4)
+
+
+class Raisable(Protocol):
+    """A count of free things."""
+
+    def add(self, n: int) -> None:
+        """Raise the count."""
 
 
 class WaitList:
@@ -122,14 +130,16 @@ class WaitList:
         """How many things all owners of places have."""
         return sum(self._words[place + _HELD] for place in self._used())
 
-    def reclaim(self) -> int:
-        """Free the places of dead processes, and return how many things they had."""
+    def reclaim(self, counter: Raisable) -> int:
+        """Free the places of dead processes; give ``counter`` what they had and return it."""
         dead = [place for place in self._used() if self._is_dead(place)]
-        held = 0
+        total = 0
         for place in dead:
-            held += self._words[place + _HELD]
+            if held := self._words[place + _HELD]:
+                counter.add(held)  # first: after a death here it is given back twice, not never
+                total += held
             self._words[place + _WHO] = 0
-        return held
+        return total
 
     def get(self, number: int) -> int:
         """One of the user's two words."""

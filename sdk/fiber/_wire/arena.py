@@ -27,6 +27,13 @@ RETAINED_LIMIT = 1 << 25
 RETAINED_BLOCKS = 32
 """How many pieces that memory is kept in; each holds two descriptors."""
 
+HUGE_PAGES_UP_TO = 1 << 30
+"""Bytes of a message for which huge pages are asked for.
+
+They save a page fault for each 4 KiB, which costs several times the copy.  For more, a virtual
+machine has to get memory back from its host first: that was slower than small pages.
+"""
+
 DATA_OFFSET = 64
 """Where the content starts; before it lies the flag."""
 

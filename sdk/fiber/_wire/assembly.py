@@ -6,10 +6,12 @@ the frame on to a process of this host carries the memfd's descriptor and says w
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import mmap
 import os
 
-from fiber._wire.arena import DATA_OFFSET, Mapping
+from fiber._wire.arena import DATA_OFFSET, HUGE_PAGES_UP_TO, Mapping
 from fiber._wire.descriptor import Descriptor, opened
 
 IN_FILE = 1 << 22
@@ -20,15 +22,18 @@ A smaller one is copied once more on its way, into memory that is used again and
 
 
 class Assembly:
-    """A frame of ``size`` bytes of which the pieces arrive in order."""
+    """A frame of ``size`` bytes of which the pieces arrive in order.
+
+    One that this process does not pass on has memory that is private to it, and costs half.
+    """
 
     __slots__ = ("_memory", "_small", "arrived", "size")
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, *, passed_on: bool = True) -> None:
         self.size = size
         self.arrived = 0
         self._small = bytearray()
-        self._memory = _memory(size) if size >= IN_FILE else None
+        self._memory = _memory(size, passed_on) if size >= IN_FILE else None
 
     def add(self, piece: memoryview) -> None:
         """Copy the next piece; ValueError if it is more than was announced."""
@@ -54,8 +59,8 @@ class Assembly:
 class Memory(Mapping):
     """Memory of one frame, laid out as an arena's block, which is not used again.
 
-    It has no ``owner`` where the system had no descriptor for it, or lets this process write no
-    files.
+    It has no ``owner`` where it is not passed on, or where the system had no descriptor for it or
+    lets this process write no files.
     """
 
     passes_on = False
@@ -80,9 +85,11 @@ def place_of(view: memoryview) -> tuple[Descriptor, int] | None:
     return memory.owner, address(view) - address(memoryview(memory))
 
 
-def _memory(size: int) -> Memory:
+def _memory(size: int, passed_on: bool) -> Memory:
     """OSError, ValueError or OverflowError if there is no room for so much."""
     total = DATA_OFFSET + size
+    if not passed_on:
+        return _private(total)
     try:
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
         owner = opened(os.memfd_create, "fiber-frame", flags)
@@ -90,8 +97,17 @@ def _memory(size: int) -> Memory:
         fcntl.fcntl(owner.fileno(), fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)  # as of every block
         memory = Memory(owner.fileno(), total)
     except OSError:
-        return Memory(-1, total)
+        return _private(total)
     memory.owner, memory.process = owner, os.getpid()
+    return memory
+
+
+def _private(total: int) -> Memory:
+    memory = Memory(-1, total, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    memory.process = os.getpid()
+    if total <= HUGE_PAGES_UP_TO:
+        with contextlib.suppress(OSError):  # a kernel may have none
+            memory.madvise(mmap.MADV_HUGEPAGE)
     return memory
 
 

@@ -15,14 +15,13 @@ class Blob:
     An agent has them for as long as the master has the object (``fiber._backends.blob_sender``).
     """
 
-    __slots__ = ("__weakref__", "_data", "_file", "_frame", "digest")
+    __slots__ = ("__weakref__", "_data", "_file", "digest")
 
     def __init__(self, data: BytesLike) -> None:
         import hashlib  # most programs need none of it, nor what follows
 
         self.digest = hashlib.sha256(data).digest()
         self._data = data
-        self._frame: bytes | None = None
         self._file: Descriptor | None = None
 
     @classmethod
@@ -34,20 +33,16 @@ class Blob:
         import tempfile
 
         blob = cls.__new__(cls)
-        blob.digest, blob._data, blob._frame = digest, b"", None
+        blob.digest, blob._data = digest, b""
         with tempfile.TemporaryFile(dir=directory) as file:
             blob._file = own(os.dup(file.fileno()))
         _write(blob._file.fileno(), data)
         return blob
 
     @property
-    def frame(self) -> bytes:
-        """The message that brings it to an agent: one, for all of them."""
-        if self._frame is None:
-            size = len(self._data)
-            self._frame = messages.Blob(self.digest, self._data).encode()
-            self._data = memoryview(self._frame)[len(self._frame) - size :]
-        return self._frame
+    def message(self) -> messages.Blob:
+        """The message that brings it to an agent."""
+        return messages.Blob(self.digest, self._data)
 
     def fileno(self) -> int:
         """The descriptor of a file that holds the bytes; it stays this object's."""

@@ -59,7 +59,11 @@ class Blob(NamedTuple):
 
     def encode(self) -> bytes:
         """The frame."""
-        return _BLOB_HEAD.pack(PROTOCOL, _BLOB, self.digest) + self.data
+        return b"".join(self.pieces())
+
+    def pieces(self) -> Sequence[BytesLike]:
+        """The frame, of which the data is not copied."""
+        return _BLOB_HEAD.pack(PROTOCOL, _BLOB, self.digest), self.data
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -274,6 +278,20 @@ class Shutdown(NamedTuple):
         return _GRACE.pack(PROTOCOL, _SHUTDOWN, self.grace)
 
 
+class Leave(NamedTuple):
+    """Agent to master: this agent takes no new work and goes, in ``grace`` seconds at the latest.
+
+    It closes the link once its last child is gone.
+    """
+
+    grace: float
+    reason: str
+
+    def encode(self) -> bytes:
+        """The frame."""
+        return _GRACE.pack(PROTOCOL, _LEAVE, self.grace) + _utf8(self.reason)
+
+
 Message: TypeAlias = (
     Start
     | Blob
@@ -292,6 +310,7 @@ Message: TypeAlias = (
     | TunnelClose
     | Memory
     | Shutdown
+    | Leave
 )
 
 
@@ -326,7 +345,7 @@ def decode(frame: BytesLike) -> Message:
 
 _START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
-_BLOB, _FORGET, _LACKING, _MEMORY = 15, 16, 17, 18
+_BLOB, _FORGET, _LACKING, _MEMORY, _LEAVE = 15, 16, 17, 18, 19
 
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
@@ -339,7 +358,7 @@ _PACKET = struct.Struct("<IQ")
 
 def pieces(message: Message) -> Sequence[BytesLike]:
     """A message's frame, in pieces if it has large ones: these are not copied."""
-    if isinstance(message, Start | Deliver | FromChild | TunnelData):
+    if isinstance(message, Start | Blob | Deliver | FromChild | TunnelData):
         return message.pieces()
     return (message.encode(),)
 
@@ -347,14 +366,23 @@ def pieces(message: Message) -> Sequence[BytesLike]:
 def lane(message: Message) -> Hashable:
     """The lane that the message travels in.
 
-    Messages about one child's tasks keep their order, and so do those of one tunnel.  A Signal is
-    in no lane: it does not wait for what a child was sent.
+    Messages about one child's start and tasks keep their order, and so do those about one blob and
+    those of one tunnel.  A Signal is in no lane: it does not wait for what a child was sent.
     """
     if isinstance(message, TunnelData | TunnelClose):
         return (_TUNNEL_DATA, message.tunnel)
-    if isinstance(message, Deliver | FromChild | Recall | Recalled | Exited | Output):
+    if isinstance(message, Start | Deliver | FromChild | Recall | Recalled | Exited | Output):
         return (_DELIVER, message.child)
+    if isinstance(message, Blob | Forget):
+        return (_BLOB, message.digest)
     return None
+
+
+def is_passed_on(frame: BytesLike) -> bool:
+    """Return whether the receiver of a frame, of which this is the beginning, may pass it on to
+    another process.  The master keeps what children send it.
+    """
+    return bytes(frame[1:2]) != bytes([_FROM_CHILD])
 
 
 def _pieces(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> Sequence[BytesLike]:
@@ -504,6 +532,10 @@ def _read_shutdown(view: memoryview) -> Shutdown:
     return Shutdown(_GRACE.unpack(view)[2])
 
 
+def _read_leave(view: memoryview) -> Leave:
+    return Leave(_GRACE.unpack_from(view)[2], _text(view[_GRACE.size :]))
+
+
 def _integer(value: Any) -> int:
     if type(value) is not int:
         raise ValueError("it has something else where a number belongs")
@@ -534,6 +566,7 @@ _READERS: dict[int, Callable[[memoryview], Message]] = {
     _TUNNEL_CLOSE: _read_tunnel_close,
     _MEMORY: _read_memory,
     _SHUTDOWN: _read_shutdown,
+    _LEAVE: _read_leave,
 }
 
 

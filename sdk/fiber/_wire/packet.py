@@ -19,12 +19,14 @@ Buffers are pickle protocol 5's out-of-band buffers (PEP 574).
 from __future__ import annotations
 
 import errno
+import operator
 import os
 import pickle
 import socket
 import struct
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import starmap
 from operator import is_not
 from typing import Any, TypeAlias
@@ -84,6 +86,7 @@ _DONTWAIT_TO_SEND = int(socket.MSG_DONTWAIT)
 _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
+_CALL: Callable[[Callable[[], Any]], Any] = operator.call
 _Ancillary: TypeAlias = list[tuple[int, int, bytes]]
 _Call: TypeAlias = tuple[tuple[tuple[bytearray], int, int]]
 _Received: TypeAlias = list[Any]
@@ -400,21 +403,27 @@ def receive_object(sock: socket.socket) -> Any:
 
 
 def receive(
-    sock: socket.socket, *, descriptors: bool = False, wait: bool = True, passing: bool = False
+    sock: socket.socket,
+    *,
+    descriptors: bool = False,
+    wait: bool = True,
+    passing: bool = False,
+    then: Callable[[], None] | None = None,
 ) -> Message:
     """Receive one packet; ConnectionClosed when no one can ever send again.
 
     Without ``wait``, or on a non-blocking socket, BlockingIOError says that there is none.
     ``descriptors`` makes room for those that the sender attached; without it only the memfd of a
     large message is taken.  ``passing``: it is passed on or copied soon, so that a large one may
-    stay where its sender wrote it, who has no other use for that memory until then.
+    stay where its sender wrote it, who has no other use for that memory until then.  ``then`` is a
+    function of C that is called as soon as there is a packet: no signal's handler runs in between.
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
     buffer = free.pop() if free else _Buffer()
     try:
         call = (((buffer.data,), space, _CLOEXEC if wait else _DONTWAIT),)
-        received = _recvmsg(sock, buffer.data, call)
+        received = _recvmsg(sock, buffer.data, call, then)
     except BaseException:
         free.append(buffer)
         raise
@@ -427,16 +436,23 @@ def receive(
     return _receive_parts(buffer, received, passing=passing)
 
 
-def _recvmsg(sock: socket.socket, data: bytearray, call: _Call) -> _Received:
+def _recvmsg(
+    sock: socket.socket,
+    data: bytearray,
+    call: _Call,
+    then: Callable[[], None] | None = None,
+) -> _Received:
     received: _Received = []
     try:
         # Received and noted in one step: in between a signal's handler could lose descriptors.
         try:
-            received.extend(starmap(sock.recvmsg_into, call))
+            received.extend(
+                _receiving(sock, call, then) if then else starmap(sock.recvmsg_into, call)
+            )
         except ConnectionResetError:
             # The peer closed with packets of ours unread.  The kernel says so once, ahead of what
             # the peer sent before; the next call delivers that, or the end.
-            received.extend(starmap(sock.recvmsg_into, call))
+            received.extend(_receiving(sock, call, then))
         ancillary = received[0][1]
         if ancillary and data[0] in (PARTS_IN_MEMFD, PASSED, WAKE_UP):
             received.extend(map(own, _rights(ancillary)[:1]))
@@ -445,6 +461,14 @@ def _recvmsg(sock: socket.socket, data: bytearray, call: _Call) -> _Received:
         for fd in _rights(received[0][1])[len(received) - 1 :] if received else ():
             os.close(fd)
         raise
+
+
+def _receiving(sock: socket.socket, call: _Call, then: Callable[[], None] | None) -> Iterator[Any]:
+    if then is None:
+        return starmap(sock.recvmsg_into, call)
+    steps: tuple[Callable[[], Any], ...] = partial(sock.recvmsg_into, *call[0]), then
+    results: map[Any] = map(_CALL, steps)
+    return filter(None, results)
 
 
 def _rights(ancillary: _Ancillary) -> list[int]:

@@ -17,7 +17,8 @@ From a worker, pickled tuples of plain values, so that reading one never runs th
     (BROKEN, seq, error)                        its function does not unpickle
     (READY,)  (INIT_FAILED, text)               initialized; failed before that
 
-``kept`` is how many tasks of the batch the worker keeps, None for all: it gives the others back.
+``kept`` is how many tasks of the batch the worker keeps, one at least, or None for all: it gives
+the others back.
 ``values`` holds plain values; what is not plain is None there and stands in ``odd`` as (position
 in values, VALUE | ERROR | AGAIN, pickle, number of buffers), AGAIN being an error after which the
 pool was told to run the task again.  A large pickle is the first of its buffers, and None here.

@@ -33,6 +33,9 @@ class Columns(Protocol):
     def put(self, row: int, value: Any) -> None:
         """Set one environment's value."""
 
+    def take_back(self, row: int) -> None:
+        """Restore the value before the last ``put``, of all parts that might not be pickled."""
+
     def get(self, row: int) -> Any:
         """One environment's value, which nothing that happens later changes."""
 
@@ -81,6 +84,9 @@ class ArrayColumn:
         else:
             self._views[row][...] = value
 
+    def take_back(self, row: int) -> None:
+        pass  # numbers are always pickled
+
     def get(self, row: int) -> Any:
         return self._array[row] if self._views is None else self._views[row].copy()
 
@@ -113,9 +119,15 @@ class ObjectColumn:
 
     def __init__(self, values: Array) -> None:
         self._values = values
+        self._before = values.copy()
 
     def put(self, row: int, value: Any) -> None:
-        self._values[row] = value
+        if value is not self._values[row]:  # else it is shown once more
+            self._before[row] = self._values[row]
+            self._values[row] = value
+
+    def take_back(self, row: int) -> None:
+        self._values[row] = self._before[row]
 
     def get(self, row: int) -> Any:
         return self._values[row]
@@ -151,6 +163,10 @@ class DictColumns:
     def put(self, row: int, value: Any) -> None:
         for key, column in self._columns.items():
             column.put(row, value[key])
+
+    def take_back(self, row: int) -> None:
+        for column in self._columns.values():
+            column.take_back(row)
 
     def get(self, row: int) -> dict[str, Any]:
         return {key: column.get(row) for key, column in self._columns.items()}
@@ -188,6 +204,10 @@ class TupleColumns:
     def put(self, row: int, value: Any) -> None:
         for column, part in zip(self._columns, value, strict=True):
             column.put(row, part)
+
+    def take_back(self, row: int) -> None:
+        for column in self._columns:
+            column.take_back(row)
 
     def get(self, row: int) -> tuple[Any, ...]:
         return tuple(column.get(row) for column in self._columns)

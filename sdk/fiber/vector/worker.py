@@ -322,6 +322,8 @@ class Worker:
                     raise
             for row, error in refused:
                 report.remove(row)
+                if not _pickles(self._arrays.observations.pack([row], shared=self._shared)):
+                    self._arrays.observations.take_back(row)
                 self._at_work[self._setup.worker] = row + 1
                 self._retry(row, operation, doing, error, report, _UNPICKLABLE)
             self._at_work[self._setup.worker] = 0

@@ -1,0 +1,77 @@
+"""Connections to several addresses of one master, and listeners of both IP families."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from fiber._transport.connecting import connect
+from fiber._transport.credentials import make_credentials
+from unit.link_site import Site, black_hole, free_port, port_of
+
+PATIENCE = 3600.0
+"""Seconds, longer than any test may take: an attempt that must not be waited for."""
+
+
+def has_ipv6() -> bool:
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6):
+            return True
+    except OSError:
+        return False
+
+
+pytestmark = pytest.mark.skipif(not has_ipv6(), reason="this machine has no ::1")
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    made = Site(make_credentials())
+    yield made
+    made.end()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_the_address_that_answers_is_taken(host: str) -> None:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server((host, 0), family=family) as server:
+        port = server.getsockname()[1]
+        nothing = free_port()
+        addresses = [("127.0.0.1", nothing), ("::1", nothing), (host, port)]
+        with connect(addresses, PATIENCE) as sock:
+            assert sock.getpeername()[:2] == (host, port)
+
+
+def test_an_address_without_an_answer_does_not_delay_the_other() -> None:
+    with black_hole() as silent, socket.create_server(("::1", 0), family=socket.AF_INET6) as server:
+        where = server.getsockname()[:2]
+        with connect([("127.0.0.1", port_of(silent)), where], PATIENCE) as sock:
+            assert sock.getpeername()[:2] == where
+
+
+def test_an_address_that_answers_nothing_is_an_error_of_time() -> None:
+    with black_hole() as silent, pytest.raises(TimeoutError):
+        connect([("127.0.0.1", port_of(silent)), ("::1", free_port())], 0.1)
+
+
+def test_where_all_refuse_the_error_says_so() -> None:
+    with pytest.raises(ConnectionRefusedError):
+        connect([("127.0.0.1", free_port()), ("::1", free_port())], PATIENCE)
+
+
+def test_an_agent_reaches_its_master_at_one_of_two_addresses(site: Site) -> None:
+    listener, master = site.listener("[::1]:0")
+    assert listener.address.startswith("[::1]:")
+    _, agent = site.dialer(f"127.0.0.1:{free_port()},{listener.address}")
+    agent.link.send(b"by IPv6")
+    master.wait(lambda: master.frames == [b"by IPv6"])
+
+
+def test_a_master_at_the_unspecified_ipv6_address_takes_both_families(site: Site) -> None:
+    listener, master = site.listener("[::]:0")
+    for host in ("127.0.0.1", "[::1]"):
+        _, agent = site.dialer(f"{host}:{port_of(listener.address)}")
+        agent.link.send(host.encode())
+    master.wait(lambda: sorted(master.frames) == [b"127.0.0.1", b"[::1]"])

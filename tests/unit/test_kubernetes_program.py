@@ -1,0 +1,117 @@
+"""A program on a cluster: how it finds its own pod, and what of that pod stays behind."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+
+from fakes.kubernetes_api import Fault
+from fiber._backends.kubernetes import program
+from fiber._backends.kubernetes.claims import Claims, without_claims
+from fiber._backends.kubernetes.own_pool import OwnPool
+from fiber._backends.kubernetes.program import Program
+from fiber._backends.kubernetes.shape import Shape
+from fiber._transport.loop import Loop
+from fiber.config import Config
+from fiber.errors import ConfigError
+from patience import PATIENCE
+from unit.kubernetes_rig import NAMESPACE, Rig, rig
+
+
+@pytest.fixture(name="rig")
+def a_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    with rig(tmp_path, monkeypatch) as made:
+        yield made
+
+
+@pytest.mark.parametrize(
+    ("name", "why"), [("laptop", "with hostNetwork"), ("a" * 63, "cut after 63 characters")]
+)
+def test_the_reason_why_the_own_pod_is_not_found(rig: Rig, name: str, why: str) -> None:
+    made = Program(Config())
+    try:
+        with pytest.raises(ConfigError, match=f"{why}.*fieldRef"):
+            made._read_own_pod(name, threading.Event())
+    finally:
+        made.api.close()
+
+
+def test_variables_that_stay_behind_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    program._say_what_stays_behind([])
+    assert capsys.readouterr().err == ""
+    program._say_what_stays_behind(["API_KEY", "TOKEN"])
+    assert "API_KEY, TOKEN" in capsys.readouterr().err
+
+
+POD = {
+    "metadata": {"name": "train", "namespace": NAMESPACE, "uid": "1"},
+    "spec": {
+        "containers": [
+            {
+                "name": "main",
+                "image": "train:1",
+                "volumeMounts": [
+                    {"name": name, "mountPath": f"/{name}"} for name in ("one", "shared", "secret")
+                ],
+            }
+        ],
+        "volumes": [
+            {"name": name, "persistentVolumeClaim": {"claimName": f"{name}-claim"}}
+            for name in ("one", "shared", "secret", "of-another-container")
+        ],
+    },
+}
+
+
+def prepared(made: Program, shape: Shape) -> dict[str, Any]:
+    """The pod template of a pool that is prepared in the pod."""
+    loop = Loop()
+    loop.start_thread("test-io")
+    try:
+        pool = made.prepare_own(shape, loop, Mock(), threading.Event())
+        closed = threading.Event()
+        loop.call_soon(lambda: pool.listener.close("", then=closed.set))
+        assert closed.wait(PATIENCE)
+    finally:
+        loop.stop()
+    assert isinstance(pool.attachment, OwnPool)
+    return dict(pool.attachment._body["spec"]["template"]["spec"])
+
+
+@pytest.mark.parametrize("mode", ["ReadWriteOnce", "ReadWriteOncePod"])
+def test_a_claim_of_one_node_stays_behind_and_is_named_once(
+    rig: Rig, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(program, "reachable_address", lambda *args, **kwargs: "127.0.0.1")
+    modes = {"one-claim": [mode], "shared-claim": [mode, "ReadOnlyMany"]}
+    for name, allowed in modes.items():
+        claim = {"metadata": {"name": name}, "spec": {"accessModes": allowed}}
+        rig.server.do(rig.server.store.create, "persistentvolumeclaims", NAMESPACE, claim)
+    rig.server.api.faults.append(Fault("get", name="secret-claim", status=403, times=math.inf))
+    made = Program(Config())
+    made._find_own_pod = lambda cancel: POD  # type: ignore[method-assign]
+    try:
+        spec = prepared(made, Shape())
+        assert [volume["name"] for volume in spec["volumes"]] == ["shared", "secret"]
+        (worker,) = spec["containers"]
+        assert [mount["name"] for mount in worker["volumeMounts"]] == ["shared", "secret"]
+        unread, left_out = capsys.readouterr().err.splitlines()
+        assert "mount the PersistentVolumeClaim secret-claim" in unread
+        assert "do not get the PersistentVolumeClaims one-claim:" in left_out
+        assert "fiber.init(template=)" in left_out
+        assert len(prepared(made, Shape(image="other"))["volumes"]) == 2
+        assert capsys.readouterr().err == ""
+    finally:
+        made.api.close()
+
+
+def test_a_claim_that_the_template_brings_is_not_told(rig: Rig) -> None:
+    claims = Claims(("one-claim",))
+    assert claims.warnings(POD) == []
+    assert len(claims.warnings(without_claims(POD, claims.one_node))) == 1

@@ -1,0 +1,81 @@
+"""An agent among processes of its own user: they read nothing of it and outlive no master."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fiber._agent import leftovers
+from patience import PATIENCE
+
+SOURCE = Path(leftovers.__file__).read_text(encoding="utf-8")
+
+AS_A_USER = """
+if os.geteuid() == 0:  # whom the kernel lets read everything
+    os.setresgid(65534, 65534, 65534)
+    os.setresuid(65534, 65534, 65534)
+ctypes.CDLL(None).prctl(4, 1)  # dumpable, as processes are that begin as a user
+"""
+
+SPY = """
+if os.fork() == 0:
+    for name in ("mem", "environ", "fd", "maps"):
+        path = "/proc/%d/%s" % (os.getppid(), name)
+        with contextlib.suppress(PermissionError):
+            os.listdir(path) if name == "fd" else open(path, "rb").close()
+            print("reads", name, flush=True)
+    os._exit(0)
+os.wait()
+"""
+
+
+def run(program: str) -> str:
+    command = [sys.executable, "-I", "-S", "-c", SOURCE + AS_A_USER + program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_no_process_of_its_user_reads_a_hidden_one() -> None:
+    assert run("hide_this_process()" + SPY) == ""
+
+
+def test_without_that_every_process_of_its_user_reads_it() -> None:
+    assert "reads environ" in run(SPY)
+
+
+def test_a_kernel_that_refuses_to_hide_it_is_noticed() -> None:
+    refuses = "ctypes.CDLL = lambda name: type('', (), {'prctl': lambda *arguments: -1})\n"
+    answers = "print(hide_this_process())"
+    assert run(f"{answers}\n{refuses}\n{answers}") == "True\nFalse\n"
+
+
+LEAVES = """
+ctypes.CDLL(None).prctl(36, 1)  # a subreaper, as an agent that serves several masters
+reader, writer = os.pipe()
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        os.write(writer, str(os.getpid()).encode())
+        time.sleep(600)
+    os._exit(0)
+left = int(os.read(reader, 100))
+print(end(60))
+print(os.path.exists("/proc/%d" % left))
+"""
+
+
+def test_a_process_that_left_its_parents_and_session_is_ended() -> None:
+    assert run(LEAVES) == "True\nFalse\n"
+
+
+def test_a_process_that_cannot_be_ended_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(leftovers, "_reap", lambda: True)
+    monkeypatch.setattr(leftovers, "_descendants", list)
+    assert not leftovers.end(0.0)
