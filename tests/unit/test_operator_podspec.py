@@ -119,18 +119,41 @@ def first_of(container: Json, **spec: Any) -> Json:
 
 
 def test_the_init_container_names_the_pod_whatever_the_template_says() -> None:
-    own = [
-        {"name": "FIBER_AGENT_NAME", "value": "another"},
-        {"name": "FIBER_AGENT_UID", "value": "7"},
-        {"name": "PYTHONPATH", "value": "/code"},
-    ]
+    own = [{"name": "FIBER_AGENT_NAME", "value": "another"}, {"name": "FIBER_AGENT_UID"}]
     env = {v["name"]: v for v in first_of({"env": own})["env"]}
     fields = {
         n: v["valueFrom"]["fieldRef"]["fieldPath"] for n, v in env.items() if "valueFrom" in v
     }
     assert fields == {"FIBER_AGENT_NAME": "metadata.name", "FIBER_AGENT_UID": "metadata.uid"}
-    assert env["PYTHONPATH"]["value"] == "/code"
     assert env["FIBER_AGENT_KEY"]["value"] == "/etc/fiber/key"
+
+
+def test_nothing_that_tasks_may_have_written_reaches_the_init_container() -> None:
+    """Each of these makes Python, its loader or its shell run code from the shared volume."""
+    names_of_code = ("PYTHONPATH", "PYTHONHOME", "HOME", "PATH", "LD_PRELOAD", "BASH_ENV")
+    shared = {
+        "workingDir": "/shared",
+        "env": [{"name": name, "value": "/shared"} for name in names_of_code],
+        "envFrom": [{"configMapRef": {"name": "variables"}}],
+        "volumeMounts": [{"name": "shared", "mountPath": "/shared"}],
+        "volumeDevices": [{"name": "disk", "devicePath": "/dev/xvda"}],
+    }
+    first, plain = first_of(shared), first_of({})
+    assert first == plain
+    assert {v["name"] for v in first["env"]}.isdisjoint(names_of_code)
+
+
+def test_the_init_container_has_the_volume_of_the_interpreter_and_no_other() -> None:
+    mounts = [
+        {"name": "tools", "mountPath": "/opt/", "subPath": "venv"},
+        {"name": "shared", "mountPath": "/op"},
+    ]
+    first = first_of(
+        {"command": ["/opt/bin/python", "-m", "fiber.agent"], "volumeMounts": mounts},
+        volumes=[{"name": "tools"}, {"name": "shared"}],
+    )
+    assert first["volumeMounts"][0] == {**mounts[0], "readOnly": True}
+    assert [m["name"] for m in first["volumeMounts"][1:]] == ["fiber-credentials", "fiber-key"]
 
 
 @pytest.mark.parametrize(

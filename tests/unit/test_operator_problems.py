@@ -160,6 +160,29 @@ def test_a_failed_worker_shows_its_exit_code_and_its_last_lines() -> None:
     assert found.message.endswith("Traceback:\nKeyError: 'x'")
 
 
+@pytest.mark.parametrize(
+    ("end", "reason", "said"),
+    [
+        ({"reason": "Error", "message": "No module named fiber"}, "ContainerFailed", "code 1"),
+        ({"reason": "StartError", "message": "no such file"}, "RunContainerError", "no such file"),
+    ],
+)
+def test_an_image_that_has_no_fiber_is_told_of_the_container_that_lacks_it(
+    end: Json, reason: str, said: str
+) -> None:
+    pod = pod_document(1, phase="Failed")
+    state = {"terminated": {"exitCode": 1, **end}}
+    pod["status"]["initContainerStatuses"] = [{"name": "fiber-identity", "state": state}]
+    found = problem(POOL, pod)
+    assert found.reason == reason
+    assert f"The init container fiber-identity of {name_of(1)}" in found.message
+    assert said in found.message
+    assert end["message"] in found.message
+    assert "Install Fiber in the image" in found.message
+    pod["status"]["initContainerStatuses"][0]["name"] = "mine"
+    assert "fiber-identity" not in problem(POOL, pod).message
+
+
 def test_a_signal_is_named() -> None:
     assert "code 139 (SIGSEGV)" in problem(POOL, ended(1, code=139)).message
 

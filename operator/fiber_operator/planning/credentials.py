@@ -1,14 +1,17 @@
 """How an agent gets its own key, and no task the pool's.
 
 A first init container mounts the pool's Secret, derives the agent's key from it and from the pod's
-name and uid, and writes it to a volume in memory.  The agent reads the file and removes it.  The
-init container is like the worker's, so that what lets the worker run lets it run, too.
+name and uid, and writes it to a volume in memory.  The agent reads the file and removes it.
+
+The init container runs the worker's command on the worker's image and nothing that a task could
+have written: no volume, environment or working directory of the template reaches it.  The one
+exception is a volume that the command names, which has the interpreter.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from fiber_api import names
@@ -18,14 +21,10 @@ from fiber_operator.planning.documents import items, mapping, text
 _LIKE_THE_WORKER = (
     "args",
     "command",
-    "envFrom",
     "image",
     "imagePullPolicy",
     "securityContext",
     "terminationMessagePolicy",
-    "volumeDevices",
-    "volumeMounts",
-    "workingDir",
 )
 
 _AGENT = "fiber.agent"
@@ -58,23 +57,41 @@ def add(pool: FiberPool, spec: dict[str, Any], worker: dict[str, Any]) -> None:
         {"name": names.CREDENTIALS_VOLUME, "emptyDir": {"medium": "Memory", "sizeLimit": "1Mi"}},
     ]
     mount = {"name": names.CREDENTIALS_VOLUME, "mountPath": names.CREDENTIALS_DIRECTORY}
+    spec["initContainers"] = [_container(worker, mount), *first]
     worker["volumeMounts"] = [*mounts, mount]
-    spec["initContainers"] = [_container(worker), *first]
 
 
-def _container(worker: Mapping[str, Any]) -> dict[str, Any]:
+def _container(worker: Mapping[str, Any], written: Mapping[str, Any]) -> dict[str, Any]:
     made = {k: copy.deepcopy(worker[k]) for k in _LIKE_THE_WORKER if worker.get(k) is not None}
     made["name"] = names.IDENTITY_CONTAINER
     if not _runs_the_agent(worker):
         made.pop("args", None)
         made["command"] = ["python", "-m", _AGENT]
-    made["volumeMounts"].append(
-        {"name": names.KEY_VOLUME, "mountPath": names.KEY_DIRECTORY, "readOnly": True}
-    )
+    made["volumeMounts"] = [
+        *_mounts_of_the_interpreter(worker, made),
+        dict(written),
+        {"name": names.KEY_VOLUME, "mountPath": names.KEY_DIRECTORY, "readOnly": True},
+    ]
     if resources := _resources(worker):
         made["resources"] = resources
-    made["env"] = _environment(worker)
+    made["env"] = [
+        {"name": names.ENV_KEY, "value": names.KEY_DIRECTORY},
+        {"name": names.ENV_CREDENTIALS, "value": _FILE},
+        _of_the_pod(names.ENV_NAME, "metadata.name"),
+        _of_the_pod(names.ENV_UID, "metadata.uid"),
+    ]
     return made
+
+
+def _mounts_of_the_interpreter(
+    worker: Mapping[str, Any], made: Mapping[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """The mounts without which the command could not run: it names a path on them."""
+    command = str([made.get("command"), made.get("args")])
+    for mount in items(worker.get("volumeMounts")):
+        path = text(mount.get("mountPath")).rstrip("/")
+        if path and f"{path}/" in command:
+            yield {**copy.deepcopy(dict(mount)), "readOnly": True}
 
 
 def _runs_the_agent(worker: Mapping[str, Any]) -> bool:
@@ -90,18 +107,6 @@ def _resources(worker: Mapping[str, Any]) -> dict[str, Any]:
         if kept := {name: asked[name] for name in _ASKED_FOR if name in asked}:
             found[kind] = kept
     return found
-
-
-def _environment(worker: Mapping[str, Any]) -> list[dict[str, Any]]:
-    ours: list[dict[str, Any]] = [
-        {"name": names.ENV_KEY, "value": names.KEY_DIRECTORY},
-        {"name": names.ENV_CREDENTIALS, "value": _FILE},
-        _of_the_pod(names.ENV_NAME, "metadata.name"),
-        _of_the_pod(names.ENV_UID, "metadata.uid"),
-    ]
-    taken = {variable["name"] for variable in ours}
-    own = [copy.deepcopy(dict(v)) for v in items(worker.get("env")) if v.get("name") not in taken]
-    return [*own, *ours]
 
 
 def _of_the_pod(name: str, field: str) -> dict[str, Any]:

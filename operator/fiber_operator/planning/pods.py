@@ -84,6 +84,8 @@ class PodView:
     deletion_cost: int = 0
     address: str = ""
     """Where the agent dials; empty where that is not said in so many words."""
+    init_container: str = ""
+    """The init container that failed, so that the worker never ran; empty if none did."""
 
     @property
     def live(self) -> bool:
@@ -182,6 +184,7 @@ class _Observation:
             lingers=state is State.ENDED and self._others_go_on(),
             deletion_cost=self._deletion_cost(),
             address=self._address(),
+            init_container="" if self._end else text(self._failed_init().get("name")),
         )
 
     # Where it is in its life
@@ -228,8 +231,10 @@ class _Observation:
         """How the worker ended or, if it never ran, the init container that was to blame."""
         if self._end:
             return self._end
-        ends = (_end(status.get("state")) for status in self._init)
-        return next((end for end in ends if _exit_code(end)), {})
+        return _end(self._failed_init().get("state"))
+
+    def _failed_init(self) -> Mapping[str, Any]:
+        return next((s for s in self._init if _exit_code(_end(s.get("state")))), {})
 
     def _ran(self) -> float:
         start, finish = seconds(self._end.get("startedAt")), seconds(self._end.get("finishedAt"))

@@ -183,6 +183,8 @@ def completed(pool: FiberPool, failures: Failures, pod: PodView) -> str:
 
 
 def _ending(pool: FiberPool, reason: Reason, pod: PodView) -> str:
+    if pod.init_container == names.IDENTITY_CONTAINER and reason != Reason.OOM_KILLED:
+        return _without_identity(reason, pod)
     if reason == Reason.OOM_KILLED:
         limit = _memory_limit(pool)
         return (
@@ -206,6 +208,17 @@ def _ending(pool: FiberPool, reason: Reason, pod: PodView) -> str:
             "spec.template if it asks for what a node cannot give."
         )
     return f"{pod.name} {_exit(pod)}. See kubectl logs {pod.name} while the pod is kept."
+
+
+def _without_identity(reason: Reason, pod: PodView) -> str:
+    could_not = reason == Reason.RUN_CONTAINER_ERROR
+    what = f"could not be run{quoted(_said(pod))}" if could_not else _exit(pod)
+    return (
+        f"The init container {names.IDENTITY_CONTAINER} of {pod.name} {what}. It has the pool's "
+        "key, and runs the worker's command on the image alone: without environment, working "
+        "directory and volumes of spec.template, but for a volume whose path the command names. "
+        "Install Fiber in the image, or name its interpreter by its path in the command."
+    )
 
 
 def _ended_by_node(pod: PodView) -> bool:
