@@ -104,9 +104,10 @@ def _pod(
     _default(spec, "enableServiceLinks", False)
     spec["tolerations"] = _tolerations(spec.get("tolerations"))
     _secure(spec)
+    variables = _variables(pool, spec, name, address, revision)
     for container in _containers(spec, "containers"):
         if container.get("name") == pool.spec.worker_container:
-            _equip(pool, spec, container, name, address, revision)
+            _equip(spec, container, variables)
             _request(spec, container, requests)
             credentials.add(pool, spec, container)
     return {
@@ -200,16 +201,27 @@ def _secure_container(container: dict[str, Any], *, root_is_welcome: bool) -> No
 # The worker's container
 
 
-def _equip(
-    pool: FiberPool,
-    spec: dict[str, Any],
-    container: dict[str, Any],
-    name: str,
-    address: str,
-    revision: str,
-) -> None:
+def _variables(
+    pool: FiberPool, spec: Mapping[str, Any], name: str, address: str, revision: str
+) -> dict[str, str]:
+    master = pool.spec.master
+    grace = master.lost_grace_seconds if master else _LOST_GRACE
+    return {
+        names.ENV_NAME: name,
+        names.ENV_ADDRESS: address,
+        names.ENV_CREDENTIALS: f"{names.CREDENTIALS_DIRECTORY}/{names.CREDENTIALS_FILE}",
+        names.ENV_POOL: pool.metadata.name,
+        names.ENV_NAMESPACE: pool.metadata.namespace,
+        names.ENV_PROCESSES: str(pool.spec.processes_per_pod),
+        names.ENV_LOST_GRACE: str(grace),
+        names.ENV_TERMINATION_GRACE: str(_termination_grace(spec)),
+        names.ENV_TEMPLATE_HASH: revision,
+    }
+
+
+def _equip(spec: dict[str, Any], container: dict[str, Any], variables: Mapping[str, str]) -> None:
     _default(container, "terminationMessagePolicy", "FallbackToLogsOnError")
-    _add_environment(pool, spec, container, name, address, revision)
+    _add_environment(container, variables)
     if mapping(container, "securityContext").get("readOnlyRootFilesystem") is True:
         # The agent's sockets are in /tmp, and Python's temporary files.  Where the root can be
         # written to, the image's own /tmp does, with what the image may have put there.
@@ -234,36 +246,18 @@ def _request(
         container["resources"] = {**(resources or {}), "requests": {**asked, **added}}
 
 
-def _add_environment(
-    pool: FiberPool,
-    spec: Mapping[str, Any],
-    container: dict[str, Any],
-    name: str,
-    address: str,
-    revision: str,
-) -> None:
+def _add_environment(container: dict[str, Any], variables: Mapping[str, str]) -> None:
     own = container.get("env")
     if own is not None and not isinstance(own, list):
         return
     # An agent by another name than its pod's could never be released.
     own = [v for v in own or () if not (isinstance(v, Mapping) and v.get("name") == names.ENV_NAME)]
-    master = pool.spec.master
-    grace = master.lost_grace_seconds if master else _LOST_GRACE
-    ours = {
-        names.ENV_NAME: name,
-        names.ENV_ADDRESS: address,
-        names.ENV_CREDENTIALS: f"{names.CREDENTIALS_DIRECTORY}/{names.CREDENTIALS_FILE}",
-        names.ENV_POOL: pool.metadata.name,
-        names.ENV_NAMESPACE: pool.metadata.namespace,
-        names.ENV_PROCESSES: str(pool.spec.processes_per_pod),
-        names.ENV_LOST_GRACE: str(grace),
-        names.ENV_TERMINATION_GRACE: str(_termination_grace(spec)),
-        names.ENV_TEMPLATE_HASH: revision,
-    }
     uid = {"fieldRef": {"apiVersion": "v1", "fieldPath": "metadata.uid"}}
     taken = {text(variable.get("name")) for variable in items(own)}
     # Ours first, so that the user's may refer to them.
-    added: list[dict[str, Any]] = [{"name": key, "value": value} for key, value in ours.items()]
+    added: list[dict[str, Any]] = [
+        {"name": key, "value": value} for key, value in variables.items()
+    ]
     added.append({"name": names.ENV_UID, "valueFrom": uid})
     container["env"] = [variable for variable in added if variable["name"] not in taken] + own
 
