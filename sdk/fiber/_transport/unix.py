@@ -86,10 +86,10 @@ def grow(sock: socket.socket) -> None:
 
 # How a receiver looks for an answer before it sleeps (decision 16)
 
-_LOOK = 50e-6
+_LOOK = 200e-6
 """Seconds that it looks: more than it takes to wake a processor on which the other end sleeps."""
 
-_SOON = 15e-6
+_SOON = 30e-6
 """Seconds in which the answer has to come, so that looking for the next one is worth it."""
 
 _TRIES = 8
