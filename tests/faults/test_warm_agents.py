@@ -153,6 +153,20 @@ def test_it_serves_where_the_kernel_does_not_hide_it_and_says_so(pool: Pool) -> 
     assert "fiber agent warm-0: the kernel refused prctl(PR_SET_DUMPABLE)" in agent.stderr
 
 
+def test_it_serves_no_second_master_where_it_cannot_find_what_tasks_left(pool: Pool) -> None:
+    refused = """
+    from fiber._agent import child
+    child.become_subreaper = lambda: False
+    """
+    agent = pool.agent(30, refused + AGENT)
+    master = pool.master()
+    assert master.line() == "joined warm-0"
+    master.signal(signal.SIGTERM)
+    assert agent.wait() == 1
+    assert "the kernel refused prctl(PR_SET_CHILD_SUBREAPER)" in agent.stderr
+    assert agent.left() == []
+
+
 def test_it_finds_the_next_master_when_the_last_was_killed(pool: Pool) -> None:
     agent = pool.agent(grace=30)
     for _ in range(2):

@@ -125,9 +125,13 @@ def go_on_without_parent() -> None:
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
 
 
-def become_subreaper() -> None:
-    """Have the kernel make this process the parent of what our children leave behind."""
-    _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
+def become_subreaper() -> bool:
+    """Have the kernel make this process the parent of what our children leave behind.
+
+    Return whether the kernel does.  A seccomp profile may refuse it.
+    """
+    refused: int = _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    return not refused
 
 
 def run(

@@ -26,8 +26,8 @@ def hide_this_process() -> bool:
 def end(timeout: float) -> bool:
     """Kill all descendants; return whether none is left after ``timeout`` seconds.
 
-    This process is a subreaper, or the first one of its container: a process whose parent ends
-    becomes its child, however it was started.
+    This process must be a subreaper, or the first one of its container: a process whose parent ends
+    becomes its child then, however it was started.
     """
     deadline = time.monotonic() + timeout
     while True:

@@ -52,6 +52,17 @@ _OPEN = (
     "their agent. Allow prctl in the seccomp profile of the container."
 )
 
+_UNSEEN = (
+    "the kernel refused prctl(PR_SET_CHILD_SUBREAPER) and this agent is not process 1, so it "
+    "cannot find all that tasks left behind and serves no other master: it ends, and its pod with "
+    "it. Allow prctl in the seccomp profile of the container, or have the agent be process 1."
+)
+
+_LEFT_BEHIND = (
+    "processes that tasks left behind could not be ended, so this agent serves no other master: it "
+    "ends, and its pod with it"
+)
+
 _LEFT = 5.0
 """Seconds to end the processes that tasks left behind."""
 
@@ -71,8 +82,9 @@ class Main:
         if not is_hidden:
             self._complain(_OPEN)
         self._lost_grace = _seconds(_LOST_GRACE)
-        if self._lost_grace is not None:
-            become_subreaper()
+        self._inherits_orphans = os.getpid() == 1
+        if self._lost_grace is not None and not self._inherits_orphans:
+            self._inherits_orphans = become_subreaper()
         self._waits_until = _seconds(_WAITS_UNTIL)
         grace = _seconds(_TERMINATION_GRACE)
         self._grace = _DEFAULT_GRACE if grace is None else grace
@@ -111,11 +123,9 @@ class Main:
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
         if self._again and not self._is_told_to_end():
             # Nothing of what the last master did or left may reach the next one.
-            if not leftovers.end(_LEFT):
-                self._complain(
-                    "processes that tasks left behind could not be ended, so this agent serves no "
-                    "other master: it ends, and its pod with it"
-                )
+            why_not = self._unfit_for_another()
+            if why_not is not None:
+                self._complain(why_not)
                 return 1
             self._hand_on_credentials()
             os.execve(sys.executable, sys.orig_argv, self._environment)
@@ -123,6 +133,12 @@ class Main:
         for end in self._signals:
             end.close()
         return self._status
+
+    def _unfit_for_another(self) -> str | None:
+        """End what tasks left behind; return why that failed."""
+        if self._service is not None and not self._inherits_orphans:
+            return _UNSEEN
+        return None if leftovers.end(_LEFT) else _LEFT_BEHIND
 
     def _hand_on_credentials(self) -> None:
         descriptor = replace(self._credentials, epoch=self._dialer.epoch).to_descriptor()
