@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -131,6 +132,33 @@ def test_it_serves_one_master_after_the_other_and_keeps_nothing_of_them(pool: Po
         f"fiber agent warm-0: the master at {pool.address} refused this agent: "
         "this master is ending"
     }
+
+
+PLANTED = """
+import os
+if "FIBER_AGENT_CREDENTIALS" in os.environ:  # which the agent alone has, as it begins
+    open(__file__ + ".ran", "w").close()
+raise ImportError(__name__)
+"""
+
+
+@pytest.mark.parametrize("module", ["sitecustomize", "socket", "fiber", "msvcrt"])
+def test_modules_that_a_task_wrote_do_not_run_in_the_next_life(
+    pool: Pool, tmp_path: Path, module: str
+) -> None:
+    """In the working directory, which Python searches first, and on PYTHONPATH."""
+    before = "import sys; sys.path.insert(0, '')\n"
+    path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    agent = pool.agent(30, before + textwrap.dedent(AGENT), PYTHONPATH=path)
+    master = pool.master()
+    assert master.line() == "joined warm-0"
+    places = agent.folder / f"{module}.py", tmp_path / f"{module}.py"
+    for place in places:
+        place.write_text(PLANTED)
+    master.signal(signal.SIGTERM)
+    assert master.wait() == 0
+    assert pool.master().line() == "joined warm-0"
+    assert [place for place in places if Path(f"{place}.ran").exists()] == []
 
 
 def test_credentials_from_a_file_serve_for_all_its_masters(pool: Pool, tmp_path: Path) -> None:

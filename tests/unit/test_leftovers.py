@@ -32,8 +32,8 @@ os.wait()
 """
 
 
-def run(program: str) -> str:
-    command = [sys.executable, "-I", "-S", "-c", SOURCE + AS_A_USER + program]
+def run(program: str, first: str = AS_A_USER) -> str:
+    command = [sys.executable, "-I", "-S", "-c", SOURCE + first + program]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.stderr == ""
     return done.stdout
@@ -51,6 +51,26 @@ def test_a_kernel_that_refuses_to_hide_it_is_noticed() -> None:
     refuses = "ctypes.CDLL = lambda name: type('', (), {'prctl': lambda *arguments: -1})\n"
     answers = "print(hide_this_process())"
     assert run(f"{answers}\n{refuses}\n{answers}") == "True\nFalse\n"
+
+
+def test_modules_come_only_from_where_modules_came_from(tmp_path: Path) -> None:
+    """``used`` has one of this process, ``kept`` has a dependency that is imported late."""
+    for place, name in [
+        ("used", "mine"), ("used", "wave"), ("used", "late"), ("kept", "pynng"), ("cwd", "msvcrt"),
+    ]:  # fmt: skip
+        (tmp_path / place).mkdir(exist_ok=True)
+        (tmp_path / place / f"{name}.py").write_text("")
+    before = f"sys.path[:0] = [{str(tmp_path)!r} + each for each in ('/cwd', '/used', '/kept')]\n"
+    after = """
+import mine
+keep_search_path()
+import wave, late
+try: import msvcrt
+except ImportError: print("no msvcrt")
+print(os.path.dirname(wave.__file__) == sysconfig.get_path("stdlib"))
+print([os.path.basename(place) for place in sys.path][-2:])
+"""
+    assert run(after, before) == "no msvcrt\nTrue\n['used', 'kept']\n"
 
 
 LEAVES = """

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib.util
 import os
 import signal
+import sys
+import sysconfig
 import time
 
 _PR_SET_DUMPABLE = 4
+
+_DEPENDENCIES = ("cloudpickle", "cryptography", "pynng")
+"""Packages that an agent may import late."""
 
 _PAUSE = 0.01
 """Seconds between two looks at processes that end."""
@@ -21,6 +27,29 @@ def hide_this_process() -> bool:
     """
     refused: int = ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
     return not refused
+
+
+def keep_search_path() -> None:
+    """Import from now on only from places that have modules of this process, Python's own first.
+
+    A task may write a module to the working directory or to a folder of ``PYTHONPATH``.
+    """
+    main = sys.modules["__main__"]  # has a second name, for multiprocessing
+    found = [importlib.util.find_spec(name) for name in _DEPENDENCIES]
+    files = [spec.origin for spec in found if spec is not None]
+    others = [module for module in list(sys.modules.values()) if module is not main]
+    files += [getattr(module, "__file__", None) for module in others]
+    places = list(dict.fromkeys(map(os.path.abspath, sys.path)))
+    used = {_place_of(file, places) for file in files if file is not None}
+    own = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
+    own += [os.path.join(path, "lib-dynload") for path in own]
+    sys.path[:] = sorted(filter(used.__contains__, places), key=lambda place: place not in own)
+
+
+def _place_of(file: str, places: list[str]) -> str:
+    """The innermost of the places that the file is in; empty if it is in none."""
+    within = [place for place in places if file.startswith(place.rstrip(os.sep) + os.sep)]
+    return max(within, key=len, default="")
 
 
 def end(timeout: float) -> bool:

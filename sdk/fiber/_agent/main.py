@@ -13,7 +13,7 @@ from multiprocessing import current_process
 from typing import NoReturn
 
 from fiber import _logs, config
-from fiber._agent import leftovers
+from fiber._agent import leftovers, zygote_process
 from fiber._agent.agent import Agent
 from fiber._agent.allocator import keep_memory
 from fiber._agent.child import become_subreaper, go_on_without_parent
@@ -128,7 +128,7 @@ class Main:
                 self._complain(why_not)
                 return 1
             self._hand_on_credentials()
-            os.execve(sys.executable, sys.orig_argv, self._environment)
+            os.execve(sys.executable, _next_life(), self._environment)
         signal.set_wakeup_fd(-1)
         for end in self._signals:
             end.close()
@@ -167,6 +167,7 @@ class Main:
         print(f"fiber agent {self._name}: {what}", file=sys.stderr, flush=True)
 
     def _joined(self, link: Link) -> None:
+        leftovers.keep_search_path()  # before the first task
         self._service = AgentService(self._loop, link, self._agent, self._hub, self._ended)
         self._link = link
         link.attach(self._service)
@@ -238,6 +239,21 @@ class Main:
         if directory:
             remove_directory(directory)
         os._exit(0)
+
+
+def _next_life() -> list[str]:
+    """The command line of an agent that imports nothing that a task may have put in its way.
+
+    The environment is for its children: the interpreter of the agent itself ignores it.
+    """
+    leftovers.keep_search_path()
+    flags = zygote_process.flags()
+    statement = (
+        f"import sys; sys.path[:] = {sys.path!r}; from fiber._agent import zygote_process; "
+        f"zygote_process.interpreter_flags = {flags!r}; "
+        "import runpy; runpy.run_module('fiber.agent', run_name='__main__')"
+    )
+    return [sys.executable, *flags, "-I", "-B", "-c", statement]
 
 
 def _read(credentials: str) -> Credentials:

@@ -23,6 +23,9 @@ class ZygoteProcess(NamedTuple):
     sock: socket.socket
 
 
+interpreter_flags: list[str] | None = None
+"""Flags for new interpreters; None: those of this one."""
+
 _early: ZygoteProcess | None = None
 
 
@@ -55,8 +58,14 @@ def interpreter_arguments(executable: str, statement: str) -> list[str]:
     """The command line of a fresh interpreter with our flags that can import this package."""
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     code = f"import sys; sys.path.insert(0, {root!r}); {statement}"
-    interpreter_flags: list[str] = cast("Any", subprocess)._args_from_interpreter_flags()
-    return [executable, *interpreter_flags, "-c", code]
+    return [executable, *flags(), "-c", code]
+
+
+def flags() -> list[str]:
+    """Return the flags for new interpreters."""
+    if interpreter_flags is not None:
+        return interpreter_flags
+    return cast("list[str]", cast("Any", subprocess)._args_from_interpreter_flags())
 
 
 def is_standard_stream(fd: int) -> bool:
