@@ -183,7 +183,7 @@ class ProgramTooLarge(FiberError):
     """
 
     def __init__(self, folder: str, size: str, limit: str, largest: Mapping[str, str]) -> None:
-        lines = [f"{size:>12}  {path}" for path, size in largest.items()]
+        lines = [f"{size:>12}  {in_one_line(path)}" for path, size in largest.items()]
         super().__init__(
             f"the program in {folder!r} cannot be sent to its workers: it has {size}, and what is "
             f"sent is at most {limit}.\n{block('What takes most:', lines)}\n"
@@ -391,6 +391,11 @@ def _advice(exitcode: int | None, reason: str, stack: str) -> str:
             f"belongs in its image. Otherwise {ended_itself}"
         )
     return ended_itself
+
+
+def in_one_line(path: str) -> str:
+    """Return a path for people: quoted if it has line breaks or bytes that are no text."""
+    return path if path.isprintable() else repr(path)
 
 
 def block(title: str, lines: Sequence[str]) -> str:

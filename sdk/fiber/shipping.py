@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from multiprocessing import spawn
 
 from fiber._backends import program_files
-from fiber._backends.ignore_rules import INCLUDING
+from fiber._backends.ignore_rules import BYTECODE, INCLUDING
 from fiber._backends.program_files import Entry, Why
 from fiber._backends.program_layout import LOOSE, Layout, find_layout
+from fiber.errors import in_one_line
 
 __all__ = ["LeftOut", "Listing", "Sent", "listing"]
 
@@ -43,7 +44,9 @@ class LeftOut:
     path: str
     """The path here."""
     size: int | None
-    """Bytes, of a folder with all that is in it; None if those are too many files to count."""
+    """Bytes, of a folder with all that is in it; None if that cannot be counted: it has too many
+    files, or is not readable.
+    """
     reason: str
     """Why it is left out."""
 
@@ -82,10 +85,11 @@ class Listing:
                 f"{_readable(program_files.LIMIT)} are sent"
             )
         for file in self.sent:
-            yield f"{_readable(file.size):>12}  {file.path}  ({file.reason})"
+            yield f"{_readable(file.size):>12}  {in_one_line(file.path)}  ({file.reason})"
         yield f"left out: {len(self.left_out)}"
         for left in self.left_out:
-            yield f"{_readable(left.size):>12}  {left.path}  ({left.reason})"
+            where, why = in_one_line(left.path), in_one_line(left.reason)
+            yield f"{_readable(left.size):>12}  {where}  ({why})"
 
 
 def listing() -> Listing:
@@ -111,6 +115,7 @@ _REASONS = {
     Why.IGNORED: "{}",
     Why.SECRET: "looks like a secret: {}",
     Why.LINK: "a link that leads out of its folder, to {}",
+    Why.UNREADABLE: "this program may not read it",
     Why.PATH: "on sys.path; what the program imported from it is sent",
 }
 
@@ -137,9 +142,11 @@ def _size_of(path: str, sent: frozenset[str]) -> int | None:
     """Bytes of what is at ``path``, without what is sent of it, links and bytecode."""
     if os.path.islink(path) or not os.path.isdir(path):
         return _bytes_of(path)
+    if not os.access(path, os.R_OK | os.X_OK):
+        return None
     total = count = 0
     for folder, folders, names in os.walk(path):
-        folders[:] = [each for each in folders if each != "__pycache__"]
+        folders[:] = [each for each in folders if each != BYTECODE]
         count += len(names) + 1
         if count > program_files.MOST_FILES:
             return None
@@ -161,7 +168,7 @@ def _counted(number: int, what: str) -> str:
 
 def _readable(size: int | None) -> str:
     if size is None:
-        return "many files"
+        return "not counted"
     for unit, bytes_in_it in (("GiB", 1 << 30), ("MiB", 1 << 20), ("KiB", 1 << 10)):
         if size >= bytes_in_it:
             return f"{size / bytes_in_it:.1f} {unit}"

@@ -31,7 +31,7 @@ def files(*folders: Path, **options: Any) -> dict[str, Entry]:
 def packed(*folders: Path, **options: Any) -> bytes:
     """The archive of them."""
     there = layout(*folders, **options)
-    return pack(there, select(there).files)
+    return pack(there, select(there).files).archive
 
 
 def unpacked(archive: bytes, target: Path) -> Path:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import os
+import re
 import socket
 import tarfile
 import time
@@ -11,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fiber._backends import program_archive, program_files
+from fiber._backends import program_archive, program_files, shipping
 from fiber._backends.program_files import Why
 from fiber.errors import ProgramTooLarge
 from unit.shipping_site import files, layout, packed, tree, unpacked, write
@@ -186,6 +188,8 @@ def test_a_package_behind_a_link_is_sent_once_it_is_imported(folder: Path, tmp_p
 
 # Secrets
 
+PRIVATE = "-----BEGIN PRIVATE KEY-----\n" + "A" * 64 + "\n"
+
 
 def reasons(folder: Path, *others: Path) -> dict[str, tuple[Why, str]]:
     """What is left out, and why."""
@@ -258,30 +262,63 @@ def test_names_of_any_bytes_come_back(folder: Path, tmp_path: Path) -> None:
     assert found[os.fsdecode(odd[0])] == odd[0]
 
 
-def test_a_file_that_changes_while_it_is_read_is_read_again(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_rules_hold_for_names_with_line_breaks(folder: Path) -> None:
+    odd = folder / "new\nline"
+    write(odd, run__a_log="x", a_txt="x", server_key="x")
+    (odd / "a.log\n").write_text("x")
+    (folder / ".gitignore").write_text("*.log\n")
+    assert names(folder) == {".gitignore", "main.py", "data/weights.npy", *(
+        f"new\nline/{name}" for name in ("a.txt", "a.log\n")
+    )}  # fmt: skip
+    assert reasons(folder)["new\nline/server.key"] == (Why.SECRET, "private keys")
+
+
+@pytest.mark.parametrize("name", ["new\nline.key", "a[1]*?!.key", "b .key ", "\udcff.key", "ä.key"])
+def test_the_line_that_a_warning_advises_has_the_file_sent(folder: Path, name: str) -> None:
+    secret = folder / name
+    secret.write_text(PRIVATE)
+    found = layout(folder)
+    assert set(reasons(folder)) == {name}
+    quoted = re.search(r"for example ('.*?'|\".*?\")\.", shipping._advice(found, str(secret)))
+    assert quoted
+    (folder / ".fiberignore").write_text(ast.literal_eval(quoted[1]) + "\n")
+    assert reasons(folder) == {}
+
+
+@pytest.mark.parametrize(
+    ("changes", "text", "torn"),
+    [(2, "it is whole now", []), (99, "the end of all: ", ["main.py"])],
+)
+def test_a_file_that_changes_while_it_is_read_is_read_again_and_else_named(
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    changes: int,
+    text: str,
+    torn: list[str],
 ) -> None:
     found = files(folder)
-    fstat, changes = os.fstat, ["the end of all: ", "it is whole now"]
+    fstat, left = os.fstat, ["the end of all: "] * (changes - 1) + ["it is whole now"]
 
     def changing(fd: int) -> os.stat_result:
         status = fstat(fd)
-        if changes and status.st_ino == (folder / "main.py").stat().st_ino:
-            (folder / "main.py").write_text(changes.pop(0))
-            os.utime(folder / "main.py", ns=(0, time.time_ns() + len(changes)))
+        if left and status.st_ino == (folder / "main.py").stat().st_ino:
+            (folder / "main.py").write_text(left.pop(0))
+            os.utime(folder / "main.py", ns=(0, time.time_ns() + len(left)))
         return status
 
     monkeypatch.setattr(program_archive.os, "fstat", changing)
-    archive = program_archive.pack(layout(folder), found)
+    packed = program_archive.pack(layout(folder), found)
     monkeypatch.undo()
-    there = unpacked(archive, tmp_path / "there")
-    assert (there / "es/main.py").read_text() == "it is whole now"
+    there = unpacked(packed.archive, tmp_path / "there")
+    assert (there / "es/main.py").read_text() == text
+    assert packed.torn == [str(folder / name) for name in torn]
 
 
 def test_a_file_that_is_gone_when_it_is_read_is_left_out(folder: Path, tmp_path: Path) -> None:
     found = files(folder)
     (folder / "main.py").unlink()
-    archive = program_archive.pack(layout(folder), found)
+    archive = program_archive.pack(layout(folder), found).archive
     assert "es/main.py" not in tree(unpacked(archive, tmp_path / "there"))
 
 

@@ -274,6 +274,78 @@ if __name__ == "__main__":
     assert last.endswith(f"False {size}")
 
 
+WITHOUT_RIGHTS = """
+import ctypes, struct
+# Root, too, may read only what the modes allow, once it has no capability.
+assert ctypes.CDLL(None).capset(struct.pack("Ii", 0x20080522, 0), bytes(24)) == 0
+"""
+
+
+def test_a_listing_leaves_out_what_cannot_be_read(site: Site) -> None:
+    write(site.program, data_txt="text", closed_txt="text", folder__in_txt="text", hidden__x="x")
+    for name, mode in (("closed.txt", 0), ("folder", 0), ("hidden", 0o400)):
+        (site.program / name).chmod(mode)
+    program = f"""
+{WITHOUT_RIGHTS}
+import os, elsewhere, fiber
+if __name__ == "__main__":
+    listing = fiber.shipping.listing()
+    print(sorted(os.path.basename(file.path) for file in listing.sent))
+    for left in listing.left_out[:3]:
+        print(left.size, os.path.basename(left.path), left.reason)
+    print("not counted" in str(listing))
+"""
+    assert site.prints(program=program) == [
+        "['data.txt', 'elsewhere.py', 'main.py']",
+        "4 closed.txt this program may not read it",
+        "None folder this program may not read it",
+        "None hidden this program may not read it",
+        "True",
+    ]
+
+
+def test_a_listing_has_a_line_for_each_path_whatever_its_name(site: Site) -> None:
+    for name in ("new\nline.txt", "new\nline.key", "\udcff.txt"):
+        (site.program / name).write_text("x")
+    program = """
+import elsewhere, fiber
+if __name__ == "__main__":
+    listing = fiber.shipping.listing()
+    print(len(listing.sent) + len(listing.left_out) + 2 == len(str(listing).splitlines()))
+    print(listing)
+"""
+    first, *table = site.prints(program=program)
+    assert first == "True"
+    for path in (r"new\nline.txt", r"new\nline.key", r"\udcff.txt"):
+        assert [line for line in table if f"'{site.program}/{path}'" in line]
+
+
+def test_files_that_are_being_written_are_named_once(site: Site) -> None:
+    write(site.program, results_csv="1")
+    program = """
+import os
+import elsewhere, fiber
+from fiber._backends import program_archive
+
+def growing(descriptor):
+    if os.readlink(f"/proc/self/fd/{descriptor}").endswith("results.csv"):
+        with open("results.csv", "a") as file:
+            file.write("1")
+    return fstat(descriptor)
+
+if __name__ == "__main__":
+    elsewhere.begin()
+    fstat, os.fstat = os.fstat, growing
+    for _ in range(2):
+        with fiber.Pool(1) as pool:
+            print(pool.apply(len, ("a",)))
+"""
+    done = site.run(program=program)
+    assert done.stdout == "1\n1\n"
+    assert done.stderr.count("changed each time that they were read") == 1
+    assert done.stderr.count(f"  {site.program}/results.csv") == 1
+
+
 def test_a_script_whose_folder_is_too_large_is_told_at_once(site: Site) -> None:
     write(site.program, large_npy=bytes(2 << 20))
     program = """
@@ -297,8 +369,8 @@ if __name__ == "__main__":
 def test_what_keeps_files_from_being_unpacked_is_said(site: Site) -> None:
     program = """
 import elsewhere, fiber
-from fiber._backends import shipping
-shipping.pack = lambda *_: b"no archive"
+from fiber._backends import program_archive, shipping
+shipping.pack = lambda *_: program_archive.Packed(b"no archive", [])
 if __name__ == "__main__":
     elsewhere.begin()
     try:

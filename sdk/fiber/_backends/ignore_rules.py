@@ -24,11 +24,14 @@ _FILES = (".gitignore", INCLUDING)
 
 _REPOSITORIES = (".git", ".hg", ".svn")
 
-_NEVER_NEEDED = """
+BYTECODE = "__pycache__"
+"""The folder that Python keeps compiled modules in."""
+
+_NEVER_NEEDED = f"""
 .git
 .hg
 .svn
-__pycache__/
+{BYTECODE}/
 *.py[co]
 .ipynb_checkpoints/
 .mypy_cache/
@@ -48,7 +51,8 @@ class _Level(NamedTuple):
     patterns: GitIgnoreSpec
 
     def decide(self, path: str) -> _Decision | None:
-        found = self.patterns.check_file(path[len(self.folder) + 1 :])
+        # No pattern has a line break, and none of pathspec's expressions gets past one.
+        found = self.patterns.check_file(path[len(self.folder) + 1 :].replace("\n", "\0"))
         if found.include is None or found.index is None:
             return None
         return _Decision(found.include, str(self.patterns.patterns[found.index].pattern), self)
@@ -105,7 +109,7 @@ class IgnoreRules:
                 where = os.path.join(level.folder, level.name)
                 return f"{decision.line!r} in {where}" if decision.ignored else None
         name = os.path.basename(path.rstrip("/")) + ("/" if is_folder else "")
-        tool = _compiled(_NEVER_NEEDED).check_file(name).include
+        tool = _compiled(_NEVER_NEEDED).check_file(name.replace("\n", "\0")).include
         return "left by a tool" if tool else None
 
     def asks_for(self, path: str, *, is_folder: bool) -> bool:

@@ -8,6 +8,7 @@ import io
 import os
 import stat
 import tarfile
+from typing import NamedTuple
 
 from fiber._backends import program_files
 from fiber._backends.program_files import Entry
@@ -17,9 +18,17 @@ _ATTEMPTS = 3
 """Times to read a file that changes meanwhile."""
 
 
-def pack(layout: Layout, files: dict[str, Entry]) -> bytes:
+class Packed(NamedTuple):
+    """An archive, and the paths of files that may be in it half written."""
+
+    archive: bytes
+    torn: list[str]
+
+
+def pack(layout: Layout, files: dict[str, Entry]) -> Packed:
     """The archive: names in order, no times, no owners.  Reads what is there now."""
     buffer = io.BytesIO()
+    torn: list[str] = []
     with (
         gzip.GzipFile("", "wb", 1, buffer, mtime=0) as compressed,
         tarfile.open(fileobj=compressed, mode="w|", format=tarfile.PAX_FORMAT) as archive,
@@ -28,10 +37,10 @@ def pack(layout: Layout, files: dict[str, Entry]) -> bytes:
             archive.addfile(_member(folder, stat.S_IFDIR))
         left = program_files.LIMIT
         for name in sorted(files, key=os.fsencode):
-            left -= _append(archive, name, files[name])
+            left -= _append(archive, name, files[name], torn)
             if left < 0:
                 raise program_files.too_large(layout, files, "files that are growing")
-    return buffer.getvalue()
+    return Packed(buffer.getvalue(), torn)
 
 
 def _folders_of(names: dict[str, Entry]) -> list[str]:
@@ -43,13 +52,13 @@ def _folders_of(names: dict[str, Entry]) -> list[str]:
     return sorted(folders, key=os.fsencode)
 
 
-def _append(archive: tarfile.TarFile, name: str, entry: Entry) -> int:
+def _append(archive: tarfile.TarFile, name: str, entry: Entry, torn: list[str]) -> int:
     """Add a file or link; the bytes that it has."""
     member = _member(name, entry.mode)
     if entry.target is not None:
         member.linkname = entry.target
         archive.addfile(member)
-    elif stat.S_ISREG(entry.mode) and (data := _read(entry.path)) is not None:
+    elif stat.S_ISREG(entry.mode) and (data := _read(entry.path, torn)) is not None:
         member.size = len(data)
         archive.addfile(member, io.BytesIO(data))
         return len(data)
@@ -65,8 +74,11 @@ def _member(name: str, mode: int) -> tarfile.TarInfo:
     return member
 
 
-def _read(path: str) -> bytes | None:
-    """What is in a file, if it can be in one state, and not of two; None if it cannot be read."""
+def _read(path: str, torn: list[str]) -> bytes | None:
+    """What is in a file, if it can be in one state, and not of two; None if it cannot be read.
+
+    A file that changes each time is added to ``torn``.
+    """
     data = None
     with contextlib.suppress(OSError):
         for _ in range(_ATTEMPTS):
@@ -78,5 +90,6 @@ def _read(path: str) -> bytes | None:
                 data = file.read(program_files.LIMIT + 1)
                 after = os.fstat(file.fileno())
             if (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns):
-                break
+                return data
+        torn.append(path)
     return data

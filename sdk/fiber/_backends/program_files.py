@@ -24,10 +24,7 @@ _LARGEST = 5
 
 
 class Entry(NamedTuple):
-    """One file, folder or link, as it was when it was found.
-
-    What this program may not read its children could not either, and is left out.
-    """
+    """One file, folder or link, as it was when it was found."""
 
     path: str
     """Here.  Its contents are read from there, through a link if need be."""
@@ -45,6 +42,7 @@ class Why(enum.Enum):
     SECRET = "secret"
     LINK = "link"
     PATH = "path"
+    UNREADABLE = "unreadable"
 
 
 class LeftOut(NamedTuple):
@@ -132,6 +130,9 @@ class _Walk:
         entry = _entry(top)
         if entry is None:
             return
+        if not _is_readable(entry):
+            self.left_out.append(LeftOut(top, Why.UNREADABLE, ""))
+            return
         yield top, entry
         if stat.S_ISDIR(entry.mode):
             real = os.path.realpath(top)
@@ -172,9 +173,9 @@ class _Walk:
             return LeftOut(path, Why.IGNORED, ignored)
         holds = None if around.trusted else _secret(entry, real)
         leads_out = not _is_inside(real, around.top) and path not in self._packages
-        if not (holds or leads_out) or rules.asks_for(path, is_folder=is_folder):
-            return None
-        return LeftOut(path, Why.SECRET, holds) if holds else LeftOut(path, Why.LINK, real)
+        if (holds or leads_out) and not rules.asks_for(path, is_folder=is_folder):
+            return LeftOut(path, Why.SECRET, holds) if holds else LeftOut(path, Why.LINK, real)
+        return None if _is_readable(entry) else LeftOut(path, Why.UNREADABLE, "")
 
 
 def _found_in(folder: str) -> list[os.DirEntry[str]]:
@@ -183,6 +184,14 @@ def _found_in(folder: str) -> list[os.DirEntry[str]]:
             return list(found)
     except OSError:
         return []
+
+
+def _is_readable(entry: Entry) -> bool:
+    """Whether this program can read the file, or list and enter the folder."""
+    if entry.target is not None:
+        return True
+    needed = os.R_OK | os.X_OK if stat.S_ISDIR(entry.mode) else os.R_OK
+    return os.access(entry.path, needed)
 
 
 def _secret(entry: Entry, real: str) -> str | None:

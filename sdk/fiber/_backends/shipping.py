@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Iterable, Mapping
+from itertools import islice
 from typing import Any, NamedTuple
 
 from fiber._agent.program_folder import ProgramPaths
@@ -13,7 +15,7 @@ from fiber._backends.program_archive import pack
 from fiber._backends.program_files import Entry, LeftOut, Why, select
 from fiber._backends.program_layout import Layout, find_layout, main_file
 from fiber._wire.blob import Blob
-from fiber.errors import ProgramTooLarge
+from fiber.errors import ProgramTooLarge, in_one_line
 
 _SHOWN = 10
 """Entries that a warning lists."""
@@ -63,7 +65,7 @@ class Shipping:
             latest = self._latest
             if latest is not None and latest[0] == files:
                 return files, latest[1]._replace(paths=layout.paths)
-            data = pack(layout, files)
+            packed = pack(layout, files)
         except ProgramTooLarge as error:
             if not layout.session:
                 raise
@@ -73,7 +75,8 @@ class Shipping:
                 "from it."
             )
             return self._look(preparation)
-        archive = Blob(data)
+        self._tell_torn(packed.torn)
+        archive = Blob(packed.archive)
         if latest is not None and latest[1].archive.digest == archive.digest:
             archive = latest[1].archive  # touched, and the same
         return files, Program(archive, layout.paths)
@@ -85,10 +88,17 @@ class Shipping:
         for why, sentence in _SENTENCES.items():
             entries = [left for left in news if left.why is why]
             if entries:
-                shown = [f"  {left.path} ({left.detail})" for left in entries[:_SHOWN]]
-                if len(entries) > _SHOWN:
-                    shown.append(f"  and {len(entries) - _SHOWN} more: fiber.shipping.listing()")
+                shown = _shown(f"{left.path} ({left.detail})" for left in entries)
+                more = f"  and {len(entries) - _SHOWN} more: fiber.shipping.listing()"
+                shown += [more] * (len(entries) > _SHOWN)
                 self._warn("\n".join((sentence, *shown, _advice(layout, entries[0].path))))
+
+    def _tell_torn(self, torn: list[str]) -> None:
+        """Say once of each file that it changed each time that it was read."""
+        news = [path for path in torn if path not in self._said]
+        self._said.update(news)
+        if news:
+            self._warn("\n".join((_TORN, *_shown(news))))
 
     def _warn(self, message: str) -> None:
         if message not in self._said:
@@ -102,9 +112,22 @@ _SENTENCES = {
 }
 
 
+_TORN = (
+    "these files changed each time that they were read, so workers on other machines may have them "
+    "half written. Write to another file and rename it, or name it in .fiberignore if workers do "
+    "not need it:"
+)
+
+
+def _shown(lines: Iterable[str]) -> list[str]:
+    return [f"  {in_one_line(line)}" for line in islice(lines, _SHOWN)]
+
+
 def _advice(layout: Layout, path: str) -> str:
     place = layout.places.place_of(path) or os.path.dirname(path)
-    name, rules = path[len(place) :], os.path.join(place, INCLUDING)
+    rules = os.path.join(place, INCLUDING)
+    # In a line of .fiberignore these would be patterns, the end of the line, or nothing.
+    name = re.sub(r"[^\w./@+~:,%= -]| $", "?", path[len(place) :])
     return (
         f"To send one that workers need, write a line with its name into {rules}, "
         f"for example {'!' + name!r}. The line {name!r} leaves it out without this warning."
