@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from cluster import control_plane, network, places
+from cluster import control_plane, filters, network, places
 from cluster.containerd import Containerd
 from cluster.daemons import all_daemons
+from cluster.filters import Allowed
 from cluster.shell import ClusterError
 
 APISERVER = "apiserver"
@@ -32,6 +33,20 @@ def cut_off(node: str) -> Iterator[None]:
         yield
     finally:
         restore(node)
+
+
+@contextmanager
+def closed(node: str) -> Iterator[Callable[[Allowed], None]]:
+    """No packet reaches the node's pods or leaves them meanwhile, but for what is then allowed.
+
+    Connections that there are go on.
+    """
+    index = _index(node)
+    filters.close(index)
+    try:
+        yield lambda allowed: filters.allow(index, allowed)
+    finally:
+        filters.reopen(index)
 
 
 def stop(name: str) -> None:

@@ -7,7 +7,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from cluster import build, control_plane, diagnosis, fake_nodes, network, packages, places, remains
+from cluster import (
+    build,
+    control_plane,
+    diagnosis,
+    fake_nodes,
+    filters,
+    network,
+    packages,
+    places,
+    remains,
+)
 from cluster.daemons import Daemon, all_daemons
 from cluster.kubectl import answer_of, ready_nodes
 from cluster.node import Node
@@ -96,6 +106,8 @@ def _start(count: int) -> None:
     """Start all that does not run: the control plane and the nodes at the same time."""
     pki = Pki(places.KUBECONFIG.parent)
     network.connect(count)
+    for index in range(1, count + 1):
+        filters.reopen(index)  # a test that was killed may have closed it
     nodes = [Node(index, pki) for index in range(1, count + 1)]
     with ThreadPoolExecutor() as pool:
         starts = [pool.submit(control_plane.start, pki)]

@@ -52,11 +52,11 @@ def _plug_in(index: int) -> None:
     output("ip", "netns", "add", name)
     output("ip", "link", "add", cable, "type", "veth", "peer", "name", "eth0", "netns", name)
     output("ip", "link", "set", cable, "master", places.BRIDGE)
-    _inside(index, "ip", "link", "set", "lo", "up")
-    _inside(index, "ip", "addr", "add", f"{places.node_ip(index)}/24", "dev", "eth0")
-    _inside(index, "ip", "link", "set", "eth0", "up")
-    _inside(index, "ip", "route", "add", "default", "via", places.HOST_IP)
-    _inside(index, "sh", "-c", f"echo 1 > {_FORWARD}")
+    inside(index, "ip", "link", "set", "lo", "up")
+    inside(index, "ip", "addr", "add", f"{places.node_ip(index)}/24", "dev", "eth0")
+    inside(index, "ip", "link", "set", "eth0", "up")
+    inside(index, "ip", "route", "add", "default", "via", places.HOST_IP)
+    inside(index, "sh", "-c", f"echo 1 > {_FORWARD}")
 
 
 def _route_pods(index: int, count: int) -> None:
@@ -64,7 +64,7 @@ def _route_pods(index: int, count: int) -> None:
     output(*route)
     for other in range(1, count + 1):
         if other != index:
-            _inside(other, *route)
+            inside(other, *route)
 
 
 def set_cable(index: int, *, up: bool) -> None:
@@ -109,5 +109,6 @@ def _has_link(name: str) -> bool:
     return Path("/sys/class/net", name).exists()
 
 
-def _inside(index: int, *command: str) -> None:
-    output("nsenter", f"--net=/run/netns/{places.namespace(index)}", "--", *command)
+def inside(index: int, *command: str, check: bool = True) -> None:
+    """Run a command in the network namespace of a node."""
+    output("nsenter", f"--net=/run/netns/{places.namespace(index)}", "--", *command, check=check)

@@ -16,7 +16,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -34,6 +34,7 @@ from cluster import (
     places,
 )
 from cluster.ability import Choice
+from cluster.filters import Allowed
 from cluster.images import Image
 from cluster.shell import ClusterError, output, wait_for
 
@@ -77,6 +78,13 @@ class Cluster:
         with self._cut_off(node):
             yield
         self._wait_until_ready(node)
+
+    def closed(self, node: str) -> AbstractContextManager[Callable[[Allowed], None]]:
+        """Nothing reaches the node's pods meanwhile, and they reach what is then allowed.
+
+        Connections that there are go on.
+        """
+        self._skip(f"close the network of the pods on {node}")
 
     @contextlib.contextmanager
     def without_apiserver(self) -> Iterator[None]:
@@ -137,6 +145,9 @@ class Own(Cluster):
         except BaseException:
             self.close()
             raise
+
+    def closed(self, node: str) -> AbstractContextManager[Callable[[Allowed], None]]:
+        return faults.closed(node)
 
     def _cut_off(self, node: str) -> AbstractContextManager[None]:
         return faults.cut_off(node)

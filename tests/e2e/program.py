@@ -168,6 +168,7 @@ class Inside(Program):
         image: str,
         cluster: Cluster,
         node: str | None,
+        claims: Sequence[str],
     ) -> None:
         super().__init__(scene)
         self._cluster = cluster
@@ -178,7 +179,7 @@ class Inside(Program):
         body = {"metadata": {"generateName": "program-"}, "data": files}
         config = scene.kube.create(scene.path("configmaps"), body)["metadata"]["name"]
         command = ["python", f"{_MOUNT}/{script.name}", *arguments]
-        pod = _pod(command, environment, image, config)
+        pod = _pod(command, environment, image, config, claims)
         pod["spec"]["nodeName"] = node
         self._name = str(scene.kube.create(scene.path("pods"), pod)["metadata"]["name"])
         self._log = Stream(scene.kube, self._begin, self._repeat)
@@ -199,7 +200,8 @@ class Inside(Program):
     @property
     def _terminated(self) -> Body:
         statuses = self._body.get("status", {}).get("containerStatuses", [])
-        found: Body = next((each["state"].get("terminated", {}) for each in statuses), {})
+        states: list[Body] = [each["state"] for each in statuses if each["name"] == CONTAINER]
+        found: Body = states[0].get("terminated", {}) if states else {}
         return found
 
     def kill(self) -> None:
@@ -207,7 +209,7 @@ class Inside(Program):
 
     def interrupt(self) -> None:
         # Process 1 has Python's handler, or the signal would be ignored.
-        kill = ("--", "sh", "-c", "kill -INT 1")
+        kill = ("--container", CONTAINER, "--", "sh", "-c", "kill -INT 1")
         self.scene.kube.kubectl("--namespace", self.scene.namespace, "exec", self._name, *kill)
 
     def close(self) -> None:
@@ -221,7 +223,7 @@ class Inside(Program):
             self.scene.remark()
             return None
         self._heard, self._has_ended = 0, bool(self._terminated)
-        return f"{self.scene.path('pods', self._name, 'log')}?follow=true"
+        return f"{self.scene.path('pods', self._name, 'log')}?follow=true&container={CONTAINER}"
 
     def _repeat(self, line: str) -> None:
         """Hear what was not heard before the connection broke."""
@@ -230,20 +232,35 @@ class Inside(Program):
             self._hear(line)
 
 
-def _pod(command: list[str], environment: dict[str, str], image: str, config: str) -> Body:
+def _pod(
+    command: list[str],
+    environment: dict[str, str],
+    image: str,
+    config: str,
+    claims: Sequence[str],
+) -> Body:
+    mounts = [{"name": claim, "mountPath": f"/claims/{claim}"} for claim in claims]
     container = {
         "name": CONTAINER,
         "image": image,
         "command": command,
         "env": [{"name": name, "value": value} for name, value in environment.items()],
-        "volumeMounts": [{"name": "program", "mountPath": _MOUNT}],
+        "volumeMounts": [{"name": "program", "mountPath": _MOUNT}, *mounts],
         "resources": {"requests": {"cpu": "5m", "memory": "16Mi"}},
+        # What the restricted standard of pod security asks for, which its workers take over.
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "capabilities": {"drop": ["ALL"]},
+            "runAsNonRoot": True,
+            "seccompProfile": {"type": "RuntimeDefault"},
+        },
     }
+    volumes = [{"name": c, "persistentVolumeClaim": {"claimName": c}} for c in claims]
     spec = {
         "serviceAccountName": ACCOUNT,
         "restartPolicy": "Never",
         "containers": [container],
-        "volumes": [{"name": "program", "configMap": {"name": config}}],
+        "volumes": [{"name": "program", "configMap": {"name": config}}, *volumes],
     }
     return {"metadata": {"generateName": "program-"}, "spec": spec}
 
@@ -258,6 +275,8 @@ class Programs:
         """Of what is started beside the tests from now on."""
         self.node: str | None = None
         """Where what is started inside from now on runs; None: anywhere."""
+        self.claims: tuple[str, ...] = ()
+        """PersistentVolumeClaims that what is started inside from now on mounts."""
         self.image: str | None = None
         """What is started from now on runs in pods of this image; None: of one of ours."""
         self._started: list[Program] = []
@@ -304,7 +323,8 @@ class Programs:
     ) -> Inside:
         # No setting is needed: in a pod whose account may make FiberPools, pods are the default.
         variables = _variables(settings)
-        return Inside(self.scene, script, words, variables, image, self._cluster, self.node)
+        cluster, node, claims = self._cluster, self.node, self.claims
+        return Inside(self.scene, script, words, variables, image, cluster, node, claims)
 
 
 def local(script: str, *arguments: object) -> list[str]:

@@ -1,4 +1,4 @@
-"""A node that is drained while a program's tasks run on it."""
+"""A node that is drained: under a program's tasks, and under a warm pool with a budget."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from e2e.clusters import Cluster
+from e2e.kube import Body
 from e2e.leftovers import leaves_nothing
+from e2e.pools import Pool, is_ready
 from e2e.program import Program, Programs
 from e2e.scene import Scene
 from e2e.test_program import ever, ran, workers
@@ -65,6 +69,31 @@ def test_tasks_that_do_not_end_in_time_run_elsewhere(
     assert Counter(ran(program)) == {task: 1 + (host in pods) for task, host in began}
     program.ends()
     leaves_nothing(program)
+
+
+def test_a_budget_keeps_a_warm_pool_ready(pool: Pool, agent: Body, cluster: Cluster) -> None:
+    """Of two workers on a node, the second goes once there is another on the other node."""
+    scene = pool.scene
+    *others, node = cluster.workers()
+    scene.kube.kubectl("cordon", *others)
+    try:
+        before = pool.apply(agent, minReplicas=2, minAvailable=1).ready(2)
+    finally:
+        scene.kube.kubectl("uncordon", *others)
+    with drained(scene, node) as pods:
+        assert sorted(pods) == before
+        pool.ready(2)
+    came = scene.first("pods", lambda pod: name_of(pod) not in pods and is_ready(pod))
+    went = sorted(scene.first("pods", partial(is_ending, name=name)) for name in pods)
+    assert went[0] < came <= went[1]
+
+
+def is_ending(pod: Body, *, name: str) -> bool:
+    return name_of(pod) == name and "deletionTimestamp" in pod["metadata"]
+
+
+def name_of(pod: Body) -> str:
+    return str(pod["metadata"]["name"])
 
 
 def start(

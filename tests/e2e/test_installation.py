@@ -104,6 +104,8 @@ def test_the_api_server_takes_all_that_the_chart_renders(release: Release, kube:
     # What is of the Prometheus Operator's kinds is compared with its schema in tests/chart.
     everything = {
         "networkPolicy": {"create": True},
+        "workerNetworkPolicy": {"create": True, "namespaces": ["default"]},
+        "admissionPolicy": {"create": True},
         "metrics": {"dashboard": {"create": True}},
         "priorityClassName": "system-cluster-critical",
         "commonLabels": {"team": "research"},
@@ -118,7 +120,14 @@ def test_the_api_server_takes_all_that_the_chart_renders(release: Release, kube:
         "-",
         stdin=release.render(everything),
     )
-    for kind in ("deployment.apps", "networkpolicy", "configmap", "clusterrole", "service"):
+    for kind in (
+        "deployment.apps",
+        "networkpolicy",
+        "validatingadmissionpolicy",
+        "configmap",
+        "clusterrole",
+        "service",
+    ):
         assert f"\n{kind}" in f"\n{said}"
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+import socket
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -11,7 +12,7 @@ from e2e.accounts import ACCOUNT, may_read_credentials
 from e2e.clusters import Cluster
 from e2e.kube import Body, Refused, path_of
 from e2e.leftovers import leaves_nothing
-from e2e.pools import Pool
+from e2e.pools import Pool, says
 from e2e.program import Programs
 from e2e.release import Release
 from e2e.scene import Scene
@@ -26,11 +27,27 @@ def no_pods_allowed(scene: Scene) -> None:
     scene.kube.create(scene.path("resourcequotas"), hard)
 
 
+def quota_on_requests(scene: Scene) -> None:
+    hard = {"metadata": {"name": "counted"}, "spec": {"hard": {"requests.memory": "1Gi"}}}
+    scene.kube.create(scene.path("resourcequotas"), hard)
+
+
+def limits(**kinds: str) -> Callable[[Scene], None]:
+    """A LimitRange with these bounds of memory for each container."""
+
+    def make(scene: Scene) -> None:
+        limit = {"type": "Container", **{k: {"memory": v} for k, v in kinds.items()}}
+        body = {"metadata": {"name": "limits"}, "spec": {"limits": [limit]}}
+        scene.kube.create(scene.path("limitranges"), body)
+
+    return make
+
+
 def role_taken_away(scene: Scene) -> None:
     scene.kube.delete(scene.path("rolebindings", ACCOUNT))
 
 
-REFUSED = {
+REFUSED: dict[str, tuple[Callable[[Scene], None], Body, tuple[str, ...], float]] = {
     "an image that is not there": (
         nothing_done,
         {"image": "registry.invalid/none:1"},
@@ -39,6 +56,24 @@ REFUSED = {
     ),
     "no name of an image": (nothing_done, {"image": "No:Name:1"}, ("InvalidImageName",), 15),
     "a quota": (no_pods_allowed, {}, ("exceeded quota", "none"), 15),
+    "a quota that wants requests": (
+        quota_on_requests,
+        {"memory_request": 0},
+        ("RequestsMissing", "must specify requests.memory", "fiber.init(cpu_request="),
+        15,
+    ),
+    "a limit below the request": (
+        limits(default="48Mi"),
+        {},
+        ("must be less than or equal to memory limit", "fiber.init(cpu_request=0"),
+        15,
+    ),
+    "a request below the minimum": (
+        limits(min="96Mi"),
+        {},
+        ("minimum memory usage per Container is 96Mi", "LimitRange"),
+        15,
+    ),
     "no right": (role_taken_away, {}, ("fiberpools", "fiber-user"), 10),
     "a namespace that is not there": (nothing_done, {"namespace": "nowhere"}, ("nowhere",), 10),
 }
@@ -53,6 +88,18 @@ def test_what_cannot_come_is_an_error_at_once(case: str, programs: Programs, sce
     output = program.ends(status=1, seconds=seconds)
     assert "FiberPoolError" in output
     assert all(word in output for word in words), output
+    leaves_nothing(program)
+
+
+def test_a_port_that_is_taken(programs: Programs, cluster: Cluster) -> None:
+    with socket.socket() as taken:
+        taken.bind((cluster.outside or "", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        program = programs.start("outside", "mapping.py", listen_port=port)
+        output = program.ends(status=1)
+    words = ("LinkError", f":{port}: another program uses that port", "choose another port")
+    assert says(output, *words)
     leaves_nothing(program)
 
 
