@@ -48,7 +48,20 @@ def found(path: Path) -> str | None:
         "client_secret_12.json",
         "service-account-prod.json",
         "secrets.toml",
+        "credentials.yml",
+        "secrets.ini",
+        "AuthKey_ABC.p8",
+        ".flaskenv",
+        ".bash_history",
+        "rclone.conf",
+        "terraform.tfstate",
+        "terraform.tfstate.backup",
+        "prod.tfvars",
+        "prod.auto.tfvars.json",
         ".docker/config.json",
+        "gh/hosts.yml",
+        "gcloud/credentials.db",
+        "huggingface/token",
         ".env~",
         "prod.env.bak",
         ".netrc.old",
@@ -73,7 +86,22 @@ def test_names_of_secrets(tmp_path: Path, name: str) -> None:
         "keys.txt",
         "monkey",
         "credentials.py",
+        "credentials.md",
+        "credentials.yml.example",
         "secrets.py",
+        "main.tf",
+        "terraform.tfvars.example",
+        "history",
+        "hosts.yml",
+        "token",
+        "tokens.txt",
+        "tokenizer.json",
+        "settings.xml",
+        "environment.yml",
+        "train_env.yaml",
+        "gcloud.sh",
+        "rclone.sh",
+        "model.p8.onnx",
         "kubeconfig.py",
         "notes.txt~",
         "#",
@@ -82,6 +110,18 @@ def test_names_of_secrets(tmp_path: Path, name: str) -> None:
 def test_names_that_are_none(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("x")
     assert found(tmp_path / name) is None
+
+
+@pytest.mark.parametrize("name", [".aws", ".envs", ".ssh", ".Kube"])
+def test_folders_of_secrets(name: str) -> None:
+    assert secret_files.in_folder(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["aws", "envs", "environments", "gcloud", "gh", "secrets", ".github"]
+)
+def test_folders_that_are_none(name: str) -> None:
+    assert secret_files.in_folder(name) is None
 
 
 SECRETS = {
@@ -97,6 +137,18 @@ SECRETS = {
     "credentials of AWS": f"[default]\naws_secret_access_key = {'aB3/' * 10}\n",
     "exported credentials of AWS": f"export AWS_SECRET_ACCESS_KEY='{'aB3+' * 10}'\n",
     "answer of AWS": json.dumps({"SecretAccessKey": "aB3/" * 10}),
+    "user of Google Cloud": json.dumps({"type": "authorized_user", "refresh_token": "1//0e"}),
+    "age": "AGE-SECRET-KEY-1" + "QPZRY9X8GF" * 5 + "2TVDW0S3",
+    "GitHub": f"token: ghp_{'aB3d' * 9}\n",
+    "GitHub, finely grained": f"github_pat_{'aB3d' * 5}aB_{'aB3d' * 14}aB3",
+    "GitLab": f"glpat-{'aB3d' * 5}",
+    "Hugging Face": f"HF_TOKEN=hf_{'aBcD' * 8}eF\n",
+    "PyPI": f"password = pypi-AgEIcHlwaS5vcmc{'aB3d' * 15}",
+    "npm": f"_authToken=npm_{'aB3d' * 9}\n",
+    "Slack": f"xoxb-{'123' * 4}-{'123' * 4}-{'aB3d' * 6}",
+    "Stripe": f"sk_live_{'aB3d' * 6}",
+    "Anthropic": f"sk-ant-api03-{'aB3d' * 23}-AA",
+    "OpenAI": f"sk-proj-{'aB3d' * 10}T3BlbkFJ{'aB3d' * 10}",
     "service account": json.dumps({"type": "service_account", "private_key": "..."}),
 }
 
@@ -117,6 +169,11 @@ def test_contents_of_secrets(tmp_path: Path, name: str) -> None:
         "apiVersion: v1\nkind: Config\nclusters: []\n",
         "aws_secret_access_key = YOUR_KEY_HERE",
         '{"type": "service_account", "project": "x"}',
+        '{"type": "authorized_user", "name": "x"}',
+        f"ghp_YOUR_TOKEN glpat-xxxx hf_xxx sk_test_{'aB3d' * 6} sk-learn-T3BlbkFJ",
+        f"from digest_{'aB3d' * 5}-ghp_{'aB3d' * 9}: not a word of its own",
+        f"def hf_{'transformer' * 3}_model(): npm_config_registry",
+        base64.b64encode(b"OpenAI" * 100).decode(),
         CERTIFICATE,
     ],
 )

@@ -14,6 +14,7 @@ from functools import lru_cache
 _FOLDERS = {
     ".aws": "credentials of AWS",
     ".azure": "credentials of Azure",
+    ".envs": "environment variables",
     ".gcloud": "credentials of Google Cloud",
     ".gnupg": "private keys",
     ".kube": "credentials of Kubernetes",
@@ -23,14 +24,24 @@ _FOLDERS = {
 }
 
 _FILES = {
-    "environment variables": (".env", ".env.*", "*.env", ".envrc"),
-    "passwords of hosts": (".netrc", "_netrc", ".git-credentials", ".htpasswd"),
-    "passwords of databases": (".pgpass", ".my.cnf"),
+    "environment variables": (".env", ".env.*", "*.env", ".envrc", ".flaskenv"),
+    "passwords of hosts": (
+        ".netrc",
+        "_netrc",
+        ".git-credentials",
+        ".htpasswd",
+        ".ftpconfig",
+        "sftp-config.json",
+        "rclone.conf",
+        ".passwd-s3fs",
+    ),
+    "passwords of databases": (".pgpass", ".my.cnf", ".mylogin.cnf"),
     "tokens of package registries": (".npmrc", ".pypirc"),
     "credentials of image registries": (".dockercfg", ".dockerconfigjson"),
     "credentials of Kubernetes": ("kubeconfig", "*.kubeconfig", "kubeconfig.*"),
     "credentials of a cloud": (
-        "credentials.json",
+        "credentials.db",
+        "access_tokens.db",
         "application_default_credentials.json",
         "client_secret*.json",
         "service-account*.json",
@@ -38,13 +49,37 @@ _FILES = {
         ".boto",
         ".s3cfg",
     ),
-    "tokens of a service": (".vault-token", ".terraformrc", ".databrickscfg", "kaggle.json"),
-    "secrets": ("secrets.json", "secrets.toml", "secrets.yaml", "secrets.yml"),
+    "tokens of a service": (
+        ".vault-token",
+        ".terraformrc",
+        "terraform.rc",
+        "credentials.tfrc.json",
+        ".databrickscfg",
+        "kaggle.json",
+        ".comet.config",
+        ".modal.toml",
+        ".sentryclirc",
+        "ngrok.yml",
+    ),
+    "values of Terraform": ("*.tfstate", "*.tfstate.*", "*.tfvars", "*.tfvars.json"),
+    "secrets": tuple(
+        f"{name}.{kind}"
+        for name in ("credentials", "secrets")
+        for kind in ("ini", "json", "toml", "yaml", "yml")
+    ),
+    "commands that were typed": (
+        ".bash_history",
+        ".mysql_history",
+        ".psql_history",
+        ".python_history",
+        ".zsh_history",
+    ),
     "private keys": (
         "*.key",
         "*.pem",
         "*.p12",
         "*.pfx",
+        "*.p8",
         "*.ppk",
         "*.jks",
         "*.keystore",
@@ -58,7 +93,21 @@ _FILES = {
 }
 """Patterns of names, in lower case, by what such files hold."""
 
-_REGISTRIES = "/.docker/config.json"
+_PATHS = {
+    "/.docker/config.json": "credentials of image registries",
+    "/containers/auth.json": "credentials of image registries",
+    "/.composer/auth.json": "tokens of package registries",
+    "/.cargo/credentials": "tokens of package registries",
+    "/.gem/credentials": "tokens of package registries",
+    "/.m2/settings.xml": "tokens of package registries",
+    "/gh/hosts.yml": "tokens of GitHub",
+    "/glab-cli/config.yml": "tokens of GitLab",
+    "/huggingface/token": "tokens of Hugging Face",
+    "/.huggingface/token": "tokens of Hugging Face",
+    "/.mlflow/credentials": "passwords of MLflow",
+    "/.snowsql/config": "passwords of databases",
+}
+"""Ends of paths, in lower case, of files whose names alone say little."""
 
 _EXAMPLES = (".env.example", ".env.sample", ".env.template", ".env.dist")
 
@@ -83,8 +132,26 @@ _CONTENTS = {
         rb""""type"\s*:\s*"service_account\"""",
         rb""""private_key"\s*:""",
     ),
+    "credentials of a user of Google Cloud": (
+        rb""""type"\s*:\s*"authorized_user\"""",
+        rb""""refresh_token"\s*:""",
+    ),
+    "an identity of age": (rb"AGE-SECRET-KEY-1[0-9A-Z]{58}",),
+    "a token of GitHub": (
+        rb"g(?:h[opsur]_(?<![\w-]gh[opsur]_)|ithub_pat_[A-Za-z0-9]{22}_)[A-Za-z0-9]{36}",
+    ),
+    "a token of GitLab": (rb"glpat-(?<![\w-]glpat-)[\w-]{20}",),
+    "a token of Hugging Face": (rb"hf_(?<![\w-]hf_)[A-Za-z]{34}(?!\w)",),
+    "a token of PyPI": (rb"pypi-AgEIcHlwaS5vcmc[\w-]{50}",),
+    "a token of npm": (rb"npm_(?<![\w-]npm_)[A-Za-z0-9]{36}(?!\w)",),
+    "a token of Slack": (rb"xox[abeprs]-[0-9]{10,}-[0-9A-Za-z-]{20,}",),
+    "a key of Stripe": (rb"k_live_(?<=[rs]k_live_)[0-9A-Za-z]{24}",),
+    "a key of Anthropic": (rb"sk-ant-[a-z]+[0-9]{2}-[\w-]{80}",),
+    "a key of OpenAI": (rb"sk-[\w-]{20,}T3BlbkFJ[\w-]{20}",),
 }
-"""What such contents show: each of the expressions is found in them."""
+"""What such contents show: each of the expressions is found in them.  One that begins with fixed
+letters is found fastest, so what must not precede them comes after.
+"""
 
 _CODE = (".py", ".pyi", ".pyx", ".so")
 
@@ -118,8 +185,9 @@ def in_file(path: str, size: int, modified: int) -> str | None:
     if name.endswith(_CODE):
         return None
     holds = _by_name(name)
-    if path.lower().endswith(_REGISTRIES):
-        return "credentials of image registries"
+    if holds is None:
+        whole = path.lower()
+        holds = next((held for end, held in _PATHS.items() if whole.endswith(end)), None)
     if holds is not None and not name.endswith(".pem"):
         return holds
     found = _by_contents(path, size, modified) if 0 < size <= _SMALL else ""
