@@ -16,7 +16,7 @@ ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback
 	tests/conformance/test_executors.py
 OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
 PARTS = test-prepare test-modules $(addprefix test-python-,$(OTHER_PYTHONS)) test-programs \
-	test-conformance test-on-cluster
+	test-side-by-side
 # The tests start hundreds of interpreters. Without bytecode each compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
@@ -38,7 +38,7 @@ test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV
 	for part in $(PARTS); do $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; done; \
 	[ -z "$$failed" ] || { echo "make test: failed:$$failed (each is a target of make)" >&2; exit 1; }
 
-.PHONY: test-prepare test-modules test-programs test-conformance test-on-cluster
+.PHONY: test-prepare test-modules test-programs test-side-by-side test-conformance test-on-cluster
 test-prepare:
 	$(CLUSTER) prepare
 
@@ -47,6 +47,17 @@ test-modules:
 
 test-programs:
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not long" $(WHOLE_PROGRAMS)
+
+# The tests on the cluster wait most of the time, and so do CPython's: side by side they take little
+# longer than the first alone. What the second print is shown at its end.
+test-side-by-side:
+	@mkdir -p build; failed=; \
+	$(MAKE) --no-print-directory test-conformance >build/test-conformance.log 2>&1 & conformance=$$!; \
+	trap 'kill $$conformance; wait; exit 130' INT TERM; \
+	$(MAKE) --no-print-directory test-on-cluster || failed=" test-on-cluster"; \
+	wait $$conformance || failed="$$failed test-conformance"; \
+	cat build/test-conformance.log; \
+	[ -z "$$failed" ] || { echo "test-side-by-side: failed:$$failed" >&2; exit 1; }
 
 test-conformance:
 	$(BIN)/python -m pytest -m "not long" tests/conformance
