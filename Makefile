@@ -52,8 +52,8 @@ test-programs:
 # longer than the first alone. What the second print is shown at its end.
 test-side-by-side:
 	@mkdir -p build; failed=; \
-	$(MAKE) --no-print-directory test-conformance >build/test-conformance.log 2>&1 & conformance=$$!; \
-	trap 'kill $$conformance; wait; exit 130' INT TERM; \
+	setsid $(MAKE) --no-print-directory test-conformance >build/test-conformance.log 2>&1 & \
+	conformance=$$!; trap 'kill -- -$$conformance; wait; exit 130' INT TERM; \
 	$(MAKE) --no-print-directory test-on-cluster || failed=" test-on-cluster"; \
 	wait $$conformance || failed="$$failed test-conformance"; \
 	cat build/test-conformance.log; \
