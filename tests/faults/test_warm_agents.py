@@ -161,6 +161,23 @@ def test_modules_that_a_task_wrote_do_not_run_in_the_next_life(
     assert [place for place in places if Path(f"{place}.ran").exists()] == []
 
 
+def test_children_of_the_next_life_have_the_flags_of_the_first() -> None:
+    program = """
+import subprocess, sys
+from fiber._agent import main, zygote_process
+show = "print(sys.flags.isolated, *zygote_process.interpreter_arguments('python', '')[:-2])"
+exec(show)
+sys.stdout.flush()
+*command, statement = main._next_life()
+subprocess.run([*command, statement.partition("import runpy")[0] + show], check=True)
+"""
+    command = [sys.executable, "-O", "-c", program]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    first, second = ran.stdout.splitlines()
+    assert (first[0], second[0], first[1:]) == ("0", "1", second[1:])
+    assert "-O" in first
+
+
 def test_credentials_from_a_file_serve_for_all_its_masters(pool: Pool, tmp_path: Path) -> None:
     file = tmp_path / "agent.json"
     file.write_text(json.dumps(asdict(pool.credentials.agent("warm-0", "uid"))))
