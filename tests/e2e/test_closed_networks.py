@@ -12,7 +12,7 @@ from cluster.filters import Allowed
 from e2e.clusters import Cluster
 from e2e.kube import Body, path_of
 from e2e.leftovers import leaves_nothing
-from e2e.program import PLACES, Programs
+from e2e.program import Programs
 from e2e.release import Release
 from e2e.scene import Scene
 
@@ -22,7 +22,7 @@ PORTS = range(29100, 29104)
 SAME_NAMESPACE: Body = {"podSelector": {}}
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("place", ["inside", pytest.param("outside", marks=pytest.mark.long)])
 def test_workers_reach_their_program_and_nothing_else(
     place: str, programs: Programs, scene: Scene, cluster: Cluster, release: Release
 ) -> None:

@@ -66,7 +66,7 @@ def test_a_program_works_beside_sidecars(
     if cluster.outside is None:
         pytest.skip(f"{cluster.description}: the API server cannot reach a webhook of the tests")
     with sidecars(scene, cluster.outside, image, tmp_path):
-        program = programs.start("inside", "mapping.py", "--tasks", 300, "--seconds", 0.05)
+        program = programs.start("inside", "mapping.py", "--tasks", 300, "--seconds", 0.1)
         program.says("first")
         (victim, *_) = scene.wait(
             "a worker is Ready", lambda: list(filter(is_ready, workers(scene)))

@@ -43,9 +43,18 @@ def sidecars(scene: Scene, host: str, image: str, folder: Path) -> Iterator[None
         webhooks = path_of("mutatingwebhookconfigurations")
         scene.kube.create(webhooks, _configuration(scene.namespace, client))
         try:
+            scene.wait("the webhook is asked", lambda: _adds(scene, image), poll=0.2)
             yield
         finally:
             scene.kube.delete(f"{webhooks}/{scene.namespace}")
+
+
+def _adds(scene: Scene, image: str) -> bool:
+    """Whether a pod of one container would get another."""
+    spec = {"containers": [{"name": "only", "image": image}]}
+    pod = {"metadata": {"name": "probe"}, "spec": spec}
+    made = scene.kube.create(scene.path("pods"), pod, dryRun="All")
+    return len(made["spec"]["containers"]) == 2
 
 
 def _configuration(namespace: str, client: Body) -> Body:
