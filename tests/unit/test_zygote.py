@@ -24,6 +24,7 @@ from fiber import reduction
 from fiber._agent import child, zygote, zygote_process
 from fiber._agent.preload import Imports
 from fiber._agent.progress import ProgressTable
+from fiber._agent.signals import is_expected
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
 from fiber.process import Process
@@ -118,6 +119,35 @@ def master(progress_table: ProgressTable) -> Iterator[Master]:
 def gone(pid: int) -> bool:
     found = census.read(pid)
     return found is None or found.state == "Z"
+
+
+def test_a_child_that_is_just_born_does_not_count_as_prepared_for_a_signal(master: Master) -> None:
+    # A new child still has the zygote's handlers and mask.
+    master.started(1)  # from here on the zygote has set its own
+    status = Path(f"/proc/{master.process.pid}/status").read_text()
+    (mask,) = (line.split()[1] for line in status.splitlines() if line.startswith("SigIgn"))
+    assert int(mask, 16) >> (signal.SIGTERM - 1) & 1
+    assert not is_expected(master.process.pid, signal.SIGTERM)
+
+
+@pytest.mark.parametrize(
+    ("prepare", "expected"),
+    [
+        ("signal.signal(signal.SIGTERM, lambda *_: None)", True),
+        ("signal.signal(signal.SIGTERM, signal.SIG_IGN)", True),
+        ("signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())", True),
+        ("pass", False),
+    ],
+)
+def test_whether_a_process_is_prepared_for_a_signal(prepare: str, expected: bool) -> None:
+    script = f"import signal, sys; {prepare}; print(flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", script]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"\n"
+        assert is_expected(process.pid, signal.SIGTERM) is expected
+        process.communicate()
+    assert not is_expected(process.pid, signal.SIGTERM)
 
 
 @pytest.mark.slow

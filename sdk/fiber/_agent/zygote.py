@@ -115,6 +115,8 @@ class Zygote:
             signal.signal(signum, signal.SIG_IGN)
         # A terminal with `stty tostop` stops whole groups that are not its own when they print.
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+        # A child ignores it until it has undone all of this: signals.py tells its birth by that.
+        signal.signal(last_words.TELL, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.set_wakeup_fd(self._sigchld_in, warn_on_full_buffer=False)
 
@@ -204,6 +206,7 @@ class Zygote:
                 signal.signal(signum, signal.SIG_DFL)
             signal.signal(signal.SIGINT, signal.default_int_handler)
             signal.pthread_sigmask(signal.SIG_UNBLOCK, _SHUTDOWN_SIGNALS)
+            signal.signal(last_words.TELL, signal.SIG_DFL)
             self._control.close()
             os.close(self._sigchld)
             os.close(self._sigchld_in)
