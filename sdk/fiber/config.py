@@ -226,7 +226,8 @@ class Config:
         elsewhere.
     retries: how many times a task runs again after its worker died.
     disruptions: how many times a task runs again after the cluster ended its worker, as by a drain
-        or an eviction; that uses up no retry.  Where `retries` is 0 no task runs twice.
+        or an eviction; that uses up no retry.  Where `retries` is 0 no task runs twice.  It is also
+        how often in a row the environments of a vector environment are made anew for that reason.
     log_level: the least severe records that are shown on stderr, in children too, as by
         `fiber.log_to_stderr()`. "DEBUG" shows workers, processes, agents and links come and go.
     runtime_directory*: where Fiber makes its private directory for sockets and credentials;

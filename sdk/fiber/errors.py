@@ -317,7 +317,7 @@ class WorkerDied(FiberError):
         ]
         if self.disruptions:
             lines.append(
-                f"The task was tried {self.attempts + self.disruptions} times: its worker died "
+                f"The task was tried {_times(self.attempts + self.disruptions)}: its worker died "
                 f"{_times(self.attempts)}, and the cluster ended it {_times(self.disruptions)}."
             )
         elif self.attempts > 1:

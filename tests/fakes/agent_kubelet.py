@@ -18,9 +18,6 @@ from fiber._transport import credentials_file
 from fiber_api import names
 from patience import PATIENCE
 
-GRACE = "4"
-"""Seconds that agents believe they have to end, once their pod is deleted."""
-
 
 class AgentKubelet:
     """Runs what ``store`` says; the agents dial their pool's master directly.
@@ -34,6 +31,10 @@ class AgentKubelet:
         self._folders: dict[str, Path] = {}
         """What there is in place of a container's own files, by pod."""
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self.grace = 4.0
+        """Seconds that agents believe they have to end, once their pod is deleted."""
+        self.told: set[str] = set()
+        """Pods whose agents have been told to end."""
         self.forced: list[str] = []
         """Pods whose agents did not end when they were told to."""
         self.fails_with: tuple[str, str] | None = None
@@ -110,7 +111,7 @@ class AgentKubelet:
             **_environment(pod),
             names.ENV_ADDRESS: address,
             names.ENV_CREDENTIALS: str(folder / names.CREDENTIALS_FILE),
-            names.ENV_TERMINATION_GRACE: GRACE,
+            names.ENV_TERMINATION_GRACE: str(self.grace),
             "TMPDIR": str(folder),
         }
         process = await asyncio.create_subprocess_exec(
@@ -167,6 +168,7 @@ class AgentKubelet:
             change.cancel()
         if not ended.done():
             process.terminate()
+            self.told.add(name)
             await asyncio.wait([ended], timeout=PATIENCE)
             if not ended.done():
                 self.forced.append(name)

@@ -160,6 +160,10 @@ class ChildHandle(Protocol):
     def waiting(self) -> bool:
         """Whether it waits for a host."""
 
+    @property
+    def leaving(self) -> str:
+        """Why its host takes no new work and is about to go; empty if the host stays."""
+
     def start(self) -> None:
         """Start it; what becomes of that, the observer hears.  Once, on the loop's thread."""
 

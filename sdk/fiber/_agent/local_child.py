@@ -57,6 +57,7 @@ class LocalChild:
         self.node = ""
         self.pid: int | None = None
         self.waiting = False
+        self.leaving = ""
         self.slot: int | None = None
         self.start_error: Exception | None = None
         self.fault: Exception | None = None

@@ -258,6 +258,12 @@ class RemoteChild:
         """Whether it has no agent yet."""
         return self._agent is None and not self._gone
 
+    @property
+    def leaving(self) -> str:
+        """Why its agent is about to go."""
+        agent = self._agent
+        return "" if agent is None or not agent.leaving else agent.ending or agent.leaving
+
     def start(self) -> None:
         """Have it started."""
         self._starter.start(self)

@@ -114,6 +114,12 @@ class Popen:
                 self.kill()
             self.exited(ExitReport(UNKNOWN, str(error)))
 
+    @property
+    def leaving(self) -> str:
+        """Why the host of the process is about to go; empty if the host stays."""
+        child = self._child
+        return "" if child is None else child.leaving
+
     # What Process asks
 
     @property

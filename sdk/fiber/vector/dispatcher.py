@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from fiber import reduction
 from fiber._exceptions import add_note, fresh
 from fiber._transport.loop import DOZE
+from fiber.errors import StartError
 from fiber.vector.arrays import Shape, SharedMemory, StepArrays
 from fiber.vector.failures import ATTEMPTS, Failure
 from fiber.vector.slot import Note
@@ -23,12 +24,17 @@ _STEP = Pending("step")
 
 
 class Dispatcher:
-    """Tells workers what to do.  Environments are known by their numbers."""
+    """Tells workers what to do.  Environments are known by their numbers.
 
-    def __init__(self, workers: WorkerSet, *, restart: bool) -> None:
+    ``restart``: environments whose worker has died are made anew.  Those of a worker that the
+    cluster ends are in any case, ``disruptions`` times in a row.
+    """
+
+    def __init__(self, workers: WorkerSet, *, restart: bool, disruptions: int) -> None:
         self._workers = workers
         self._worker_of = [worker for worker in workers for _ in worker.numbers]
         self._restart = restart
+        self._disruptions = disruptions
         self._calls: list[_Group] = []
         """Whose results are awaited."""
         self._ready: deque[int] = deque()
@@ -65,6 +71,7 @@ class Dispatcher:
         ``actions``: a list with one for each, or None if they are in the arrays.  ``together``:
         nobody asks for the first of them that are done.
         """
+        self._move_idle_workers()
         commands = []
         for group in self._groups(numbers):
             if actions is not None:
@@ -86,6 +93,7 @@ class Dispatcher:
         options: Sequence[dict[str, Any] | None],
     ) -> None:
         """Reset some environments, or all, with a seed and options for each."""
+        self._move_idle_workers()
         commands = []
         for group in self._groups(numbers):
             told = {
@@ -99,6 +107,7 @@ class Dispatcher:
         self, numbers: Sequence[int], method: str, arguments: Sequence[tuple[Any, ...]]
     ) -> None:
         """Have ``Slot.method(*arguments)`` called, with arguments for each environment."""
+        self._move_idle_workers()
         self._wait(self._all_there, None)
         groups = self._groups(numbers)
         commands = []
@@ -219,10 +228,13 @@ class Dispatcher:
             left = DOZE if deadline is None else min(DOZE, deadline - time.monotonic())
             if left < 0:
                 raise WaitedTooLong(f"not all environments answered within {timeout:g} s")
-            for worker, message in self._workers.receive(left):
+            heard = self._workers.receive(left)
+            for worker, message in heard:
                 self._hear(worker, message)
             for each in self._workers:
                 each.kill_if_stuck()
+            if not heard:  # else a step is being made, which is not to be held up
+                self._move_idle_workers()
         self._raise_failure()
 
     def _hear(self, worker: WorkerProcess, message: Any) -> None:
@@ -239,7 +251,7 @@ class Dispatcher:
                 self._blame(worker, message.error)
             case Answer() | Results():
                 if not _only_reports_losses(message):
-                    worker.deaths = 0
+                    worker.deaths = worker.disruptions = 0
                 if message.generation == worker.generation:
                     self._failures += [self._told(worker, each) for each in message.failures]
                     if isinstance(message, Answer):
@@ -297,22 +309,40 @@ class Dispatcher:
         if worker.error is not None:
             return  # it said why
         error = worker.death(self._at_work(worker))
-        worker.deaths += 1
-        if not self._begun or not self._restart or worker.deaths > ATTEMPTS:
+        if not self._may_be_made_anew(worker):
             self._lose(worker, error)
             return
-        if any(group.worker is worker and worker.results is None for group in self._calls):
+        if self._is_called(worker):
             # Nobody knows what of the call was done.
             worker.results = []
             self._failures.append((worker.setup.first, error))
         self._warn(f"{worker.whose()} made anew: {error}")
-        self._workers.drop(worker)
-        worker.hello, worker.lost, worker.deadline = None, str(error), None
+        self._make_anew(worker, self._workers.drop, str(error), error)
+
+    def _may_be_made_anew(self, worker: WorkerProcess) -> bool:
+        if worker.disrupted:
+            return worker.disruptions <= self._disruptions
+        return self._begun and self._restart and worker.deaths <= ATTEMPTS
+
+    def _make_anew(
+        self,
+        worker: WorkerProcess,
+        let_go: Callable[[WorkerProcess], None],
+        why: str,
+        error: Exception,
+    ) -> None:
+        """Start another process for its environments; without one, ``error`` is what is told."""
         try:
+            let_go(worker)
+            worker.hello, worker.deadline = None, None
+            worker.lost = why if self._begun else None
             self._workers.start(worker)
         except BaseException:
             self._lose(worker, error)
             raise
+
+    def _is_called(self, worker: WorkerProcess) -> bool:
+        return any(group.worker is worker and worker.results is None for group in self._calls)
 
     def _lose(self, worker: WorkerProcess, error: Exception) -> None:
         """There is no worker for its environments any more."""
@@ -320,6 +350,23 @@ class Dispatcher:
         worker.results = []
         worker.give_up()
         self._failures.append((worker.setup.first, error))
+
+    def _move_idle_workers(self) -> None:
+        """Move workers whose hosts are about to go, once they have answered all."""
+        for worker in self._workers:
+            if worker.hello is None or worker.pending or worker.error is not None:
+                continue
+            if (why := worker.leaving()) and not self._is_called(worker):
+                self._move(worker, why)
+
+    def _move(self, worker: WorkerProcess, why: str) -> None:
+        if worker.disruptions >= self._disruptions:
+            return  # it stays until it is ended, which its error tells of
+        lost = f"the host of worker {worker.name!r} is about to go: {why}"
+        self._warn(f"{worker.whose()} made anew: {lost}")
+        worker.disruptions += 1
+        error = StartError(f"worker {worker.name!r} on another host", lost)
+        self._make_anew(worker, self._workers.release, lost, error)
 
     def _at_work(self, worker: WorkerProcess) -> int | None:
         """The row that a worker of this host was busy with."""

@@ -10,7 +10,7 @@ from typing import Any
 from gymnasium.vector import AutoresetMode
 
 import fiber
-from fiber import cpu
+from fiber import config, cpu
 from fiber.vector.arrays import Shape, SharedMemory, StepArrays
 from fiber.vector.dispatcher import Dispatcher
 from fiber.vector.slot import MakeEnv
@@ -54,7 +54,11 @@ class SubEnvironments:
         ]
         chosen = fiber.get_context(context)
         workers = [WorkerProcess(setup, chosen, owner) for setup in setups]
-        self.dispatcher = Dispatcher(WorkerSet(workers), restart=on_error == "restart")
+        self.dispatcher = Dispatcher(
+            WorkerSet(workers),
+            restart=on_error == "restart",
+            disruptions=config.current().disruptions,
+        )
         try:
             self.dispatcher.start()
             hellos = [worker.hello for worker in workers if worker.hello is not None]

@@ -49,7 +49,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
       reported as truncated, with reward 0 and ``infos["restarted"]`` saying why, and goes on as
       after any end of an episode.  By default the error is raised: it is what the environment
       raised, ``WorkerDied`` or ``multiprocessing.TimeoutError``, and names the environment and its
-      worker.
+      worker.  Environments whose pod the cluster ends, by a drain for instance, are made anew on
+      another one in either case, at most ``disruptions`` times in a row (``fiber.init``).
     * ``timeout``: seconds that the making, a step or a reset of one environment may take.  It is
       kept by an alarm in the worker (SIGALRM); a worker whose native code does not return to the
       interpreter from a step or a reset is killed a little later.  From the making it may return

@@ -62,7 +62,11 @@ class WorkerProcess:
         self.stuck = False
         """Killed, since the deadline was over."""
         self.deaths = 0
-        """Since it answered anything."""
+        """Of its processes since it answered anything, but for those that the cluster ended."""
+        self.disruptions = 0
+        """Of its processes that the cluster ended, or that moved, since it answered anything."""
+        self.disrupted = False
+        """Whether the cluster ended the process before this one."""
         self.lost: str | None = None
         """What became of the process before this one."""
         self.error: Exception | None = None
@@ -86,13 +90,21 @@ class WorkerProcess:
                     self._check_pickling()
                 raise
 
+    def leaving(self) -> str:
+        """Return why the host of its process is about to go; empty if the host stays."""
+        popen: Any = self.process._popen
+        return str(popen.leaving)
+
     def whose(self) -> str:
         """Its environments, for a person."""
         first, last = self.numbers[0], self.numbers[-1]
         return f"environment {first}" if first == last else f"environments {first} to {last}"
 
     def death(self, row: int | None) -> Exception:
-        """The error that tells of its end; ``row`` was at work then, if that is known."""
+        """Count the end of the process, and return the error that tells of it.
+
+        ``row`` was at work then, if that is known.
+        """
         told = next(iter(self.pending.values()), None) if self.hello else None
         doing = told.operation if told else "a call" if self.hello else "the making"
         whose = self.whose() if row is None else f"environment {self.numbers[row]}"
@@ -102,6 +114,9 @@ class WorkerProcess:
             self.process.join(NEWS)
         popen: Any = self.process._popen
         report = popen.report
+        self.disrupted = bool(report and report.disrupted and not self.stuck)
+        self.disruptions += self.disrupted
+        self.deaths += not self.disrupted
         if self.stuck:
             self.stuck = False
             lines = [
@@ -120,6 +135,8 @@ class WorkerProcess:
             reason=report.reason if report else "its connection is lost",
             log=report.log if report else (),
             stack=report.stack if report else "",
+            attempts=self.deaths,
+            disruptions=self.disruptions,
             pod=(report and report.pod) or None,
             node=(report and report.node) or None,
         )
@@ -158,12 +175,7 @@ class WorkerProcess:
     def close(self, timeout: float | None) -> None:
         """Wait for its end; kill it when ``timeout`` is over."""
         self.connection.close()
-        with contextlib.suppress(ValueError):  # closed just before Ctrl-C
-            self.process.join(timeout)
-            if self.process.exitcode is None:
-                self.process.kill()
-                self.process.join()
-            self.process.close()
+        end(self.process, timeout)
 
     def _check_pickling(self) -> None:
         for number, make in zip(self.numbers, self.setup.makes, strict=True):
@@ -172,3 +184,13 @@ class WorkerProcess:
             except Exception as error:
                 what = f"the function that makes environment {number}, of worker {self.name!r},"
                 raise UnpicklableError(what, str(error)) from error
+
+
+def end(process: Process, timeout: float | None) -> None:
+    """Wait for the end of a process; kill it when ``timeout`` is over."""
+    with contextlib.suppress(ValueError):  # closed just before Ctrl-C
+        process.join(timeout)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+        process.close()

@@ -9,7 +9,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from fiber._wire import packet
-from fiber.vector.worker_process import WorkerProcess
+from fiber.process import Process
+from fiber.vector.worker_process import WorkerProcess, end
 
 
 class Ended:
@@ -29,6 +30,8 @@ class WorkerSet:
         self._workers = workers
         self._started: list[WorkerProcess] = []
         """Those whose process has to be closed."""
+        self._released: list[Process] = []
+        """Processes that were told to end while they were well."""
         self._ended: deque[WorkerProcess] = deque()
         """Those of whose end we have heard, and not told."""
         self._poller = select.epoll()
@@ -55,6 +58,15 @@ class WorkerSet:
         """Let go of a process that has ended."""
         self._forget(worker)
         worker.close(0)
+        self._started.remove(worker)
+
+    def release(self, worker: WorkerProcess) -> None:
+        """Let go of a process that is well: it closes its environments, and ends."""
+        self._forget(worker)
+        self._ended = deque(each for each in self._ended if each is not worker)
+        worker.hang_up(kill=False)
+        running = [process for process in self._released if process.exitcode is None]
+        self._released = [*running, worker.process]
         self._started.remove(worker)
 
     def send(self, worker: WorkerProcess, data: bytes) -> None:
@@ -86,13 +98,20 @@ class WorkerSet:
     def close(self, timeout: float | None) -> None:
         """Wait until they have ended; kill those that have not when ``timeout`` is over."""
         deadline = None if timeout is None else time.monotonic() + timeout
+
+        def left() -> float | None:
+            return None if deadline is None else max(0.0, deadline - time.monotonic())
+
         for worker in self._started:
             self._forget(worker)
             worker.hang_up(kill=timeout == 0)
         while self._started:
             worker = self._started[-1]  # until it is closed: Ctrl-C may come before
-            worker.close(None if deadline is None else max(0.0, deadline - time.monotonic()))
+            worker.close(left())
             self._started.pop()
+        while self._released:
+            end(self._released[-1], left())
+            self._released.pop()
         self._poller.close()
 
     def _forget(self, worker: WorkerProcess) -> bool:
