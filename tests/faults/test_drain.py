@@ -1,63 +1,31 @@
-"""Agents that are drained: told to end by SIGTERM, as pods are.  No finished work is lost."""
+"""Hosts that are drained, as pods are by SIGTERM: no finished work is lost."""
 
 from __future__ import annotations
 
-import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
 import fiber
+from faults import drained
+from faults.drained import PodSite, Site, note, notes, patient, played
 from faults.program import wait_for
-from faults.runtime import running
-from fiber._backends.loopback import LoopbackBackend
+from fiber._hub import client
+from fiber.errors import ConnectionClosed, MemberLost
+from fiber.managers import BaseManager
 from patience import PATIENCE
 
+pytestmark = pytest.mark.may_leak("the operator's connections, for as long as the cluster is there")
 
-@pytest.fixture
-def backend(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[LoopbackBackend]:
-    """Two agents, whose hosts give them ``request.param`` seconds after SIGTERM."""
-    usual = LoopbackBackend._environment
-    grace = {"FIBER_AGENT_TERMINATION_GRACE": str(request.param)}
-    monkeypatch.setattr(
-        LoopbackBackend, "_environment", lambda self, name: usual(self, name) | grace
-    )
-    with running(backend="loopback", agents=2) as runtime:
-        loopback = runtime.backend
-        assert isinstance(loopback, LoopbackBackend)
-        wait_for(lambda: len(loopback.agents.agents) == 2)
-        yield loopback
-
-
-patient = pytest.mark.parametrize("backend", [2 * PATIENCE], indirect=True)
-hasty = pytest.mark.parametrize("backend", [1.0], indirect=True)
-
-
-def drain(backend: LoopbackBackend, host: str) -> None:
-    """Tell an agent to end, and wait until the program has heard of that."""
-    agent = backend.agents.agents[host]
-    (slot,) = (slot for slot in backend._slots if slot.name == host)
-    assert slot.process.pid is not None
-    os.kill(slot.process.pid, signal.SIGTERM)
-    wait_for(lambda: bool(agent.leaving))
-
-
-def note(directory: Path, word: str) -> None:
-    with open(directory / "log", "a") as log:
-        log.write(f"{word}\n")
-
-
-def notes(directory: Path) -> list[str]:
-    log = directory / "log"
-    return log.read_text().split() if log.exists() else []
+played_cluster, site = drained.played_cluster, drained.site
+grace, settings = drained.grace, drained.settings
 
 
 def ran(directory: Path, times: int) -> bool:
@@ -87,7 +55,7 @@ def block(directory: Path) -> None:
 
 
 def hosts_of(pool: Any) -> set[str]:
-    return {handle.host for handle in pool._executor._scheduler.workers.members}
+    return {handle.host for handle in list(pool._executor._scheduler.workers.members)}
 
 
 def wait_at_sigterm(directory: Path, ready: Any) -> None:
@@ -103,51 +71,102 @@ def go_on(directory: Path, ready: Any) -> None:
     wait_for((directory / "go").exists)
 
 
+def listen(directory: Path, word: str = "heard") -> None:
+    signal.signal(signal.SIGTERM, lambda *_: note(directory, word))
+
+
+class Tally:
+    def __init__(self) -> None:
+        self.count = 0
+
+    def add(self) -> int:
+        self.count += 1
+        return self.count
+
+    def host(self) -> str:
+        return client.host()
+
+
+class Tallies(BaseManager):
+    pass
+
+
+Tallies.register("Tally", Tally)
+
+
+def add_for_ever(tally: Any) -> NoReturn:
+    while True:
+        tally.add()
+
+
+def begin_member(member: Any, directory: Path) -> None:
+    """Be prepared for SIGTERM, if this is member 0, and say where it is."""
+    global place
+    place = directory
+    if member.rank == 0:
+        listen(directory)
+    note(directory, f"{member.rank}@{client.host()}")
+
+
+place: Path
+
+
+def go_round(rank: int, _size: int) -> Any:
+    """Exchange the ranks; member 0 does so once there is a file."""
+    while rank == 0 and not (place / "go").exists():
+        time.sleep(0.01)
+    return fiber.ring.current().exchange(rank)
+
+
+def host_of_member_0(directory: Path) -> str:
+    """Wait until both members of a ring have begun."""
+    wait_for(lambda: sum("@" in word for word in notes(directory)) == 2)
+    (host,) = (word[2:] for word in notes(directory) if word.startswith("0@"))
+    return host
+
+
 @patient
-def test_what_runs_ends_and_nothing_runs_twice(backend: LoopbackBackend, tmp_path: Path) -> None:
+def test_what_runs_ends_and_nothing_runs_twice(site: Site, tmp_path: Path) -> None:
     with fiber.Pool(2, retries=1, disruptions=0) as pool:
         results = pool.map_async(begin_and_wait, [(tmp_path, n) for n in range(12)])
         wait_for(lambda: len(notes(tmp_path)) >= 2)
-        assert hosts_of(pool) == {"loopback-0", "loopback-1"}
-        drain(backend, "loopback-0")
-        wait_for(lambda: "loopback-2" in hosts_of(pool))
+        before = hosts_of(pool)
+        assert len(before) == 2
+        site.drain(min(before))
+        wait_for(lambda: bool(hosts_of(pool) - before - {""}))
         (tmp_path / "go").touch()
         assert results.get(PATIENCE) == [str(n) for n in range(12)]
     assert set(Counter(notes(tmp_path)).values()) == {1}
 
 
 @patient
-def test_an_agent_leaves_by_name_when_its_last_child_is_gone(backend: LoopbackBackend) -> None:
-    agent = backend.agents.agents["loopback-0"]
-    drain(backend, "loopback-0")
+@pytest.mark.parametrize("site", ["loopback"], indirect=True)
+def test_an_agent_leaves_by_name_when_its_last_child_is_gone(site: Site) -> None:
+    agent = site.drain("loopback-0")
     wait_for(lambda: agent.lost is not None)
     assert agent.lost == agent.leaving
     assert agent.leaving.startswith("Drained: ")
 
 
-@hasty
 def test_what_does_not_end_in_time_runs_elsewhere_and_uses_up_no_retry(
-    backend: LoopbackBackend, tmp_path: Path
+    site: Site, tmp_path: Path
 ) -> None:
     with fiber.Executor(1, retries=0, disruptions=1) as executor:
         future = executor.submit(block_unless_it_ran, tmp_path)
         wait_for(lambda: bool(notes(tmp_path)))
-        (host,) = (agent.host for agent in backend.agents.agents.values() if agent._children)
-        drain(backend, host)
+        (host,) = site.busy()
+        site.drain(host)
         assert future.result(PATIENCE) == 2
 
 
-@hasty
-def test_a_task_that_is_disrupted_again_and_again_ends(
-    backend: LoopbackBackend, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("site", ["loopback"], indirect=True)
+def test_a_task_that_is_disrupted_again_and_again_ends(site: Site, tmp_path: Path) -> None:
     with fiber.Executor(1, retries=3, disruptions=2) as executor:
         future = executor.submit(block, tmp_path)
         for runs in range(1, 4):
             wait_for(partial(ran, tmp_path, runs))
-            agents = backend.agents.agents.values()
-            (host,) = (agent.host for agent in agents if agent._children and not agent.leaving)
-            drain(backend, host)
+            (host,) = site.busy()
+            site.drain(host)
         with pytest.raises(fiber.errors.WorkerDied) as caught:
             future.result(PATIENCE)
     error = caught.value
@@ -156,10 +175,33 @@ def test_a_task_that_is_disrupted_again_and_again_ends(
     assert error.reason.startswith("Drained: ")
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900, func_only=True)
+@played
+@pytest.mark.parametrize("grace", [0.2])
+def test_twenty_preemptions_in_a_row_are_borne_and_one_more_is_not(
+    site: PodSite, tmp_path: Path
+) -> None:
+    with fiber.Executor(1) as executor:
+        future = executor.submit(block, tmp_path)
+        for runs in range(1, 22):
+            wait_for(partial(ran, tmp_path, runs))
+            assert not future.done()
+            (host,) = site.busy()
+            site.preempt(host)
+        with pytest.raises(fiber.errors.WorkerDied) as caught:
+            future.result(PATIENCE)
+    error = caught.value
+    assert (error.attempts, error.disruptions) == (0, 21)
+    assert "its worker died 0 times, and the cluster ended it 21 times" in str(error)
+    assert error.reason.startswith("Preempted: ")
+    assert len(notes(tmp_path)) == 21
+
+
 @patient
 @pytest.mark.parametrize(("target", "told"), [(wait_at_sigterm, ["heard", "saved"]), (go_on, [])])
 def test_a_process_hears_sigterm_if_it_is_prepared_and_goes_on_if_not(
-    backend: LoopbackBackend,
+    site: Site,
     tmp_path: Path,
     target: Callable[[Path, Any], None],
     told: list[str],
@@ -169,7 +211,7 @@ def test_a_process_hears_sigterm_if_it_is_prepared_and_goes_on_if_not(
     process.start()
     assert ready.wait(PATIENCE)
     popen: Any = process._popen
-    drain(backend, popen._child.host)
+    site.drain(popen._child.host)
     (tmp_path / "go").touch()
     process.join(PATIENCE)
     assert process.exitcode == 0
@@ -177,20 +219,59 @@ def test_a_process_hears_sigterm_if_it_is_prepared_and_goes_on_if_not(
 
 
 @patient
-def test_new_processes_are_placed_elsewhere(backend: LoopbackBackend, tmp_path: Path) -> None:
+def test_new_processes_are_placed_elsewhere(site: Site, tmp_path: Path) -> None:
     ready = fiber.Event()
     process = fiber.Process(target=go_on, args=(tmp_path, ready))
     process.start()
     assert ready.wait(PATIENCE)
     popen: Any = process._popen
     host = popen._child.host
-    drain(backend, host)
-    others = [fiber.Process(target=go_on, args=(tmp_path, ready)) for _ in range(3)]
-    for other in others:
-        other.start()
-    found: list[Any] = [other._popen for other in others]
-    assert host not in {each._child.host for each in found}
+    site.drain(host)
+    other = fiber.Process(target=go_on, args=(tmp_path, ready))
+    other.start()
     (tmp_path / "go").touch()
-    for each in [process, *others]:
+    for each in (process, other):
         each.join(PATIENCE)
         assert each.exitcode == 0
+    other_popen: Any = other._popen
+    assert other_popen.report.host != host
+
+
+@patient
+def test_a_manager_hears_sigterm_and_goes_on(site: Site, tmp_path: Path) -> None:
+    manager: Any = Tallies()
+    manager.start(listen, (tmp_path,))
+    with manager:
+        tally = manager.Tally()
+        site.drain(tally.host())
+        wait_for(lambda: "heard" in notes(tmp_path))
+        assert tally.add() == 1
+
+
+def test_a_manager_that_is_killed_at_the_end_of_the_grace_says_why(site: Site) -> None:
+    manager: Any = Tallies()
+    with manager:
+        tally = manager.Tally()
+        site.drain(tally.host())
+        with pytest.raises(ConnectionClosed, match=r"'Tallies-\d+'.*(Drained|Deleted): "):
+            add_for_ever(tally)
+
+
+@patient
+def test_members_of_a_ring_hear_sigterm_and_go_on(site: Site, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as threads:
+        results = threads.submit(fiber.Ring(2, go_round, begin_member, (tmp_path,)).run)
+        site.drain(host_of_member_0(tmp_path))
+        wait_for(lambda: "heard" in notes(tmp_path))
+        (tmp_path / "go").touch()
+        assert results.result(PATIENCE) == [1, 0]
+
+
+def test_a_member_of_a_ring_that_is_killed_at_the_end_of_the_grace_is_lost(
+    site: Site, tmp_path: Path
+) -> None:
+    with ThreadPoolExecutor(1) as threads:
+        results = threads.submit(fiber.Ring(2, go_round, begin_member, (tmp_path,)).run)
+        site.drain(host_of_member_0(tmp_path))
+        with pytest.raises(MemberLost, match=r"(Drained|Deleted): "):
+            results.result(PATIENCE)
