@@ -22,7 +22,10 @@ from fiber.errors import ConnectionClosed, MemberLost
 from fiber.managers import BaseManager
 from patience import PATIENCE
 
-pytestmark = pytest.mark.may_leak("the operator's connections, for as long as the cluster is there")
+pytestmark = [
+    pytest.mark.may_leak("the operator's connections, for as long as the cluster is there"),
+    pytest.mark.timeout(300),
+]
 
 played_cluster, site = drained.played_cluster, drained.site
 grace, settings = drained.grace, drained.settings
@@ -176,7 +179,7 @@ def test_a_task_that_is_disrupted_again_and_again_ends(site: Site, tmp_path: Pat
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900, func_only=True)
+@pytest.mark.timeout(1800)
 @played
 @pytest.mark.parametrize("grace", [0.2])
 def test_twenty_preemptions_in_a_row_are_borne_and_one_more_is_not(

@@ -18,7 +18,10 @@ from fiber.vector import VectorEnv
 from patience import PATIENCE
 from vector_envs import Faulty
 
-pytestmark = pytest.mark.may_leak("the operator's connections, for as long as the cluster is there")
+pytestmark = [
+    pytest.mark.may_leak("the operator's connections, for as long as the cluster is there"),
+    pytest.mark.timeout(300),
+]
 
 played_cluster, site = drained.played_cluster, drained.site
 grace, settings = drained.grace, drained.settings
