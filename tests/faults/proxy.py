@@ -54,6 +54,12 @@ class Proxy:
         for sock in (self._door, self._wake_in, self._wake_out):
             sock.close()
 
+    def lead_to(self, target: str) -> None:
+        """Forward new connections there, as a Service does; those that are there stay."""
+        host, _, port = target.rpartition(":")
+        with self._lock:
+            self._target = host, int(port)
+
     def silence(self) -> None:
         with self._lock:
             self._silent.set()
@@ -89,7 +95,11 @@ class Proxy:
         if self._severed or self._silent.is_set():
             inner.close()
             return
-        outer = socket.create_connection(self._target)
+        try:
+            outer = socket.create_connection(self._target)
+        except OSError:  # nobody listens there now
+            inner.close()
+            return
         self.connections += 1
         for one, other in ((inner, outer), (outer, inner)):
             self._peers[one] = other

@@ -68,6 +68,7 @@ class Told:
     attached: list[bool] = field(default_factory=list)
     statuses: list[Body] = field(default_factory=list)
     pods: list[tuple[str, Body | None]] = field(default_factory=list)
+    expiries: list[bool] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     errors: list[FiberPoolError] = field(default_factory=list)
     ended: bool = False
@@ -81,6 +82,9 @@ class Told:
 
     def on_pod(self, name: str, pod: Body | None) -> None:
         self._note(self.pods, (name, pod))
+
+    def on_lease_expired(self) -> None:
+        self._note(self.expiries, True)
 
     def on_warning(self, message: str) -> None:
         self._note(self.warnings, message)
@@ -140,10 +144,16 @@ class Rig:
         self.operator = Operator(server)
         self._clients: list[FiberPoolClient] = []
 
-    def own(self, told: Told, name: str = "es-1", owner: Body | None = None) -> FiberPoolClient:
+    def own(
+        self,
+        told: Told,
+        name: str = "es-1",
+        owner: Body | None = None,
+        master: Master = MASTER,
+    ) -> FiberPoolClient:
         """A client that makes a pool."""
         credentials = make_credentials()
-        attachment = OwnPool(self.api, NAMESPACE, pool_body(name), credentials, MASTER, owner)
+        attachment = OwnPool(self.api, NAMESPACE, pool_body(name), credentials, master, owner)
         return self._client(attachment, told)
 
     def warm(self, told: Told, master: Master = MASTER, name: str = "warm") -> FiberPoolClient:

@@ -8,6 +8,7 @@ import queue
 import signal
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 
 from fakes.kubernetes_api import Call, Fault
 from fakes.store import Failure
-from fiber._backends.kubernetes import fiber_pool, informer, scaling
+from fiber._backends.kubernetes import fiber_pool, informer, lease, scaling
 from fiber._backends.kubernetes.api_errors import Forbidden
 from fiber_api import identity, names
 from patience import PATIENCE
@@ -103,10 +104,14 @@ def test_what_belongs_to_a_pool_goes_with_it(rig: Rig, told: Told) -> None:
         }
 
 
+@pytest.mark.parametrize("readable", [True, False], ids=["readable", "forbidden"])
 @pytest.mark.parametrize("plural", ["secrets", "leases"])
 def test_an_object_of_somebody_else_is_not_taken_for_the_pools(
-    rig: Rig, told: Told, plural: str
+    rig: Rig, told: Told, plural: str, readable: bool
 ) -> None:
+    """The role fiber-user reads no Secret."""
+    if not readable:
+        rig.server.api.faults.append(Fault("get", plural, 403, reason="Forbidden"))
     name = names.secret_name("es-1") if plural == "secrets" else names.master_lease_name("es-1")
     other = {"metadata": {"name": name}, "data": {}, "spec": {"holderIdentity": "other"}}
     rig.server.do(rig.server.store.create, plural, NAMESPACE, other)
@@ -114,6 +119,15 @@ def test_an_object_of_somebody_else_is_not_taken_for_the_pools(
     assert told.error().reason == "AlreadyExists"
     client.close()
     assert not rig.server.objects(names.PLURAL)
+
+
+def test_a_lease_that_was_there_before_is_not_taken_for_the_pools(rig: Rig, told: Told) -> None:
+    """A neighbour may read in the pool which holder the Lease will have."""
+    name = names.master_lease_name("es-1")
+    forged = {"metadata": {"name": name}, "spec": {"holderIdentity": MASTER.identity}}
+    rig.server.do(rig.server.store.create, "leases", NAMESPACE, forged)
+    rig.own(told)
+    assert told.error().reason == "AlreadyExists"
 
 
 def test_a_secret_that_may_not_be_read_is_taken_for_the_pools(rig: Rig, told: Told) -> None:
@@ -401,6 +415,29 @@ def test_an_operator_of_which_nothing_could_be_heard(
     rig.own(told).demand(1)
     told.wait(lambda: told.statuses)
     assert not told.errors
+
+
+def test_an_own_pool_keeps_its_connections_when_its_lease_expires(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
+    monkeypatch.setattr(lease, "_RETRY", 0.01)
+    tried: queue.SimpleQueue[None] = queue.SimpleQueue()
+    expired = lease.LeaseRenewer._notice_expiry
+
+    def notice(renewer: lease.LeaseRenewer) -> None:
+        expired(renewer)
+        tried.put(None)
+
+    monkeypatch.setattr(lease.LeaseRenewer, "_notice_expiry", notice)
+    fault = Fault("patch", "leases", status=503, times=float("inf"))
+    rig.server.do(rig.server.api.faults.append, fault)
+    rig.own(told, master=replace(MASTER, lease_duration=0))
+    tried.get(timeout=PATIENCE)
+    seen = threading.Event()
+    rig.loop.call_soon(seen.set)
+    assert seen.wait(PATIENCE)
+    assert told.expiries == []
 
 
 def test_an_operator_that_ends_later_is_waited_for(

@@ -31,6 +31,7 @@ class Case:
         self.now = 100.0
         self.lost: queue.Queue[FiberPoolError] = queue.Queue()
         self.troubles: queue.Queue[Exception] = queue.Queue()
+        self.expiries: list[float] = []
         self.refusals: queue.Queue[Exception] = queue.Queue()
         self.faults: queue.Queue[Exception] = queue.Queue()
         master = dataclasses.replace(MASTER, lease_duration=duration)
@@ -43,6 +44,7 @@ class Case:
             self.pool,
             on_lost=self.lost.put,
             on_trouble=self.troubles.put,
+            on_expired=self.expiries.append,
             on_refused=self.refusals.put,
             on_fault=self.faults.put,
             now=lambda: self.now,
@@ -158,6 +160,27 @@ def test_what_failed_does_not_count_as_renewed(case: Case, monkeypatch: pytest.M
     case.rig.server.api.calls.clear()
     case.renewer.renew()
     assert case.rig.server.api.count("get", names.PLURAL) == 1
+
+
+def test_it_expires_once_in_each_duration_without_a_renewal(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
+    fault = Fault("patch", "leases", status=503, times=float("inf"))
+    case.rig.server.api.faults.append(fault)
+    for seconds in (29, 1, 10, 20):
+        case.now += seconds
+        case.renewer._attempt()
+        case.troubles.get_nowait()
+    assert case.expiries == [30, 60]
+    case.rig.server.api.faults.clear()
+    case.renewer._attempt()
+    case.rig.server.api.faults.append(fault)
+    for seconds in (29, 1):
+        case.now += seconds
+        case.renewer._attempt()
+        case.troubles.get_nowait()
+    assert case.expiries == [30, 60, 30]
 
 
 # -- The thread

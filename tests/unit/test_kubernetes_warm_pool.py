@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from fakes.kubernetes_api import Fault
+from fiber._backends.kubernetes import lease
 from fiber._backends.kubernetes.warm_pool import read_credentials
 from fiber._transport.credentials import MasterCredentials
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
 from unit.kubernetes_rig import rig as make_rig
+
+AT_ONCE = replace(MASTER, lease_duration=0)
+"""A master whose Lease has expired when it is not renewed for the first time."""
 
 
 @pytest.fixture
@@ -214,6 +219,21 @@ def test_being_replaced_is_an_error_and_the_successor_is_left_alone(rig: Rig, to
     assert OTHER.identity in str(error)
     client.close()
     assert spec(rig)["master"]["identity"] == OTHER.identity
+
+
+def test_a_master_whose_lease_expires_breaks_its_agents_connections(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
+    monkeypatch.setattr(lease, "_RETRY", 0.01)
+    rig.warm(told, AT_ONCE)
+    has_master(rig, told, 1)
+    fault = Fault("patch", "leases", status=503, times=float("inf"))
+    rig.server.do(rig.server.api.faults.append, fault)
+    told.wait(lambda: len(told.expiries) > 1)
+    (said,) = (warning for warning in told.warnings if "may get another master" in warning)
+    assert "has not renewed its Lease for 0 s" in said
+    assert told.errors == []
 
 
 def test_no_such_pool(rig: Rig, told: Told) -> None:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -84,8 +84,11 @@ def test_many_agents_share_one_socket(site: Site) -> None:
         assert agent.frames == [b"agent-%d" % number]
 
 
+@pytest.mark.parametrize("break_off", [break_connections, MasterListener.break_connections])
 @pytest.mark.parametrize("times", [1, 5])
-def test_a_broken_connection_loses_and_repeats_nothing(site: Site, times: int) -> None:
+def test_a_broken_connection_loses_and_repeats_nothing(
+    site: Site, times: int, break_off: Callable[[MasterListener], None]
+) -> None:
     # nng may not notice the break; then the agent's suspicion makes it dial again.
     keepalive = Keepalive(heartbeat=0.1, suspect_after=0.5, lost_after=60)
     listener, master = site.listener(keepalive=keepalive)
@@ -97,7 +100,7 @@ def test_a_broken_connection_loses_and_repeats_nothing(site: Site, times: int) -
         agent.link.send(frame)
         if number % (len(sent) // times) == 50:
             master.wait(lambda number=number: len(master.frames) > number // 2)
-            site.on_loop(lambda: break_connections(listener))
+            site.on_loop(lambda: break_off(listener))
     for notes in (master, agent):
         notes.wait(lambda notes=notes: len(notes.frames) == len(sent))
         assert notes.frames == sent

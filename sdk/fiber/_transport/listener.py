@@ -97,6 +97,14 @@ class MasterListener:
             for then in finished:
                 then()
 
+    def break_connections(self) -> None:
+        """Have each agent dial again, as after a broken connection.  On the loop's thread.
+
+        An agent that reaches this master again goes on with its link, and loses nothing.
+        """
+        for link in self._links.values():
+            link.disconnect()
+
     def look_again(self) -> None:
         """Decide about the agents that wait.  On the loop's thread."""
         waiting, self._waiting = self._waiting, {}

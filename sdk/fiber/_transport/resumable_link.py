@@ -130,7 +130,7 @@ class ResumableLink:
         self._flush()
 
     def disconnect(self) -> None:
-        """Let go of the wire: the peer has, and comes with another one."""
+        """Let go of the wire.  The peer has, or dials again once it notices."""
         if self._wire is not None:
             self._unplug().close()
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypedDict, Unpack
 
 from fiber._backends.kubernetes.api_errors import (
     Body,
+    Conflict,
     Transient,
     Unreachable,
     document_of,
@@ -142,14 +143,19 @@ class Api:
         wait = (cancel or threading.Event()).wait
         deadline = time.monotonic() + timeout
         pause = _PAUSE_MIN
+        repeated = False
         while True:
             try:
                 seconds = min(READ_TIMEOUT, max(deadline - time.monotonic(), CONNECT_TIMEOUT))
                 found = _document(self._session.send(request, seconds))
                 self.trouble = None
                 return found
+            except Conflict as error:
+                error.repeated = repeated
+                raise
             except Transient as error:
                 self.trouble = str(error)
+                repeated = True
                 delay = max(pause * random.uniform(0.5, 1.0), error.retry_after)
                 if delay > deadline - time.monotonic() or wait(delay):
                     raise

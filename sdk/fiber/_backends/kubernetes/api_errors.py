@@ -56,6 +56,9 @@ class NotFound(ApiError):
 class Conflict(ApiError):
     """The name is taken, or the object is not the one that was meant."""
 
+    repeated = False
+    """Whether an earlier attempt of the same call had no answer, and may have taken the name."""
+
 
 class Expired(ApiError):
     """What a watch was to go on from is forgotten: list anew."""

@@ -57,7 +57,8 @@ class AttachedPool:
         self, api: Api, found: Body, master: Master, epoch: int, *, kept_by_others: bool = False
     ) -> None:
         self._api = api
-        self._kept_by_others = kept_by_others
+        self.kept_by_others = kept_by_others
+        """Whether other programs may be its master before and after this one."""
         self.master = master
         self.epoch = epoch
         metadata = found["metadata"]
@@ -145,7 +146,7 @@ class AttachedPool:
 
     def _loss(self, reason: str, what: str, advice: str) -> FiberPoolError:
         """``advice`` is for a pool that somebody else keeps; its own is followed by another."""
-        if not self._kept_by_others:
+        if not self.kept_by_others:
             advice = "What is to run from now on gets another FiberPool, and lost tasks run again"
         return FiberPoolError(
             f"the FiberPool {self.name!r} in namespace {self.namespace!r} {what}. {advice}",

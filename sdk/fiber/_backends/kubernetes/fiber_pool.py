@@ -66,6 +66,9 @@ class Observer(Protocol):
     def on_pod(self, name: str, pod: Body | None) -> None:
         """A pod of the pool, as it is now; None once it is gone."""
 
+    def on_lease_expired(self) -> None:
+        """Another program may become the pool's master, and this one would not know."""
+
     def on_warning(self, message: str) -> None:
         """Something that keeps the pool waiting, and may pass."""
 
@@ -181,6 +184,7 @@ class FiberPoolClient:
             attached,
             on_lost=self._reporter.fail,
             on_trouble=partial(self._reporter.trouble, _RENEW),
+            on_expired=partial(self._lease_expired, attached),
             on_refused=partial(self._reporter.refused, _RENEW),
             on_fault=self._reporter.fault,
         )
@@ -233,6 +237,12 @@ class FiberPoolClient:
         return OPERATOR_ABSENT - silent
 
     # -- On the threads that follow it
+
+    def _lease_expired(self, attached: AttachedPool, seconds: float) -> None:
+        if not attached.kept_by_others:
+            return  # a pool of this program's own never has another master
+        self._reporter.expired(seconds)
+        self._loop.call_soon(self._observer.on_lease_expired)
 
     def _pool_changed(
         self, attached: AttachedPool, renewer: LeaseRenewer, name: str, found: Body | None

@@ -41,22 +41,28 @@ class LeaseRenewer:
         *,
         on_lost: Callable[[FiberPoolError], None],
         on_trouble: Callable[[ApiError], None],
+        on_expired: Callable[[float], None],
         on_refused: Callable[[ApiError], None],
         on_fault: Callable[[Exception], None],
         now: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
     ) -> None:
         """The Lease is fresh.  Told on the thread: ``on_trouble`` what keeps it from being renewed,
-        each time.  And once, which ends the thread: ``on_lost`` that the pool is this program's no
-        more, ``on_refused`` that a login or a right has been missing for a whole duration,
-        ``on_fault`` of a fault of ours.  ``now`` counts seconds, a machine's sleep among them.
+        each time; ``on_expired``, once in each duration that passes without a renewal, the seconds
+        since the last one.  And once, which ends the thread: ``on_lost`` that the pool is this
+        program's no more, ``on_refused`` that a login or a right has been missing for a whole
+        duration, ``on_fault`` of a fault of ours.  ``now`` counts seconds, a machine's sleep among
+        them.
         """
         self._pool = pool
         self._on_lost = on_lost
         self._on_trouble = on_trouble
+        self._on_expired = on_expired
         self._on_refused = on_refused
         self._on_fault = on_fault
         self._now = now
         self._renewed = now()
+        self._expires = self._renewed + pool.master.lease_duration
+        """When the Lease runs out next, as far as this program knows."""
         self._refused: float | None = None
         """Since when.  An API server that was away refuses everybody as it starts."""
         self._stopped = threading.Event()
@@ -99,6 +105,7 @@ class LeaseRenewer:
         except NotFound:
             self._make()
         self._renewed = now
+        self._expires = now + self._pool.master.lease_duration
 
     def _run(self) -> None:
         pause = self._pool.master.lease_duration / RENEWALS
@@ -121,10 +128,17 @@ class LeaseRenewer:
             if self._stays_refused(error):
                 raise
             self._on_trouble(error)
+            self._notice_expiry()
             asked = error.retry_after if isinstance(error, Transient) else 0.0
             return max(_RETRY, min(asked, pause))  # who lives must be heard in time all the same
         self._refused = None
         return pause
+
+    def _notice_expiry(self) -> None:
+        now = self._now()
+        if now >= self._expires:
+            self._expires = now + self._pool.master.lease_duration
+            self._on_expired(now - self._renewed)
 
     def _stays_refused(self, error: ApiError) -> bool:
         if not isinstance(error, Forbidden | Unauthorized):

@@ -55,8 +55,8 @@ class OwnPool:
         self._make_secret(self._attached, cancel)
         try:
             self._attached.make_lease(cancel=cancel)
-        except Conflict:
-            if not self._attached.has_lease(cancel=cancel):
+        except Conflict as error:
+            if not (error.repeated and self._attached.has_lease(cancel=cancel)):
                 raise
             # It was made by an attempt whose answer was lost.
         return self._attached
@@ -76,7 +76,9 @@ class OwnPool:
         secret = secret_body(name, self._credentials, pool.owner, pool.labels)
         try:
             self._api.create(SECRETS.path(self.namespace), secret, cancel=cancel)
-        except Conflict:
+        except Conflict as error:
+            if not error.repeated:
+                raise  # somebody else was faster
             try:
                 found = self._api.get(SECRETS.path(self.namespace, name), cancel=cancel)
             except Forbidden:
@@ -99,7 +101,9 @@ class OwnPool:
         body = {**self._body, "metadata": metadata, "spec": spec}
         try:
             return self._api.create(POOLS.path(self.namespace), body, strict=True, cancel=cancel)
-        except Conflict:
+        except Conflict as error:
+            if not error.repeated:
+                raise
             found = self._api.get(POOLS.path(self.namespace, self.name), cancel=cancel)
             if identity_in(found) != self._master.identity:
                 raise

@@ -293,6 +293,11 @@ class Pods:
             prepared.listener.epoch = epoch
             self._waiting.way = Way(prepared.address, prepared.attachment.displaced)
 
+    def on_lease_expired(self) -> None:
+        """Have the agents dial the pool's Service, which leads to its master of the moment."""
+        if self._prepared is not None:
+            self._prepared.listener.break_connections()
+
     def on_warning(self, message: str) -> None:
         """Something that keeps the pool waiting, and may pass."""
         self._output.write("fiber", message)

@@ -19,6 +19,8 @@ from fiber._backends.kubernetes.problems import PoolName
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
 
+_EXPIRED = "Lease expired"
+
 
 class Reporter:
     """Any thread may call; ``on_warning`` and ``on_error`` are told on the loop's.
@@ -53,7 +55,8 @@ class Reporter:
 
     def answered(self) -> None:
         """The API server is well: if it fails again that is news."""
-        self._warned -= {kind.__name__ for kind in (Unreachable, ServerError, TooManyRequests)}
+        kinds = {kind.__name__ for kind in (Unreachable, ServerError, TooManyRequests)}
+        self._warned -= {*kinds, _EXPIRED}
 
     def warn_anew(self) -> None:
         """Somebody begins to wait, and is to be told what was told before, if it is still so."""
@@ -71,6 +74,15 @@ class Reporter:
         kind = type(error).__name__
         what = kind if isinstance(error, Transient) else f"{kind}: {doing}"
         self.warn(what, str(self._explained(doing, error)))
+
+    def expired(self, seconds: float) -> None:
+        """Tell that the Lease has not been renewed for its duration."""
+        what = (
+            f"may get another master: this program has not renewed its Lease for {seconds:.0f} s. "
+            "Its agents dial anew: they come back with their work, or go to the next master. See "
+            "that this program can reach the API server"
+        )
+        self.warn(_EXPIRED, str(self.error("LeaseExpired", what)))
 
     def refused(self, doing: str, error: ApiError) -> None:
         """It will not pass."""
