@@ -31,6 +31,7 @@ class FakeBackend:
 
     name = "fake"
     same_host = True
+    same_pids = True
     elastic = False
     sends_program = False
 

@@ -46,6 +46,7 @@ class FakeCluster:
 
     name = "fake"
     same_host = False
+    same_pids = True
     elastic = False
     sends_program = False
 

@@ -279,7 +279,8 @@ def how_it_ended(process: Any) -> str | None:
     if popen is None:
         return None
     # The parent hears of a death moments after the kernel has closed what the process held.
-    if popen.wait(_LAST_MOMENT) is None and _is_exiting(popen.pid):
+    # On another host its pid is another process's, or nobody's: there is nothing to look at.
+    if popen.wait(_LAST_MOMENT) is None and (not popen.same_pids or _is_exiting(popen.pid)):
         popen.wait(_NEWS)
     return None if popen.report is None else popen.report.describe()
 

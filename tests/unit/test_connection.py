@@ -11,6 +11,7 @@ import threading
 from array import array
 from collections.abc import Callable
 from multiprocessing.connection import wait
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import connection
+from fiber._agent.interface import ExitReport
 from fiber._transport import unix
 from fiber._transport.unix import UnixChannel
 from fiber._wire.packet import Message
@@ -516,3 +518,31 @@ def test_a_client_does_not_believe_a_listener_that_welcomes_everybody() -> None:
         with pytest.raises(connection.AuthenticationError):
             connection.Client(listener.address, authkey=b"one")
         welcoming.join(PATIENCE)
+
+
+class Elsewhere:
+    """A process that has ended, whose news comes while it is waited for."""
+
+    def __init__(self, pid: int, *, same_pids: bool) -> None:
+        self.pid = pid
+        self.same_pids = same_pids
+        self.report: ExitReport | None = None
+        self._waits = 0
+
+    def wait(self, timeout: float) -> int | None:
+        self._waits += 1
+        if self._waits == 1:
+            return None
+        self.report = ExitReport(-signal.SIGKILL, "killed by SIGKILL", pod="es-1")
+        return self.report.exitcode
+
+
+@pytest.mark.parametrize(
+    ("same_pids", "told"), [(True, None), (False, "killed by SIGKILL, in pod es-1")]
+)
+def test_a_pid_of_another_host_is_not_looked_up_on_this_one(
+    same_pids: bool, told: str | None
+) -> None:
+    """The pid is that of a process here that lives: this one."""
+    process = SimpleNamespace(_popen=Elsewhere(os.getpid(), same_pids=same_pids))
+    assert connection.how_it_ended(process) == told

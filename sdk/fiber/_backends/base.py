@@ -14,6 +14,9 @@ class Backend(Protocol):
     same_host: bool
     """Whether its agents run on the program's own host, so that descriptors can be handed over."""
 
+    same_pids: bool
+    """Whether the pids of its children are those of this host and this PID namespace."""
+
     elastic: bool
     """Whether a host may be made for a child: starting one does not wait for that."""
 

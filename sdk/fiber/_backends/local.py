@@ -15,6 +15,7 @@ class LocalBackend:
     name = "local"
     elastic = False
     same_host = True
+    same_pids = True
     sends_program = False
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None) -> None:

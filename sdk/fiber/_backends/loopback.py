@@ -56,6 +56,7 @@ class LoopbackBackend:
     name = "loopback"
     elastic = False
     same_host = False
+    same_pids = True
     elsewhere: str | None = None
     """For tests: a directory that agents are started in as if this machine were another one, which
     has not the program's files.

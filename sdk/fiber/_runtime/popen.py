@@ -33,6 +33,8 @@ class Popen:
         self._pid: int | None = None
         self._child: ChildHandle | None = None
         self._may_wait = runtime().backend.elastic
+        self.same_pids = runtime().backend.same_pids
+        """Whether its pid says something on this host, in this PID namespace."""
         self._answered = Latch()
         """Whoever starts it need not wait any more."""
         self._born = Latch()

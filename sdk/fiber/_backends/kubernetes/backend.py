@@ -21,6 +21,7 @@ class KubernetesBackend:
 
     name = "kubernetes"
     same_host = False
+    same_pids = False
     elastic = True
     sends_program = True
 
