@@ -25,6 +25,7 @@ class Account:
         self._answer = answer
         self.served = True
         self.claim: dict[str, Any] | None = None
+        self.pools: list[dict[str, Any]] = []
         self.asked: list[dict[str, Any]] = []
         self.closed = False
 
@@ -48,6 +49,11 @@ class Account:
         if path.endswith("/leases/fiberpools.fiber.dev") and self.claim is not None:
             return {"spec": self.claim}
         raise NotFound("404 page not found", status=404)
+
+    def list(self, path: str, selector: dict[str, str], *, timeout: float) -> dict[str, Any]:
+        assert timeout <= 5.0
+        assert path == "/apis/fiber.dev/v1alpha1/namespaces/lab/fiberpools"
+        return {"items": self.pools}
 
     def close(self) -> None:
         self.closed = True
@@ -124,22 +130,25 @@ FRESH, OLD = "9000-01-01T00:00:00Z", "2020-01-01T00:00:00Z"
 
 
 @pytest.mark.parametrize(
-    ("claim", "taken"),
+    ("claim", "pools", "taken"),
     [
-        (None, True),  # a namespace that has had no pool yet
-        ({**RELEASE, "renewTime": FRESH}, True),
-        ({**RELEASE, "renewTime": OLD}, False),
-        ({**RELEASE, "renewTime": OLD, "holderIdentity": ""}, True),  # it was given back
+        (None, 0, True),  # a namespace that has had no pool yet
+        ({**RELEASE, "renewTime": FRESH}, 1, True),
+        ({**RELEASE, "renewTime": OLD}, 1, False),
+        ({**RELEASE, "renewTime": OLD, "holderIdentity": ""}, 1, True),  # it was given back
+        ({**RELEASE, "renewTime": OLD}, 0, True),  # operators give up a namespace without pools
     ],
-    ids=["absent", "fresh", "old", "free"],
+    ids=["absent", "fresh", "old", "free", "unused"],
 )
 def test_an_operator_that_is_gone_makes_no_pods(
     claim: dict[str, Any] | None,
+    pools: int,
     taken: bool,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     account = in_a_pod(monkeypatch, ALLOWED)
     account.claim = claim
+    account.pools = [{}] * pools
     assert _is_on_cluster(Config()) == taken
     assert ("is gone" in caplog.text) != taken

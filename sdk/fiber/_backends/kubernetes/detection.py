@@ -8,7 +8,7 @@ import time
 
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.api_errors import ApiError, Body, NotFound
-from fiber._backends.kubernetes.resources import LEASES
+from fiber._backends.kubernetes.resources import LEASES, POOLS
 from fiber.errors import ConfigError
 from fiber_api import names
 from fiber_api.times import parse_time
@@ -39,7 +39,7 @@ def _serves(api: Api, namespace: str) -> bool:
         api.get(f"/apis/{names.API_VERSION}", timeout=_TIMEOUT)
     except NotFound:
         return _on_this_machine("the cluster knows no FiberPools. Install the operator's chart")
-    if _has_expired(_claim(api, namespace)):
+    if _has_expired(_claim(api, namespace)) and _has_pools(api, namespace):
         return _on_this_machine(
             f"the operator that served the namespace {namespace!r} is gone. Start it again"
         )
@@ -73,6 +73,18 @@ def _has_expired(claim: Body) -> bool:
     except ValueError:
         return False
     return renewed + int(claim.get("leaseDurationSeconds") or 0) < time.time()
+
+
+def _has_pools(api: Api, namespace: str) -> bool:
+    """Return whether the namespace has FiberPools; False where they cannot be listed.
+
+    An operator gives up a namespace without pools, and leaves its Lease to expire.
+    """
+    try:
+        found = api.list(POOLS.path(namespace), {"limit": "1"}, timeout=_TIMEOUT)
+    except ApiError:
+        return False
+    return bool(found.get("items"))
 
 
 def _review(namespace: str) -> Body:
