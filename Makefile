@@ -49,11 +49,13 @@ test-programs:
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not long" $(WHOLE_PROGRAMS)
 
 # The tests on the cluster wait most of the time, and so do CPython's: side by side they take little
-# longer than the first alone. What the second print is shown at its end.
+# longer than the first alone. What the second print is shown at its end. The shell starts them with
+# Ctrl-C ignored, which CPython's tests of signals would inherit.
 test-side-by-side:
 	@mkdir -p build; failed=; \
-	setsid $(MAKE) --no-print-directory test-conformance >build/test-conformance.log 2>&1 & \
-	conformance=$$!; trap 'kill -- -$$conformance; wait; exit 130' INT TERM; \
+	setsid env --default-signal=INT,QUIT $(MAKE) --no-print-directory test-conformance \
+		>build/test-conformance.log 2>&1 & \
+	conformance=$$!; trap 'kill -s INT -- -$$conformance; wait; exit 130' INT TERM; \
 	$(MAKE) --no-print-directory test-on-cluster || failed=" test-on-cluster"; \
 	wait $$conformance || failed="$$failed test-conformance"; \
 	cat build/test-conformance.log; \
