@@ -32,6 +32,7 @@ from unit.kubernetes_rig import kubeconfig
 
 pytestmark = [
     pytest.mark.may_leak("the operator's connections, for as long as the cluster is there"),
+    pytest.mark.timeout(300),  # Leases expire meanwhile
 ]
 
 cluster = test_pods.cluster
@@ -129,7 +130,7 @@ def ran(folder: Path) -> list[str]:
 def test_agents_come_back_to_a_master_that_is_cut_off_and_lose_nothing(
     warm: Warm, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with running(backend="kubernetes"), fiber.Pool(1, pool="warm") as pool:
+    with running(backend="kubernetes", lost_after=PATIENCE), fiber.Pool(1, pool="warm") as pool:
         result = pool.map_async(partial(note_and_wait, tmp_path), range(3), chunksize=1)
         warm.lead_to_master(1)
         wait_for(lambda: ran(tmp_path) == ["0"])
@@ -141,13 +142,13 @@ def test_agents_come_back_to_a_master_that_is_cut_off_and_lose_nothing(
         assert result.get(PATIENCE) == [0, 1, 2]
         assert ran(tmp_path) == ["0", "1", "2"]
         assert {info.host for info in pool.workers()} == {warm.pod}
-    assert capfd.readouterr().err.count("may get another master") == 1
+    assert "may get another master" in capfd.readouterr().err
 
 
 def test_the_next_master_gets_the_agents_of_one_that_is_cut_off(
     warm: Warm, tmp_path: Path, cluster: FakeCluster, launch: Callable[..., Program]
 ) -> None:
-    with running(backend="kubernetes"), fiber.Pool(1, pool="warm") as pool:
+    with running(backend="kubernetes", lost_after=PATIENCE), fiber.Pool(1, pool="warm") as pool:
         result = pool.apply_async(note_and_wait, (tmp_path, 0))
         warm.lead_to_master(1)
         wait_for(lambda: ran(tmp_path) == ["0"])
@@ -155,7 +156,11 @@ def test_the_next_master_gets_the_agents_of_one_that_is_cut_off(
         warm.wait_until_master_is_lost()
         folder = tmp_path / "next"
         folder.mkdir()
-        env = {"FIBER_BACKEND": "kubernetes", "KUBECONFIG": str(kubeconfig(folder, cluster.url))}
+        env = {
+            "FIBER_BACKEND": "kubernetes",
+            "FIBER_LOST_AFTER": f"{PATIENCE:g}",
+            "KUBECONFIG": str(kubeconfig(folder, cluster.url)),
+        }
         successor = launch(NEXT_MASTER, env=env, stdin=subprocess.PIPE)
         warm.lead_to_master(2)
         assert successor.line() == warm.pod
