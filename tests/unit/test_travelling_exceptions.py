@@ -115,6 +115,34 @@ def test_a_group_keeps_the_others_of_one_that_cannot_be_made_again() -> None:
     assert several.__notes__ == []
 
 
+def test_a_group_keeps_the_others_of_one_that_only_its_receiver_cannot_unpickle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    inner = kinds.Several([kinds.Diverged(1, loss=0.5), kinds.BadlyReduced(3, 0.5)], step=2)
+    data = encode_error(ExceptionGroup("outer", [ValueError("plain"), inner]))
+    monkeypatch.delattr(kinds, "Diverged")
+    found = pickle.loads(data)
+    assert found.message == "outer"
+    plain, several = found.exceptions
+    assert (type(plain), type(several), several.step) == (ValueError, kinds.Several, 2)
+    lost, reduced = several.exceptions
+    assert type(lost) is MaybeEncodingError
+    assert "Diverged('loss 0.5 at step 1')" in str(lost)
+    assert "has no attribute" in str(lost) or "Can't get attribute" in str(lost)
+    assert (type(reduced), reduced.step) == (kinds.BadlyReduced, 3)
+    assert several.args[1][0] is lost
+
+
+def test_a_member_that_has_its_group() -> None:
+    member = kinds.Diverged(1, loss=0.5)
+    group = ExceptionGroup("outer", [member, member])
+    member.group = group  # type: ignore[attr-defined]
+    found = travelled(group)
+    first, second = found.exceptions
+    assert first is second
+    assert first.group.exceptions == (first, first)
+
+
 def test_one_that_has_another_and_itself() -> None:
     found = travelled(kinds.Wraps(kinds.BadlyReduced(3, 0.5), step=2))
     assert (type(found.inner), found.inner.step, found.step) == (kinds.BadlyReduced, 3, 2)

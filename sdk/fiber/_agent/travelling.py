@@ -195,10 +195,18 @@ class _Pickling:
         self._met: set[int] = set()
         """Open exceptions that are parts of the one being checked."""
         self._checked: dict[int, tuple[BaseException, _Reduced]] = {}
+        self._apart: set[int] | None = None
+        """Groups whose members are being pickled apart; None while pickles are checked."""
 
     def checked(self, error: BaseException) -> bytes:
-        """Pickle ``error``, and unpickle it as a check."""
+        """Pickle ``error``, and unpickle it as a check.
+
+        The members of a group are then pickled apart, as only some may unpickle at the receiver.
+        """
         data, has_handles = self._trial(error)
+        if isinstance(error, BaseExceptionGroup):
+            self._apart = set()
+            return self._dumped(error)
         # The handles in a trial end with it.
         return self._dumped(error) if has_handles else data
 
@@ -219,6 +227,22 @@ class _Pickling:
         return file.getvalue()
 
     def _reduce(self, error: BaseException) -> _Reduced:
+        reduced = self._reduce_whole(error)
+        if self._apart is None or id(error) in self._apart:
+            return reduced
+        if isinstance(reduced, str) or reduced[0] is not make:
+            return reduced
+        _, (kind, group), state, *_ = reduced
+        if not group:
+            return reduced
+        self._apart.add(id(error))  # A member may have its group.
+        try:
+            members = {id(each): _Member(self._dumped(each), _shown(each)) for each in group[1]}
+        finally:
+            self._apart.remove(id(error))
+        return _rebuilt(kind, *_with_members(group, _State(*state), members))
+
+    def _reduce_whole(self, error: BaseException) -> _Reduced:
         kind = type(error)
         if id(error) in self._checked:
             return self._checked[id(error)][1]
@@ -233,7 +257,7 @@ class _Pickling:
         if self._incomplete and id(error) not in self._open:
             return self._reduce_checked(error, state)
         self._met.add(id(error))
-        return _rebuilt(error, group_of(error), state)
+        return _rebuilt(kind, group_of(error), state)
 
     def _reduce_checked(self, error: BaseException, state: _State) -> _Reduced:
         """Reduce an exception to what travels of it.
@@ -249,7 +273,7 @@ class _Pickling:
             self._open.remove(id(error))
             is_in_cycle = bool(self._met)  # Then the outcome depends on where the check began.
             self._met = met | self._met - {id(error)}
-        reduced = _rebuilt(error, group, state)
+        reduced = _rebuilt(type(error), group, state)
         if not is_in_cycle:
             self._checked[id(error)] = error, reduced
         return reduced
@@ -260,19 +284,11 @@ class _Pickling:
         """Replace the members of a group that cannot travel by errors that say why."""
         if not isinstance(error, BaseExceptionGroup):
             return (), state
-        sent: dict[int, BaseException] = {}
+        sent: dict[int, object] = {}
         for member in error.exceptions:
             refusal = self._refusal(member)
             sent[id(member)] = unsendable(_Text(refusal), member) if refusal else member
-        args = tuple(
-            type(arg)(sent.get(id(each), each) for each in arg)
-            if type(arg) in (list, tuple)
-            else arg
-            for arg in state.args
-        )
-        fields = {name: value for name, value in state.fields.items() if name != "exceptions"}
-        members = tuple(sent[id(member)] for member in error.exceptions)
-        return (error.message, members), state._replace(args=args, fields=fields)
+        return _with_members(group_of(error), state, sent)
 
     def _without_refused(self, state: _State) -> _State:
         """Drop the attributes that do not travel, and note them; such arguments become text."""
@@ -312,8 +328,41 @@ class _Exceptions(dict[type, Callable[[Any], _Reduced]]):
         raise KeyError(kind)
 
 
-def _rebuilt(error: BaseException, group: tuple[Any, ...], state: _State) -> _Reduced:
-    return make, (type(error), group), tuple(state), None, None, _set_state
+class _Member:
+    """Stands for a member of a group: an error that shows it, where it does not unpickle."""
+
+    def __init__(self, data: bytes, shown: str) -> None:
+        self._parts = data, shown
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _received_member, self._parts
+
+
+def _received_member(data: bytes, shown: str) -> BaseException:
+    try:
+        return _exception(pickle.loads(data))
+    except Exception as refusal:
+        return unsendable(refusal, _Text(shown))
+
+
+def _with_members(
+    group: tuple[Any, ...], state: _State, members: Mapping[int, object]
+) -> tuple[tuple[Any, ...], _State]:
+    """Put ``members`` in the places of those with these ids."""
+    args = tuple(
+        type(arg)(members.get(id(each), each) for each in arg)
+        if type(arg) in (list, tuple)
+        else arg
+        for arg in state.args
+    )
+    fields = {name: value for name, value in state.fields.items() if name != "exceptions"}
+    message, earlier = group
+    group = message, tuple(members[id(member)] for member in earlier)
+    return group, state._replace(args=args, fields=fields)
+
+
+def _rebuilt(kind: type, group: tuple[Any, ...], state: _State) -> _Reduced:
+    return make, (kind, group), tuple(state), None, None, _set_state
 
 
 def _set_state(error: BaseException, state: tuple[Any, ...]) -> None:
