@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons e2e large-messages lint bench bench-operator bench-kubernetes conformance conformance-original crds images cluster cluster-down clean
+.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds images cluster cluster-down clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -84,9 +84,9 @@ e2e: $(VENV)/.with-dev
 	$(CLUSTER) prepare
 	$(BIN)/python -m pytest tests/e2e
 
-## make large-messages  messages of 256 MB to 4 GB between hosts: minutes, and 14 GB of free memory
-large-messages: $(VENV)/.with-dev
-	$(BIN)/python -m pytest -m long tests/faults/test_large_messages.py
+## make test-long     messages of up to 4 GB between hosts, twenty preemptions: minutes, and 14 GB of memory
+test-long: $(VENV)/.with-dev
+	$(BIN)/python -m pytest -m long tests/faults
 
 ## make lint          style, types and import contracts, each tool's own words
 lint: $(VENV)/.with-dev

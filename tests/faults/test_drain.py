@@ -178,7 +178,7 @@ def test_a_task_that_is_disrupted_again_and_again_ends(site: Site, tmp_path: Pat
     assert error.reason.startswith("Drained: ")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(1800)
 @played
 @pytest.mark.parametrize("grace", [0.2])
