@@ -52,6 +52,8 @@ ANNOTATIONS_KEEP_NODE: Final = {
     "karpenter.sh/do-not-disrupt": "true",
 }
 """What keeps the cluster autoscaler and Karpenter from emptying a node under workers at work."""
+ANNOTATION_CONNECTED: Final = f"{GROUP}/connected-agents"
+"""Of a master's Lease: how many agents were linked to it when it was renewed."""
 
 # -- The worker container
 
@@ -79,6 +81,8 @@ ENV_LOST_GRACE: Final = "FIBER_AGENT_LOST_GRACE"
 """Seconds that an agent outlives its master: ``spec.master.lostGraceSeconds``."""
 ENV_TERMINATION_GRACE: Final = "FIBER_AGENT_TERMINATION_GRACE"
 """Seconds that a pod has after SIGTERM: the template's ``terminationGracePeriodSeconds``."""
+ENV_LINKED: Final = "FIBER_AGENT_LINKED"
+"""The file that the agent makes once a master has answered it; the startup probe waits for it."""
 
 IDENTITY_CONTAINER: Final = "fiber-identity"
 """The first init container: derives the agent's key from the pool's."""
@@ -88,6 +92,10 @@ KEY_DIRECTORY: Final = "/etc/fiber/key"
 CREDENTIALS_VOLUME: Final = "fiber-credentials"
 CREDENTIALS_DIRECTORY: Final = "/etc/fiber/credentials"
 CREDENTIALS_FILE: Final = "agent.json"
+PROBE_PROGRAM: Final = "python"
+"""Beside the credentials: the interpreter that runs the startup probe.  The init container links it
+to its own, since nobody else knows where an image has one."""
+LINKED_FILE: Final = "linked"
 
 # -- The way to the master
 

@@ -31,7 +31,8 @@ _HEADER = "# Generated from crds/fiber_api by `make crds`; edit the models, not 
 _COLUMNS = (
     ("Desired", "integer", ".status.desiredReplicas", "Workers wanted, after the bounds"),
     ("Ready", "integer", ".status.readyReplicas", "Workers that are ready"),
-    ("Pending", "integer", ".status.pendingReplicas", "Workers that were never ready yet"),
+    ("Connected", "integer", ".status.connectedReplicas", "Workers linked to the master"),
+    ("Pending", "integer", ".status.pendingReplicas", "Workers that do not run yet"),
     ("Phase", "string", ".status.phase", "The conditions in one word"),
     ("Reason", "string", ".status.problems[0].reason", "The worst problem"),
     ("Master", "string", ".status.master", "Where the program is that uses the pool"),

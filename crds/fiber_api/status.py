@@ -96,9 +96,11 @@ class FiberPoolStatus(Model):
     replicas: Count | None = None
     """Workers that live: pending, starting or ready."""
     ready_replicas: Count | None = None
-    """Workers that are ready."""
+    """Workers that are ready: each has reached its master, or waits for one on purpose."""
+    connected_replicas: Count | None = None
+    """Workers that are linked to the master, as its Lease says. Absent where it says nothing."""
     pending_replicas: Count | None = None
-    """Workers that were never ready yet."""
+    """Workers that do not run yet."""
     terminating_replicas: Count | None = None
     """Workers that are being deleted."""
     updated_replicas: Count | None = None

@@ -26,6 +26,7 @@ import kopf
 
 from fiber_api import names
 from fiber_operator.cluster import LEASES, PAGE, Configuration
+from fiber_operator.lease_monitor import connected_in
 from fiber_operator.planning.documents import mapping, text, whole
 from fiber_operator.watch_session import open_watch_session
 from fiber_operator.watches import Answered, tracing
@@ -41,8 +42,9 @@ END_WAIT = 4.0
 Notice = Callable[[Key, str, int | None], None]
 """Told of a pool: its uid and generation if it is the pool itself that changed, else None."""
 
-Renewed = Callable[[str, str, str], None]
-"""Told of a Lease of a pool: its namespace, name, and resourceVersion; empty: it is deleted."""
+Renewed = Callable[[str, str, str, int | None], None]
+"""Told of a Lease of a pool: its namespace, name, resourceVersion (empty: it is deleted), and how
+many agents its master has."""
 
 Configure = Callable[[], Awaitable[Configuration]]
 """Where the API server is and how to log in; asked again when a login has expired."""
@@ -108,7 +110,8 @@ def registry(
     async def lease_event(type: str | None, body: Mapping[str, Any], **_: Any) -> None:
         metadata = mapping(body, "metadata")
         version = "" if type == "DELETED" else text(metadata.get("resourceVersion"))
-        renewed(text(metadata.get("namespace")), text(metadata.get("name")), version)
+        namespace, name = text(metadata.get("namespace")), text(metadata.get("name"))
+        renewed(namespace, name, version, connected_in(body))
 
     return handlers
 
@@ -143,7 +146,7 @@ def kopf_settings() -> kopf.OperatorSettings:
 async def watch(
     notice: Notice,
     *,
-    renewed: Renewed = lambda namespace, name, version: None,
+    renewed: Renewed = lambda *_: None,
     configure: Configure,
     namespaces: Collection[str],
     gate: Callable[[], Awaitable[None]],
@@ -243,7 +246,7 @@ class Watcher:
         self,
         notice: Notice,
         *,
-        renewed: Renewed = lambda namespace, name, version: None,
+        renewed: Renewed = lambda *_: None,
         configure: Configure,
         namespaces: Collection[str],
         gate: Callable[[], Coroutine[Any, Any, None]],

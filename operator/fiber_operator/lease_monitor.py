@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+from fiber_api.names import ANNOTATION_CONNECTED
 from fiber_operator.cluster import LEASES, ApiError, Cluster, Gone, Refused
 from fiber_operator.logs import about
 from fiber_operator.planning.documents import mapping, text
@@ -87,10 +88,13 @@ class LeaseMonitor:
             self._wake.set()
         return LeaseVerdict()
 
-    def heard(self, namespace: str, name: str, version: str) -> None:
-        """The watch says what a Lease's resourceVersion is now; empty: it was deleted."""
+    def heard(self, namespace: str, name: str, version: str, connected: int | None = None) -> None:
+        """The watch says what a Lease's resourceVersion is now; empty: it was deleted.
+
+        ``connected`` is how many agents the master says it has.
+        """
         for key in tuple(self._pools.get((namespace, name), ())):
-            self._see(key, self._watched[key], version)
+            self._see(key, self._watched[key], version, connected)
 
     async def run(self) -> None:
         """Read the Leases of which nothing is heard, until cancelled."""
@@ -118,9 +122,11 @@ class LeaseMonitor:
         if watched is None:
             return
         late = self._now() - watched.due > watched.lease.seconds * CONFIRMED_AFTER
+        connected = None
         try:
             lease = await self._cluster.read(LEASES, key.namespace, watched.lease.name)
             version = text(mapping(lease, "metadata").get("resourceVersion"))
+            connected = connected_in(lease)
         except Gone:
             version = ""  # judged like one that does not change: it may be made yet
         except ApiError as error:
@@ -130,7 +136,7 @@ class LeaseMonitor:
                 watched.version = None
                 self._conclude(key, watched, LeaseVerdict(unreadable=error.message))
             return
-        if self._see(key, watched, version):
+        if self._see(key, watched, version, connected):
             return
         if late and watched.verdict.alive is not False:
             # This process was stopped, or busy: what did not reach it meanwhile says nothing.
@@ -138,7 +144,7 @@ class LeaseMonitor:
         else:
             self._find_unchanged(key, watched)
 
-    def _see(self, key: Key, watched: _Watched, version: str) -> bool:
+    def _see(self, key: Key, watched: _Watched, version: str, connected: int | None) -> bool:
         """Whether the Lease is not as it was.
 
         To find it is no sign of life, for it may be that of a master that died long ago.
@@ -153,7 +159,9 @@ class LeaseMonitor:
         if before is None or version:
             watched.begin_anew(self._now())
             alive = None if before is None else True
-        self._conclude(key, watched, LeaseVerdict(alive, missing=not version))
+        # Until it changes, it may be the word of the master before.
+        said = connected if alive else None
+        self._conclude(key, watched, LeaseVerdict(alive, missing=not version, connected=said))
         return True
 
     def _find_unchanged(self, key: Key, watched: _Watched) -> None:
@@ -175,3 +183,9 @@ class LeaseMonitor:
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
+
+
+def connected_in(lease: object) -> int | None:
+    """Return how many agents the Lease says its master has, if it says so."""
+    said = text(mapping(lease, "metadata", "annotations").get(ANNOTATION_CONNECTED))
+    return int(said) if said.isascii() and said.isdigit() and len(said) < 10 else None

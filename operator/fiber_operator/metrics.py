@@ -38,7 +38,9 @@ class PoolSample:
         failures = mapping(status, "failures")
         return cls(
             desired=whole(status.get("desiredReplicas")),
-            pods=collections.Counter(pod.state.value.lower() for pod in pods),
+            pods=collections.Counter(
+                "starting" if pod.joining else pod.state.value.lower() for pod in pods
+            ),
             problems={
                 text(problem.get("reason")): whole(problem.get("count"), 1)
                 for problem in items(status.get("problems"))

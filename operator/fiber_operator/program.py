@@ -213,9 +213,9 @@ class Program:
         elif self.controller.is_news(key, uid, generation):
             self.queue.add(key, urgent=True)
 
-    def _renewed(self, namespace: str, lease: str, version: str) -> None:
+    def _renewed(self, namespace: str, lease: str, version: str, connected: int | None) -> None:
         self.metrics.watched("leases")
-        self.lease_monitor.heard(namespace, lease, version)
+        self.lease_monitor.heard(namespace, lease, version, connected)
 
     async def _reconcile(self, key: Key) -> Result:
         if not self.elector.is_leader:

@@ -59,4 +59,7 @@ def _brief(item: Body) -> Body:
     metadata = mapping(item, "metadata")
     label = {names.LABEL_POOL: mapping(metadata, "labels").get(names.LABEL_POOL)}
     kept = {name: metadata[name] for name in _KEPT if name in metadata}
+    said = mapping(metadata, "annotations").get(names.ANNOTATION_CONNECTED)
+    if said is not None:
+        kept["annotations"] = {names.ANNOTATION_CONNECTED: said}
     return {"metadata": {**kept, "labels": label}}

@@ -17,6 +17,7 @@ It takes everything from its environment, nothing from its command line (but ``-
 ``FIBER_AGENT_TERMINATION_GRACE``  optional: seconds from SIGTERM to the end by force.  After
                            SIGTERM the agent takes no new work; what runs may end in that time,
                            less what cleaning up takes
+``FIBER_AGENT_LINKED``       optional: a file to make once a master has answered
 ``FIBER_START_TIMEOUT``      seconds to find the master, as for every Fiber process
 
 Exit status 0: the master ended it, or the grace for a lost one is over.  1: it could not join, or

@@ -170,7 +170,8 @@ def test_a_status_has_no_default() -> None:
 def test_columns_lead_somewhere() -> None:
     columns = definition()["spec"]["versions"][0]["additionalPrinterColumns"]
     shown = [column["name"].upper() for column in columns if not column.get("priority")]
-    assert shown == ["DESIRED", "READY", "PENDING", "PHASE", "REASON", "MASTER", "AGE"]
+    known = ["DESIRED", "READY", "CONNECTED", "PENDING", "PHASE", "REASON", "MASTER", "AGE"]
+    assert shown == known
     for column in columns:
         path = re.sub(r"\[\d+\]", "[]", column["jsonPath"])
         if path != ".metadata.creationTimestamp":

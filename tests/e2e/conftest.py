@@ -165,6 +165,13 @@ def agent(cluster: Cluster) -> Body:
 
 
 @pytest.fixture(scope="session")
+def lone_agent(cluster: Cluster) -> Body:
+    """Return the template of a worker that is Ready though the pool's master is nowhere."""
+    probe = {"exec": {"command": ["true"]}}
+    return template(cluster.images["fiber-worker"], startupProbe=probe)
+
+
+@pytest.fixture(scope="session")
 def image(cluster: Cluster) -> str:
     """The worker's image."""
     return cluster.images["fiber-worker"]

@@ -103,8 +103,8 @@ def test_kubectl_scales_a_warm_pool_between_its_bounds(pool: Pool, agent: Body) 
     assert pool.scene.most_at_once(is_live) == 3
 
 
-def test_an_attached_master_says_who_goes(pool: Pool, agent: Body) -> None:
-    pool.apply(agent, maxReplicas=5)
+def test_an_attached_master_says_who_goes(pool: Pool, lone_agent: Body) -> None:
+    pool.apply(lone_agent, maxReplicas=5)
     pool.attach(master=SOMEWHERE, replicas=3)
     first, second, third = pool.ready(3)
     pool.scale(1)
@@ -128,8 +128,8 @@ def test_a_released_name_that_is_no_worker_is_told(pool: Pool, agent: Body) -> N
     pool.ready(1)
 
 
-def test_policy_any_takes_workers_from_a_master(pool: Pool, agent: Body) -> None:
-    pool.apply(agent, scaleDown={"policy": "Any"})
+def test_policy_any_takes_workers_from_a_master(pool: Pool, lone_agent: Body) -> None:
+    pool.apply(lone_agent, scaleDown={"policy": "Any"})
     pool.attach(master=SOMEWHERE, replicas=2)
     two = pool.ready(2)
     pool.scale(1)

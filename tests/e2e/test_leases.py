@@ -26,12 +26,12 @@ Pools = Mapping[str, Pool]
 
 
 @pytest.fixture(scope="module")
-def pools(module_scene: Scene, agent: Body) -> Pools:
+def pools(module_scene: Scene, lone_agent: Body) -> Pools:
     """One for each fate and one whose master comes back, each with a master that is alive."""
     fates = {"delete": "Delete", "shrink": "ScaleToMin", "retain": "Retain", "return": "Delete"}
     pools = {name: Pool(module_scene, name) for name in fates}
     for name, pool in pools.items():
-        pool.apply(agent, minReplicas=1, onLost=fates[name])
+        pool.apply(lone_agent, minReplicas=1, onLost=fates[name])
         pool.attach(replicas=2, master=master_of(pool, 60 if name == "return" else GRACE))
         make_lease(pool)
     everyone = list(pools.values())

@@ -9,7 +9,7 @@ from e2e.clusters import Cluster
 from e2e.delays import record
 from e2e.kube import Body
 from e2e.masters import Inside, Master, outside
-from e2e.pools import Pool, is_ready, template
+from e2e.pools import Pool, is_ready, state_of, template
 from e2e.scene import Scene
 from e2e.test_apply import SOMEWHERE
 
@@ -76,6 +76,27 @@ def test_a_worker_that_comes_later_joins_too(pool: Pool, agent: Body, host: str)
         master.is_joined_by(*pool.ready(2))
 
 
+def test_workers_are_ready_once_a_master_has_answered_them(
+    pool: Pool, agent: Body, host: str
+) -> None:
+    pool.apply(agent)
+    pool.attach(master=SOMEWHERE, replicas=1)
+    pool.wait("it runs", lambda: [pod for pod in pool.live if "running" in state_of(pod)], 60.0)
+    pool.wait("it is said", lambda: pool.status.get("pendingReplicas") == 0)
+    assert not any(is_ready(pod) for pod in pool.live)
+    assert (pool.status["replicas"], pool.status["readyReplicas"]) == (1, 0)
+    assert pool.status["phase"] == "Scaling"
+    assert "connectedReplicas" not in pool.status  # no Lease says anything of it
+    pool.patch(minReplicas=1)  # what the next master does not say of replicas goes
+    (worker,) = pool.names
+    with outside(pool, host) as master:
+        master.is_joined_by(worker)
+        assert pool.ready(1) == [worker]
+        master.end()
+    pool.wait("nobody is linked", lambda: pool.status.get("connectedReplicas") == 0)
+    assert pool.ready(1) == [worker]  # it waits for the next one on purpose
+
+
 def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
     may_use_pools(pool.scene)
     may_read_credentials(pool.scene, pool.name)
@@ -101,8 +122,15 @@ def test_workers_end_some_time_after_their_master(pool: Pool, agent: Body, host:
     with outside(pool, host, lost_grace=1) as master:
         master.has_welcomed(worker)
     pool.wait("another", lambda: pool.ever - {worker}, seconds=90)
-    assert worker not in pool.ready(1)
-    assert pool.status["phase"] == "Ready"  # one that ended well is no failure
+
+    def runs() -> bool:
+        # It is not Ready: it was made for a master of which nobody knows that it is dead.
+        counts = [pool.status.get(f"{kind}Replicas") for kind in ("ready", "pending")]
+        return len(pool.live) == 1 and counts == [0, 0]
+
+    pool.wait("it runs", runs, seconds=60)
+    assert worker not in pool.names
+    assert pool.status["problems"] == []  # one that ended well is no failure
 
 
 def test_each_master_gets_the_agents_of_its_own_pool(scene: Scene, agent: Body, host: str) -> None:

@@ -22,11 +22,11 @@ def revisions(pool: Pool) -> set[str]:
     return {pod["metadata"]["labels"][names.LABEL_TEMPLATE_HASH] for pod in pool.live}
 
 
-def test_on_idle_waits_for_the_master(pool: Pool, agent: Body) -> None:
-    pool.apply(agent)
+def test_on_idle_waits_for_the_master(pool: Pool, lone_agent: Body) -> None:
+    pool.apply(lone_agent)
     pool.attach(master=SOMEWHERE, replicas=2)
     first, second = pool.ready(2)
-    pool.apply(newer(agent))
+    pool.apply(newer(lone_agent))
     pool.wait("none is updated", lambda: pool.status.get("updatedReplicas") == 0)
     assert pool.condition("Progressing")["reason"] == "Updating"
     pool.scene.never("a worker goes", lambda: len(pool.live) < 2, seconds=2)
@@ -59,12 +59,12 @@ def test_on_idle_replaces_a_warm_pool_bit_by_bit(pool: Pool, agent: Body) -> Non
     assert fewest == 3
 
 
-def test_recreate_replaces_all_at_once(pool: Pool, agent: Body) -> None:
+def test_recreate_replaces_all_at_once(pool: Pool, lone_agent: Body) -> None:
     recreate = {"update": {"strategy": "Recreate"}}
-    pool.apply(agent, **recreate)
+    pool.apply(lone_agent, **recreate)
     pool.attach(master=SOMEWHERE, replicas=3)
     before = pool.ready(3)
-    pool.apply(newer(agent), **recreate)
+    pool.apply(newer(lone_agent), **recreate)
     pool.wait("all are new", lambda: len(pool.names) == 3 and pool.names.isdisjoint(before))
     pool.ready(3)
     assert len(pool.ever) == 6

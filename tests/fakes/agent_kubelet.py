@@ -18,6 +18,9 @@ from fiber._transport import credentials_file
 from fiber_api import names
 from patience import PATIENCE
 
+_PROBED_EVERY = 0.05
+"""Seconds."""
+
 
 class AgentKubelet:
     """Runs what ``store`` says; the agents dial their pool's master directly.
@@ -112,13 +115,15 @@ class AgentKubelet:
             names.ENV_ADDRESS: address,
             names.ENV_CREDENTIALS: str(folder / names.CREDENTIALS_FILE),
             names.ENV_TERMINATION_GRACE: str(self.grace),
+            names.ENV_LINKED: str(folder / names.LINKED_FILE),
             "TMPDIR": str(folder),
         }
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "fiber.agent", env=environment, cwd=folder, process_group=0
         )
         self.processes[name] = process
-        self._set(namespace, name, "Running", {"running": {"startedAt": self._store.now()}})
+        state = {"running": {"startedAt": self._store.now()}}
+        self._set(namespace, name, "Running", state, started="startupProbe" not in _worker(pod))
         return process
 
     def _address(self, namespace: str, pool: str) -> str | None:
@@ -148,8 +153,38 @@ class AgentKubelet:
     async def _watch(self, namespace: str, name: str, process: asyncio.subprocess.Process) -> None:
         """Until the pod is to be gone."""
         ended = asyncio.ensure_future(process.wait())
-        told = False
+        linked = asyncio.ensure_future(self._link(name))
+        try:
+            await self._follow(namespace, name, ended, linked)
+        finally:
+            linked.cancel()
+        if not ended.done():
+            process.terminate()
+            self.told.add(name)
+            await asyncio.wait([ended], timeout=PATIENCE)
+            if not ended.done():
+                self.forced.append(name)
+
+    async def _link(self, name: str) -> None:
+        """Wait as the startup probe does."""
+        while not (self._folders[name] / names.LINKED_FILE).exists():
+            await asyncio.sleep(_PROBED_EVERY)
+
+    async def _follow(
+        self,
+        namespace: str,
+        name: str,
+        ended: asyncio.Future[int],
+        linked: asyncio.Future[None],
+    ) -> None:
+        """Tell of the agent's link and of its end, until its pod is deleted."""
+        told = ready = False
         while not self._is_deleted(namespace, name):
+            if linked.done() and not (ready or ended.done()):
+                ready = True
+                before = self._store.get("pods", namespace, name)["status"]["containerStatuses"][0]
+                if not before["started"]:
+                    self._set(namespace, name, "Running", before["state"])
             if ended.done() and not told:
                 told = True
                 code = ended.result() if ended.result() >= 0 else 128 - ended.result()
@@ -162,16 +197,9 @@ class AgentKubelet:
                 phase = "Failed" if code else "Succeeded"
                 self._set(namespace, name, phase, {"terminated": state})
             change = asyncio.ensure_future(self._store.changed())
-            await asyncio.wait(
-                [change, *(() if told else (ended,))], return_when=asyncio.FIRST_COMPLETED
-            )
+            others = [] if told else [ended, *(() if ready else (linked,))]
+            await asyncio.wait([change, *others], return_when=asyncio.FIRST_COMPLETED)
             change.cancel()
-        if not ended.done():
-            process.terminate()
-            self.told.add(name)
-            await asyncio.wait([ended], timeout=PATIENCE)
-            if not ended.done():
-                self.forced.append(name)
 
     def _is_deleted(self, namespace: str, name: str) -> bool:
         """By somebody, or together with its pool, which may have gone before it was made."""
@@ -182,10 +210,12 @@ class AgentKubelet:
         pools = self._store.list("fiberpools", namespace)
         return owners.isdisjoint(pool["metadata"]["uid"] for pool in pools)
 
-    def _set(self, namespace: str, name: str, phase: str, state: Body) -> None:
+    def _set(
+        self, namespace: str, name: str, phase: str, state: Body, *, started: bool = True
+    ) -> None:
         if "nodeName" not in self._store.get("pods", namespace, name)["spec"]:
             self._store.merge("pods", namespace, name, {"spec": {"nodeName": "node-1"}})
-        now, ready = self._store.now(), "running" in state
+        now, ready = self._store.now(), "running" in state and started
         condition = {
             "type": "Ready",
             "status": "True" if ready else "False",
@@ -194,6 +224,7 @@ class AgentKubelet:
         container = {
             "name": names.WORKER_CONTAINER,
             "ready": ready,
+            "started": ready,
             "restartCount": 0,
             "state": state,
         }
@@ -207,9 +238,11 @@ def _secret(pod: Body) -> str:
     return str(volume["secret"]["secretName"])
 
 
+def _worker(pod: Body) -> Any:
+    return next(c for c in pod["spec"]["containers"] if c["name"] == names.WORKER_CONTAINER)
+
+
 def _environment(pod: Body) -> dict[str, str]:
-    container: Any = next(
-        c for c in pod["spec"]["containers"] if c["name"] == names.WORKER_CONTAINER
-    )
+    container = _worker(pod)
     values = {names.ENV_UID: pod["metadata"]["uid"]}
     return values | {v["name"]: v["value"] for v in container["env"] if "value" in v}

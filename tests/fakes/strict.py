@@ -27,12 +27,15 @@ def unknown_fields(value: Any, kind: Any = V1Pod, path: str = "") -> Iterator[st
         for number, element in enumerate(value):
             yield from unknown_fields(element, item, f"{path}[{number}]")
     elif isinstance(value, dict) and model is not None:
-        fields = {alias: name for name, alias in model.attribute_map.items()}
+        # A field whose name is a word of Python's has a prefix.
+        fields = {
+            alias: model.model_fields.get(name) or model.model_fields[f"var{name}"]
+            for name, alias in model.attribute_map.items()
+        }
         for key, element in value.items():
             below = f"{path}.{key}".lstrip(".")
             if key in fields:
-                annotation = model.model_fields[fields[key]].annotation
-                yield from unknown_fields(element, annotation, below)
+                yield from unknown_fields(element, fields[key].annotation, below)
             else:
                 yield below
 

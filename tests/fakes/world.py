@@ -21,6 +21,7 @@ from fakes.memory_connector import MemoryConnector
 from fakes.store import Body, Failure, Store
 from fiber_api import names
 from fiber_operator.cluster import Configuration
+from fiber_operator.lease_monitor import connected_in
 from fiber_operator.program import Program
 from fiber_operator.settings import Settings
 from fiber_operator.workqueue import Key
@@ -78,7 +79,8 @@ class Feed:
                     self._notice(Key(namespace, pool), "", None)
                 elif plural == "leases":
                     gone = change.type == "DELETED"
-                    self._renewed(namespace, name, "" if gone else metadata["resourceVersion"])
+                    version = "" if gone else metadata["resourceVersion"]
+                    self._renewed(namespace, name, version, connected_in(change.object))
             seen = len(changes)
             await self._world.store.changed()
 

@@ -72,7 +72,11 @@ class Told:
     warnings: list[str] = field(default_factory=list)
     errors: list[FiberPoolError] = field(default_factory=list)
     ended: bool = False
+    agents: int = 0
     _changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def connected(self) -> int:
+        return self.agents
 
     def on_attached(self, epoch: int) -> None:
         self._note(self.attached, True)

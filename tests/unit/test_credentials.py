@@ -65,6 +65,8 @@ def test_what_the_init_container_writes_the_agent_reads_once(
         assert credentials_file.write(environment) == 0, "a node may fail between the two"
     finally:
         os.umask(before)
+    probe = tmp_path / names.PROBE_PROGRAM
+    assert os.readlink(probe) == os.path.realpath(sys.executable)
     file = tmp_path / "agent.json"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert credentials.pool_key not in file.read_text()

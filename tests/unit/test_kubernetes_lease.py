@@ -76,6 +76,17 @@ def test_it_says_who_lives_since_when_and_for_how_long(case: Case) -> None:
     assert {**after, "renewTime": ""} == {**before, "renewTime": ""}
 
 
+def test_it_says_how_many_agents_are_linked(case: Case) -> None:
+    def said() -> str:
+        metadata = case.rig.get("leases", LEASE)["metadata"]
+        return str(metadata["annotations"][names.ANNOTATION_CONNECTED])
+
+    assert said() == "0"
+    case.pool.connected = lambda: 12
+    case.renewer.renew()
+    assert said() == "12"
+
+
 def test_in_time_it_is_one_call(case: Case) -> None:
     case.rig.server.api.calls.clear()
     case.now += 30

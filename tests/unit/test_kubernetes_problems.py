@@ -84,11 +84,13 @@ class TestFailure:
         "hopeless",
         [
             status(problem("InvalidTemplate", terminal=True), replicas=0),
-            status(problem("ErrImageNeverPull", pods=1, terminal=True), replicas=3),
+            status(
+                problem("ErrImageNeverPull", pods=1, terminal=True), replicas=3, pendingReplicas=3
+            ),
             status(problem("BackoffLimitExceeded", pods=1, terminal=True), replicas=0),
             status(problem("QuotaExceeded"), replicas=0),
-            status(problem("ImagePullError", pods=3), replicas=3),
-            status(problem("CreateContainerConfigError", pods=3), replicas=3),
+            status(problem("ImagePullError", pods=3), replicas=3, pendingReplicas=3),
+            status(problem("CreateContainerConfigError", pods=3), replicas=3, pendingReplicas=3),
         ],
         ids=lambda one: str(one["problems"][0]["reason"]),
     )
@@ -104,11 +106,13 @@ class TestFailure:
         "hopeful",
         [
             {},
-            status(replicas=3),
-            status(UNSCHEDULABLE, replicas=30),
-            status(problem("ImagePullError", pods=3, severity="Warning"), replicas=3),
-            status(problem("ImagePullError", pods=2), replicas=3),
-            status(problem("QuotaExceeded"), replicas=2),
+            status(replicas=3, pendingReplicas=3),
+            status(UNSCHEDULABLE, replicas=30, pendingReplicas=30),
+            status(
+                problem("ImagePullError", pods=3, severity="Warning"), replicas=3, pendingReplicas=3
+            ),
+            status(problem("ImagePullError", pods=2), replicas=3, pendingReplicas=3),
+            status(problem("QuotaExceeded"), replicas=2, pendingReplicas=2),
             status(problem("OOMKilled", pods=1), replicas=0),
             status(problem("ContainerFailed", pods=1), replicas=0),
             status(problem("ApiUnavailable"), replicas=0),
@@ -119,9 +123,9 @@ class TestFailure:
         assert failure(POOL, hopeful, joined=0) is None
 
     def test_a_pool_with_workers_goes_on(self) -> None:
-        hopeless = status(problem("ErrImageNeverPull", pods=1, terminal=True), replicas=1)
-        assert failure(POOL, hopeless, joined=1) is None
-        assert failure(POOL, {**hopeless, "readyReplicas": 1}, joined=0) is None
+        hopeless = status(problem("ErrImageNeverPull", pods=1, terminal=True), replicas=2)
+        assert failure(POOL, {**hopeless, "pendingReplicas": 2}, joined=1) is None
+        assert failure(POOL, {**hopeless, "pendingReplicas": 1}, joined=0) is None
 
     def test_a_suspended_pool_has_no_workers(self) -> None:
         suspended = status(conditions=[{"type": "Suspended", "status": "True"}])
@@ -146,26 +150,26 @@ class TestOverdue:
         assert error.reason == "StartTimeout"
         assert "the operator has not looked at it yet. See kubectl describe" in str(error)
 
-    def test_workers_that_are_ready_and_did_not_join_cannot_reach_the_program(self) -> None:
-        error = overdue(POOL, status(desiredReplicas=2, readyReplicas=2), 60.0, NOW, WAY)
-        assert "2 of 2 pods ready" in str(error)
+    def test_workers_that_run_and_did_not_join_cannot_reach_the_program(self) -> None:
+        error = overdue(POOL, status(desiredReplicas=2, replicas=2), 60.0, NOW, WAY)
+        assert "0 of 2 pods ready" in str(error)
         assert WAY.advice in str(error)
 
 
 class TestUnreachable:
     def test_says_the_address_the_reasons_and_the_remedies(self) -> None:
-        error = unreachable(POOL, status(readyReplicas=2), 8.0, WAY)
+        error = unreachable(POOL, status(replicas=3, pendingReplicas=1), 8.0, WAY)
         assert error.reason == "Unreachable"
-        assert "no agent of its 2 ready pods has reached this program at 10.0.0.7:41337" in str(
+        assert "no agent of its 2 running pods has reached this program at 10.0.0.7:41337" in str(
             error
         )
         for part in ("within 8 s", "NAT", "NetworkPolicy", "in a pod", "FIBER_LISTEN_HOST"):
             assert part in str(error)
-        assert "its ready pod has" in str(unreachable(POOL, status(readyReplicas=1), 8.0, WAY))
+        assert "its running pod has" in str(unreachable(POOL, status(replicas=1), 8.0, WAY))
 
     def test_of_a_pool_that_was_taken_over_names_its_last_master(self) -> None:
         way = Way("10.0.0.7:41337", displaced="laptop-8:4712")
-        told = str(unreachable(POOL, status(readyReplicas=1), 8.0, way))
+        told = str(unreachable(POOL, status(replicas=1), 8.0, way))
         assert "Or the pods still serve laptop-8:4712" in told
 
 

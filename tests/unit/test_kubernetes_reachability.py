@@ -1,4 +1,4 @@
-"""Ready pods that send no agent: what is concluded, and when those that wait are told."""
+"""Running pods that send no agent: what is concluded, and when those that wait are told."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ERROR_AT = DOUBTED_AFTER + GIVEN_UP_AFTER
 
 
 class TestReachability:
-    def test_doubts_and_gives_up_by_the_time_since_the_first_ready_pod(self) -> None:
+    def test_doubts_and_gives_up_by_the_time_since_the_first_running_pod(self) -> None:
         found = Reachability()
         assert found.judge(1, 100.0) is Verdict.OPEN
         assert found.due == 100.0 + DOUBTED_AFTER
@@ -33,7 +33,7 @@ class TestReachability:
         assert found.judge(1, found.due) is Verdict.UNREACHABLE
 
     def test_gives_the_newest_pod_time_to_dial(self) -> None:
-        """Pods become ready one by one while an image is pulled."""
+        """Pods begin to run one by one while an image is pulled."""
         found = Reachability()
         found.judge(1, 0.0)
         found.judge(1, DOUBTED_AFTER)
@@ -47,7 +47,7 @@ class TestReachability:
         found.prove()
         assert found.judge(4, 1000.0) is Verdict.OPEN
 
-    def test_begins_anew_when_no_pod_was_ready_for_a_while(self) -> None:
+    def test_begins_anew_when_no_pod_ran_for_a_while(self) -> None:
         found = Reachability()
         found.judge(2, 0.0)
         assert found.judge(0, 5.0) is Verdict.OPEN
@@ -90,8 +90,10 @@ class Site:
         self.waiting.look(10)
         return child
 
-    def pods_are_ready(self, number: int) -> None:
-        status = {"observedGeneration": 1, "desiredReplicas": 4, "readyReplicas": number}
+    def pods_run(self, number: int) -> None:
+        """Have so many pods of four run; none is ready, since no agent is linked."""
+        counts = {"desiredReplicas": 4, "replicas": 4, "pendingReplicas": 4 - number}
+        status = {"observedGeneration": 1, **counts}
         self.waiting.on_status(status)
 
     @property
@@ -103,12 +105,12 @@ class Site:
 def test_a_wait_for_agents_that_do_not_come_is_explained_and_ends() -> None:
     site = Site()
     child = site.start()
-    site.pods_are_ready(4)
+    site.pods_run(4)
     site.loop.run_for(DOUBTED_AFTER - 0.1)
     assert not site.told
     site.loop.run_for(0.2)
     (doubt,) = site.told
-    assert "no agent of its 4 ready pods has reached this program at 10.0.0.7:41337" in doubt
+    assert "no agent of its 4 running pods has reached this program at 10.0.0.7:41337" in doubt
     assert doubt.endswith(f"Waiting for {GIVEN_UP_AFTER:g} s more")
     site.loop.run_for(GIVEN_UP_AFTER)
     assert child.start_error.reason == "Unreachable"
@@ -120,7 +122,7 @@ def test_slow_pods_are_no_reason_for_doubt() -> None:
     """As while an image is pulled."""
     site = Site()
     site.start()
-    site.pods_are_ready(0)
+    site.pods_run(0)
     site.loop.run_for(ERROR_AT + 1)
     assert not site.told
     assert site.report is None
@@ -129,7 +131,7 @@ def test_slow_pods_are_no_reason_for_doubt() -> None:
 def test_an_agent_that_dials_at_last_ends_the_doubt() -> None:
     site = Site()
     site.start()
-    site.pods_are_ready(2)
+    site.pods_run(2)
     site.loop.run_for(ERROR_AT - 1)
     site.waiting.reached()
     site.loop.run_for(ERROR_AT)
@@ -141,7 +143,7 @@ def test_pods_that_may_serve_another_program_are_waited_for() -> None:
     """A warm pool's last master may be cut off from the API server alone, and keep its agents."""
     site = Site(displaced="laptop-8:4712")
     site.start()
-    site.pods_are_ready(2)
+    site.pods_run(2)
     site.loop.run_for(ERROR_AT + 1)
     (doubt,) = site.told
     assert doubt.endswith(
@@ -156,7 +158,7 @@ def test_doubts_are_told_to_those_that_wait(waits: bool) -> None:
     site = Site()
     if waits:
         site.start()
-    site.pods_are_ready(2)
+    site.pods_run(2)
     site.loop.run_for(DOUBTED_AFTER + 1)
     assert len(site.told) == waits
     site.start()

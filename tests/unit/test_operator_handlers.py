@@ -18,6 +18,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.store import Body
 from fakes.world import NAMESPACE, World, a_world, configuration
+from fiber_api import names
 from fiber_operator import handlers
 from fiber_operator.cluster import ApiError, Configuration, load_configuration
 from fiber_operator.handlers import Watcher
@@ -38,7 +39,7 @@ class Watching:
         self.api = world.api
         self.store = world.store
         self.notices: list[Notice] = []
-        self.renewals: list[tuple[str, str, str]] = []
+        self.renewals: list[tuple[str, str, str, int | None]] = []
         self.starts: list[bool] = []
         self.answers: dict[str, str] = {}
         """What was asked -> why that failed the last time, or nothing."""
@@ -161,12 +162,17 @@ async def test_renewals_of_the_masters_leases_are_told_and_of_no_others(kopf: Wa
     await kopf.watched()
     labels = {"fiber.dev/pool": "es", "fiber.dev/pool-uid": "1"}
     kopf.store.create("leases", NAMESPACE, {"metadata": {"name": "kubernetes"}})
+    said = {names.ANNOTATION_CONNECTED: "2"}
     made = kopf.store.create("leases", NAMESPACE, {"metadata": {"name": "es", "labels": labels}})
-    renewed = kopf.store.merge("leases", NAMESPACE, "es", {"spec": {"renewTime": "now"}})
+    told = {"metadata": {"annotations": said}, "spec": {"renewTime": "now"}}
+    renewed = kopf.store.merge("leases", NAMESPACE, "es", told)
     kopf.store.remove("leases", NAMESPACE, "es")
-    versions = [made["metadata"]["resourceVersion"], renewed["metadata"]["resourceVersion"], ""]
+    versions = [lease["metadata"]["resourceVersion"] for lease in (made, renewed)]
     await kopf.world.until(lambda: len(kopf.renewals) >= 3)
-    assert kopf.renewals == [(NAMESPACE, "es", version) for version in versions]
+    first, second, last = kopf.renewals
+    assert first == (NAMESPACE, "es", versions[0], None)
+    assert second == (NAMESPACE, "es", versions[1], 2)
+    assert last[:3] == (NAMESPACE, "es", "")
     assert kopf.notices == []
 
 

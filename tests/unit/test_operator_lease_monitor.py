@@ -13,8 +13,14 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Store
 from fakes.world import configuration
+from fiber_api.names import ANNOTATION_CONNECTED
 from fiber_operator.cluster import Cluster
-from fiber_operator.lease_monitor import MISSING_AFTER, LeaseMonitor, MasterLease
+from fiber_operator.lease_monitor import (
+    MISSING_AFTER,
+    LeaseMonitor,
+    MasterLease,
+    connected_in,
+)
 from fiber_operator.planning.plans import LeaseVerdict
 from fiber_operator.workqueue import Key
 
@@ -46,7 +52,7 @@ class Watch:
                 gone = change.type == "DELETED"
                 if not self.deaf and not self.api.down:
                     version = "" if gone else change.object["metadata"]["resourceVersion"]
-                    self.monitor.heard(namespace, name, version)
+                    self.monitor.heard(namespace, name, version, connected_in(change.object))
             seen = len(changes)
             await self.store.changed()
 
@@ -57,13 +63,16 @@ class Watch:
     def alive(self) -> bool | None:
         return self.monitor.follow(ES, LEASE).alive
 
-    def write(self, name: str = "lease") -> None:
+    def write(self, name: str = "lease", connected: str | None = None) -> None:
         self._count += 1
+        said = {} if connected is None else {ANNOTATION_CONNECTED: connected}
         spec = {"holderIdentity": "es-1", "renewTime": f"time {self._count}"}
         if any(lease["metadata"]["name"] == name for lease in self.store.list("leases", "team")):
-            self.store.merge("leases", "team", name, {"spec": spec})
+            body = {"metadata": {"annotations": said}, "spec": spec}
+            self.store.merge("leases", "team", name, body)
         else:
-            self.store.create("leases", "team", {"metadata": {"name": name}, "spec": spec})
+            body = {"metadata": {"name": name, "annotations": said}, "spec": spec}
+            self.store.create("leases", "team", body)
 
     def renew(self, every: float = 10.0) -> None:
         async def renewing() -> None:
@@ -112,6 +121,21 @@ async def test_one_that_renews_is_alive(watch: Watch) -> None:
         assert watch.alive() is True
         await asyncio.sleep(5)
     assert [verdict for _, verdict in watch.told] == [LeaseVerdict(alive=True)]
+
+
+@played
+async def test_what_it_says_of_its_agents_counts_from_its_first_renewal_on(watch: Watch) -> None:
+    """Before that it may be the word of the last master."""
+    watch.write(connected="7")
+    watch.monitor.follow(ES, LEASE)
+    for said, heard in (("2", 2), ("3", 3), ("some", None), ("-1", None)):
+        await asyncio.sleep(5)
+        if said == "2":
+            assert watch.monitor.follow(ES, LEASE) == LeaseVerdict()
+        watch.write(connected=said)
+        await asyncio.sleep(1)
+        assert watch.monitor.follow(ES, LEASE) == LeaseVerdict(alive=True, connected=heard)
+    assert watch.api.count("get", "leases") == 1
 
 
 @played

@@ -54,6 +54,7 @@ def test_a_worker_knows_who_and_where_it_is() -> None:
         "FIBER_AGENT_TERMINATION_GRACE": "30",
         "FIBER_AGENT_TEMPLATE_HASH": template_hash(pool),
         "FIBER_AGENT_UID": "",
+        "FIBER_AGENT_LINKED": "/etc/fiber/credentials/linked",
     }
     (uid,) = (v for v in worker["env"] if v["name"] == "FIBER_AGENT_UID")
     assert uid["valueFrom"]["fieldRef"]["fieldPath"] == "metadata.uid"

@@ -37,6 +37,9 @@ class Assessment:
         ]
         self.pods = [self._fairly_judged(pod) for pod in pods]
         self.attachment = judge(pool, memory.master, now)
+        if self.spec.master is None or self.attachment.alive is False:
+            # Those whose master has gone before they reached it wait for the next on purpose.
+            self.pods = [replace(pod, joining=False) for pod in self.pods]
         self.idleness = idleness(pool, self.attachment, now)
         lost = cut_off.find(pool, [pod for pod in self.pods if pod.live], memory)
         self.pods = cut_off.outdated(self.pods, lost, attached=self.attachment.attached)

@@ -27,6 +27,8 @@ class Attachment:
     """When the grace of a lost master ends, if it has not ended."""
     missing: bool = False
     """There is no Lease of that name, and it is too soon to call the master lost."""
+    connected: int | None = None
+    """Agents that are linked to it; None: nobody can tell."""
     gone: bool = False
     """The grace is over and this process itself found the Lease expired: ``onLost`` applies."""
 
@@ -44,7 +46,7 @@ def judge(pool: FiberPool, lease: plans.LeaseVerdict, now: float) -> Attachment:
     """
     master = pool.spec.master
     if master is None:
-        return Attachment(attached=False, alive=None)
+        return Attachment(attached=False, alive=None, connected=0)
     if master.lease_name is None or lease.unreadable:
         return Attachment(attached=True, alive=None)
     before = _condition(pool)
@@ -52,13 +54,21 @@ def judge(pool: FiberPool, lease: plans.LeaseVerdict, now: float) -> Attachment:
     if alive is None and before is not None and before.status != "Unknown":
         alive = before.status == "True"
     if alive is not False:
-        return Attachment(attached=True, alive=alive, missing=lease.missing)
+        known = lease.alive is not None
+        connected = lease.connected if known else _connected_before(pool)
+        return Attachment(attached=True, alive=alive, connected=connected, missing=lease.missing)
     since = _lost_since(pool, before, now)
     due = since + master.lost_grace_seconds
     if now < due:
-        return Attachment(attached=True, alive=False, lost_since=since, due=due)
+        return Attachment(attached=True, alive=False, connected=0, lost_since=since, due=due)
     gone = lease.alive is False
-    return Attachment(attached=not gone, alive=False, lost_since=since, gone=gone)
+    return Attachment(attached=not gone, alive=False, connected=0, lost_since=since, gone=gone)
+
+
+def awaits_agents(pool: FiberPool) -> bool:
+    """Return whether the pool has a master that is not known to be lost."""
+    before = _condition(pool)
+    return pool.spec.master is not None and not (before and before.status == "False")
 
 
 @dataclass(frozen=True)
@@ -97,6 +107,13 @@ def _lost_since(pool: FiberPool, before: Condition | None, now: float) -> float:
         if known is not None and known >= (pool.metadata.creation_timestamp or 0.0):
             return known
     return float(math.floor(now))
+
+
+def _connected_before(pool: FiberPool) -> int | None:
+    """What was known of this very master before this operator began to look."""
+    master, status = pool.spec.master, pool.status
+    same = master is not None and status.master_epoch == master.epoch
+    return status.connected_replicas if same else None
 
 
 def _condition(pool: FiberPool) -> Condition | None:

@@ -24,6 +24,8 @@ class Counts:
     desired: int
     live: int
     ready: int
+    joining: int
+    """They run, and their agents have not reached a master yet."""
     pending: int
     """Live and never Ready."""
     terminating: int
@@ -36,7 +38,8 @@ class Counts:
         return cls(
             desired=desired,
             live=len(live),
-            ready=sum(pod.state is State.READY for pod in live),
+            ready=sum(pod.state is State.READY and not pod.joining for pod in live),
+            joining=sum(pod.joining for pod in live),
             pending=sum(not pod.was_ready for pod in live),
             terminating=sum(pod.state is State.TERMINATING for pod in pods),
             updated=sum(pod.template_hash == template_hash for pod in live),
@@ -204,6 +207,9 @@ def _progressing(pool: FiberPool, outlook: Outlook) -> Finding:
         return Finding(kind, "True", Reason.UPDATING, message)
     if counts.pending:
         return Finding(kind, "True", Reason.STARTING, f"workers starting: {counts.pending}")
+    if counts.joining:
+        message = f"workers that no master has answered yet: {counts.joining}"
+        return Finding(kind, "True", Reason.STARTING, message)
     if ending := counts.terminating + outlook.delete:
         return Finding(kind, "True", Reason.DELETING, f"workers ending: {ending}")
     if missing and (worst := outlook.worst):

@@ -64,7 +64,7 @@ def add(pool: FiberPool, spec: dict[str, Any], worker: dict[str, Any]) -> None:
 def _container(worker: Mapping[str, Any], written: Mapping[str, Any]) -> dict[str, Any]:
     made = {k: copy.deepcopy(worker[k]) for k in _LIKE_THE_WORKER if worker.get(k) is not None}
     made["name"] = names.IDENTITY_CONTAINER
-    if not _runs_the_agent(worker):
+    if not runs_the_agent(worker):
         made.pop("args", None)
         made["command"] = ["python", "-m", _AGENT]
     made["volumeMounts"] = [
@@ -94,7 +94,7 @@ def _mounts_of_the_interpreter(
             yield {**copy.deepcopy(dict(mount)), "readOnly": True}
 
 
-def _runs_the_agent(worker: Mapping[str, Any]) -> bool:
+def runs_the_agent(worker: Mapping[str, Any]) -> bool:
     """Whether the same command line ends in an agent: that of the image does, too."""
     words = [worker.get("command"), worker.get("args")]
     return not any(words) or _AGENT in str(words)

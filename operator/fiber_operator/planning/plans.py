@@ -100,6 +100,8 @@ class LeaseVerdict:
     alive: bool | None = None
     missing: bool = False
     """There is no Lease of that name."""
+    connected: int | None = None
+    """Agents that were linked to the master at its last renewal, if the Lease says so."""
     unreadable: str = ""
     """Why the Lease cannot be read at all, in the API server's words: there is no right to."""
 

@@ -12,6 +12,7 @@ from enum import StrEnum
 from typing import Any
 
 from fiber_api.names import ANNOTATION_DELETION_COST, ENV_ADDRESS, LABEL_TEMPLATE_HASH
+from fiber_operator.planning import readiness
 from fiber_operator.planning.documents import items, mapping, seconds, text, whole
 
 BRIEF = 10.0
@@ -69,6 +70,9 @@ class PodView:
     """When it came into this state, as far as the cluster says."""
     was_ready: bool = False
     """Whether the pod is or was Ready, as far as its conditions tell."""
+    joining: bool = False
+    """It runs, and its agent has not reached a master yet.  Nothing is planned by that: it counts
+    as ``READY`` in all but what is shown."""
     trouble: Trouble | None = None
     reason: str = ""
     """The cluster's own word for the trouble: ``ErrImagePull``, ``OOMKilled``, ``Evicted``."""
@@ -145,7 +149,8 @@ class _Observation:
             for condition in items(self._status.get("conditions"))
         }
         statuses = {text(s.get("name")): s for s in items(self._status.get("containerStatuses"))}
-        self._state = mapping(statuses.get(container), "state")
+        self._own = mapping(statuses.get(container))
+        self._state = mapping(self._own, "state")
         self._others = [s for name, s in statuses.items() if name != container]
         self._init = list(items(self._status.get("initContainerStatuses")))
         self._end = _end(self._state)
@@ -175,6 +180,7 @@ class _Observation:
             state=state,
             since=self._since(state),
             was_ready=self._was_ready(),
+            joining=state is State.READY and self._is_joining(),
             trouble=trouble,
             reason=reason,
             message=_shorten(message),
@@ -201,7 +207,15 @@ class _Observation:
         return State.NOT_READY if self._was_ready() else State.STARTING
 
     def _ready(self) -> bool:
-        return self._condition("Ready").get("status") == "True"
+        return self._condition("Ready").get("status") == "True" or self._is_joining()
+
+    def _is_joining(self) -> bool:
+        return (
+            self._condition("Ready").get("status") == "False"
+            and isinstance(self._state.get("running"), Mapping)
+            and readiness.is_awaited(self._worker, self._own)
+            and all(other.get("ready") is True for other in self._others)
+        )
 
     def _was_ready(self) -> bool:
         # The kubelet writes "not Ready" when it takes the pod, before any container runs; a later
@@ -220,9 +234,9 @@ class _Observation:
         if state is State.ENDED:
             ended = seconds(self._ending().get("finishedAt"))
             return ended or self._changed("Ready") or self._created
-        if state in (State.READY, State.NOT_READY):
+        if state in (State.READY, State.NOT_READY) and not self._is_joining():
             return self._changed("Ready") or self._created
-        if state is State.STARTING:
+        if state in (State.READY, State.STARTING):
             started = seconds(mapping(self._state, "running").get("startedAt"))
             return started or self._created
         return self._created

@@ -14,7 +14,7 @@ from typing import Any
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, Master
-from fiber_operator.planning import credentials
+from fiber_operator.planning import credentials, readiness
 from fiber_operator.planning.documents import items, mapping, text
 from fiber_operator.planning.revisions import template_hash
 
@@ -110,6 +110,7 @@ def _pod(
             _equip(spec, container, variables)
             _request(spec, container, requests)
             credentials.add(pool, spec, container)
+            readiness.add(pool, spec, container)
     return {
         **_others(template, _POD),
         "apiVersion": "v1",

@@ -43,6 +43,7 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
         desired_replicas=counts.desired,
         replicas=counts.live,
         ready_replicas=counts.ready,
+        connected_replicas=_connected(outlook),
         pending_replicas=counts.pending,
         terminating_replicas=counts.terminating,
         updated_replicas=counts.updated,
@@ -58,6 +59,12 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
         problems=outlook.problems,
         conditions=found,
     )
+
+
+def _connected(outlook: Outlook) -> int | None:
+    # What a Lease says may be older than the end of a pod, and is the word of a program.
+    known = outlook.attachment.connected
+    return None if known is None else min(known, outlook.counts.live)
 
 
 def patch(pool: FiberPool, status: FiberPoolStatus) -> dict[str, Any] | None:

@@ -36,6 +36,7 @@ _LOST_GRACE = "FIBER_AGENT_LOST_GRACE"
 _WAITS_UNTIL = "FIBER_AGENT_WAITS_UNTIL"  # time.monotonic(), from an agent to its next life
 
 _TERMINATION_GRACE = "FIBER_AGENT_TERMINATION_GRACE"
+_LINKED = "FIBER_AGENT_LINKED"
 
 _DEFAULT_GRACE = 15.0
 """Seconds from SIGTERM to the end by force, where the environment does not say."""
@@ -89,6 +90,7 @@ class Main:
         grace = _seconds(_TERMINATION_GRACE)
         self._grace = _DEFAULT_GRACE if grace is None else grace
         self._cleaning_up = min(_CLEANING_UP, self._grace / 4)
+        self._linked = os.environ.pop(_LINKED, "")
         self._parent = _pid(_PARENT)
         if self._parent is not None:
             # What the parent leaves has to be removed when it dies.  If this process is stopped
@@ -171,6 +173,15 @@ class Main:
         self._service = AgentService(self._loop, link, self._agent, self._hub, self._ended)
         self._link = link
         link.attach(self._service)
+        if self._linked:
+            self._tell_of_link()
+
+    def _tell_of_link(self) -> None:
+        try:
+            with open(self._linked, "ab"):
+                pass
+        except OSError as error:
+            self._complain(f"it is linked, and its pod does not get Ready, because of {error}")
 
     def _failed(self, error: Exception) -> None:
         self._complain(error)

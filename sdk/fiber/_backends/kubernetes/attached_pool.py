@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,6 +67,8 @@ class AttachedPool:
         self.uid = str(metadata["uid"])
         self.path = POOLS.path(self.namespace, self.name)
         self._lease_path = LEASES.path(self.namespace, names.master_lease_name(self.name))
+        self.connected: Callable[[], int] = lambda: 0
+        """Agents that are linked to this program, as its Lease tells; called on any thread."""
         self.generation = int(metadata["generation"])
         """That of the spec as this program wrote it last."""
 
@@ -175,6 +177,7 @@ class AttachedPool:
             "metadata": {
                 "name": names.master_lease_name(self.name),
                 "labels": self.labels,
+                "annotations": self._lease_annotations,
                 "ownerReferences": [self.owner],
             },
             "spec": {**self._lease_spec(now), "acquireTime": now},
@@ -193,7 +196,8 @@ class AttachedPool:
             self._patch_lease({"holderIdentity": ""}, **how)
 
     def _patch_lease(self, spec: Body, **how: Any) -> None:
-        patch = {"metadata": {"labels": self.labels}, "spec": spec}
+        metadata = {"labels": self.labels, "annotations": self._lease_annotations}
+        patch = {"metadata": metadata, "spec": spec}
         self._api.merge_patch(self._lease_path, patch, **how)
 
     @property
@@ -203,6 +207,10 @@ class AttachedPool:
         The operator watches only Leases that have the first.
         """
         return {names.LABEL_POOL_UID: self.uid, names.LABEL_POOL: self.name}
+
+    @property
+    def _lease_annotations(self) -> dict[str, str]:
+        return {names.ANNOTATION_CONNECTED: str(self.connected())}
 
     def _lease_spec(self, now: str) -> Body:
         return {

@@ -57,6 +57,9 @@ class Attachment(Protocol):
 class Observer(Protocol):
     """Who is told, on the loop's thread."""
 
+    def connected(self) -> int:
+        """Return how many agents are linked; called on any thread."""
+
     def on_attached(self, epoch: int) -> None:
         """Once: the pool is there, with this program as its master."""
 
@@ -180,6 +183,7 @@ class FiberPoolClient:
         attached = self._attachment.attach(self._closing)
         self._began, self._generation = time.monotonic(), attached.generation
         self._doing = "scale"
+        attached.connected = self._observer.connected
         renewer = LeaseRenewer(
             attached,
             on_lost=self._reporter.fail,

@@ -286,6 +286,10 @@ class Pods:
                 self._tell(agent)
         self._changed()
 
+    def connected(self) -> int:
+        """Return how many agents are linked; any thread may ask."""
+        return len(self._placement.loads)
+
     def on_attached(self, epoch: int) -> None:
         """The pool is there, with this program as its master."""
         self._waiting.attached = True

@@ -87,12 +87,17 @@ _WAITS_FOR_SOMEBODY = frozenset(
 operator takes care: it tries again, and says when it gives up."""
 
 
+def running(status: Status) -> int:
+    """Return how many pods run; one whose agent does not arrive is never ready."""
+    return max(0, (status.get("replicas") or 0) - (status.get("pendingReplicas") or 0))
+
+
 def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | None:
     """Why nobody will serve the program, with ``joined`` workers there now.
 
     A pool with workers goes on with them, whatever is wrong with others.
     """
-    if joined or status.get("readyReplicas"):
+    if joined or running(status):
         return None
     if _is_true(status, ConditionType.SUSPENDED):
         return pool.error(
@@ -109,7 +114,7 @@ def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | Non
 def overdue(pool: PoolName, status: Status, waited: float, now: float, way: Way) -> FiberPoolError:
     """No worker came in time: what is known of why.  ``now`` is in unix seconds."""
     worst = next(_problems(status), None)
-    why = f"{way.advice}." if status.get("readyReplicas") else ""
+    why = f"{way.advice}." if running(status) else ""
     if not why and worst is not None:
         why = _told(worst)
     return pool.error(
@@ -121,9 +126,9 @@ def overdue(pool: PoolName, status: Status, waited: float, now: float, way: Way)
 
 
 def unreachable(pool: PoolName, status: Status, waited: float, way: Way) -> FiberPoolError:
-    """Return the error for ready pods whose agents do not arrive."""
-    ready = status.get("readyReplicas") or 0
-    pods = f"its {ready} ready pods" if ready != 1 else "its ready pod"
+    """Return the error for pods that run and whose agents do not arrive."""
+    number = running(status)
+    pods = f"its {number} running pods" if number != 1 else "its running pod"
     return pool.error(
         f"no agent of {pods} has reached this program at {way.address} within {waited:.0f} s. "
         f"{way.advice}",

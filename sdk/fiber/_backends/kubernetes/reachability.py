@@ -1,4 +1,4 @@
-"""Reachability of the program from ready pods.
+"""Reachability of the program from pods that run.
 
 Pure: ``now`` is an argument.
 """
@@ -9,8 +9,8 @@ import enum
 import math
 
 DOUBTED_AFTER = 8.0
-"""Seconds from the first ready pod until the missing agent is reported.  An agent needs a second or
-two to start and to dial."""
+"""Seconds from the first running pod until the missing agent is reported.  An agent needs a second
+or two to start and to dial."""
 
 GIVEN_UP_AFTER = 60.0
 """Seconds from that report to the error."""
@@ -21,7 +21,7 @@ held up, and that agents had to wait for it."""
 
 
 class Verdict(enum.Enum):
-    """Conclusion from ready pods that send no agent."""
+    """Conclusion from running pods that send no agent."""
 
     OPEN = enum.auto()
     DOUBTFUL = enum.auto()
@@ -29,13 +29,13 @@ class Verdict(enum.Enum):
 
 
 class Reachability:
-    """Record of the ready pods of one pool, and of the first sign of an agent."""
+    """Record of the running pods of one pool, and of the first sign of an agent."""
 
     def __init__(self) -> None:
         self.due = math.inf
         """Time of the next judgement that can differ from the last."""
         self._proven = False
-        self._ready = 0
+        self._running = 0
         self._since = math.inf
         self._newest = math.inf
 
@@ -44,17 +44,17 @@ class Reachability:
         self._proven = True
         self.due = math.inf
 
-    def judge(self, ready: int, now: float) -> Verdict:
-        """Return the conclusion, with ``ready`` pods there now."""
+    def judge(self, running: int, now: float) -> Verdict:
+        """Return the conclusion, with ``running`` pods there now."""
         late, self.due = now > self.due + _LATE, math.inf
-        if not ready or self._proven:
-            self._ready = 0
+        if not running or self._proven:
+            self._running = 0
             return Verdict.OPEN
-        if not self._ready or late:
+        if not self._running or late:
             self._since = now
-        if ready > self._ready or late:
+        if running > self._running or late:
             self._newest = now  # as much time for this pod's agent as for the first
-        self._ready = ready
+        self._running = running
         doubted_at = self._since + DOUBTED_AFTER
         given_up_at = max(doubted_at + GIVEN_UP_AFTER, self._newest + DOUBTED_AFTER)
         if now >= given_up_at:

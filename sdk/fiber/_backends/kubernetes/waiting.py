@@ -15,6 +15,7 @@ from fiber._backends.kubernetes.problems import (
     failure,
     new_problems,
     overdue,
+    running,
     summary,
     unreachable,
 )
@@ -153,8 +154,7 @@ class Waiting:
     def _judge_reachability(self) -> None:
         loop = self._agents.loop
         self._cancel_judgement()
-        ready = self.status.get("readyReplicas") or 0
-        self._verdict = self._reachability.judge(ready, now := loop.now())
+        self._verdict = self._reachability.judge(running(self.status), now := loop.now())
         if self._verdict is Verdict.OPEN:
             self._told_of_verdict = False
         if self._reachability.due < math.inf:
