@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from patience import PATIENCE
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 BACKENDS = ("local", "loopback")
 
@@ -30,7 +32,7 @@ def run(
         env=environment(backend),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=2 * PATIENCE,
     )
     assert done.returncode == status, f"{done.args}\n{done.stdout}{done.stderr}"
     return done

@@ -43,10 +43,11 @@ def command(output: Path, scratch: Path, *arguments: str) -> subprocess.Popen[st
     )
 
 
+@pytest.mark.timeout(5 * PATIENCE)  # half a minute of work on a quiet machine
 def test_a_tiny_run_of_everything(tmp_path: Path, scratch: Path) -> None:
     only = ["--contenders", "multiprocessing", "--size", "0.002", "--rounds", "1"]
     with command(tmp_path, scratch, *only) as process:
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=4 * PATIENCE)
     assert process.returncode == 0, said
     assert "failed" not in said
     assert "left a process behind" not in said

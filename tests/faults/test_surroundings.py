@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from faults.program import Program
+from patience import PATIENCE
 
 WORK = """
     import fiber, os, sys
@@ -186,6 +187,6 @@ def test_process_1_of_a_container_leaves_no_zombies(tmp_path: Path) -> None:
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=PATIENCE,
     )
     assert (done.stdout, done.stderr) == ("1\n[]\n", "")

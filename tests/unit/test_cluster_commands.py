@@ -12,6 +12,7 @@ import pytest
 from cluster import commands, faults, images, lifecycle, network, places
 from cluster.daemons import Daemon
 from cluster.lifecycle import Found
+from patience import PATIENCE
 
 TESTS = Path(__file__).resolve().parents[1]
 
@@ -111,7 +112,7 @@ def test_an_error_is_a_sentence_and_not_a_traceback(tmp_path: Path) -> None:
         cwd=TESTS,
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=PATIENCE,
     )
     assert done.returncode == 1
     assert done.stderr.startswith("cluster: there is no node node-99; there are: ")

@@ -44,7 +44,7 @@ def daemon() -> Iterator[int]:
         stdout=subprocess.PIPE,
         check=True,
         text=True,
-        timeout=20,
+        timeout=PATIENCE,
     )
     pid = int(done.stdout)
     yield pid

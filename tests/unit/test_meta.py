@@ -231,7 +231,7 @@ class TestPickle:
             "sys.stdout.buffer.write(cloudpickle.dumps([decorated, rebound, small]))\n"
         )
         made = subprocess.run(
-            [sys.executable, str(script)], check=True, capture_output=True, timeout=30
+            [sys.executable, str(script)], check=True, capture_output=True, timeout=60
         )
         decorated, rebound, small = pickle.loads(made.stdout)
         assert (decorated(1), rebound(1), small(1)) == (4, 3, 2)

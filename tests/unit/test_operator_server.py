@@ -315,7 +315,7 @@ def test_the_process_refuses_settings_that_make_no_sense(tmp_path: Path) -> None
         env=environment(tmp_path, "http://127.0.0.1:9", NAMESPCES="team"),
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=PATIENCE,
     )
     assert done.returncode == 2
     assert "fiber_operator: FIBER_OPERATOR_NAMESPCES is no setting" in done.stderr
@@ -327,7 +327,7 @@ def test_the_process_says_why_it_cannot_begin(tmp_path: Path) -> None:
         env={**environment(tmp_path, "http://127.0.0.1:9"), "KUBECONFIG": "/nowhere/config"},
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=PATIENCE,
     )
     assert done.returncode == 1
     assert "KUBECONFIG" in done.stderr or "kube-config" in done.stderr
