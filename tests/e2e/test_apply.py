@@ -51,6 +51,7 @@ def test_the_minimal_example_gives_workers(scene: Scene, image: str) -> None:
         "NAME": "minimal",
         "DESIRED": "2",
         "READY": "2",
+        "CONNECTED": "0",
         "PENDING": "0",
         "PHASE": "Ready",
         "REASON": "",
@@ -120,8 +121,8 @@ def test_an_attached_master_says_who_goes(pool: Pool, lone_agent: Body) -> None:
     assert not pool.status["problems"]
 
 
-def test_a_released_name_that_is_no_worker_is_told(pool: Pool, agent: Body) -> None:
-    pool.apply(agent)
+def test_a_released_name_that_is_no_worker_is_told(pool: Pool, lone_agent: Body) -> None:
+    pool.apply(lone_agent)
     pool.attach(master=SOMEWHERE, replicas=1, scaleDown={"release": ["kube-dns"]})
     problem = pool.has_problem("InvalidRelease", severity="Warning")
     assert says(problem["message"], "spec.scaleDown.release", "kube-dns", "Nothing is deleted")
