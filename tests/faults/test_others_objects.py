@@ -71,8 +71,11 @@ def test_the_address_of_a_hub_opens_nothing_that_others_have() -> None:
 def hand_on(depth: int, by: Any, of: Any) -> Any:
     """Put ``of`` through another process, and so on; it comes back as a result, too."""
     if depth:
-        with fiber.Pool(1) as pool:
-            return pool.apply_async(hand_on, (depth - 1, by, of)).get(PATIENCE)
+        pool = fiber.Pool(1)
+        answer = pool.apply_async(hand_on, (depth - 1, by, of)).get(PATIENCE)
+        pool.close()
+        pool.join()  # The worker ends once it has sent what it put.
+        return answer
     by.put(of)
     return of
 
