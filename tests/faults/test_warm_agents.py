@@ -272,6 +272,31 @@ def test_sigterm_ends_it_while_it_waits(pool: Pool) -> None:
     assert agent.left() == []
 
 
+def test_sigterm_that_another_thread_takes_between_two_lives_ends_it(pool: Pool) -> None:
+    told = """
+    import os, signal, threading
+    from fiber._agent import leftovers
+
+    def take() -> None:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def end(seconds: float) -> bool:
+        thread = threading.Thread(target=take)
+        thread.start()
+        thread.join()
+        return True
+
+    leftovers.end = end
+    """
+    agent = pool.agent(30, told + AGENT)
+    master = pool.master()
+    assert master.line() == "joined warm-0"
+    master.signal(signal.SIGTERM)
+    assert agent.wait() == 0
+    assert agent.left() == []
+
+
 def test_a_grace_that_is_no_number(pool: Pool) -> None:
     agent = pool.agent(grace=1, FIBER_AGENT_LOST_GRACE="soon")
     assert agent.wait() == 1

@@ -129,8 +129,11 @@ class Main:
             if why_not is not None:
                 self._complain(why_not)
                 return 1
+            command = _next_life()
             self._hand_on_credentials()
-            os.execve(sys.executable, _next_life(), self._environment)
+            # What comes above takes seconds, in which another thread may have taken the signal.
+            if not self._is_told_to_end():
+                os.execve(sys.executable, command, self._environment)
         signal.set_wakeup_fd(-1)
         for end in self._signals:
             end.close()
@@ -212,9 +215,11 @@ class Main:
     def _is_told_to_end(self) -> bool:
         """Also by a signal that another thread took, and of which Python has not told us yet."""
         try:
-            return self._told_to_end or bool(self._signals[0].recv(1))
+            taken = self._signals[0].recv(4096)
         except BlockingIOError:
-            return False
+            taken = b""
+        self._told_to_end |= signal.SIGTERM in taken
+        return self._told_to_end
 
     def _wake_by_signals(self) -> None:
         """A signal that strikes just before the loop sleeps is noted by Python, and slept over."""
