@@ -75,7 +75,8 @@ _TIER_SAYS = {
     "ext": "promised to nobody",
     "na": "not applicable",
 }
-LIMIT = 120.0  # seconds for one test: the slowest, of a thousand barriers, takes 30 between hosts
+LIMIT = 300.0  # seconds for one test: a thousand barriers between hosts take 30, or many times that
+# on a busy machine
 JOBS = 2
 
 
