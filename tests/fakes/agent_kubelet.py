@@ -10,6 +10,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,7 @@ class AgentKubelet:
                 process.kill()
                 await process.wait()
             if name in self._folders:
-                shutil.rmtree(self._folders.pop(name), ignore_errors=True)
+                await _remove(self._folders.pop(name))
 
     async def _start_if_there(self, namespace: str, name: str) -> asyncio.subprocess.Process | None:
         try:
@@ -230,6 +231,14 @@ class AgentKubelet:
         }
         status = {"phase": phase, "conditions": [condition], "containerStatuses": [container]}
         self._store.set_status("pods", namespace, name, status)
+
+
+async def _remove(folder: Path) -> None:
+    """Remove a pod's folder, in which processes of a killed agent may make files for a moment."""
+    deadline = time.monotonic() + PATIENCE
+    while folder.exists() and time.monotonic() < deadline:
+        shutil.rmtree(folder, ignore_errors=True)
+        await asyncio.sleep(0 if not folder.exists() else _PROBED_EVERY)
 
 
 def _secret(pod: Body) -> str:
