@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import threading
 import weakref
 from collections.abc import Iterator
@@ -232,3 +234,22 @@ def test_where_no_thread_can_be_started_memory_is_given_back_at_once(
     os.ftruncate(owner.fileno(), 1 << 16)
     kept = weakref.ref(mapping(owner, 1 << 16))
     assert kept() is None
+
+
+KEPT_TO_THE_END = """
+import os
+from fiber._wire import arena
+from fiber._wire.descriptor import opened
+
+arena.SLOWLY = 1 << 16
+owner = opened(os.memfd_create, "message")
+os.ftruncate(owner.fileno(), 1 << 16)
+kept = arena.mapping(owner, 1 << 16)
+"""
+
+
+def test_a_program_that_keeps_a_large_message_to_its_end_ends() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", KEPT_TO_THE_END], capture_output=True, timeout=PATIENCE, check=True
+    )
+    assert ended.stderr == b""

@@ -12,6 +12,7 @@ import contextlib
 import fcntl
 import mmap
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Iterable
@@ -142,7 +143,8 @@ class Mapping(mmap.mmap):
     """Id of the process that made it.  A fork of that process does not give it back."""
 
     def __del__(self) -> None:
-        if self.process == os.getpid() and len(self) >= SLOWLY:
+        # While the interpreter ends no thread begins any more, and its start would wait for that.
+        if self.process == os.getpid() and len(self) >= SLOWLY and not sys.is_finalizing():
             with contextlib.suppress(RuntimeError):  # then it takes what it takes
                 threading.Thread(target=self._give_back, name="fiber-free", daemon=True).start()
 
