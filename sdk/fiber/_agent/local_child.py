@@ -32,6 +32,10 @@ from fiber.errors import TooManyOpenFiles
 
 _SEQ = struct.Struct("<Q")
 
+_NO_ROOM = (TooManyOpenFiles, MemoryError)
+_LOST = (*_NO_ROOM, ValueError, struct.error)
+"""Errors of a packet that was taken from its socket, and that nobody gets."""
+
 
 class Owner(Protocol):
     """What a child needs of the agent that runs it."""
@@ -251,7 +255,7 @@ class LocalChild:
             message = packet.receive(self._ours, passing=self._spec.passing)
         except (BlockingIOError, EOFError):
             return False
-        except (TooManyOpenFiles, ValueError, struct.error) as error:  # nobody should wait for it
+        except _LOST as error:  # nobody should wait for it
             self.abort(error)
             return True
         try:
@@ -270,7 +274,7 @@ class LocalChild:
                 message = packet.receive(self._theirs, wait=False)
             except (BlockingIOError, EOFError):
                 break
-            except TooManyOpenFiles as error:
+            except _NO_ROOM as error:
                 self.abort(error)
                 continue
             seqs.append(_SEQ.unpack_from(message.payload)[0])
@@ -299,7 +303,7 @@ class Channel:
             return packet.receive(self._sock)
         except BlockingIOError:  # its agent took it, which is burying the child
             return None
-        except TooManyOpenFiles as error:
+        except _NO_ROOM as error:
             self._abort(error)
             raise
 

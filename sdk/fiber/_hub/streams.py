@@ -158,8 +158,8 @@ class SocketStream:
             except (EOFError, ConnectionError):
                 self._close("")
                 return
-            except (OSError, struct.error, ValueError, IndexError) as error:
-                # No descriptor free for what it sent, or no packet of ours.
+            except (OSError, MemoryError, struct.error, ValueError, IndexError) as error:
+                # No descriptor or memory free for what it sent, or no packet of ours.
                 handler = self.handler
                 self.finish(str(error))
                 handler.on_closed(str(error))

@@ -128,7 +128,7 @@ class Leases:
                 message = channel.receive(ATTENTION)
             except BrokenPipeError:  # it was gone before that was sent
                 return UNAVAILABLE
-            except (EOFError, OSError):  # it is gone, as the loop is about to hear
+            except (EOFError, OSError, MemoryError):  # it is gone, as the loop is about to hear
                 return ADOPTED
             if message is None:
                 return ADOPTED

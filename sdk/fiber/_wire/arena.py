@@ -9,6 +9,7 @@ leaves it set, and the block is forgotten when its turn comes.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import mmap
 import os
@@ -18,6 +19,7 @@ from collections import deque
 from collections.abc import Iterable
 
 from fiber._wire.descriptor import Descriptor, opened
+from fiber.errors import TooManyOpenFiles
 
 RETAINED_LIMIT = 1 << 25
 """Bytes of memory kept for later messages, per process.
@@ -158,8 +160,15 @@ class Mapping(mmap.mmap):
 
 
 def mapping(memory: Descriptor, size: int) -> Mapping:
-    """Map a message."""
-    mapped = Mapping(memory.fileno(), size)
+    """Map a message; MemoryError or TooManyOpenFiles says that this process has no room for it."""
+    try:
+        mapped = Mapping(memory.fileno(), size)
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):  # a mapping has a descriptor of its own
+            raise TooManyOpenFiles("receiving a large message") from error
+        if error.errno == errno.ENOMEM:
+            raise MemoryError(f"no memory is left to receive a message of {size} bytes") from error
+        raise
     mapped.owner, mapped.process = memory, os.getpid()
     return mapped
 
