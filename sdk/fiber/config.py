@@ -215,8 +215,8 @@ class Config:
     listen_host*: the address at which the program listens for agents; None means the loopback
         address for agents on this machine, and for pods the one that they reach it at, which
         is found.
-    listen_port*: the port for it; 0 takes one that is free. Each FiberPool of a program needs one:
-        of a range such as "9000-9009" it takes the first that is free.
+    listen_port*: the port for it, for all agents of the program; 0 takes one that is free, and a
+        range such as "9000-9009" the first that is free, for several programs on one host.
     advertised_host*: the address that pods dial where it is not the one above, as behind NAT or
         port forwarding; the port is the same. None means the address that is listened at.
     start_timeout: seconds that a process or an agent may take to start.

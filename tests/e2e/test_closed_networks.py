@@ -18,7 +18,7 @@ from e2e.scene import Scene
 
 pytestmark = pytest.mark.timeout(240, func_only=True)
 
-PORTS = range(29100, 29104)
+PORT = 29100
 SAME_NAMESPACE: Body = {"podSelector": {}}
 
 
@@ -31,7 +31,7 @@ def test_workers_reach_their_program_and_nothing_else(
     (node, *_) = (name for name in cluster.workers() if name != programs.node)
     targets = [metrics_of(operator), *api_servers(scene, cluster)]
     settings = {
-        "listen_port": f"{PORTS[0]}-{PORTS[-1]}",
+        "listen_port": PORT,
         "node_selector": f"kubernetes.io/hostname={node}",
     }
     program = programs.start(place, "closing.py", *targets, **settings)
@@ -71,7 +71,7 @@ def workers_policy(release: Release, namespace: str, master: Body) -> Body:
         "create": True,
         "namespaces": [namespace],
         "masters": [master],
-        "masterPorts": list(PORTS),
+        "masterPorts": [PORT],
     }
     manifests = yaml.safe_load_all(release.render({"workerNetworkPolicy": values}))
     (policy,) = (found for found in manifests if found and found["kind"] == "NetworkPolicy")

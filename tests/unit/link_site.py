@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import pynng
 
 from fiber._transport import tls
+from fiber._transport.acceptor import Acceptor
 from fiber._transport.credentials import Credentials, MasterCredentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.handshake import Identity
@@ -93,13 +94,16 @@ class Site:
         self._names = (f"agent-{number}" for number in itertools.count(1))
 
     def listener(
-        self, address: str = "127.0.0.1:0", keepalive: Keepalive = SHORT
+        self,
+        at: str | Acceptor = "127.0.0.1:0",
+        keepalive: Keepalive = SHORT,
+        credentials: MasterCredentials | None = None,
     ) -> tuple[MasterListener, Notes]:
         notes = Notes()
         listener = MasterListener(
             self.loop,
-            address,
-            self.credentials,
+            at,
+            credentials or self.credentials,
             on_agent=notes.on_link,
             on_refused=notes.on_refused,
             on_proven=notes.on_proven,
@@ -132,6 +136,12 @@ class Site:
         )
         self._closing.append(dialling.close)
         return dialling, notes
+
+    def acceptor(self) -> Acceptor:
+        """Return an acceptor for several pools, which show the certificate of the site."""
+        acceptor = Acceptor("127.0.0.1:0", self.credentials.certificate)
+        self._closing.append(acceptor.close)
+        return acceptor
 
     def pair(self) -> tuple[Notes, Notes]:
         listener, master = self.listener()

@@ -229,8 +229,9 @@ def test_one_that_breaks_as_it_is_taken_stays_open_nowhere(site: Site) -> None:
         accepted, _ = server.accept()
     taken = _BreaksAfterTheCheck(fileno=accepted.detach())
     taken.other = other
-    context = tls.master_context(site.credentials)
-    with contextlib.closing(tls.MasterHandshake(taken, context, site.credentials).sock) as secured:
+    context = tls.master_context(site.credentials.certificate)
+    handshake = tls.MasterHandshake(taken, context, site.credentials.certificate)
+    with contextlib.closing(handshake.sock) as secured:
         fd = secured.fileno()
         assert fd >= 0, "whoever goes on with it has it to close"
     with pytest.raises(OSError, match="Bad file descriptor"):
@@ -333,7 +334,9 @@ def test_complaints_are_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> 
     notes: Notes = master
     notes.wait(lambda: len(notes.refusals) == 4)
     assert "strangers come from many addresses" in notes.refusals[-1]
-    listener._acceptor.report("10.0.0.99", "10.0.0.99:1", "an agent's trouble", proven=True)
+    listener._acceptor.report(
+        "10.0.0.99", "10.0.0.99:1", "an agent's trouble", pool=listener._served
+    )
     notes.wait(lambda: len(notes.refusals) == 5)
     assert notes.refusals[-1] == "an agent's trouble (10.0.0.99:1)"
     site.on_loop(lambda: None)

@@ -38,7 +38,7 @@ def test_each_run_has_its_own_key_and_certificate(credentials: MasterCredentials
 
 def test_the_next_master_of_a_pool_has_another_certificate(credentials: MasterCredentials) -> None:
     first, second = (make_credentials(credentials.pool_key) for _ in range(2))
-    assert first.certificate_hash != second.certificate_hash
+    assert first.certificate.hash != second.certificate.hash
     assert first.agent("a", "1") == second.agent("a", "1")
     assert first.fingerprint == ""
 

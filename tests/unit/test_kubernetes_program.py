@@ -39,7 +39,7 @@ def test_the_reason_why_the_own_pod_is_not_found(rig: Rig, name: str, why: str) 
         with pytest.raises(ConfigError, match=f"{why}.*fieldRef"):
             made._read_own_pod(name, threading.Event())
     finally:
-        made.api.close()
+        made.close()
 
 
 def test_variables_that_stay_behind_are_named(capsys: pytest.CaptureFixture[str]) -> None:
@@ -108,7 +108,7 @@ def test_a_claim_of_one_node_stays_behind_and_is_named_once(
         assert len(prepared(made, Shape(image="other"))["volumes"]) == 2
         assert capsys.readouterr().err == ""
     finally:
-        made.api.close()
+        made.close()
 
 
 def test_a_claim_that_the_template_brings_is_not_told(rig: Rig) -> None:

@@ -11,8 +11,7 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes import lease
-from fiber._backends.kubernetes.warm_pool import read_credentials
-from fiber._transport.credentials import MasterCredentials
+from fiber._backends.kubernetes.warm_pool import read_pool_key
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
@@ -266,37 +265,35 @@ def make_secret(rig: Rig, name: str = names.secret_name("warm"), **changed: str)
     rig.server.do(rig.server.store.create, "secrets", NAMESPACE, body)
 
 
-def credentials(rig: Rig) -> MasterCredentials:
-    return read_credentials(rig.api, NAMESPACE, "warm", rig.spec("warm"))
+def pool_key(rig: Rig) -> str:
+    return read_pool_key(rig.api, NAMESPACE, "warm", rig.spec("warm"))
 
 
-def test_the_credentials_that_the_operator_made_are_read(rig: Rig) -> None:
+def test_the_key_that_the_operator_made_is_read(rig: Rig) -> None:
     make_secret(rig)
-    read = credentials(rig)
-    assert read.pool_key == "ab" * 32
-    assert read.fingerprint == "", "the next master has another certificate"
+    assert pool_key(rig) == "ab" * 32
 
 
-def test_credentials_that_cannot_serve(rig: Rig) -> None:
+def test_a_key_that_cannot_serve(rig: Rig) -> None:
     make_secret(rig, **{names.KEY_POOL: "damaged"})
     with pytest.raises(FiberPoolError, match=r"key does not hold.*delete it") as caught:
-        credentials(rig)
+        pool_key(rig)
     assert caught.value.reason == "InvalidCredentials"
     assert "damaged" not in str(caught.value)
 
 
-def test_credentials_that_this_program_may_not_read(rig: Rig) -> None:
+def test_a_key_that_this_program_may_not_read(rig: Rig) -> None:
     rig.server.api.faults.append(Fault("get", "secrets", status=403, message="no secrets"))
     with pytest.raises(FiberPoolError, match=r"no secrets.*--resource-name=warm-") as caught:
-        credentials(rig)
+        pool_key(rig)
     assert caught.value.reason == "Forbidden"
 
 
-def test_credentials_that_the_pools_owner_brought(rig: Rig) -> None:
+def test_a_key_that_the_pools_owner_brought(rig: Rig) -> None:
     make_secret(rig, "brought")
     patch = {"spec": {"credentialsSecretName": "brought"}}
     rig.server.do(rig.server.store.merge, names.PLURAL, NAMESPACE, "warm", patch)
-    assert credentials(rig).key
+    assert pool_key(rig) == "ab" * 32
 
 
 def test_one_that_was_deleted_is_not_begun_anew(rig: Rig, told: Told) -> None:

@@ -194,7 +194,9 @@ def test_a_master_without_the_key_of_the_pool_gets_no_agent(site: Site) -> None:
 
 
 def test_a_certificate_that_is_no_pem_is_named(site: Site) -> None:
-    broken = Site(replace(site.credentials, key="nonsense"))
+    broken = Site(
+        replace(site.credentials, certificate=replace(site.credentials.certificate, key="nonsense"))
+    )
     try:
         with pytest.raises(AuthenticationError, match="master's certificate cannot be used"):
             broken.listener()

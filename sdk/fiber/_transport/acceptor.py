@@ -1,4 +1,4 @@
-"""Takes connections, and lets pass agents that prove in time which pod they are.
+"""Takes connections, and lets pass agents that prove in time which pod of which pool they are.
 
 It has a thread and a loop of its own.  TLS costs milliseconds of processor time for each who comes,
 be it a thousand agents or strangers without end, and the program's own loop must not wait for that;
@@ -14,13 +14,15 @@ import os
 import resource
 import select
 import socket
+import threading
 from collections.abc import Callable
+from typing import NamedTuple
 
 from fiber._transport import address as addresses
-from fiber._transport import tls
+from fiber._transport import handshake, tls
 from fiber._transport.admission import Admission
-from fiber._transport.credentials import MasterCredentials
-from fiber._transport.handshake import Identity
+from fiber._transport.credentials import Certificate, MasterCredentials
+from fiber._transport.handshake import Hello, Identity, Refusal
 from fiber._transport.loop import Loop
 from fiber._transport.refusals import Refusals
 from fiber._transport.sealing import Secrets
@@ -45,32 +47,43 @@ _LAST_WORD = 1.0
 
 _BACKLOG = 1024
 
+MASTER = "the master"
+"""Name under which every master greets its agents."""
+
 _SHORT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
-class Acceptor:
-    """Listens on ``address``, which then says where it really does.
-
-    Port 0 is a free one, and a range such as 9000-9009 the first of them that is free.
-
-    ``on_hello`` is called on its thread with a connection and its first words, which are not proved
-    yet: ``trust`` tells.  ``on_refused`` is called with why one was turned away, once in some
-    minutes for each address and reason.  Strangers from many addresses are summed up.
+class ServedPool(NamedTuple):
+    """One of the pools whose agents dial the same address. Both functions run on the acceptor's
+    thread.
     """
 
-    def __init__(
-        self,
-        address: str,
-        credentials: MasterCredentials,
-        *,
-        on_hello: Callable[[PendingConnection, bytes], None],
-        on_refused: Callable[[str], None],
-    ) -> None:
-        self.credentials = credentials
-        self.context = tls.master_context(credentials)
-        self.on_hello = on_hello
+    credentials: MasterCredentials
+    on_agent: Callable[[PendingConnection, Hello], None]
+    """Called with a connection that has proved to be an agent of the pool."""
+    on_refused: Callable[[str], None]
+    """Called with why a connection was turned away, once in some minutes for each address and
+    reason. Strangers from many addresses are summed up."""
+
+
+class Acceptor:
+    """Listens on ``address``, for the agents of any number of pools.
+
+    Port 0 is a free one, and a range such as 9000-9009 the first of them that is free; ``address``
+    then says which.  Connections are taken once there is a pool.
+
+    All pools show the same ``certificate``.  An agent does not name its pool: the key of its proof
+    tells (decision 39).  Strangers belong to no pool, and the first one hears of them.
+    """
+
+    def __init__(self, address: str, certificate: Certificate) -> None:
+        self.certificate = certificate
+        self.context = tls.master_context(certificate)
         self.loop = Loop()
-        self._on_refused = on_refused
+        self._lock = threading.Lock()
+        self._pools: tuple[ServedPool, ...] = ()
+        self._past: tuple[ServedPool, ...] = ()
+        """Pools that were removed.  Their agents are told so, and not taken for strangers."""
         self._refusals = Refusals()
         descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         most = min(_MOST, max(descriptors // 4, 2))
@@ -82,9 +95,24 @@ class Acceptor:
             raise
         host = address.rpartition(":")[0].strip("[]")
         self.address = addresses.join(host, self._listener.getsockname()[1])
-        self.loop.register(self._listener.fileno(), self._accept)
         self._pending: set[PendingConnection] = set()
         self.loop.start_thread("fiber-accept")
+
+    def add(self, pool: ServedPool) -> None:
+        """Serve the agents of ``pool`` too.  Any thread."""
+        with self._lock:
+            first = not self._pools and not self._past
+            self._pools += (pool,)
+        if first:
+            self.loop.call_soon(self._resume)
+
+    def remove(self, pool: ServedPool) -> None:
+        """Refuse the agents of ``pool`` from now on.  Any thread."""
+        past = ServedPool(pool.credentials, _turn_away, on_refused=lambda reason: None)
+        with self._lock:
+            if pool in self._pools:
+                self._pools = tuple(other for other in self._pools if other is not pool)
+                self._past += (past,)
 
     def take(self, sock: socket.socket, origin: str) -> None:
         """Treat a connection that came by another way, a relay's say, as if it were accepted."""
@@ -97,11 +125,21 @@ class Acceptor:
 
     # On its own thread
 
-    def report(self, host: str, origin: str, reason: str, *, proven: bool = False) -> None:
-        """Somebody was turned away; ``proven``: one with the pool's credentials."""
-        news = self._refusals.news(host, origin, reason, self.loop.now(), own=proven)
-        if news:
-            self._on_refused(news)
+    def report(
+        self, host: str, origin: str, reason: str, *, pool: ServedPool | None = None
+    ) -> None:
+        """Say that a connection was turned away: an agent of ``pool``, or a stranger."""
+        own = pool is not None
+        if news := self._refusals.news(host, origin, reason, self.loop.now(), own=own):
+            for told in (pool,) if pool else self._pools[:1]:
+                told.on_refused(news)
+
+    def pool_of(self, believes: Callable[[MasterCredentials], bool]) -> ServedPool | None:
+        """Return the pool whose credentials are believed."""
+        for pool in (*self._pools, *self._past):
+            if believes(pool.credentials):
+                return pool
+        return None
 
     def make_room(self, connection: PendingConnection) -> None:
         """It is no stranger, and takes no stranger's place."""
@@ -167,30 +205,39 @@ class PendingConnection:
         self._loop = acceptor.loop
         self._watched: int | None = None
         self._awaited = ""
+        self._pool: ServedPool | None = None
 
     def start(self, sock: socket.socket) -> None:
         """Prove each other and hear its first words; HungUp if it has gone already."""
         with contextlib.suppress(OSError):  # no TCP, or broken already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         acceptor = self._acceptor
-        self._handshake = tls.MasterHandshake(sock, acceptor.context, acceptor.credentials)
+        self._handshake = tls.MasterHandshake(sock, acceptor.context, acceptor.certificate)
         self._timer = self._loop.call_later(_DEADLINE, self._too_late)
-        self._run(self._handshake.listen(), lambda hello: self._acceptor.on_hello(self, hello))
+        self._run(self._handshake.listen(), self._hear)
 
-    def trust(self, identity: Identity) -> bool:
-        """Return whether it has proved this identity; hang up if not.  On the acceptor's thread."""
-        key = self._acceptor.credentials.agent_key(identity.name, identity.uid)
-        if self._handshake.believes(key):
-            self._acceptor.make_room(self)
-            return True
-        self._acceptor.report(
-            self._host, self.origin, f"it cannot prove that it is {identity.name!r}"
+    def _hear(self, words: bytes) -> None:
+        """Find out whose agent it is, from its first words and its proof."""
+        try:
+            hello = handshake.decode(words)
+        except ProtocolError as error:
+            self._distrust(f"it is no agent of Fiber: {error}")
+            return
+        if not isinstance(hello, Hello):
+            self._distrust(f"{hello.identity.name!r} is no agent")
+            return
+        name, uid = hello.identity.name, hello.identity.uid
+        self._pool = self._acceptor.pool_of(
+            lambda credentials: self._handshake.believes(credentials.agent_key(name, uid))
         )
-        self._run(self._handshake.disbelieve(), lambda _: self._part())
-        return False
+        if self._pool is None:
+            self._acceptor.report(self._host, self.origin, f"it cannot prove that it is {name!r}")
+            self._run(self._handshake.disbelieve(), lambda _: self._part())
+        else:
+            self._acceptor.make_room(self)
+            self._pool.on_agent(self, hello)
 
-    def distrust(self, reason: str) -> None:
-        """Hang up on one that claims to be no agent.  On the acceptor's thread."""
+    def _distrust(self, reason: str) -> None:
         self._acceptor.report(self._host, self.origin, reason)
         self._part()
 
@@ -216,7 +263,7 @@ class PendingConnection:
     def report_proven(self, reason: str) -> None:
         """It has the pool's credentials, and is nobody who can be served.  Any thread."""
         self._loop.call_soon(
-            lambda: self._acceptor.report(self._host, self.origin, reason, proven=True)
+            lambda: self._acceptor.report(self._host, self.origin, reason, pool=self._pool)
         )
 
     def _answer(self, greeting: bytes, then: Callable[[tuple[int, Secrets]], None]) -> None:
@@ -308,6 +355,12 @@ class PendingConnection:
             self.hang_up()
         else:
             self.refuse(f"it did not prove itself within {_DEADLINE:g} s")
+
+
+def _turn_away(connection: PendingConnection, hello: Hello) -> None:
+    reason = "this master has given back the pool of this agent"
+    refusal = Refusal(Identity.of_this_process(MASTER), reason)
+    connection.turn_away(refusal.encode(), reason)
 
 
 def _listen(address: str) -> socket.socket:

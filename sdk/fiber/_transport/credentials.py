@@ -95,26 +95,33 @@ class Credentials:
 
 
 @dataclass(frozen=True)
-class MasterCredentials:
-    """What a master has: the pool's key, its own certificate, and the key to that, in PEM."""
+class Certificate:
+    """Certificate that a master signed itself, and the private key to it, in PEM."""
 
-    pool_key: str = field(repr=False)
-    certificate: str = field(repr=False)
+    text: str = field(repr=False)
     key: str = field(repr=False)
-    only: bool = True
-    """Whether the pool never has another master, so that agents may be told the fingerprint."""
 
     @cached_property
-    def certificate_hash(self) -> bytes:
+    def hash(self) -> bytes:
         """The SHA-256 of the certificate."""
         import ssl
 
-        return hashlib.sha256(ssl.PEM_cert_to_DER_cert(self.certificate)).digest()
+        return hashlib.sha256(ssl.PEM_cert_to_DER_cert(self.text)).digest()
+
+
+@dataclass(frozen=True)
+class MasterCredentials:
+    """Key of a pool, and the certificate of its master."""
+
+    pool_key: str = field(repr=False)
+    certificate: Certificate = field(repr=False)
+    only: bool = True
+    """Whether the pool never has another master, so that agents may be told the fingerprint."""
 
     @property
     def fingerprint(self) -> str:
         """What agents compare the certificate with; empty where another master may follow."""
-        return self.certificate_hash.hex() if self.only else ""
+        return self.certificate.hash.hex() if self.only else ""
 
     def agent_key(self, name: str, uid: str) -> str:
         """Derive the key of an agent."""
@@ -125,15 +132,20 @@ class MasterCredentials:
         return Credentials(name, uid, self.agent_key(name, uid), self.fingerprint)
 
 
-def make_credentials(pool_key: str | None = None) -> MasterCredentials:
-    """Make a certificate, and a key too if the pool has none yet.  Takes a millisecond."""
-    certificate, key = _self_signed()
+def make_credentials(
+    pool_key: str | None = None, certificate: Certificate | None = None
+) -> MasterCredentials:
+    """Return the credentials of a pool's master.
+
+    A pool without a key gets a new one. A master without a certificate gets a new one too.
+    """
     return MasterCredentials(
-        pool_key or identity.new_key(), certificate, key, only=pool_key is None
+        pool_key or identity.new_key(), certificate or make_certificate(), only=pool_key is None
     )
 
 
-def _self_signed() -> tuple[str, str]:
+def make_certificate() -> Certificate:
+    """Make a certificate and its private key, in a millisecond."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -157,4 +169,4 @@ def _self_signed() -> tuple[str, str]:
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
     )
-    return certificate.public_bytes(serialization.Encoding.PEM).decode(), pem.decode()
+    return Certificate(certificate.public_bytes(serialization.Encoding.PEM).decode(), pem.decode())

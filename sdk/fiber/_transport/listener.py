@@ -1,4 +1,4 @@
-"""The master's end of its agents' links."""
+"""The master's end of the links of a pool's agents."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import socket
 from collections.abc import Callable
 
 from fiber._transport import handshake
-from fiber._transport.acceptor import Acceptor, PendingConnection
+from fiber._transport.acceptor import MASTER, Acceptor, PendingConnection, ServedPool
 from fiber._transport.credentials import MasterCredentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
 from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, Link, SelectorEventLoop
 from fiber._transport.nng import Connection
 from fiber._transport.resumable_link import ResumableLink
 from fiber._transport.sealing import Secrets
-from fiber._wire.messages import ProtocolError
 from fiber.errors import FiberError
 
 
 class MasterListener:
-    """The master's end of all its links: one address that agents dial.
+    """The master's end of the links of a pool's agents.
 
-    ``address`` is ``host:port``; port 0 takes a free one, and ``address`` then says which.  The
+    ``at`` is the acceptor that the agents dial, which other pools may share, or an address for an
+    acceptor of this pool's own, which is closed with the pool.  An address is ``host:port``.  The
     callbacks run on the loop's thread: ``on_agent`` attaches an observer to the new link, or
     returns why it does not want it; ``on_refused`` hears who was turned away and why;
     ``on_proven`` hears of each connection that proved to be an agent of the pool.  ``objection``
@@ -34,7 +34,7 @@ class MasterListener:
     def __init__(
         self,
         loop: SelectorEventLoop,
-        address: str,
+        at: Acceptor | str,
         credentials: MasterCredentials,
         *,
         on_agent: Callable[[Link], str | None],
@@ -54,16 +54,18 @@ class MasterListener:
         self._by_peer: dict[tuple[str, str], ResumableLink] = {}
         self._keepalive = keepalive
         self._lost_grace = lost_grace
-        self._identity = Identity.of_this_process("the master")
+        self._identity = Identity.of_this_process(MASTER)
         self._links: dict[str, ResumableLink] = {}
         self._closing: list[Callable[[], None]] | None = None
-        self._acceptor = Acceptor(
-            address,
+        self._shares = isinstance(at, Acceptor)
+        self._acceptor = at if isinstance(at, Acceptor) else Acceptor(at, credentials.certificate)
+        self.address = self._acceptor.address
+        self._served = ServedPool(
             credentials,
-            on_hello=self._hear,
+            on_agent=lambda pending, hello: loop.call_soon(self._proven, pending, hello),
             on_refused=lambda reason: loop.call_soon(on_refused, reason),
         )
-        self.address = self._acceptor.address
+        self._acceptor.add(self._served)
 
     def take(self, sock: socket.socket, origin: str) -> None:
         """Serve a connection to an agent that came by another way than ``address``."""
@@ -76,9 +78,9 @@ class MasterListener:
         linger: float = 1.0,
         then: Callable[[], None] | None = None,
     ) -> None:
-        """Close every link as ``Link.close`` does, then the listening socket, then call ``then``.
+        """Close every link as ``Link.close`` does, then call ``then``.
 
-        Who comes meanwhile is refused.
+        Agents that come meanwhile, and later to a shared acceptor, are refused.
         """
         self._loop.call_soon(self._close, reason, linger, then)
 
@@ -86,16 +88,24 @@ class MasterListener:
         first = self._closing is None
         self._closing = [*(self._closing or ()), *([then] if then else ())]
         if first:
+            for pending, _ in self._waiting.values():
+                pending.drop()
+            self._waiting.clear()
             for link in list(self._links.values()):
                 link.close(reason, linger=linger, then=self._finish_closing)
         self._finish_closing()
 
     def _finish_closing(self) -> None:
         if not self._links and self._closing is not None:
-            self._acceptor.close()
+            self._leave()
             finished, self._closing = self._closing, []
             for then in finished:
                 then()
+
+    def _leave(self) -> None:
+        self._acceptor.remove(self._served)
+        if not self._shares:
+            self._acceptor.close()
 
     def break_connections(self) -> None:
         """Have each agent dial again, as after a broken connection.  On the loop's thread.
@@ -111,18 +121,6 @@ class MasterListener:
         for pending, hello in waiting.values():
             if not pending.gone:
                 self._greet(pending, hello)
-
-    def _hear(self, pending: PendingConnection, words: bytes) -> None:
-        """Somebody has said its first words.  On the acceptor's thread."""
-        try:
-            hello = handshake.decode(words)
-        except ProtocolError as error:
-            pending.distrust(f"it is no agent of Fiber: {error}")
-            return
-        if not isinstance(hello, Hello):
-            pending.distrust(f"{hello.identity.name!r} is no agent")
-        elif pending.trust(hello.identity):
-            self._loop.call_soon(self._proven, pending, hello)
 
     def _proven(self, pending: PendingConnection, hello: Hello) -> None:
         self._on_proven()

@@ -36,7 +36,7 @@ import struct
 from collections.abc import Callable, Generator
 from typing import Any, TypeAlias, TypeVar
 
-from fiber._transport.credentials import Credentials, MasterCredentials
+from fiber._transport.credentials import Certificate, Credentials
 from fiber._transport.sealing import SECRET_SIZE, Secrets, derive
 from fiber._wire.messages import ProtocolError
 from fiber.errors import AuthenticationError
@@ -66,12 +66,12 @@ class _TakenSocket(ssl.SSLSocket):
         """Nobody asks any more."""
 
 
-def master_context(credentials: MasterCredentials) -> ssl.SSLContext:
-    """What a master shows; AuthenticationError if ``credentials`` cannot be used."""
+def master_context(certificate: Certificate) -> ssl.SSLContext:
+    """Return the context of a master; AuthenticationError if ``certificate`` cannot be used."""
     context = _context(ssl.PROTOCOL_TLS_SERVER)
     context.num_tickets = 0  # nobody resumes, and nothing must follow the handshake
     try:
-        _load_own(context, credentials)
+        _load_own(context, certificate)
     except (ssl.SSLError, ValueError) as error:
         raise AuthenticationError(
             f"the master's certificate cannot be used: {_words(error)}. It is cut short or not PEM."
@@ -93,12 +93,12 @@ def _context(protocol: int) -> ssl.SSLContext:
     return context
 
 
-def _load_own(context: ssl.SSLContext, credentials: MasterCredentials) -> None:
+def _load_own(context: ssl.SSLContext, certificate: Certificate) -> None:
     # The ssl module takes them from a file only; this one is in memory and has no name.
     file = os.memfd_create("credentials")
     try:
         with open(file, "wb", closefd=False) as writer:
-            writer.write(f"{credentials.certificate}\n{credentials.key}\n".encode())
+            writer.write(f"{certificate.text}\n{certificate.key}\n".encode())
         context.load_cert_chain(f"/proc/self/fd/{file}")
     finally:
         os.close(file)
@@ -216,10 +216,10 @@ class MasterHandshake(_Handshake):
     _for_master = True
 
     def __init__(
-        self, sock: socket.socket, context: ssl.SSLContext, credentials: MasterCredentials
+        self, sock: socket.socket, context: ssl.SSLContext, certificate: Certificate
     ) -> None:
         super().__init__(sock, context)
-        self._certificate = credentials.certificate_hash
+        self._certificate = certificate.hash
         self._key = ""
         self._words = self._said = b""
 

@@ -67,7 +67,7 @@ class KubernetesBackend:
         self._closing = True
         with contextlib.ExitStack() as rest:  # of which nothing is left out if it is interrupted
             rest.callback(self._output.close)
-            rest.callback(self._program.api.close)
+            rest.callback(self._program.close)
             for pods in list(self._pods.values()):
                 pods.begin_close()
                 rest.callback(pods.close)

@@ -323,7 +323,7 @@ class Pods:
             agent.close()
         if self._prepared is None:
             self._end()
-        else:  # first: the next one may have to listen at the same port
+        else:
             self._prepared.listener.close(_NOT_OURS, then=self._end)
 
     def _end(self) -> None:

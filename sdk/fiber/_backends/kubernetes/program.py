@@ -26,14 +26,15 @@ from fiber._backends.kubernetes.template import (
     pod_template,
     secrets_left_out,
 )
-from fiber._backends.kubernetes.warm_pool import WarmPool, read_credentials
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._backends.kubernetes.warm_pool import WarmPool, read_pool_key
+from fiber._transport.acceptor import Acceptor
+from fiber._transport.credentials import MasterCredentials, make_certificate, make_credentials
 from fiber._transport.handshake import Identity
 from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber.config import Config
-from fiber.errors import ConfigError, FiberPoolError, LinkError
+from fiber.errors import ConfigError, FiberPoolError
 from fiber_api import names
 
 _SUFFIX_BYTES = 4
@@ -88,8 +89,16 @@ class Program:
         self._name = program_name(getattr(sys.modules["__main__"], "__file__", None))
         self._suffix = secrets.token_hex(_SUFFIX_BYTES)
         self._numbers = itertools.count()
-        self._listens = False
-        """Whether a pool of this program has begun to listen."""
+        self._certificate = make_certificate()
+        self._acceptors: dict[str, Acceptor] = {}
+        """Acceptors by the host that they listen at: one, unless this machine's address changes.
+        All pools share them, and they stay until the program ends."""
+
+    def close(self) -> None:
+        """Listen no more, and say good-bye to the API server."""
+        for acceptor in self._acceptors.values():
+            acceptor.close()
+        self.api.close()
 
     def prepare_own(
         self, shape: Shape, loop: Loop, observer: ListenerObserver, cancel: threading.Event
@@ -98,7 +107,7 @@ class Program:
         number = next(self._numbers)
         suffix = self._suffix if not number else f"{self._suffix}-{number}"
         name = pool_name(self._name, shape, suffix)
-        credentials = make_credentials()
+        credentials = make_credentials(certificate=self._certificate)
         own = self._find_own_pod(cancel)
         container = own_container(own, _mountinfo()) if own is not None else ""
         claims = self._claims(own, container, cancel) if own is not None else Claims()
@@ -122,9 +131,10 @@ class Program:
         try:
             path = POOLS.path(self.namespace, name)
             spec = self._api.get(path, cancel=cancel)["spec"]
-            credentials = read_credentials(self._api, self.namespace, name, spec, cancel)
+            key = read_pool_key(self._api, self.namespace, name, spec, cancel)
         except ApiError as error:
             raise self._explained(error, f"attach to the FiberPool {name!r}", name) from error
+        credentials = make_credentials(key, self._certificate)
         master, listener = self._listen(name, credentials, loop, observer)
         attachment = WarmPool(self._api, self.namespace, name, master)
         return PreparedPool(
@@ -141,30 +151,25 @@ class Program:
     ) -> tuple[Master, MasterListener]:
         config = self._config
         bound, host = self._addresses(pool)
-        patience = config.heartbeat_interval, config.suspect_after, config.lost_after
-        try:
-            listener = MasterListener(
-                loop,
-                names.address_of(bound, config.listen_port),
-                credentials,
-                on_agent=observer.on_agent,
-                on_refused=observer.on_refused,
-                on_proven=observer.on_proven,
-                objection=observer.objection,
-                keepalive=Keepalive(*patience),
-                lost_grace=Master.lost_grace,
-            )
-        except LinkError as error:
-            if not (config.listen_port and self._listens):
-                raise
-            raise ConfigError(
-                f"listen_port={config.listen_port} has no port left, and each FiberPool of a "
-                "program needs one of its own: this program uses several, for functions with "
-                "different wishes for instance. Give a range, as in listen_port='9000-9009', leave "
-                "it out, so that free ones are taken, or give all functions the same fiber.meta"
-            ) from error
-        self._listens = True
+        listener = MasterListener(
+            loop,
+            self._acceptor_at(bound),
+            credentials,
+            on_agent=observer.on_agent,
+            on_refused=observer.on_refused,
+            on_proven=observer.on_proven,
+            objection=observer.objection,
+            keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
+            lost_grace=Master.lost_grace,
+        )
         return self._master(host, listener), listener
+
+    def _acceptor_at(self, host: str) -> Acceptor:
+        with self._lock:
+            if host not in self._acceptors:
+                address = names.address_of(host, self._config.listen_port)
+                self._acceptors[host] = Acceptor(address, self._certificate)
+            return self._acceptors[host]
 
     def _addresses(self, pool: str) -> tuple[str, str]:
         """Return the address to listen at and the one that pods dial."""

@@ -1,4 +1,4 @@
-"""The key of a FiberPool: made here for a pool of our own, read for a warm one."""
+"""The Secret that holds the key of a FiberPool."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 
 from fiber._backends.kubernetes.api_errors import Body
 from fiber._backends.kubernetes.resources import SECRETS
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import MasterCredentials
 from fiber_api import identity, names
 
 
@@ -31,6 +31,6 @@ def secret_body(
     }
 
 
-def credentials_of(secret: Body) -> MasterCredentials:
-    """Those for the key in the Secret that the operator made; InvalidKey if it cannot serve."""
-    return make_credentials(identity.key_in(secret.get("data") or {}))
+def pool_key_of(secret: Body) -> str:
+    """Return the key in a Secret that the operator made; InvalidKey if it cannot serve."""
+    return identity.key_in(secret.get("data") or {})

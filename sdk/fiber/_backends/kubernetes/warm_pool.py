@@ -10,8 +10,7 @@ from fiber._backends.kubernetes.api import TIMEOUT, Api
 from fiber._backends.kubernetes.api_errors import ApiError, Body, Conflict, Forbidden, NotFound
 from fiber._backends.kubernetes.attached_pool import AttachedPool, Master, identity_in
 from fiber._backends.kubernetes.resources import LEASES, POOLS, SECRETS
-from fiber._backends.kubernetes.secret import credentials_of
-from fiber._transport.credentials import MasterCredentials
+from fiber._backends.kubernetes.secret import pool_key_of
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from fiber_api.identity import InvalidKey
@@ -21,17 +20,17 @@ _PAUSE = 0.05
 """Seconds until the next attempt after somebody else has written to the pool."""
 
 
-def read_credentials(
+def read_pool_key(
     api: Api, namespace: str, pool: str, spec: Body, cancel: threading.Event | None = None
-) -> MasterCredentials:
-    """Those of the pool with this ``spec``, from its Secret.  Blocks; ``ApiError``,
+) -> str:
+    """Read the key of the pool with this ``spec`` from its Secret.  Blocks; ``ApiError``,
     FiberPoolError.
     """
     name = spec.get("credentialsSecretName") or names.secret_name(pool)
     what = f"the Secret {name!r} of the FiberPool {pool!r} in namespace {namespace!r}"
     try:
         secret = api.get(SECRETS.path(namespace, name), cancel=cancel)
-        return credentials_of(secret)
+        return pool_key_of(secret)
     except InvalidKey as error:
         raise FiberPoolError(
             f"{what} cannot serve: {error}. If the operator made it, delete it: it makes a new "
