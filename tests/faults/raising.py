@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from faults.pool_targets import hang_in_native_code
 from fiber.managers import AsyncManager, BaseManager
+from unit.exception_kinds import Unreadable
 
 
 class Diverged(Exception):
@@ -25,6 +26,10 @@ def diverge(step: int) -> NoReturn:
 
 def diverge_as_member(rank: int, size: int) -> NoReturn:
     diverge(7)
+
+
+def raise_unreadable() -> NoReturn:
+    raise Unreadable("closed")
 
 
 def raise_with(thing: object) -> NoReturn:

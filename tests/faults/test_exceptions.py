@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from multiprocessing.pool import MaybeEncodingError  # type: ignore[attr-defined]
 from typing import Any
 
 import joblib
@@ -17,6 +18,7 @@ from faults.raising import (
     ModelManager,
     diverge,
     diverge_as_member,
+    raise_unreadable,
     raise_with,
 )
 from fiber.vector import VectorEnv
@@ -102,6 +104,13 @@ def test_its_class_and_attributes_whatever_its_init_takes(backend: str, face: st
 def test_retry_exceptions_know_it(backend: str) -> None:
     with fiber.Pool(1, retries=1, retry_exceptions=Diverged) as pool:
         heard(lambda: pool.apply(diverge, (STEP,)))
+
+
+def test_one_whose_attributes_raise_is_an_error_and_no_death(backend: str) -> None:
+    with fiber.Pool(1) as pool:
+        with pytest.raises(MaybeEncodingError, match="Unreadable"):
+            pool.apply(raise_unreadable)
+        assert pool.apply(abs, (-1,)) == 1
 
 
 def test_one_that_holds_a_handle(backend: str) -> None:

@@ -242,6 +242,15 @@ class CountsPickles:
         raise TypeError("cannot be pickled")
 
 
+class Unreadable(Exception):
+    """An error whose own attributes cannot be read."""
+
+    def __getattribute__(self, name: str) -> Any:
+        if name == "__class__":
+            return type(self)
+        raise RuntimeError(f"{name} is not to be read")
+
+
 class Hopeless(Exception):
     """Exception that cannot be unpickled."""
 

@@ -192,6 +192,14 @@ def test_what_cannot_be_made_again_says_why() -> None:
     assert "Hopeless: no hope" in str(found.__cause__)
 
 
+def test_one_whose_attributes_raise_says_so() -> None:
+    found = travelled(kinds.Unreadable("closed"))
+    assert type(found) is MaybeEncodingError
+    assert "Unreadable('closed')" in str(found)
+    assert "is not to be read" in str(found)
+    assert "in travelled" in str(found.__cause__)
+
+
 def test_what_only_its_receiver_cannot_unpickle_says_so_and_where_it_was(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

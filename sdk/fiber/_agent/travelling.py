@@ -45,7 +45,7 @@ def format_error(error: BaseException) -> str:
     try:
         return "".join(traceback.format_exception(error))
     except BaseException:  # traceback calls the __bool__ of exceptions
-        frames = "".join(traceback.format_tb(error.__traceback__))
+        frames = "".join(traceback.format_tb(_attribute(error, "__traceback__")))
         return f"Traceback (most recent call last):\n{frames}{_shown(error)}\n"
 
 
@@ -58,9 +58,10 @@ class Travelling:
 
     def __init__(self, error: BaseException) -> None:
         self.text = format_error(error)
-        error.with_traceback(None)  # its frames keep alive what the task had
+        # Its frames keep alive what the task had.
+        BaseException.with_traceback(error, None)
         self._shown = _shown(error)
-        notes = getattr(error, "__notes__", None)
+        notes = _attribute(error, "__notes__")
         self._notes = [str(note) for note in notes] if isinstance(notes, list) else []
         self._data, self._reason = _pickled(error)
         self._links: list[tuple[str, bytes]] = []
@@ -131,14 +132,24 @@ def _links(error: BaseException) -> Iterator[tuple[str, BaseException]]:
     """Yield the causes of ``error``: each with the attribute of the one before that holds it."""
     seen = {id(error)}
     while len(seen) <= LINKS:
-        name, link = "__cause__", error.__cause__
-        if link is None and not error.__suppress_context__:
-            name, link = "__context__", error.__context__
-        if link is None or id(link) in seen:
+        name, link = "__cause__", _attribute(error, "__cause__")
+        if link is None and not _attribute(error, "__suppress_context__"):
+            name, link = "__context__", _attribute(error, "__context__")
+        if not isinstance(link, BaseException) or id(link) in seen:
             return
         yield name, link
         seen.add(id(link))
         error = link
+
+
+def _attribute(error: BaseException, name: str) -> Any:
+    """Return an attribute without the ``__getattribute__`` of the class, which may raise; None if
+    there is none.
+    """
+    try:
+        return object.__getattribute__(error, name)
+    except Exception:
+        return None
 
 
 def _pickled(error: BaseException) -> tuple[bytes | None, str]:
