@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from typing import TYPE_CHECKING
 
 __version__ = "0.1.0.dev0"
@@ -230,6 +231,7 @@ if not TYPE_CHECKING:  # a type checker would accept any name
 
     def __getattr__(name: str) -> object:
         """Names are looked up when first used, so that importing Fiber costs nothing."""
+        _tell_where_it_started()
         if name in _HOMES:
             value = getattr(importlib.import_module(f"fiber.{_HOMES[name]}"), name)
         elif name in __all__:
@@ -240,6 +242,29 @@ if not TYPE_CHECKING:  # a type checker would accept any name
             raise AttributeError(f"module 'fiber' has no attribute {name!r}")
         globals()[name] = value
         return value
+
+
+def _working_directory() -> str | None:
+    try:
+        return os.getcwd()
+    except OSError:  # it was removed
+        return None
+
+
+_started_in = None if "multiprocessing.process" in sys.modules else _working_directory()
+"""Directory in which the program imported Fiber."""
+
+
+def _tell_where_it_started() -> None:
+    """Have multiprocessing know this directory, which it reads as late as it is imported.
+
+    Relative paths of modules and of the main file are relative to it, wherever the program is now.
+    """
+    global _started_in
+    if _started_in is not None:
+        from multiprocessing import process
+
+        process.ORIGINAL_DIR, _started_in = _started_in, None  # type: ignore[attr-defined]
 
 
 def __dir__() -> list[str]:

@@ -190,3 +190,24 @@ def test_process_1_of_a_container_leaves_no_zombies(tmp_path: Path) -> None:
         timeout=PATIENCE,
     )
     assert (done.stdout, done.stderr) == ("1\n[]\n", "")
+
+
+def test_a_command_that_goes_elsewhere_before_its_first_pool_has_its_modules(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "beside.py").write_text("def double(number):\n    return 2 * number\n")
+    command = """
+        import fiber as mp, os
+        import beside
+        os.chdir("/")
+        with mp.Pool(1) as pool:
+            print(pool.apply(beside.double, (2,)))
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(command)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert (done.stdout, done.stderr) == ("4\n", "")
