@@ -99,9 +99,10 @@ lint: $(VENV)/.with-dev
 bench: $(VENV)/.with-bench $(VENV)/.with-vector-peers
 	$(BIN)/python -m benchmarks
 
-## make bench-operator  FiberPools beside ReplicaSets at thousands of pretended pods (root, Go)
+## make bench-operator  FiberPools beside ReplicaSets at thousands of pretended pods, and floods (root, Go)
 bench-operator: $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.operator_scale --set-up
+	PYTHONPATH=tests $(BIN)/python -m benchmarks.operator_scale.floods --set-up
 
 ## make bench-kubernetes  Fiber on pods beside multiprocessing, Ray and Dask (root, Go)
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev

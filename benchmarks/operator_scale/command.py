@@ -8,7 +8,7 @@ import http.client
 import shlex
 import signal
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,43 +55,60 @@ _PODS_OF_A_NODE = 500
 def main(arguments: Sequence[str]) -> int:
     """0 if all was measured, 1 if something was in the way, 130 after Ctrl-C."""
     options = _parse(arguments)
+    return guarded(lambda stack: _run(stack, options, " " + shlex.join(arguments)))
+
+
+def guarded(measure: Callable[[contextlib.ExitStack], Callable[[], None]]) -> int:
+    """Measure, remove what was made, and then do what `measure` has returned: write the results."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
     try:
         with contextlib.ExitStack() as stack:
-            found = _measure(stack, options, shlex.join(arguments))
+            write = measure(stack)
     except KeyboardInterrupt:
         say("everything is removed; nothing is written")
         return 130
     except _TROUBLE as error:
         say(f"not measured: {error}")
         return 1
-    known = {**results.load(options.output / report.RESULTS), **found}
-    report.write(options.output, known)
-    for line in report.budgets(known):
-        say(f"{line.what}: {line.measured}, {line.bound}: {line.verdict}")
-    say(f"written to {options.output}")
+    write()
     return 0
 
 
-def _measure(
+def _run(
     stack: contextlib.ExitStack, options: argparse.Namespace, arguments: str
-) -> dict[str, Result]:
+) -> Callable[[], None]:
     largest = max(case.pods for case in options.cases)
+    kube, operator, about = prepared(stack, largest, options.set_up, arguments)
+    found = _play(kube, operator, options, about)
+    return lambda: _write(options.output, found)
+
+
+def _write(output: Path, found: dict[str, Result]) -> None:
+    known = {**results.load(output / report.RESULTS), **found}
+    report.write(output, known)
+    for line in report.budgets(known):
+        say(f"{line.what}: {line.measured}, {line.bound}: {line.verdict}")
+    say(f"written to {output}")
+
+
+def prepared(
+    stack: contextlib.ExitStack, pods: int, set_up: bool, arguments: str
+) -> tuple[Kube, Operator, dict[str, Any]]:
+    """Return a cluster that has room for so many pods, its operator, and what they run on."""
     kubeconfig = (
-        stack.enter_context(preparation.own_cluster(-(-largest // _PODS_OF_A_NODE)))
-        if options.set_up
+        stack.enter_context(preparation.own_cluster(-(-pods // _PODS_OF_A_NODE)))
+        if set_up
         else preparation.kubeconfig()
     )
     kube = stack.enter_context(open_api(kubeconfig))
-    if options.set_up:
+    if set_up:
         stack.enter_context(preparation.operator(kube))
-    operator, nodes = find_operator(kube), check_nodes(kube, largest)
+    operator, nodes = find_operator(kube), check_nodes(kube, pods)
     trial.remove_namespaces(kube)  # of a run that was killed
     # Once more at the end, in case that what removes a trial's is itself interrupted.
     stack.callback(trial.remove_namespaces, kube)
-    about = _about(kube, operator, nodes, arguments)
-    return _play(kube, operator, options, about)
+    return kube, operator, _about(kube, operator, nodes, arguments)
 
 
 def _play(
@@ -159,7 +176,7 @@ def _interrupt(*_: object) -> None:
 
 
 def _about(kube: Kube, operator: Operator, nodes: int, arguments: str) -> dict[str, Any]:
-    command = f"python -m benchmarks.operator_scale {arguments}".strip()
+    command = f"python -m benchmarks.operator_scale{arguments}".strip()
     about = machine.about((), command, 0, 1.0)
     wanted = ("date", "command", "cores", "processor", "memory", "load", "system", "python")
     return {

@@ -134,7 +134,8 @@ _ABOUT = (
     "One FiberPool of 1,000 pods and one of 5,000, and 100 of 10 pods each, beside ReplicaSets of "
     "the same sizes with the same pod template, on nodes that only pretend to run pods (KWOK). "
     "The API server, etcd, the scheduler and the operator are real, and all of them share the "
-    "machine's processors: it is the ratio that counts. `make bench-operator` writes this page."
+    "machine's processors: it is the ratio that counts. `make bench-operator` writes this page. "
+    "How the operator serves one namespace while another floods it: [floods](operator-floods.md)."
 )
 _TIME = (
     "A round measures both, one after the other, in an order that alternates; each has a "

@@ -32,15 +32,16 @@ class TooSlow(Exception):
 
 def run(kube: Kube, operator: Operator, case: Case, subject: Subject, turn: int) -> Trial:
     """Do it, and leave nothing behind."""
-    with _namespace(kube, case) as namespace:
+    with namespace(kube, case.name) as name:
         trial = Trial(subject.name, turn)
-        _Attempt(kube, operator, case, subject, namespace, trial).run()
+        _Attempt(kube, operator, case, subject, name, trial).run()
         return trial
 
 
 @contextlib.contextmanager
-def _namespace(kube: Kube, case: Case) -> Iterator[str]:
-    metadata = {"generateName": f"fiber-bench-{case.name}-", "labels": {LABEL: "true"}}
+def namespace(kube: Kube, word: str) -> Iterator[str]:
+    """Make a namespace with this word in its name, and remove it in the end."""
+    metadata = {"generateName": f"fiber-bench-{word}-", "labels": {LABEL: "true"}}
     name = kube.create(path_of("namespaces"), {"metadata": metadata})["metadata"]["name"]
     try:
         _wait(

@@ -22,6 +22,7 @@ sys.path.insert(0, str(ROOT))
 from benchmarks.operator_scale import (  # noqa: E402
     command,
     counters,
+    floods,
     report,
     results,
     trial,
@@ -499,3 +500,18 @@ def test_an_unknown_case_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         command.main(["--cases", "1000,10"])
     assert "no case '10'; there are 1000, 100x10, 5000" in capsys.readouterr().err
+
+
+def test_the_page_of_floods_has_the_delay_beside_that_without_one() -> None:
+    usual = floods.Measured([0.5, 0.5, 2.0], changes=10, seconds=2.0, memory=9e7)
+    flooded = floods.Measured([1.0, 1.0, 3.0], changes=10, seconds=2.0, memory=2.5e8)
+    page = floods.page(ABOUT, dict.fromkeys(floods.FLOODS, usual) | {"large": flooded})
+    assert "| no flood | 5 | 500 ms | 2.00 s | 1.000x | 90.0 MB |" in page
+    assert "| 40 pools of 1.3 MB | 5 | 1.00 s | 3.00 s | 2.00x | 250 MB |" in page
+    assert "with 40 pools of 1.3 MB: missed." in page
+
+
+@pytest.mark.parametrize("name", ["large", "changed", "broken"])
+def test_the_pools_of_a_flood_are_fiber_pools(name: str) -> None:
+    for body in floods.FLOODS[name].pools:
+        FiberPool.model_validate(body)
