@@ -1,1 +1,1 @@
-"""How it travels: unix sockets and counters on one host, nng between hosts, one event loop."""
+"""Transport of messages: sockets and counters on one host, nng between hosts, one event loop."""

@@ -1,9 +1,9 @@
 """Takes connections, and lets pass agents that prove in time which pod of which pool they are.
 
-It has a thread and a loop of its own.  TLS costs milliseconds of processor time for each who comes,
-be it a thousand agents or strangers without end, and the program's own loop must not wait for that;
-one thread is all that they get together.  Nothing on it blocks, OpenSSL runs without the
-interpreter's lock, and who is slow holds up nobody but himself.
+The acceptor has its own thread and loop.  A TLS handshake costs milliseconds of processor time.  A
+thousand agents, or strangers without end, must not hold up the program's loop: one thread serves
+them all.  Nothing on this thread blocks, OpenSSL runs without the interpreter's lock, and a slow
+peer delays only itself.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from fiber._wire.messages import ProtocolError
 from fiber.errors import LinkError, TooManyOpenFiles
 
 _DEADLINE = 10.0
-"""Seconds for a connection to prove itself, all in all."""
+"""Seconds in which a connection must have proved itself."""
 
 _MOST = 512
-"""Pending connections at the same time; half of them from one address, as a relay or a NAT has one
-for all.  Never more than a quarter of the descriptors that this process may have."""
+"""Limit of pending connections.  Half of them may come from one address, as from behind a NAT.  The
+limit is never more than a quarter of the descriptors that this process may have."""
 
 _TURN = 16
-"""Connections taken in one turn, so that those under way have theirs."""
+"""Connections accepted in one turn of the loop.  Then pending connections get their turn."""
 
 _PAUSE = 0.2
-"""Seconds without accepting when there is no descriptor left."""
+"""Seconds without accepting after the process ran out of descriptors."""
 
 _LAST_WORD = 1.0
-"""Seconds for the peer to read why it was turned away: closing at once might destroy that."""
+"""Seconds for the peer to read the reason for a refusal.  Closing at once could destroy it."""
 
 _BACKLOG = 1024
 
@@ -54,9 +54,7 @@ _SHORT_OF_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM
 
 
 class ServedPool(NamedTuple):
-    """One of the pools whose agents dial the same address. Both functions run on the acceptor's
-    thread.
-    """
+    """Pool whose agents dial the acceptor.  Both functions run on the acceptor's thread."""
 
     credentials: MasterCredentials
     on_agent: Callable[[PendingConnection, Hello], None]
@@ -73,7 +71,7 @@ class Acceptor:
     then says which.  Connections are taken once there is a pool.
 
     All pools show the same ``certificate``.  An agent does not name its pool: the key of its proof
-    tells (decision 39).  Strangers belong to no pool, and the first one hears of them.
+    tells the pool (decision 39).  A stranger has no pool, and is reported to the first one.
     """
 
     def __init__(self, address: str, certificate: Certificate) -> None:
@@ -83,7 +81,7 @@ class Acceptor:
         self._lock = threading.Lock()
         self._pools: tuple[ServedPool, ...] = ()
         self._past: tuple[ServedPool, ...] = ()
-        """Pools that were removed.  Their agents are told so, and not taken for strangers."""
+        """Pools that were removed.  Their agents are told so, not reported as strangers."""
         self._refusals = Refusals()
         descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         most = min(_MOST, max(descriptors // 4, 2))
@@ -115,11 +113,11 @@ class Acceptor:
                 self._past += (past,)
 
     def take(self, sock: socket.socket, origin: str) -> None:
-        """Treat a connection that came by another way, a relay's say, as if it were accepted."""
+        """Treat a connection from elsewhere, for example from a relay, as if it were accepted."""
         self.loop.call_soon(self._admit, sock, origin, origin)
 
     def close(self) -> None:
-        """Take nobody any more and hang up on who is under way.  Not on its own thread."""
+        """Stop accepting, and hang up on pending connections.  Do not call it on its own thread."""
         self.loop.call_soon(self._close)
         self.loop.stop()
 
@@ -142,11 +140,11 @@ class Acceptor:
         return None
 
     def make_room(self, connection: PendingConnection) -> None:
-        """It is no stranger, and takes no stranger's place."""
+        """Stop counting ``connection`` as a stranger."""
         self._admission.leave(connection)
 
     def forget(self, connection: PendingConnection) -> None:
-        """It is gone, or in."""
+        """Forget ``connection``, which has ended or belongs to a link now."""
         self._admission.leave(connection)
         self._pending.discard(connection)
 
@@ -196,7 +194,7 @@ class Acceptor:
 
 
 class PendingConnection:
-    """A connection from its first byte to its last in TLS."""
+    """Connection from its first byte to its last byte in TLS."""
 
     def __init__(self, acceptor: Acceptor, host: str, origin: str) -> None:
         self.origin = origin
@@ -208,7 +206,7 @@ class PendingConnection:
         self._pool: ServedPool | None = None
 
     def start(self, sock: socket.socket) -> None:
-        """Prove each other and hear its first words; HungUp if it has gone already."""
+        """Begin the handshake; HungUp if the peer has hung up already."""
         with contextlib.suppress(OSError):  # no TCP, or broken already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         acceptor = self._acceptor
@@ -217,7 +215,7 @@ class PendingConnection:
         self._run(self._handshake.listen(), self._hear)
 
     def _hear(self, words: bytes) -> None:
-        """Find out whose agent it is, from its first words and its proof."""
+        """Find the pool of the agent by its greeting and its proof."""
         try:
             hello = handshake.decode(words)
         except ProtocolError as error:
@@ -242,26 +240,27 @@ class PendingConnection:
         self._part()
 
     def waits_for(self, what: str) -> None:
-        """Note what it waits for, for as long as its time lasts.  Any thread."""
+        """Note what the connection waits for until its deadline.  Any thread."""
         self._awaited = what
 
     def drop(self) -> None:
-        """Hang up without a word.  Any thread."""
+        """Hang up without an answer.  Any thread."""
         self._loop.call_soon(lambda: None if self.gone else self.hang_up())
 
     def welcome(self, greeting: bytes, then: Callable[[int, Secrets], None]) -> None:
-        """Answer it and end TLS; ``then`` gets the connection, on the acceptor's thread.  Any
-        thread.
+        """Answer the agent and end TLS.  Any thread.
+
+        ``then`` gets the connection, on the acceptor's thread.
         """
         self._loop.call_soon(self._answer, greeting, lambda end: then(*end))
 
     def turn_away(self, greeting: bytes, reason: str) -> None:
-        """Answer it, hang up and tell whom it concerns.  Any thread."""
+        """Answer the agent, hang up, and report the refusal.  Any thread."""
         self.report_proven(reason)
         self._loop.call_soon(self._answer, greeting, lambda end: os.close(end[0]))
 
     def report_proven(self, reason: str) -> None:
-        """It has the pool's credentials, and is nobody who can be served.  Any thread."""
+        """Report an agent that has the pool's credentials and cannot be served.  Any thread."""
         self._loop.call_soon(
             lambda: self._acceptor.report(self._host, self.origin, reason, pool=self._pool)
         )
@@ -280,16 +279,16 @@ class PendingConnection:
 
     @property
     def gone(self) -> bool:
-        """Whether it hung up or was hung up on."""
+        """True if one of the two sides has hung up."""
         return self._handshake.sock.fileno() < 0
 
     def refuse(self, what: str) -> None:
-        """Hang up, and tell whom it concerns."""
+        """Hang up, and report the reason."""
         self._acceptor.report(self._host, self.origin, what)
         self.hang_up()
 
     def hang_up(self) -> None:
-        """Let go of it."""
+        """Close the connection without an answer."""
         self._unwatch()
         self._handshake.close()
         self._leave()
@@ -299,7 +298,7 @@ class PendingConnection:
         self._acceptor.forget(self)
 
     def _run(self, steps: tls.Steps[tls._T], then: Callable[[tls._T], None]) -> None:
-        """Go on with ``steps`` whenever the connection is ready."""
+        """Take one of the ``steps`` each time the connection is ready."""
 
         def step() -> None:
             try:
@@ -326,7 +325,7 @@ class PendingConnection:
             self._watched = None
 
     def _part(self) -> None:
-        """Let it read the alert that says why, then hang up."""
+        """Give the peer time to read the TLS alert, then hang up."""
         self._unwatch()
         sock = self._handshake.sock
         try:

@@ -1,9 +1,9 @@
-"""How many may stand between the door and the proof of who they are.
+"""Limits on connections that have not proved themselves yet.
 
-A stranger must cost neither descriptors nor anybody's time.  So there is a bound on all, and one on
-those from one address.  Where it is reached, a newcomer takes the place of the one who has been
-there longest, from the same address or else from the address with the most; but not before that one
-has had a fair chance.
+Strangers must not use up the descriptors of the program, nor keep its agents waiting.  So one limit
+holds for all pending connections, and one for those from one address.  At a limit, a newcomer
+replaces the oldest connection: from the same address, or else from the address with the most
+connections.  A connection is not replaced before it has had a fair chance.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from collections.abc import Hashable
 from typing import NamedTuple
 
 _FAIR_CHANCE = 1.0
-"""Seconds that nobody is sent away for a newcomer; a handshake takes some hundredths of one."""
+"""Seconds for which a newcomer replaces no connection; a handshake takes some hundredths of one."""
 
 
 class Verdict(NamedTuple):
-    """Whether a newcomer comes in, and who has to leave for it."""
+    """Decision about a newcomer, and the connection that it replaces, if any."""
 
     admitted: bool
     leaves: Hashable | None = None
 
 
 class Admission:
-    """Who is there, from where and since when.  Pure: the caller tells the time."""
+    """Table of pending connections by address and age.  Pure: the caller passes the time."""
 
     def __init__(self, total: int, per_address: int) -> None:
         self._total = total
@@ -35,7 +35,7 @@ class Admission:
         return len(self._addresses)
 
     def enter(self, newcomer: Hashable, address: str, now: float) -> Verdict:
-        """``newcomer`` asks to come in."""
+        """Decide whether ``newcomer`` is admitted."""
         crowd = self._crowd(address)
         leaves = None
         if crowd:
@@ -48,7 +48,7 @@ class Admission:
         return Verdict(True, leaves)
 
     def leave(self, one: Hashable) -> None:
-        """That one has proved itself, or is gone."""
+        """Remove a connection that has proved itself, or has ended."""
         address = self._addresses.pop(one, None)
         if address is not None:
             crowd = self._waiting[address]
@@ -57,7 +57,7 @@ class Admission:
                 del self._waiting[address]
 
     def _crowd(self, address: str) -> dict[Hashable, float] | None:
-        """Those of whom one has to make room, if there is none."""
+        """Return the connections of which one must leave for a newcomer; None if there is room."""
         own = self._waiting.get(address, {})
         if len(own) >= self._per_address:
             return own

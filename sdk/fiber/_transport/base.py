@@ -14,70 +14,76 @@ from fiber._wire.packet import BytesLike, Message
 
 
 class Channel(Protocol):
-    """One end of a message pipe.
+    """End of a message pipe.
 
     Messages arrive whole; holders may share an end without a lock.
     """
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message; BrokenPipeError when nobody can ever read it."""
+        """Send one message; BrokenPipeError if the other end has no holder left."""
 
     def send_unconfirmed(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """The same without waiting for another host's answer: an error may come with the next."""
+        """Send one message without waiting for the answer of another host.
+
+        An error may be raised by the next call.
+        """
 
     def recv(self, *, passing: bool = False) -> Message:
-        """The next message; ConnectionClosed when nobody can ever send one.
+        """Return the next message; ConnectionClosed if the other end has no holder left.
 
-        ``passing``: what is large in it is soon copied or let go of.
+        ``passing``: the caller soon copies or releases the large parts of the message.
         """
 
     def recv_object(self) -> Any:
-        """The same, unpickled."""
+        """Return the next message, unpickled."""
 
     def try_recv(self) -> Message | None:
-        """The next message if one is there."""
+        """Return the next message if one is there."""
 
     def poll(self, timeout: float | None) -> bool:
-        """Whether ``recv`` would return or raise at once; None waits for ever."""
+        """Wait until ``recv`` would return or raise at once; None waits for ever.
+
+        Return False after ``timeout`` seconds.
+        """
 
     def fileno(self) -> int:
-        """A descriptor that is readable whenever ``recv`` would not block."""
+        """Return a descriptor that is readable whenever ``recv`` would not block."""
 
     def close(self) -> None:
-        """Let go of this end; the other end sees EOF when its last holder has."""
+        """Close this holder's end.  The other end sees EOF after the last holder has closed it."""
 
 
 class Counter(Protocol):
-    """A count of things that never falls below zero, to be waited for."""
+    """Count that never falls below zero, and that callers can wait for."""
 
     def add(self, n: int = 1) -> None:
-        """Raise the count and wake who waits."""
+        """Raise the count and wake the waiters."""
 
     def take(self, timeout: float | None, taken: list[Any] | None = None) -> bool:
         """Lower the count by one once it is above zero; False when ``timeout`` is over.
 
-        ``taken`` gets an entry when it is: whoever is interrupted sees there what to give back.
+        ``taken`` gets an entry when the count is lowered: an interrupted caller can give it back.
         """
 
     def clear(self) -> int:
-        """Set the count to zero and say what it was."""
+        """Set the count to zero and return the count before."""
 
     def value(self) -> int:
-        """The count now."""
+        """Return the count."""
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until the count is above zero, without lowering it."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close this holder's end of the counter."""
 
 
 class SharedChannel(Channel, Protocol):
-    """A channel that a queue can use: it never has to wait."""
+    """Channel that a queue can use, because it can send without waiting."""
 
     @property
     def can_try_send(self) -> bool:
-        """Whether ``try_send`` is worth a try."""
+        """True if ``try_send`` can succeed."""
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room but not until it is read."""
@@ -86,29 +92,30 @@ class SharedChannel(Channel, Protocol):
         """Send one message if there is room for it now."""
 
     def recv_counting(self, counter: Any, *, wait: bool) -> Message | None:
-        """Receive a message and raise a ``SharedCounter`` of the same host; None if there is none.
+        """Receive a message and raise ``counter``, a ``SharedCounter`` of the same host.
 
-        Neither an interrupt nor the death of this process comes in between.
+        Both happen or none, also if this process is interrupted or dies.  Return None if there is
+        no message.
         """
 
 
 class Claimant(Protocol):
-    """Notes how many places of a counter a process has."""
+    """Record of how many places of a counter a process holds."""
 
     def add(self) -> None:
-        """Note one more."""
+        """Record one more place."""
 
     def drop(self) -> None:
-        """Note one less."""
+        """Record one place less."""
 
 
 class SharedCounter(Counter, Protocol):
-    """A counter whose every change can be waited for."""
+    """Counter of which callers can wait for each change."""
 
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
-        """As ``take``, and note it in ``claims``.
+        """Take one as ``take`` does, and record it in ``claims``.
 
-        A process that dies meanwhile has taken nothing, or has a claim.
+        A process that dies in between has taken nothing, or has a claim.
         """
 
     def changed(self, since: int, timeout: float | None) -> bool:

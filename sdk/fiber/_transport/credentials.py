@@ -1,8 +1,8 @@
-"""What a master and an agent prove each other by.
+"""Credentials by which a master and an agent prove themselves to each other.
 
-A master has the pool's key and a certificate that it signed itself, new for each run of a program.
-An agent has a key of its own, which the master derives again from the agent's name and uid.  So the
-master keeps nothing about agents, and an agent can prove to be no other.
+A master has the key of the pool, and a certificate that it signed itself for this run of the
+program.  An agent has its own key.  The master derives that key again from the agent's name and
+uid, so it stores nothing about agents, and an agent cannot prove to be another one.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from fiber.errors import ConfigError
 from fiber_api import identity
 
 _VALIDITY = datetime.timedelta(days=3650)
-"""No side reads it: agents compare the certificate with what the master proves."""
+"""Validity of a certificate.  No side reads it: agents compare the certificate's fingerprint."""
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """What an agent has."""
+    """Credentials of an agent."""
 
     name: str
     uid: str
     key: str = field(repr=False)
-    """The agent's own, derived from the pool's."""
+    """Key of the agent, derived from the key of the pool."""
     master: str = ""
-    """The fingerprint of the only master that this agent may have; empty where masters follow one
-    another."""
+    """Fingerprint of the only master that this agent may have; empty in a warm pool, where masters
+    follow one another."""
     epoch: int = 0
-    """The latest master that this agent has served.  An earlier one is refused."""
+    """Epoch of the latest master that this agent has served.  Earlier masters are refused."""
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Credentials:
-        """Read what a pod's init container wrote, and remove the file."""
+        """Read the file that the init container of a pod wrote, and remove it."""
         try:
             return cls._read(credentials_file.take(os.fspath(path)))
         except OSError as error:
@@ -56,7 +56,7 @@ class Credentials:
         )
 
     def to_descriptor(self) -> int:
-        """Return a descriptor from which the process that inherits it can read them once."""
+        """Return a descriptor from which its heir can read the credentials, once."""
         values = json.dumps(asdict(self)).encode()
         reader, writer = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         try:
@@ -71,12 +71,12 @@ class Credentials:
 
     @classmethod
     def from_descriptor(cls, descriptor: int) -> Credentials:
-        """Read what ``to_descriptor`` wrote, and close it.  The error does not repeat anything."""
+        """Read what ``to_descriptor`` wrote, and close the descriptor.  Errors repeat no secret."""
         try:
             with open(descriptor, "rb") as file:
                 return cls._read(file.read())
         except (OSError, OverflowError, ValueError, KeyError, TypeError, AttributeError):
-            # Whatever else a descriptor may bring.
+            # A descriptor may bring anything.
             raise ConfigError(
                 f"the credentials on descriptor {descriptor} cannot be read: it is not open, or "
                 "brings what is cut short or not Fiber's. Hand them over as the master made them."
@@ -116,11 +116,11 @@ class MasterCredentials:
     pool_key: str = field(repr=False)
     certificate: Certificate = field(repr=False)
     only: bool = True
-    """Whether the pool never has another master, so that agents may be told the fingerprint."""
+    """True if the pool never has another master.  Then its agents know the fingerprint."""
 
     @property
     def fingerprint(self) -> str:
-        """What agents compare the certificate with; empty where another master may follow."""
+        """Hash that agents compare the certificate with; empty if another master may follow."""
         return self.certificate.hash.hex() if self.only else ""
 
     def agent_key(self, name: str, uid: str) -> str:
@@ -128,7 +128,7 @@ class MasterCredentials:
         return identity.agent_key(self.pool_key, name, uid)
 
     def agent(self, name: str, uid: str) -> Credentials:
-        """Return the credentials of an agent: with them it can prove to be no other."""
+        """Return the credentials of an agent, which prove no other agent."""
         return Credentials(name, uid, self.agent_key(name, uid), self.fingerprint)
 
 

@@ -39,11 +39,11 @@ the same time, each of which costs it milliseconds; but its host may vanish in t
 more."""
 
 _LONGER = 2
-"""How much longer an agent bears silence than its master."""
+"""Factor by which an agent waits longer in silence than its master does."""
 
 
 class Unreachable(Exception):
-    """Nobody took the connection, or saw it through."""
+    """No master took the connection, or it ended before the welcome."""
 
 
 class AgentDialer:
@@ -81,18 +81,18 @@ class AgentDialer:
         self._link: ResumableLink | None = None
         self._obstacle = "nothing was tried"
         self.epoch = credentials.epoch
-        """That of the master, once there is a link."""
+        """Epoch of the master, once there is a link."""
         self.lost_grace: float | None = None
-        """What the master says of its loss, once there is a link."""
+        """Seconds to wait for another master if this one is lost, once there is a link."""
         self._over = threading.Event()
         self._lock = threading.Lock()
         self._sock: socket.socket | None = None
-        """Where the master's answer is waited for; under the lock."""
+        """Socket on which the dialling thread waits for the answer; under the lock."""
         self._deadline = None if timeout is None else loop.call_later(timeout, self._too_late)
         self._start()
 
     def close(self) -> None:
-        """Give up dialling, or drop the link without a farewell.  Calls nobody back."""
+        """Stop dialling, or drop the link without a farewell.  No callback follows."""
         self._loop.call_soon(self._stop)
 
     def _start(self, pause: float = 0.0) -> None:
@@ -128,7 +128,7 @@ class AgentDialer:
                 self._loop.call_soon(self._no_master, error)
                 return
             except (Unreachable, tls.HungUp) as error:
-                # Nobody there yet, or no way there yet.
+                # No master listens yet, or there is no route to it yet.
                 self._obstacle = str(error)
             else:
                 self._loop.call_soon(self._answered, *met)
@@ -186,7 +186,7 @@ class AgentDialer:
             self._welcomed(welcome, descriptor, secrets)
 
     def _welcome_in(self, answer: bytes) -> Welcome:
-        """What the master says, if it is a welcome."""
+        """Return the welcome in the answer of the master; raise an error if it is none."""
         try:
             greeting = handshake.decode(answer)
         except ProtocolError as error:

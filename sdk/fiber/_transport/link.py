@@ -1,7 +1,7 @@
-"""What a link between the master and an agent promises, whatever carries it.
+"""Interface of a link between the master and an agent.
 
-A link carries frames both ways, each once and in order, also across a break of the connection under
-it.  It ends when one side closes it or when nothing was heard for too long; then it stays ended.
+A link carries frames both ways, each once and in order, also when the connection under it breaks
+and is replaced.  It ends when one side closes it, or after too long a silence, and stays ended.
 ``resumable_link.ResumableLink`` is the one implementation; ``listener``, ``dialer`` and ``memory``
 make them.
 """
@@ -18,51 +18,52 @@ from fiber._wire.messages import BytesLike
 
 
 class Keepalive(NamedTuple):
-    """How long silence is borne, in seconds."""
+    """Limits of silence on a link, in seconds."""
 
     heartbeat: float = HEARTBEAT
-    """Who has nothing to say for so long says that."""
+    """A side that has sent nothing for so long sends a heartbeat."""
     suspect_after: float = 7.0
-    """Two heartbeats did not come."""
+    """The peer is suspect: two heartbeats did not come."""
     lost_after: float = 15.0
-    """The link ends; whatever comes later is dropped."""
+    """The link ends.  Messages that come later are dropped."""
 
 
 DEFAULT_KEEPALIVE = Keepalive()
 
 
 class LinkObserver(Protocol):
-    """Hears what happens to a link.  Called on the loop's thread; must not block."""
+    """Observer of a link.  Its methods run on the loop's thread and must not block."""
 
     def on_frame(self, frame: Frame) -> None:
-        """The next frame.  One that can be written to is the observer's to keep and to write to."""
+        """Take the next frame.  The observer owns a writable frame and may change it."""
 
     def on_suspect(self) -> None:
-        """The peer has not been heard for a while; it may come back."""
+        """Note that the peer has been silent for a while.  It may come back."""
 
     def on_trusted(self) -> None:
-        """The peer that was suspect is heard again, and nothing was lost."""
+        """Note that a suspect peer is heard again, and nothing was lost."""
 
     def on_lost(self, reason: str) -> None:
-        """The link ended, and not by our ``close``.  Exactly once, and last."""
+        """Note that the link ended, and not by ``close`` on this side.  Called once, and last."""
 
 
 class Link(Protocol):
-    """One end of a link.  Any thread; nothing blocks."""
+    """End of a link.  Any thread may call its methods, and none blocks."""
 
     peer: Identity
 
     def attach(self, observer: LinkObserver) -> None:
-        """Whom to tell.  What arrives before waits for it."""
+        """Set the observer.  Frames that arrived before wait for it."""
 
     def send(
         self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
     ) -> None:
         """Send a frame as soon as there is room; dropped if the link has ended.
 
-        It may come in pieces.  Large ones are not copied, and must not change until they arrived.
-        Large frames of different lanes travel at the same time (``turns.py`` says in which order).
-        ``on_left`` is called on the loop's thread when the last of it was given to the connection.
+        The frame may be given in pieces.  Large pieces are not copied, and must not change until
+        they have arrived.  Large frames of different lanes travel at the same time (``turns.py``
+        has the order).  ``on_left`` is called on the loop's thread when the connection has taken
+        the last piece.
         """
 
     def close(
@@ -72,54 +73,54 @@ class Link(Protocol):
         linger: float = 1.0,
         then: Callable[[], None] | None = None,
     ) -> None:
-        """End the link: the observer hears nothing more, the peer's hears ``on_lost(reason)``.
+        """End the link.  The peer's observer gets ``on_lost(reason)``; this side's gets nothing.
 
-        What was sent still arrives if that takes no longer than ``linger`` seconds.  ``then`` is
-        called on the loop's thread when it is over.
+        Frames that were sent still arrive if that takes at most ``linger`` seconds.  ``then`` is
+        called on the loop's thread when the link has ended.
         """
 
     def statistics(self) -> Statistics:
-        """What it holds now and has done so far."""
+        """Return what the link holds now, and what it has done so far."""
 
 
 class Wire(Protocol):
-    """What a link puts its datagrams on: a connection, which keeps their order until it breaks."""
+    """Connection under a link.  It keeps the order of datagrams until it breaks."""
 
     def put(self, datagram: Datagram) -> None:
-        """Send it; never blocks and never raises."""
+        """Send a datagram; never blocks and never raises."""
 
     def break_off(self) -> None:
-        """End the connection, as if it had broken: whoever dials dials again."""
+        """End the connection as if it had broken, so that the agent dials again."""
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
 
 
 class Timer(Protocol):
-    """A call that is due."""
+    """Call that the loop makes later."""
 
     def cancel(self) -> None:
-        """Never call it."""
+        """Cancel the call."""
 
 
 class EventLoop(Protocol):
-    """What a link needs of the loop: its clock and its turns."""
+    """Part of the loop that a link needs: its clock and its turns."""
 
     def now(self) -> float:
-        """Monotonic seconds."""
+        """Return the time in seconds of a monotonic clock."""
 
     def call_soon(self, callback: Callable[..., None], *args: Any) -> None:
-        """Call it on the loop's thread; from any thread."""
+        """Call ``callback`` on the loop's thread.  Any thread."""
 
     def call_later(self, seconds: float, callback: Callable[..., None], *args: Any) -> Timer:
-        """Call it once, later."""
+        """Call ``callback`` once, after ``seconds``."""
 
 
 class SelectorEventLoop(EventLoop, Protocol):
-    """A loop that also watches descriptors."""
+    """Loop that also watches descriptors."""
 
     def register(self, fd: int, callback: Callable[[], None]) -> None:
         """Call back whenever ``fd`` is readable."""
 
     def unregister(self, fd: int) -> None:
-        """Forget it."""
+        """Stop watching ``fd``."""

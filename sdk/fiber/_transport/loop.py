@@ -1,7 +1,7 @@
-"""One thread that waits for descriptors and timers and calls back.
+"""Event loop: a thread that waits for descriptors and timers, and runs callbacks.
 
-In a program it is the daemon thread ``fiber-io``; in an agent it is the main thread.  Callbacks run
-one at a time, must not block, and an exception in one is reported and does not stop the others.
+In a program this is the daemon thread ``fiber-io``; in an agent it is the main thread.  Callbacks
+run one at a time and must not block.  An exception in a callback is reported, and the loop goes on.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ _this_thread = threading.local()
 
 
 def runs_here() -> bool:
-    """Whether some loop runs on the calling thread, which then must not wait."""
+    """Tell whether a loop runs on the calling thread, which then must not wait."""
     return getattr(_this_thread, "runs_a_loop", False)
 
 
 class Dependent(Protocol):
-    """Waits for what only a loop can bring."""
+    """Waiter for something that only a loop can bring."""
 
     def broken(self, error: FiberError) -> None:
-        """The loop has failed, and brings nothing any more.  On its thread, once."""
+        """Note that the loop has failed and brings nothing.  Called once, on the loop's thread."""
 
 
 class Timer:
-    """A call that is due; ``cancel`` forgets it."""
+    """Call that the loop makes later, unless it is cancelled."""
 
     __slots__ = ("callback", "due")
 
@@ -67,12 +67,12 @@ class Timer:
         self.callback: Callback | None = callback
 
     def cancel(self) -> None:
-        """Never call it."""
+        """Cancel the call."""
         self.callback = None
 
 
 class Wakeup:
-    """An eventfd that lives for as long as somebody could write to it."""
+    """Eventfd that stays open while a caller may still write to it."""
 
     __slots__ = ("_owner", "fd")
 
@@ -81,16 +81,16 @@ class Wakeup:
         self.fd = self._owner.fileno()
 
     def set(self) -> None:
-        """Make it readable."""
+        """Make the eventfd readable."""
         os.eventfd_write(self.fd, 1)
 
 
 class Loop:
-    """An epoll loop.  ``register`` and ``unregister`` may be called from any thread.
+    """Event loop over epoll.  ``register`` and ``unregister`` may be called from any thread.
 
-    ``call_soon`` may be called from anywhere: another thread, a signal handler, a finalizer that
-    the garbage collector runs at any line, of this module too.  It takes no lock, and what it
-    changes it changes in single steps.
+    ``call_soon`` may be called from anywhere: from another thread, from a signal handler, from a
+    finalizer that the garbage collector runs at any line, also of this module.  It takes no lock,
+    and each of its changes is a single step.
     """
 
     def __init__(self) -> None:
@@ -119,23 +119,23 @@ class Loop:
         self._thread.start()
 
     def on_thread(self) -> bool:
-        """Whether the caller is the loop's own thread."""
+        """Tell whether the caller runs on the loop's thread."""
         return threading.get_ident() == self._ident
 
     @property
     def broken(self) -> bool:
-        """Whether it has failed, and calls nobody back any more."""
+        """True if the loop has failed.  Then it runs no callback."""
         return self._failure is not None
 
     @property
     def running(self) -> bool:
-        """Whether it still calls back."""
+        """True while the loop runs callbacks."""
         return self._running
 
     def depend(self, dependent: Dependent) -> None:
-        """Tell ``dependent`` if the loop fails; raises at once if it has failed already.
+        """Tell ``dependent`` if the loop fails; raise at once if it has failed already.
 
-        It is held weakly.
+        The loop holds ``dependent`` weakly.
         """
         # Both sides note first and look then: one of both sees the other.
         self._dependents.add(dependent)
@@ -144,20 +144,20 @@ class Loop:
 
     @staticmethod
     def now() -> float:
-        """The loop's clock: monotonic seconds."""
+        """Return the time of the loop's clock, in monotonic seconds."""
         return time.monotonic()
 
     def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
-        """Call it on the loop's thread, after what was asked before; from anywhere."""
+        """Call ``callback`` on the loop's thread, after all earlier calls.  From anywhere."""
         self._ready.append((callback, args))
-        # The loop notes that it goes to sleep and looks for calls then.  Only the loop takes that
-        # back: whoever is interrupted here, by a signal that raises, has changed nothing.
-        wakeup = self._wakeup  # held until this is over, so that it is nobody else's meanwhile
+        # The loop notes that it goes to sleep, and then looks for calls.  Only the loop takes that
+        # note back, so a caller that a signal interrupts here has changed nothing.
+        wakeup = self._wakeup  # held, so that its descriptor is not closed and reused meanwhile
         if self._asleep and wakeup is not None:
             wakeup.set()
 
     def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
-        """Call it once, ``seconds`` from now, on the loop's thread."""
+        """Call ``callback`` once, ``seconds`` from now, on the loop's thread."""
         timer = Timer(self.now() + seconds, partial(callback, *args) if args else callback)
         if self.on_thread():
             self._add_timer(timer)
@@ -227,13 +227,13 @@ class Loop:
             return
         finally:
             self._asleep = False
-        self._run_ready()  # what was asked for before something happened is done before it is told
+        self._run_ready()  # calls that were asked for before an event run before its callback
         self._dispatch(events)
         self._run_ready()
         self._run_timers()
 
     def _break(self, error: BaseException) -> None:
-        """Whoever waits must not wait for ever: tell them that nothing will come."""
+        """Tell all dependents that nothing will come, so that none waits for ever."""
         failure = FiberError(
             f"the thread that Fiber waits with has ended by {error!r}: what was asked for cannot "
             "arrive. Look whether the program closes descriptors that are not its own, as "

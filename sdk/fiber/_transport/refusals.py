@@ -1,18 +1,20 @@
-"""Which refusals are told: strangers that vary their address or their fault must not fill the log,
-nor keep what concerns the program's own agents out of it.
+"""Choice of the refusals that are logged.
+
+Strangers that vary their address or their fault must not fill the log, and must not keep refusals
+of the program's own agents out of it.
 """
 
 from __future__ import annotations
 
 _MOST = 256
-"""Refusals that are remembered of strangers, and of the program's own agents."""
+"""Limit of remembered refusals: of strangers, and of the program's own agents."""
 
 _FORGET = 300.0
-"""Seconds after which the same is told again, and how often strangers are summed up."""
+"""Seconds until the same refusal is logged again, and between two summaries of strangers."""
 
 
 class Refusals:
-    """Refusals that were told, and when.  Pure: the caller tells the time.
+    """Refusals that were logged, and when.  Pure: the caller passes the time.
 
     An own agent is one that has proved to have the pool's credentials.
     """
@@ -24,7 +26,7 @@ class Refusals:
         self._next_summary = 0.0
 
     def news(self, host: str, origin: str, reason: str, now: float, *, own: bool = False) -> str:
-        """Return what to tell of a refusal, which is nothing if it was told lately.
+        """Return the line to log for a refusal; empty if the same was logged lately.
 
         ``own`` marks a refusal of an agent of the program: no number of strangers suppresses it.
         """

@@ -1,9 +1,9 @@
-"""The one implementation of a link: a stream, the loop that drives it, the wire of the moment.
+"""Implementation of a link: a stream, the loop that drives it, and the present connection.
 
-Who touches what: ``send``, ``close`` and ``attach`` come from any thread and only leave a note for
-the loop; everything else happens on the loop's thread.  The transport under it (``listener``,
-``dialer``, ``memory``) calls ``connected``, ``disconnected``, ``datagram`` and ``refused``, and is
-told by ``on_end`` when to forget the link.
+``send``, ``close`` and ``attach`` may be called from any thread; they only leave a note for the
+loop.  All else runs on the loop's thread.  The transport under the link (``listener``, ``dialer``,
+``memory``) calls ``connected``, ``disconnected``, ``datagram`` and ``refused``.  The link calls
+``on_end`` when the transport must forget it.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ _LAST_WORD = 0.2
 
 
 _GRAIN = 0.001
-"""Seconds.  No timer is finer, or rounding could make one fire just too early, for ever."""
+"""Seconds that a timer takes at least.  By rounding, a shorter one could fire too early for ever."""
 
 
 class _State(enum.Enum):
     OPEN = enum.auto()
     CLOSING = enum.auto()
-    """Closed by us: what is queued still leaves."""
+    """This side has closed the link.  Queued frames still leave."""
     LEAVING = enum.auto()
-    """We said good-bye and wait for the answer."""
+    """This side has said good-bye and waits for the answer."""
     ENDED = enum.auto()
 
 
 class ResumableLink:
-    """A link over one wire after the other; a ``Link``."""
+    """Link over one wire after the other; a ``Link``."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class ResumableLink:
         *,
         dials: bool = False,
     ) -> None:
-        """``dials``: whether this side replaces a connection, and so may give one up."""
+        """``dials``: True if this side makes new connections, and so may give one up."""
         self.peer = peer
         self._loop = loop
         self._keepalive = keepalive
@@ -72,21 +72,21 @@ class ResumableLink:
 
     @property
     def arrived(self) -> int:
-        """How much of the peer's has arrived, for the handshake."""
+        """Number of the peer's datagrams that have arrived, for the handshake."""
         return self._stream.arrived
 
     @property
     def is_connected(self) -> bool:
-        """Whether there is a connection now."""
+        """True while there is a connection."""
         return self._wire is not None
 
     @property
     def heard(self) -> bool:
-        """Whether the peer has ever said anything."""
+        """True if the peer has ever sent anything."""
         return self._stream.heard
 
     def attach(self, observer: LinkObserver) -> None:
-        """Whom to tell.  What arrived before waits for it."""
+        """Set the observer.  Frames that arrived before wait for it."""
         self._observer = observer
         self._loop.call_soon(self._hand_over)
 
@@ -108,7 +108,7 @@ class ResumableLink:
         self._loop.call_soon(self._close, reason, linger, then)
 
     def statistics(self) -> Statistics:
-        """What it holds now and has done so far."""
+        """Return what the link holds now, and what it has done so far."""
         return self._stream.statistics()
 
     def connected(self, wire: Wire, arrived: int) -> None:
@@ -130,12 +130,12 @@ class ResumableLink:
         self._flush()
 
     def disconnect(self) -> None:
-        """Let go of the wire.  The peer has, or dials again once it notices."""
+        """Close the wire.  The peer has closed it, or dials again once it notices."""
         if self._wire is not None:
             self._unplug().close()
 
     def disconnected(self, wire: Wire) -> None:
-        """``wire`` broke; one that was replaced before does not matter."""
+        """Note that ``wire`` broke.  A wire that was replaced before does not matter."""
         if wire is not self._wire:
             return
         _logs.debug("link with %s: the connection ended", self.peer.name)
@@ -144,7 +144,7 @@ class ResumableLink:
             self._end()
 
     def datagram(self, wire: Wire, datagram: BytesLike) -> None:
-        """Take, and do not keep, what came over ``wire``; nothing from one that was replaced."""
+        """Take a datagram from ``wire`` without keeping it; ignore a wire that was replaced."""
         if wire is not self._wire or self._state is _State.ENDED:
             return
         if datagram[:1] == _BYE:
@@ -157,7 +157,7 @@ class ResumableLink:
             self._take(wire, datagram)
 
     def refused(self, reason: str) -> None:
-        """The peer does not go on with it."""
+        """End the link, which the peer does not continue."""
         self._lose(reason)
 
     def _take(self, wire: Wire, datagram: BytesLike) -> None:
@@ -187,9 +187,9 @@ class ResumableLink:
                 observer.on_trusted()
 
     def _hand_over(self) -> None:
-        """Tell the observer what waits for it.
+        """Give the observer the frames that wait for it.
 
-        A frame that it fails on cannot count as handled: the other side relies on each.
+        If the observer fails on a frame, the link ends: the peer relies on every frame.
         """
         try:
             while self._inbox and (observer := self._observer):
@@ -211,7 +211,7 @@ class ResumableLink:
             self._flush_soon()
 
     def _flush_soon(self) -> None:
-        """Flush once for all that is sent in this turn."""
+        """Flush once for all frames that are sent in this turn."""
         if not self._flush_due:
             self._flush_due = True
             self._loop.call_soon(self._flush)
@@ -232,7 +232,7 @@ class ResumableLink:
         self._set_timer(now)
 
     def _set_timer(self, now: float) -> None:
-        """Set the timer; one that is due too early only looks again."""
+        """Set the timer.  A timer that fires too early only looks again."""
         due = self._stream.next_timer()
         if self._timer is not None:
             if self._timer_due <= due:
@@ -275,7 +275,7 @@ class ResumableLink:
             self._flush()
 
     def _give_up(self) -> None:
-        """The linger is over."""
+        """End the link after its linger, with or without the peer's answer."""
         if self._state is _State.ENDED:
             return
         if self._state is _State.CLOSING and self._wire is not None:
