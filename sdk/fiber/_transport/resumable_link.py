@@ -27,7 +27,7 @@ _LAST_WORD = 0.2
 
 
 _GRAIN = 0.001
-"""Seconds that a timer takes at least.  By rounding, a shorter one could fire too early for ever."""
+"""Seconds that a timer takes at least.  Rounding could make a shorter one fire early for ever."""
 
 
 class _State(enum.Enum):
