@@ -1,4 +1,4 @@
-"""Who is there: the first words on a connection, before it belongs to a link.
+"""Greetings on a connection, before it belongs to a link.
 
     agent                                master
       │  Hello: identity, link,            │
@@ -32,7 +32,7 @@ _LONGEST_NAME = 253
 
 @dataclasses.dataclass(frozen=True)
 class Identity:
-    """Who one side is.  ``facts`` are what it tells about its host."""
+    """Identity of one side.  ``facts`` describe its host."""
 
     name: str
     protocol: int
@@ -40,60 +40,60 @@ class Identity:
     fiber: str
     facts: Mapping[str, str] = dataclasses.field(default_factory=dict)
     uid: str = ""
-    """The pod's, in an agent's.  An agent has proved to have this name and uid."""
+    """Uid of the agent's pod.  An agent has proved to have this name and uid."""
 
     @classmethod
     def of_this_process(cls, name: str, uid: str = "", **facts: str) -> Identity:
-        """This interpreter and this Fiber, called ``name``."""
+        """Return the identity of this interpreter and this Fiber, under ``name``."""
         return cls(name, PROTOCOL, platform.python_version(), _fiber_version(), facts, uid)
 
 
 class Hello(NamedTuple):
-    """An agent's first words."""
+    """Greeting of an agent."""
 
     identity: Identity
     link: str
-    """Names the link; random, so that a master that restarted takes it for no other, and nobody
-    else can name it."""
+    """Random name of the link.  A master that restarted takes it for no other link, and no other
+    agent can guess it."""
     arrived: int
-    """The master's datagrams that the agent has."""
+    """Number of the master's datagrams that the agent has."""
     welcomed: bool
-    """Whether a master has spoken on this link: then only that master can go on with it."""
+    """True if a master has spoken on this link.  Then only that master can continue it."""
 
     def encode(self) -> bytes:
-        """The datagram."""
+        """Return the datagram."""
         return _encode(_HELLO, self)
 
 
 class Welcome(NamedTuple):
-    """The master takes the agent's link, or goes on with it."""
+    """Greeting of a master that takes a new link, or continues a known one."""
 
     identity: Identity
     arrived: int
-    """The agent's datagrams that the master has."""
+    """Number of the agent's datagrams that the master has."""
     heartbeat: float
-    """How long the master bears silence: the fields of a ``Keepalive``."""
+    """Limits of silence on the link: the fields of a ``Keepalive``, in seconds."""
     suspect_after: float
     lost_after: float
     lost_grace: float | None = None
-    """Seconds for which the agent shall wait for another master if this one is lost; None: it knows
-    better, or waits for none."""
+    """Seconds for which the agent waits for another master if this one is lost.  None: it uses its
+    own setting, or waits for none."""
     epoch: int = 0
-    """Counts the masters that follow one another in a pool."""
+    """Number of this master among those that follow one another in a pool."""
 
     def encode(self) -> bytes:
-        """The datagram."""
+        """Return the datagram."""
         return _encode(_WELCOME, self)
 
 
 class Refusal(NamedTuple):
-    """The master wants nothing to do with it."""
+    """Greeting of a master that refuses the agent."""
 
     identity: Identity
     reason: str
 
     def encode(self) -> bytes:
-        """The datagram."""
+        """Return the datagram."""
         return _encode(_REFUSAL, self)
 
 

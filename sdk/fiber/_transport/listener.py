@@ -22,13 +22,16 @@ class MasterListener:
 
     ``at`` is the acceptor that the agents dial, which other pools may share, or an address for an
     acceptor of this pool's own, which is closed with the pool.  An address is ``host:port``.  The
-    callbacks run on the loop's thread: ``on_agent`` attaches an observer to the new link, or
-    returns why it does not want it; ``on_refused`` hears who was turned away and why;
-    ``on_proven`` hears of each connection that proved to be an agent of the pool.  ``objection``
-    says why an agent that has proved its name and uid is not taken, "" if it is, and None as long
-    as that is not known: then it waits until ``look_again`` is called, for some seconds at most.
-    ``lost_grace`` is told to the agents: for so many seconds they wait for another master if this
-    one is lost.
+    callbacks run on the loop's thread:
+
+    * ``on_agent`` attaches an observer to the new link, or returns why the link is not wanted.
+    * ``on_refused`` gets the line to log for a connection that was turned away.
+    * ``on_proven`` is called for each connection that proved to be an agent of the pool.
+    * ``objection`` returns why an agent with this name and uid is refused, or "".  None means that
+      this is not known yet: the agent then waits some seconds for a call of ``look_again``.
+
+    ``lost_grace`` is sent to the agents: the seconds that they wait for another master if this one
+    is lost.
     """
 
     def __init__(
@@ -49,7 +52,7 @@ class MasterListener:
         self._on_proven = on_proven
         self._knows = objection
         self.epoch = 0
-        """Counts the masters of a pool.  On the loop's thread."""
+        """Number of this master among those of the pool.  On the loop's thread."""
         self._waiting: dict[tuple[str, str], tuple[PendingConnection, Hello]] = {}
         self._by_peer: dict[tuple[str, str], ResumableLink] = {}
         self._keepalive = keepalive
@@ -68,7 +71,7 @@ class MasterListener:
         self._acceptor.add(self._served)
 
     def take(self, sock: socket.socket, origin: str) -> None:
-        """Serve a connection to an agent that came by another way than ``address``."""
+        """Serve a connection to an agent that did not come through ``address``."""
         self._acceptor.take(sock, origin)
 
     def close(
@@ -108,15 +111,15 @@ class MasterListener:
             self._acceptor.close()
 
     def break_connections(self) -> None:
-        """Have each agent dial again, as after a broken connection.  On the loop's thread.
+        """Break all connections, so that each agent dials again.  On the loop's thread.
 
-        An agent that reaches this master again goes on with its link, and loses nothing.
+        An agent that reaches this master again continues its link, and loses nothing.
         """
         for link in self._links.values():
             link.disconnect()
 
     def look_again(self) -> None:
-        """Decide about the agents that wait.  On the loop's thread."""
+        """Decide anew about the agents that wait.  On the loop's thread."""
         waiting, self._waiting = self._waiting, {}
         for pending, hello in waiting.values():
             if not pending.gone:
@@ -127,7 +130,7 @@ class MasterListener:
         self._greet(pending, hello)
 
     def _greet(self, pending: PendingConnection, hello: Hello) -> None:
-        """An agent has proved its name and uid."""
+        """Answer an agent that has proved its name and uid."""
         reason = self._objection(hello)
         if reason is None:
             self._let_wait(pending, hello)
@@ -171,8 +174,7 @@ class MasterListener:
     def _welcome(self, pending: PendingConnection, hello: Hello) -> None:
         link = self._links.get(hello.link)
         if link is not None:
-            # What its last connection might still bring is not to arrive: the agent is told now how
-            # much has.
+            # The welcome says how much has arrived.  The old connection must bring nothing more.
             link.disconnect()
         arrived = link.arrived if link else 0
         welcome = Welcome(self._identity, arrived, *self._keepalive, self._lost_grace, self.epoch)
@@ -191,7 +193,7 @@ class MasterListener:
         descriptor: int,
         secrets: Secrets,
     ) -> None:
-        """Go on without TLS."""
+        """Give the connection, which has left TLS, to its link."""
         link = self._links.get(hello.link)
         if self._closing is not None or (link.arrived if link else 0) != arrived:
             os.close(descriptor)  # this master ends, or the agent has come by another connection

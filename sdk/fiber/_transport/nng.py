@@ -1,14 +1,14 @@
-"""nng carries what two sides that have proved themselves say.  The only importer of pynng.
+"""Connections between two sides that have proved themselves, over nng.  The only importer of pynng.
 
-Each connection is a Pair1 socket of its own, made of a descriptor (nng's transport ``socket://``).
-Where it came from, and who is at its other end, others have seen to; here every message is sealed.
+Each connection is a Pair1 socket, made of a descriptor (nng's transport ``socket://``).  Acceptor
+and dialer have made the descriptor and checked the peer.  Here every message is sealed.
 
-What nng does behind one's back, and what follows from it:
+Facts about nng, and what follows from them:
 
-* It holds back what the connection does not take, up to the size of its queue; a link never has as
-  much under way.
-* It tells of a connection's beginning and end on a thread of its own; the callbacks only leave a
-  note.
+* nng queues messages that the connection does not take yet, up to the size of its queue.  A link
+  never has that many under way.
+* nng reports the beginning and the end of a connection on its own thread.  These callbacks only
+  leave a note for the loop.
 * Closed while it still exchanges its greeting (eight bytes each way), it may forget to close the
   descriptor.  So such a connection is ended first, which nng notices in a moment, and then closed.
 * A socket does not survive a fork: in the child it is made harmless, not closed.
@@ -39,7 +39,7 @@ from fiber._wire.messages import ProtocolError
 from fiber.errors import LinkError, TooManyOpenFiles
 
 _TURN = 64
-"""Messages taken in one turn of the loop, so that a flood leaves others their turn."""
+"""Messages taken in one turn of the loop.  Then other descriptors get their turn."""
 
 _LARGEST = LARGEST + OVERHEAD + 4
 """Bytes of the longest message: with a datagram goes nng's own hop count."""
@@ -54,9 +54,9 @@ _lib, _ffi = _nng.lib, _nng.ffi
 
 
 class Connection:
-    """One connection; a ``Wire``.  Its callbacks run on the loop's thread.
+    """Connection over nng; a ``Wire``.  Its callbacks run on the loop's thread.
 
-    ``on_gone`` is called once when it breaks, and not after ``close``.
+    ``on_gone`` is called once when the connection breaks, and not after ``close``.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Connection:
         on_datagram: Callable[[Wire, memoryview], None],
         on_gone: Callable[[Wire], None],
     ) -> None:
-        """Takes over ``descriptor``, whatever happens."""
+        """Take over ``descriptor``, also if an error is raised."""
         self._loop = loop
         self._sealer = Sealer(secrets.outgoing)
         self._opener = Opener(secrets.incoming)

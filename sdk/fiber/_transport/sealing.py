@@ -1,8 +1,9 @@
-"""Sealed messages: AES-256-GCM under a counter, with a key of its own for each direction.
+"""Sealed messages: AES-256-GCM under a counter, with one key for each direction.
 
-The counter is not sent: both sides count.  So whatever is changed, left out, repeated or put
-elsewhere on the way does not open, and neither does anything after it.  A key is used for a bounded
-number of messages and bytes; its successor is derived from it, and it is forgotten.
+The counter is not sent: both sides count.  A message that was changed, repeated or moved on the way
+does not open, and neither does any message after it.  The same holds if a message was left out.  A
+key serves for a bounded number of messages and bytes.  Then its successor is derived from it, and
+the key is forgotten.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _NONCE = 12
 
 
 class Secrets(NamedTuple):
-    """What the keys of one connection come from, as one side uses them."""
+    """Secrets from which one side derives the keys of a connection."""
 
     outgoing: bytes
     incoming: bytes
@@ -38,7 +39,7 @@ class Secrets(NamedTuple):
 
 
 def derive(agent: bytes, master: bytes, *, for_master: bool) -> Secrets:
-    """The secrets of a connection from what each side contributed (HKDF, RFC 5869)."""
+    """Derive the secrets of a connection from the random bytes of both sides (HKDF, RFC 5869)."""
     both = hmac.digest(b"fiber link", agent + master, "sha256")
     up, down = _expand(both, b"agent to master"), _expand(both, b"master to agent")
     return Secrets(down, up) if for_master else Secrets(up, down)
@@ -59,17 +60,17 @@ class Sealer:
 
 
 class _Block(threading.local):
-    """Memory for the message that a thread has just opened, of whatever connection.
+    """Memory for the message that a thread has just opened.
 
-    One for all of them stays in the processor's cache and needs no zeroing, and a thousand
-    connections take no more of it than one.
+    All connections share it.  So it stays in the processor's cache and needs no zeroing, and a
+    thousand connections take no more memory than one.
     """
 
     def __init__(self) -> None:
         self.view = memoryview(bytearray())
 
     def of(self, size: int) -> memoryview:
-        """So many bytes of it."""
+        """Return ``size`` bytes of the memory."""
         if size > len(self.view):
             self.view = memoryview(bytearray(size))
         return self.view[:size]
@@ -87,8 +88,9 @@ class Opener:
         self._keys = _Keys(secret, messages, size)
 
     def open(self, sealed: BytesLike) -> memoryview:
-        """The next message, to be used before this thread opens another one, of any connection;
-        ProtocolError if it is anything else.
+        """Return the next message; ProtocolError if ``sealed`` is not that message.
+
+        The caller must use it before this thread opens another message, of any connection.
         """
         size = len(sealed) - OVERHEAD
         if size < 0:
@@ -106,7 +108,7 @@ class Opener:
 
 
 class _Keys:
-    """One key after the other, each with its counter.  Both sides step at the same message."""
+    """Sequence of keys, each with its counter.  Both sides change the key at the same message."""
 
     def __init__(self, secret: bytes, messages: int, size: int) -> None:
         self._messages = messages
@@ -114,7 +116,7 @@ class _Keys:
         self._begin(secret)
 
     def next(self, size: int) -> tuple[AESGCM, bytes]:
-        """Key and nonce for the next message, of so many bytes."""
+        """Return key and nonce for the next message, which has ``size`` bytes."""
         if self._count == self._messages or self._used + size > self._size:
             self._begin(self._successor)
         nonce = self._count.to_bytes(_NONCE, "big")

@@ -1,8 +1,8 @@
-"""A stream of frames, each once and in order, over one connection after the other.
+"""Stream of frames, each once and in order, over one connection after the other.
 
-A connection keeps the order and loses nothing until it breaks; then what was under way may have
-arrived or not.  The stream makes up for that, and notices a peer that is silent.  It is pure: the
-caller tells it the time and carries its datagrams::
+A connection keeps the order and loses nothing until it breaks.  Then the datagrams under way may
+have arrived or not.  The stream makes up for that, and notices a silent peer.  It is pure: the
+caller passes the time and carries the datagrams::
 
     send(frame) ─► queue ─► outgoing(now) ─► [datagram] ─────► received(datagram, now) ─► [frame]
                                ▲    │ unacknowledged                          │
@@ -36,23 +36,23 @@ from fiber._wire.messages import BytesLike, ProtocolError, is_passed_on
 Frame: TypeAlias = bytes | bytearray | memoryview
 
 Datagram: TypeAlias = bytes | tuple[BytesLike, ...]
-"""As it leaves: in one piece, or in several, which whoever sends it puts together."""
+"""Datagram to send: one piece, or several pieces that the connection joins."""
 
 WINDOW = 256
 WINDOW_BYTES = 4 << 20
-"""What may be under way."""
+"""Limits of datagrams, and of their bytes, that are sent and not acknowledged."""
 
 LARGE = 1 << 14
-"""Bytes from which on a piece of a frame is not copied: it stays where it is until it arrived."""
+"""Bytes from which on a piece of a frame is not copied.  The stream keeps it until it arrived."""
 
 BUDGET = 512 * 1024
-"""Bytes of entries in a datagram: one is sealed while the one before it is sent."""
+"""Bytes of entries in a datagram.  One datagram is sealed while the one before it is sent."""
 
 ACK_DELAY = 0.02
-"""Seconds that an acknowledgement may wait for something to ride on."""
+"""Seconds that an acknowledgement may wait for a datagram to go with."""
 
 HEARTBEAT = 3.0
-"""Seconds without sending after which a stream says that it is alive."""
+"""Seconds without sending after which a stream sends a sign of life."""
 
 DATA, CONTROL = 1, 2
 
@@ -63,11 +63,11 @@ LARGEST = _HEADER.size + BUDGET
 
 
 class Gap(ProtocolError):
-    """The connection lost a datagram: it must not be relied upon any more."""
+    """The connection has lost a datagram, and must be given up."""
 
 
 class Statistics(NamedTuple):
-    """What a stream holds now and has done so far."""
+    """Counts of what a stream holds now, and of what it has done so far."""
 
     queued_frames: int
     queued_bytes: int
@@ -87,7 +87,7 @@ class Statistics(NamedTuple):
 
 
 class ResumableStream:
-    """One end of a stream; begins disconnected."""
+    """End of a stream.  It begins without a connection."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class ResumableStream:
         """Frames of which some pieces have arrived, by slot."""
         self._ack_due: float | None = None
         self._unanswered = self._unanswered_bytes = 0
-        """What arrived since the last acknowledgement that we sent."""
+        """Datagrams, and their bytes, that arrived since this side last acknowledged."""
         self._last_sent = self._ticked = now
         self._speak_now = False
         self._silent = 0.0
@@ -123,17 +123,17 @@ class ResumableStream:
 
     @property
     def idle(self) -> bool:
-        """Whether everything that was given to ``send`` is known to have arrived."""
+        """True if all frames are known to have arrived."""
         return not self._turns and not self._unacknowledged
 
     @property
     def arrived(self) -> int:
-        """The number of the last datagram taken: what the peer must know to resume."""
+        """Number of the last datagram taken.  The peer needs it to resume."""
         return self._received
 
     @property
     def heard(self) -> bool:
-        """Whether the peer has ever said anything."""
+        """True if the peer has ever sent anything."""
         return bool(self._counts["datagrams_received"])
 
     def send(
@@ -148,7 +148,7 @@ class ResumableStream:
         self._counts["frames_sent"] += 1
 
     def connected(self, arrived: int) -> None:
-        """There is a connection, and the peer has taken our datagrams up to ``arrived``."""
+        """Go on over a new connection, whose peer has taken the datagrams up to ``arrived``."""
         if not self._acknowledged <= arrived <= self._sent:
             raise ProtocolError(
                 f"it cannot resume after datagram {arrived}: it has acknowledged "
@@ -160,20 +160,20 @@ class ResumableStream:
         self._speak_now = True  # a connection alone says nothing: what comes over it does
 
     def disconnected(self) -> None:
-        """The connection broke; what was under way counts as not arrived."""
+        """Note that the connection broke.  Datagrams under way count as not arrived."""
         self._connected = False
         self._ack_due = None
         self._counts["breaks"] += 1
 
     def end(self) -> None:
-        """Forget the frames that have not arrived, here or there: nothing more will."""
+        """Forget the frames that have not arrived on either side."""
         self._turns.clear()
         self._unacknowledged.clear()
         self._unacknowledged_bytes = 0
         self._assemblies = [None] * SLOTS
 
     def outgoing(self, now: float) -> list[Datagram]:
-        """What to put on the connection now."""
+        """Return the datagrams to put on the connection now."""
         if not self._connected:
             return []
         datagrams: list[Datagram] = []
@@ -196,14 +196,13 @@ class ResumableStream:
         return datagrams
 
     def wants_to_speak(self, now: float) -> bool:
-        """Whether ``outgoing`` would have something."""
+        """Tell whether ``outgoing`` would return a datagram."""
         return self._connected and (self._repeat or self._may_send() or self._must_speak(now))
 
     def received(self, datagram: BytesLike, now: float) -> list[Frame]:
-        """Take a datagram from the connection, and copy what is in it; the frames that it
-        completes, in order.
+        """Take a datagram from the connection; return copies of the frames that it completes.
 
-        ProtocolError if no stream can have sent it, ``Gap`` if one before it is missing.
+        ProtocolError if no stream can have sent it, ``Gap`` if an earlier datagram is missing.
         """
         try:
             kind, count, number, acknowledged = _HEADER.unpack_from(datagram)
@@ -232,17 +231,17 @@ class ResumableStream:
         return self._take(datagram, count, now)
 
     def tick(self, now: float) -> float:
-        """Seconds without a word from the peer, leaving out the time when this process did not run.
+        """Return the seconds of the peer's silence, without the time when this process was stopped.
 
-        To be called at ``next_timer``.  A stopped process must not take its own sleep for its
-        peer's.
+        Call it at ``next_timer``.  A stopped process must not take its own sleep for a silence of
+        its peer.
         """
         self._silent += min(now - self._ticked, 2 * self._tick)
         self._ticked = now
         return self._silent
 
     def next_timer(self) -> float:
-        """When ``tick`` and ``outgoing`` want to be called again, if nothing happens before."""
+        """Return when to call ``tick`` and ``outgoing`` again, if nothing happens before."""
         due = self._ticked + self._tick
         if self._connected:
             due = min(due, self._last_sent + self._heartbeat)
@@ -251,7 +250,7 @@ class ResumableStream:
         return due
 
     def statistics(self) -> Statistics:
-        """What it holds and has done."""
+        """Return what the stream holds now, and what it has done so far."""
         return Statistics(
             queued_frames=len(self._turns),
             queued_bytes=self._turns.bytes,
@@ -278,7 +277,7 @@ class ResumableStream:
         self._unanswered = self._unanswered_bytes = 0
 
     def _pack(self) -> Datagram:
-        """Number and wrap what goes next."""
+        """Make the next datagram."""
         entries = self._turns.take()
         count = len(entries)
         self._sent += 1
@@ -330,7 +329,7 @@ class ResumableStream:
         return frames
 
     def _assemble(self, word: int, piece: memoryview) -> list[Frame]:
-        """Take a piece of a frame; the frame if it is the last one."""
+        """Take a piece of a frame; return the frame if that was its last piece."""
         slot = (word >> SLOT_SHIFT) % SLOTS
         assembly = self._assemblies[slot]
         if bool(word & FIRST) != (assembly is None):

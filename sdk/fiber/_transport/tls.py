@@ -58,12 +58,14 @@ class HungUp(Exception):
 
 
 class _TakenSocket(ssl.SSLSocket):
-    """One that was connected.  Asked for its peer as it is made, the ssl module would leave open
-    what has broken at this very moment; the handshake finds that out and closes it.
+    """Socket that was connected.
+
+    The ssl module asks a new socket for its peer.  If the connection has just broken, it would then
+    leave the socket open.  The handshake finds that out itself, and closes the socket.
     """
 
     def getpeername(self) -> None:
-        """Nobody asks any more."""
+        """Return nothing, so that the ssl module does not ask the kernel."""
 
 
 def master_context(certificate: Certificate) -> ssl.SSLContext:
@@ -80,7 +82,7 @@ def master_context(certificate: Certificate) -> ssl.SSLContext:
 
 
 def agent_context() -> ssl.SSLContext:
-    """What an agent demands of TLS: the master's certificate is part of what both sides prove."""
+    """Return the context of an agent.  TLS checks no certificate: the proofs cover it."""
     return _context(ssl.PROTOCOL_TLS_CLIENT)
 
 
@@ -105,8 +107,9 @@ def _load_own(context: ssl.SSLContext, certificate: Certificate) -> None:
 
 
 class _Handshake:
-    """One side's part on ``sock``, which it makes non-blocking and takes over; HungUp if that is
-    broken already.
+    """Handshake of one side on ``sock``, which it takes over and makes non-blocking.
+
+    HungUp if the connection has broken already.
     """
 
     _for_master: bool

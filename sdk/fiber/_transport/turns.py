@@ -48,7 +48,7 @@ class Entry(NamedTuple):
 
 
 class _Waiting:
-    """A frame, or what has not left of it."""
+    """Frame, or the part of it that has not left."""
 
     __slots__ = ("after", "left", "on_left", "pieces", "size", "slot")
 
@@ -58,11 +58,11 @@ class _Waiting:
         self.on_left = on_left
         self.slot: int | None = None
         self.after = 0
-        """How many frames of the first queue go before it."""
+        """Number of frames of the first queue that go before this one."""
 
 
 class Turns:
-    """The frames that wait.  ``budget``: bytes of a datagram's entries, with their words."""
+    """Frames that wait.  ``budget``: bytes of a datagram's entries, with their words."""
 
     def __init__(self, budget: int) -> None:
         self._budget = budget
@@ -191,7 +191,7 @@ class Turns:
 
 
 def _split(frame: Pieces, room: int) -> tuple[Pieces, Pieces]:
-    """As much of a frame as there is room for, and the rest."""
+    """Split a frame into as much as there is room for, and the rest."""
     for index, piece in enumerate(frame):
         if len(piece) > room:
             view = memoryview(piece)

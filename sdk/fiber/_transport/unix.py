@@ -20,8 +20,8 @@ from fiber.errors import FiberError, FileTooLarge, TooManyOpenFiles
 
 
 class naming_the_limit:
-    """In the block, "no more descriptors" and "too large" become errors that say the limit and what
-    to set."""
+    """Context in which "no more descriptors" and "too large" become errors that name the limit, and
+    what to set."""
 
     # Not a generator: contextlib leaves frames that translate errors in a cycle, and with them
     # whatever descriptors the program had on its stack, until some garbage collection.
@@ -163,7 +163,7 @@ class UnixChannel:
         return packet.loads(message)
 
     def recv_answer(self) -> Message:
-        """As ``recv``, for what is probably there soon."""
+        """Receive as ``recv`` does, a message that is probably there soon."""
         message = self._looked_for()
         return packet.receive(self._sock) if message is None else message
 
@@ -175,7 +175,7 @@ class UnixChannel:
         return None
 
     def _look(self) -> Message | None:
-        """The answer, if it comes soon."""
+        """Return the answer if it comes soon."""
         begin = time.perf_counter()
         while (message := self.try_recv()) is None:
             if time.perf_counter() - begin > _LOOK:
@@ -189,14 +189,14 @@ class UnixChannel:
         return message
 
     def try_recv(self) -> Message | None:
-        """The next message if one is there; EOFError at the end."""
+        """Return the next message if one is there; EOFError at the end."""
         try:
             return packet.receive(self._sock, wait=False)
         except BlockingIOError:
             return None
 
     def poll(self, timeout: float | None) -> bool:
-        """Whether ``recv`` would return or raise at once."""
+        """Wait until ``recv`` would return or raise at once; False after ``timeout`` seconds."""
         return wait_readable(self._sock.fileno(), timeout)
 
     def fileno(self) -> int:
