@@ -21,6 +21,8 @@ _NO_NEWS = frozenset(
         "BackOff",
         "Killing",
         "SandboxChanged",
+        # A notice of a kubelet that starts the pod all the same.
+        "MissingClusterDNS",
     }
 )
 """Reasons of events that say nothing of what a pod with a node waits for."""

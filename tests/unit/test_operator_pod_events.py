@@ -89,8 +89,9 @@ def test_what_ends_no_trouble_does_not_hide_it(reason: str) -> None:
     assert warning_of(event(MOUNT, 1), event(("Normal", reason), 2)) != ""
 
 
-def test_what_kept_a_pod_from_a_node_is_over_once_it_has_one() -> None:
-    assert warning_of(event(("Warning", "FailedScheduling"), 5)) == ""
+@pytest.mark.parametrize("reason", ["FailedScheduling", "MissingClusterDNS"])
+def test_what_keeps_no_pod_with_a_node_from_starting_is_not_told(reason: str) -> None:
+    assert warning_of(event(("Warning", reason), 5)) == ""
 
 
 def test_a_repeated_event_is_as_new_as_its_last_time() -> None:
