@@ -1,1 +1,1 @@
-"""What travels: packets on one host, messages between hosts.  Knows nothing of who sends them."""
+"""Formats of packets on one host, and of messages between hosts."""

@@ -28,7 +28,7 @@ RETAINED_LIMIT = 1 << 25
 """
 
 RETAINED_BLOCKS = 32
-"""How many pieces that memory is kept in; each holds two descriptors."""
+"""Number of blocks that this memory is kept in.  Each holds two descriptors."""
 
 HUGE_PAGES_UP_TO = 1 << 30
 """Bytes of a message for which huge pages are asked for.
@@ -38,7 +38,7 @@ machine has to get memory back from its host first: that was slower than small p
 """
 
 DATA_OFFSET = 64
-"""Where the content starts; before it lies the flag."""
+"""Bytes before the content in a block.  The flag lies there."""
 
 _BUSY, _FREE = 1, 0
 _CLEARED = bytes([_FREE])
@@ -46,7 +46,7 @@ _GRAIN = 1 << 16
 
 
 class Block:
-    """One memfd and the mapped page that holds its flag."""
+    """Memfd, and its mapped page that holds the flag."""
 
     __slots__ = ("_owner", "capacity", "fd", "flag")
 
@@ -55,23 +55,23 @@ class Block:
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
         self._owner = opened(os.memfd_create, "fiber-message", flags)
         self.fd = self._owner.fileno()
-        # Whoever reads it in place relies on that.
+        # Readers that map the content rely on its size.
         fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
         os.ftruncate(self.fd, mmap.PAGESIZE)
         self.flag = mmap.mmap(self.fd, mmap.PAGESIZE)
         self.flag[0] = _BUSY
 
     def close(self) -> None:
-        """Let go of it; a reader that has the descriptor keeps the content."""
+        """Close the block.  A reader that has the descriptor keeps the content."""
         self.flag.close()
         self._owner.close()
 
 
 class Arena:
-    """The blocks of this process.  Any thread; a forked child starts with none.
+    """Blocks of this process.  Any thread may use them; a forked child starts with none.
 
-    No lock, which a finalizer that sends something large could meet: a block is for whoever has
-    taken it out.
+    There is no lock, as a finalizer that sends a large message could wait for it on its own thread.
+    A thread takes a block out, and owns it until it puts it back.
     """
 
     def __init__(self) -> None:

@@ -26,9 +26,9 @@ class Blob:
 
     @classmethod
     def in_file(cls, digest: bytes, data: BytesLike, directory: str | None) -> Blob:
-        """What an agent keeps: on its disk and not in its memory, which has a limit in a pod.
+        """Return a blob that lies on disk, as the memory of an agent's pod is limited; OSError.
 
-        The file has no name, so that none is left whatever becomes of the agent.  OSError.
+        The file has no name, so that none is left when the agent is killed.
         """
         import tempfile
 

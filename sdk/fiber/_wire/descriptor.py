@@ -1,4 +1,4 @@
-"""Descriptors that are closed when nobody holds them any more, wherever a signal strikes."""
+"""Owners of descriptors.  A descriptor is closed with its last owner, also if a signal strikes."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ own: Callable[[int], Descriptor] = select.epoll.fromfd
 
 
 def opened(opener: Callable[..., int], *args: Any) -> Descriptor:
-    """What ``opener(*args)``, a function written in C, opens.
+    """Call ``opener(*args)``, a function written in C; return the owner of what it opens.
 
-    All is one step of the interpreter, between whose steps signals strike: there is no moment at
-    which the descriptor is nobody's.
+    The call is one step of the interpreter, and signals strike between steps.  So there is no
+    moment at which the descriptor has no owner.
     """
     return next(map(own, starmap(opener, (args,))))
 
@@ -35,13 +35,13 @@ def opened(opener: Callable[..., int], *args: Any) -> Descriptor:
 def opened_pair(
     opener: Callable[..., tuple[SocketType, SocketType]], *args: Any
 ) -> tuple[Descriptor, Descriptor]:
-    """The same for two sockets."""
+    """Call ``opener(*args)``, which opens two sockets; return their owners."""
     sockets = chain.from_iterable(starmap(opener, (args,)))
     one, other = map(own, map(SocketType.detach, sockets))
     return one, other
 
 
 def contents(fd: int) -> bytes | mmap.mmap:
-    """The bytes of the file ``fd``, whoever else reads them by a duplicate of it."""
+    """Return the bytes of the file ``fd``, without moving its position, which duplicates share."""
     size = os.fstat(fd).st_size
     return mmap.mmap(fd, size, access=mmap.ACCESS_READ) if size else b""

@@ -70,7 +70,7 @@ class Blob(NamedTuple):
 
 
 class Forget(NamedTuple):
-    """Master to agent: no Start will name this blob any more, unless it is sent again."""
+    """Master to agent: no later Start names this blob, unless it is sent again."""
 
     digest: bytes
 
@@ -80,7 +80,7 @@ class Forget(NamedTuple):
 
 
 class Lacking(NamedTuple):
-    """Agent to master: this blob is not here; whoever needs it has to send it again."""
+    """Agent to master: this blob is not here, and must be sent again for a child that needs it."""
 
     digest: bytes
 
@@ -174,13 +174,14 @@ class Recalled(NamedTuple):
 
 
 class Exited(NamedTuple):
-    """Agent to master: the child is gone.  The fields after ``delivered`` are an ExitReport's, as
-    far as an agent knows them.
+    """Agent to master: the child has ended.
+
+    The fields after ``delivered`` are those of an ExitReport, as far as an agent knows them.
     """
 
     child: int
     delivered: int
-    """How many Deliver frames for it came in time; what was sent after those it never saw."""
+    """Number of Deliver frames that reached the child.  It never saw those that came later."""
     exitcode: int
     reason: str
     unread: tuple[int, ...] = ()
@@ -315,7 +316,7 @@ Message: TypeAlias = (
 
 
 OfHubs: TypeAlias = TunnelOpen | TunnelData | TunnelClose | Memory
-"""What the hubs of both sides say to each other."""
+"""Messages between the hubs of both sides."""
 
 
 def decode(frame: BytesLike) -> Message:

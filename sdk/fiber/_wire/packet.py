@@ -1,8 +1,8 @@
-"""One message between two processes of one host: one ``SOCK_SEQPACKET`` packet.
+"""Messages between two processes of one host: each is one ``SOCK_SEQPACKET`` packet.
 
-A packet arrives whole or not at all, whoever else reads or writes the same socket, so that ends may
-be shared without a lock and a reader that dies takes nothing but its own message with it.  What is
-small travels inside the packet; what is large lies in a memfd whose descriptor travels with it.
+A packet arrives whole or not at all, also if several processes read or write the same socket.  So
+ends may be shared without a lock, and a reader that dies loses only its own message.  Small parts
+travel inside the packet.  Large parts lie in a memfd, whose descriptor travels with the packet.
 
 Layout (little endian)::
 
@@ -90,7 +90,7 @@ _CALL: Callable[[Callable[[], Any]], Any] = operator.call
 _Ancillary: TypeAlias = list[tuple[int, int, bytes]]
 _Call: TypeAlias = tuple[tuple[tuple[bytearray], int, int]]
 _Received: TypeAlias = list[Any]
-"""What ``recvmsg_into`` returned; then, of a large message, the owner of its memory."""
+"""Result of ``recvmsg_into``; then, of a large message, the owner of its memory."""
 
 
 class _Buffer:
@@ -161,7 +161,7 @@ class Message:
         return data
 
     def close_descriptors(self) -> None:
-        """Close descriptors that came with the packet and that nobody took."""
+        """Close the descriptors that came with the packet and were not taken."""
         for fd in self.fds:
             os.close(fd)
         self.fds = []
@@ -370,7 +370,7 @@ def _sendmsg(
 
 
 def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
-    """Where each part lies in a block, aligned for vector loads, and where the last one ends."""
+    """Return the aligned offset of each part in a block, and the end of the last part."""
     offsets, end = [], DATA_OFFSET
     for size in sizes:
         start = -(-end // ALIGNMENT) * ALIGNMENT
@@ -450,8 +450,8 @@ def _recvmsg(
                 _receiving(sock, call, then) if then else starmap(sock.recvmsg_into, call)
             )
         except ConnectionResetError:
-            # The peer closed with packets of ours unread.  The kernel says so once, ahead of what
-            # the peer sent before; the next call delivers that, or the end.
+            # The peer closed before it had read our packets.  The kernel says so once, before it
+            # delivers the peer's own packets.  The next call returns those, or the end.
             received.extend(_receiving(sock, call, then))
         ancillary = received[0][1]
         if ancillary and data[0] in (PARTS_IN_MEMFD, PASSED, WAKE_UP):

@@ -1,4 +1,4 @@
-"""What the executor and a pool worker say to each other.
+"""Messages between the executor and a pool worker.
 
 To a worker (behind the sequence number that its agent put in front)::
 
@@ -68,10 +68,10 @@ class Head(NamedTuple):
 
 
 BESIDE = (1 << 64) - 1
-"""In place of the size of a pickle that is the first of its buffers."""
+"""Value in place of the size of a pickle.  The pickle is then the first of its buffers."""
 
 BODY = SEQ.size + HEAD.size
-"""Where what follows the head begins."""
+"""Offset of the part after the head."""
 
 BUFFERS = 256
 """An object with more large buffers than this is pickled as a whole."""
