@@ -1,11 +1,11 @@
 """The agent: starts, watches and kills the children of one host.
 
-In a program with the local backend it lives in the program itself, on its loop; elsewhere it is a
-process of its own (``python -m fiber.agent``) whose ``ChildObserver`` is the link to the master.
+With the local backend the agent runs inside the program, on the program's loop.  Elsewhere it is a
+separate process (``python -m fiber.agent``), whose observers send events over the link.
 
-Everything happens on the loop's thread.  ``child``, which changes nothing here, and a child's
-``recall`` and ``signal``, which only put into the loop's queue, come from anywhere; so no lock is
-needed that a finalizer or a signal handler could meet.
+The agent runs on the loop's thread.  Any thread may call ``Agent.child``, which registers nothing,
+and a child's ``recall`` and ``signal``, which only put a call into the loop's queue.  So the agent
+needs no lock, on which a finalizer or a signal handler could block.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from fiber._wire.blob import Blob
 _ENDING = "this process is ending: no process can be started any more"
 
 _CLOSE_TIMEOUT = 10.0
-"""Seconds that the loop may take to come to the end of what it was asked before."""
+"""Seconds that the loop may take to run the calls that were queued before the close."""
 
 
 class Agent:
-    """Runs the children of this host."""
+    """Agent of this host, which runs its children."""
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None = None) -> None:
         self.host = host
@@ -52,9 +52,10 @@ class Agent:
         self._closed = False
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> LocalChild:
-        """A child to be started; it has its pid when ``observer.started`` is called.
+        """Return a child, not started yet.  It has its pid once ``observer.started`` is called.
 
-        What keeps it from starting is its ``exited``, but for what can be seen here and now.
+        Start failures are reported through ``observer.exited``.  RuntimeError is raised at once if
+        this agent is closed.
         """
         if self._closed:
             spec.close()
@@ -62,7 +63,7 @@ class Agent:
         return LocalChild(self, next(self._ids), spec, observer)
 
     def start(self, child: LocalChild) -> None:
-        """Start one of our children."""
+        """Start a child that ``child`` made."""
         self._children[child.id] = child
         try:
             child.open()
@@ -74,7 +75,7 @@ class Agent:
             self._refused(child, error)
 
     def close(self) -> None:
-        """Kill every child and end the zygotes.  Not on the loop's thread."""
+        """Kill every child and end the zygotes.  Must not be called on the loop's thread."""
         zygotes: list[ZygoteLink] = []
         taken = threading.Event()
         if self.loop.running:
@@ -93,7 +94,7 @@ class Agent:
         taken.set()
 
     def _access(self) -> HubAddress | None:
-        """What our children are told of this host's hub."""
+        """Return the address of the host's hub, which the children get."""
         if self._hub is None:
             return hub_client.inherited_address()
         return self._hub.address_or_problem
@@ -105,7 +106,10 @@ class Agent:
         instead_of: ZygoteLink | None = None,
         imports: Imports | None = None,
     ) -> ZygoteLink:
-        """Return the zygote of ``program``'s children; a new one makes ``imports``."""
+        """Return the zygote of ``program``'s children, not ``instead_of``.
+
+        A new zygote imports ``imports`` before its first fork.
+        """
         link = self._newest_zygote(program)
         if link is None or link is instead_of:
             link = ZygoteLink(
@@ -128,7 +132,7 @@ class Agent:
         return None
 
     def _retire_zygotes(self) -> None:
-        """End those of a program that has changed since, once they have no children."""
+        """End zygotes without children whose program is no longer the newest."""
         newest = self._zygotes[-1].program if self._zygotes else None
         for link in self._zygotes:
             if not (link.children or link.retired or _same(link.program, newest)):
@@ -141,14 +145,14 @@ class Agent:
         return os.path.join(directory, f"program-{next(self._folders)}")
 
     def _cleanup_directory(self) -> str | None:
-        """The hub's directory, made now if there is to be one."""
+        """Return the hub's directory, which the hub makes if needed; None without a hub."""
         self._access()
         return None if self._hub is None else self._hub.directory
 
-    # What zygotes say, on the loop's thread
+    # Messages of zygotes, on the loop's thread
 
     def on_reply(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
-        """An answer of a zygote about one of our children."""
+        """Handle a zygote's message about one of this agent's children."""
         child = self._children.get(reply[1])
         if child is None:
             self._on_reply_about_abandoned(link, reply)
@@ -165,7 +169,10 @@ class Agent:
             self._restart_elsewhere(child, reply[2])
 
     def abandon(self, child: LocalChild) -> None:
-        """It was killed before it was born, and its zygote may be busy for long: it is gone now."""
+        """Report the end of a child that was killed before its zygote forked it.
+
+        The zygote may be busy for long, so the agent does not wait for it.
+        """
         if child.pid is None and child.id in self._children:
             self._abandoned[child.id], child.slot = child.slot, None
             self._child_exited(child, -signal.SIGKILL, describe(-signal.SIGKILL))
@@ -174,10 +181,10 @@ class Agent:
         if reply[0] == zygote.STARTED:
             link.send(zygote.SIGNAL, reply[1], signal.SIGKILL)
         elif (slot := self._abandoned.pop(reply[1], None)) is not None:
-            self.progress_table.release(slot)  # it can no longer write there
+            self.progress_table.release(slot)  # the child can no longer write to the slot
 
     def on_zygote_exit(self, link: ZygoteLink) -> None:
-        """A zygote died, and its children with it."""
+        """Report the end of all children of a zygote that died; they died with it."""
         if link in self._zygotes:
             self._zygotes.remove(link)
         orphaned = [child for child in self._children.values() if child.zygote is link]
@@ -187,12 +194,12 @@ class Agent:
             )
 
     def _restart_elsewhere(self, child: LocalChild, imports: Imports) -> None:
-        """Start a child whose zygote must not be forked in one that makes ``imports`` alone.
+        """Start a child in a new zygote that imports ``imports``; forking the old one is unsafe.
 
-        The same zygote then serves all later children.  Those of the old one live on.
+        The new zygote then serves all later children.  Children of the old one live on.
         """
         if self._closed:
-            return  # and the end of its zygote is its own
+            return  # the end of its zygote ends the child
         old = child.zygote
         try:
             new = self._zygote(child.program, instead_of=old, imports=imports)
@@ -226,13 +233,13 @@ class Agent:
         child.observer.exited(report)
 
     def describe_end(self, exitcode: int) -> str:
-        """An exit code in words, with what the kernel knows of a SIGKILL."""
+        """Return an exit code in words, and whether the memory limit caused a SIGKILL."""
         if exitcode == -signal.SIGKILL and self.memory_limit.was_exceeded():
             return f"OOMKilled: {self.memory_limit.describe()}"
         return describe(exitcode)
 
     def _release(self, child: LocalChild) -> tuple[tuple[int, ...], tuple[int, int] | None]:
-        """Give back what it had; what it never read and what it was running."""
+        """Free the child's channel and slot; return its unread packets and its running task."""
         unread = child.drain_and_close()
         if child.slot is None:
             return unread, None
@@ -246,7 +253,7 @@ def _same(one: Blob | None, other: Blob | None) -> bool:
 
 
 def describe(exitcode: int) -> str:
-    """An exit code in words."""
+    """Return an exit code in words."""
     if exitcode >= 0:
         return f"exit status {exitcode}"
     try:

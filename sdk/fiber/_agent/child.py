@@ -1,4 +1,4 @@
-"""A child's first steps: from forked zygote or a fresh interpreter to the user's Process object."""
+"""First steps of a child: from the fork, or a fresh interpreter, to the user's Process object."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fiber._transport.unix import UnixChannel
 from fiber._wire.descriptor import Descriptor, contents, own
 
 _LONGEST_LINE = 1 << 16
-"""Bytes of one line that are collected before they are written."""
+"""Bytes of one line that are buffered before they are written."""
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
@@ -35,60 +35,61 @@ _descriptors: list[int] = []
 _task_channel: UnixChannel | None = None
 _progress: memoryview | None = None
 ancestors: tuple[int, ...] = ()
-"""Pids of the processes that this one ends with: its parent first; none in a program that Fiber did
-not start.
+"""Pids of the ancestors whose end also ends this process, its parent first; empty in a program that
+Fiber did not start.
 """
 host = ""
-"""The host that this process belongs to; empty in a program that Fiber did not start."""
+"""Host that this process belongs to; empty in a program that Fiber did not start."""
 
 
 class UnguardedMainError(RuntimeError):
-    """The main module starts a process each time it is imported."""
+    """Error of a main module that starts a process each time it is imported."""
 
 
 class StartRequest(NamedTuple):
-    """What a zygote is told of one child, and the child of itself; descriptors come beside it."""
+    """Request to a zygote to start a child, which gets it too; descriptors travel beside it."""
 
     name: str
     host: str
-    """What the master calls the host."""
+    """Name by which the master knows the host."""
     method: str
     preparation: bytes
     payload: bytes
     slot: int | None
-    """Its place on the progress table; a worker's first descriptor is its task channel."""
+    """Slot of a worker in the progress table; a worker's first descriptor is its task channel."""
     executable: str | None
     open_files: tuple[int, int]
-    """Its limits of descriptors, soft and hard: those of its agent's process."""
+    """Limits of open descriptors, soft and hard: those of the agent's process."""
     hub: HubAddress | None
-    """Where it finds the hub of its host."""
+    """Address of the host's hub."""
     ancestors: tuple[int, ...]
-    """Pids of the processes that it ends with: its parent, its parent's parent, and so on."""
+    """Pids of the ancestors whose end also ends the child: its parent, grandparent, and so on."""
     folder: str | None = None
-    """Where the program's files are, if they were sent here."""
+    """Folder of the program's files, if they were sent to this host."""
     has_arguments: bool = False
-    """Whether a descriptor, the next one, brings the arguments of its Process."""
+    """True if the next descriptor brings the arguments of the Process."""
     payload_at: tuple[int, int] | None = None
     """Offset and size of the payload in another descriptor, if it is large."""
 
 
 def lineage() -> tuple[int, ...]:
-    """This process's pid and those of the processes that it ends with."""
+    """Return this process's pid, and those of the ancestors whose end also ends it."""
     return os.getpid(), *ancestors
 
 
 def task_channel() -> UnixChannel:
-    """In a pool worker: the channel that brings tasks and takes results."""
+    """Return the channel that brings tasks and takes results; only in a pool worker."""
     if _task_channel is None:
         raise RuntimeError("this process is not a pool worker")
     return _task_channel
 
 
 def progress() -> memoryview:
-    """In a pool worker: two words of shared memory, sequence number and index of the running task.
+    """Return two words of shared memory: sequence number and index of the running task.
 
-    Set the sequence number last, to zero before another batch's index is written: whoever reads
-    them after a crash must never see one batch's number with another's index.
+    Only in a pool worker.  Set the sequence number to zero before another batch's index is written,
+    and to its value last.  The agent, which reads the words after a crash, must never see one
+    batch's number with another's index.
     """
     if _progress is None:
         raise RuntimeError("this process is not a pool worker")
@@ -96,7 +97,7 @@ def progress() -> memoryview:
 
 
 def take_descriptor(index: int) -> int:
-    """A descriptor that came with the start message, for whoever unpickles a handle to it."""
+    """Return a descriptor that came with the start message, for the handle that refers to it."""
     fd = _descriptors[index]
     if fd < 0:
         raise RuntimeError(f"descriptor {index} of the start message was taken twice")
@@ -105,7 +106,10 @@ def take_descriptor(index: int) -> int:
 
 
 def duplicate_descriptor(index: int) -> int:
-    """A duplicate of one to which several handles refer; it is there until all are unpickled."""
+    """Return a duplicate of a descriptor to which several handles refer.
+
+    The descriptor itself stays open until all handles are unpickled.
+    """
     return os.dup(_descriptors[index])
 
 
@@ -126,7 +130,7 @@ def go_on_without_parent() -> None:
 
 
 def become_subreaper() -> bool:
-    """Have the kernel make this process the parent of what our children leave behind.
+    """Have the kernel make this process the parent of orphans that its descendants leave behind.
 
     Return whether the kernel does.  A seccomp profile may refuse it.
     """
@@ -137,10 +141,13 @@ def become_subreaper() -> bool:
 def run(
     start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int, words: int
 ) -> int:
-    """Run what was asked for and return the exit code; ``words`` is for the stacks of a crash."""
+    """Run the child that ``start`` describes; return its exit code.
+
+    ``words`` is the descriptor to which the stacks of a crash are written.
+    """
     if start.method == "spawn":
         _exec(start, fds, progress_table, agent, words)
-    # What the zygote's imports registered, say to remove a folder, is not for each child to do.
+    # The zygote's imports may have registered functions, say to remove a folder: not for children.
     atexit._clear()
     atexit.register(util._exit_function)  # type: ignore[attr-defined]
     return _run(start, fds, progress_table, agent, words)
@@ -164,7 +171,7 @@ def _run(
     try:
         return _load_and_run(start, agent, arguments, payload)
     finally:
-        # Up to Python 3.12 ``_bootstrap`` runs multiprocessing's own, which know that they ran.
+        # Up to Python 3.12 ``_bootstrap`` runs multiprocessing's, which then run no second time.
         atexit._run_exitfuncs()
         util._flush_std_streams()  # type: ignore[attr-defined]
 
@@ -201,14 +208,14 @@ def _load(
             process._args = pickle.loads(contents(arguments.fileno()))
             arguments.close()
     for fd in _descriptors:
-        if fd >= 0:  # sent along, but nothing unpickled took it
+        if fd >= 0:  # no unpickled handle took it
             os.close(fd)
     _descriptors.clear()
     return process
 
 
 def _payload(start: StartRequest, payload: Descriptor | None) -> bytes | memoryview:
-    """The pickled Process."""
+    """Return the pickled Process."""
     if payload is None or start.payload_at is None:
         return start.payload
     offset, size = start.payload_at
@@ -216,7 +223,7 @@ def _payload(start: StartRequest, payload: Descriptor | None) -> bytes | memoryv
 
 
 def read_preparation(start: StartRequest) -> dict[str, Any]:
-    """What ``start`` has the child set up, as it is on this host."""
+    """Return the preparation in ``start``, with the paths of this host."""
     data: dict[str, Any] = pickle.loads(start.preparation)
     data |= {"name": start.name, "host": start.host}
     if start.folder is not None:
@@ -226,7 +233,7 @@ def read_preparation(start: StartRequest) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def inheriting() -> Iterator[None]:
-    """While main is imported or a Process unpickled, no process may start: main is unguarded."""
+    """Forbid to start processes; a main module that starts one at its import is unguarded."""
     mp_process.current_process()._inheriting = True  # type: ignore[attr-defined]
     try:
         yield
@@ -242,7 +249,7 @@ def prepare_paths(data: dict[str, Any]) -> None:
         known = set(sys.path)
         sys.path += [p for p in data["sys_path"] if p not in known and os.path.exists(p or ".")]
     sys.argv[:] = data["sys_argv"]
-    # A directory that is gone or forbidden is the parent's own situation too.
+    # The parent can be in a directory that is gone or forbidden, too.
     with contextlib.suppress(OSError):
         os.chdir(data["dir"])
 
@@ -284,13 +291,14 @@ def _adopt_stdio(fds: list[int]) -> None:
 
 
 def write_whole_lines() -> None:
-    """Have each line that is printed on stdout and stderr leave this process in one write.
+    """Make each line that is printed on stdout and stderr leave this process in one write.
 
-    The processes of a program share its terminal, file or pipe, and the kernel keeps together the
-    bytes of one write.  A full buffer, and each part of an unbuffered print, would end in mid-line.
+    The processes of a program share its terminal, file or pipe, and the kernel keeps the bytes of
+    one write together.  Without this, a full buffer or a part of an unbuffered print is a write
+    that ends in mid-line.
     """
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(Exception):  # closed, or replaced by something of the user's
+        with contextlib.suppress(Exception):  # the user closed or replaced the stream
             if stream.fileno() in (1, 2):
                 text: Any = stream
                 text.reconfigure(line_buffering=True, write_through=False)
@@ -298,7 +306,7 @@ def write_whole_lines() -> None:
 
 
 def _tell(problem: str) -> None:
-    """Tell the pool of this worker, which raises it; without a pool, write it to stderr."""
+    """Send ``problem`` to the pool of this worker, which raises it; else write it to stderr."""
     if _task_channel is not None:
         from fiber._wire import work
 
@@ -311,7 +319,7 @@ def _tell(problem: str) -> None:
 def _exec(
     start: StartRequest, fds: list[int], progress_table: ProgressTable, agent: int, words: int
 ) -> None:
-    """Replace this forked process by a fresh interpreter that goes on in ``spawned``."""
+    """Replace this forked process by a fresh interpreter, which continues in ``spawned``."""
     again = os.memfd_create("fiber-start")
     plan = (tuple(start._replace(method="fork")), fds, progress_table.fd, agent, words)
     with os.fdopen(os.dup(again), "wb") as file:
@@ -328,7 +336,7 @@ def _exec(
 
 
 def spawned(plan_fd: int) -> None:
-    """Entry point of a child in an interpreter of its own."""
+    """Run the child, as the entry point of a fresh interpreter."""
     with os.fdopen(plan_fd, "rb") as file:
         file.seek(0)
         fields, fds, progress_table, agent, words = pickle.load(file)

@@ -1,7 +1,8 @@
-"""The seam between whoever wants children and whoever runs them.
+"""Interface between the master, which wants children, and the agents, which run them.
 
-The master asks through ``ChildHandle`` and hears through ``ChildObserver``.  A child of this very
-process (``local_child.py``) and one behind a link (``fiber._backends``) both are one.
+The master asks through ``ChildHandle`` and gets answers through ``ChildObserver``.  Both a child of
+this process (``local_child.py``) and one behind a link (``fiber._backends``) have a
+``ChildHandle``.
 """
 
 from __future__ import annotations
@@ -17,49 +18,49 @@ from fiber._wire.packet import BytesLike, Message
 from fiber.resources import Resources
 
 UNKNOWN = 255
-"""Exit code of a child of which it is not known, as in multiprocessing."""
+"""Exit code of a child whose real one is unknown, as in multiprocessing."""
 
 
 class Cause(IntEnum):
-    """What a child's end says something of."""
+    """Part of the system that caused a child's end."""
 
     CHILD = 0
     """The child: it ended, or was killed."""
     REFUSED = 1
-    """Its host: the system had no room for it, and it never was."""
+    """The host, which had no room for the child.  The child never existed."""
     AGENT_LOST = 2
-    """The way to its host."""
+    """The agent or its link, which was lost."""
     NO_HOST = 3
-    """There is no host for it, and none will come."""
+    """The lack of a host: there is none for the child, and none will come."""
     DRAINED = 4
-    """Its host, which is about to go: it was killed, or never started."""
+    """The host, which is about to end.  It killed the child or never started it."""
 
 
 class ExitReport(NamedTuple):
-    """How a child ended."""
+    """Report of how a child ended."""
 
     exitcode: int
-    """As multiprocessing has it: the status, or minus the signal."""
+    """Exit status, or minus the signal, as in multiprocessing."""
     reason: str
-    """The same for a person: "killed by SIGKILL", "exit status 3", "agent lost: …"."""
+    """Cause in words: "killed by SIGKILL", "exit status 3", "agent lost: …"."""
     unread: tuple[int, ...] = ()
-    """Sequence numbers of packets that were delivered and that the child never read."""
+    """Sequence numbers of delivered packets that the child never read."""
     running: tuple[int, int] | None = None
-    """Sequence number and index of the task that it was running."""
+    """Sequence number of the batch that the child was running, and the task's index in it."""
     log: tuple[str, ...] = ()
-    """The last lines that it wrote, where its output is captured."""
+    """Last lines that the child wrote, if its output is captured."""
     host: str = ""
     cause: int = Cause.CHILD
     stack: str = ""
-    """The Python stacks of its threads, if it crashed or was told to write them."""
+    """Python stacks of the child's threads, if it crashed or was asked to write them."""
     pod: str = ""
-    """The pod that it ran in, and that pod's node, where there is one."""
+    """Pod that the child ran in, and the node of that pod; empty if there is none."""
     node: str = ""
     disrupted: bool = False
-    """Whether the cluster ended it, by a drain, an eviction or a lost node for instance."""
+    """True if the cluster ended the child, for instance by a drain, an eviction or a lost node."""
 
     def describe(self) -> str:
-        """The reason, and where that was if it was in a pod."""
+        """Return the reason, and the pod and node if the child was in a pod."""
         if not self.pod:
             return self.reason
         return f"{self.reason}, in pod {self.pod}" + (f" on node {self.node}" if self.node else "")
@@ -67,36 +68,36 @@ class ExitReport(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ChildSpec:
-    """What to start."""
+    """Description of a child to start."""
 
     name: str
     method: str
     """``fork`` from the zygote or ``spawn`` a new interpreter."""
     preparation: bytes
-    """Pickled dict: what a child sets up before it unpickles anything of the user's.
+    """Pickled dict that says what the child sets up before it unpickles the user's objects.
 
-    The same for many children: what is this child's own has a field of its own.
+    Many children share the same dict.  Values of one child alone are in the other fields.
     """
     payload: bytes
     """The pickled Process object."""
     fds: tuple[Descriptor, ...] = ()
-    """What the payload refers to by index, closed once the child has its own or will never be; only
-    for an agent on the same host."""
+    """Descriptors that the payload refers to by index; only for an agent on the same host.  They
+    are closed once the child has duplicates, or cannot be started."""
     tasks: bool = False
-    """Whether it is a pool worker, with a channel for tasks."""
+    """True for a pool worker, which has a channel for tasks."""
     passing: bool = False
-    """Whether what comes from there is passed on to another host (see ``packet.receive``)."""
+    """True if the child's packets are passed on to another host (see ``packet.receive``)."""
     executable: str | None = None
     stdio: tuple[int, int] | None = field(default=None)
-    """Descriptors for its stdout and stderr; None: those of the agent's process."""
+    """Descriptors for the child's stdout and stderr; None for those of the agent's process."""
     program: Blob | None = None
-    """The program's files, for an agent that has not the program's own file system."""
+    """Files of the program, for an agent that does not share the program's file system."""
     payload_at: tuple[Descriptor, int, int] | None = None
-    """Place of a large payload, used instead: a descriptor, the offset in it, and its size."""
+    """Place of a large payload, used instead of ``payload``: descriptor, offset and size."""
     arguments: Blob | None = None
-    """The pickled arguments of the Process, where they are not in the payload."""
+    """Pickled arguments of the Process, if they are not in the payload."""
     resources: Resources = field(default=Resources())
-    """What it wishes of its host, heeded where hosts are made for children."""
+    """Resources that the child asks for; used by backends that make hosts for children."""
 
     def close(self) -> None:
         """Close ``fds``."""
@@ -105,86 +106,87 @@ class ChildSpec:
 
 
 class ChildObserver(Protocol):
-    """Hears what becomes of one child.  Called on the loop's thread; must not block."""
+    """Receiver of one child's events.  Called on the loop's thread; must not block."""
 
     def started(self, pid: int) -> None:
-        """It exists."""
+        """Take note that the child runs as process ``pid``."""
 
     def received(self, message: Message) -> None:
-        """It sent a packet on its task channel."""
+        """Take a packet that the child sent on its task channel."""
 
     def recalled(self, seqs: list[int]) -> None:
-        """These packets it will never see: the answer to ``recall``."""
+        """Take the answer to ``recall``: the packets that the child will never read."""
 
     def draining(self) -> None:
-        """Its host is about to go: give it nothing more to do."""
+        """Take note that the child's host is about to end: send the child no more tasks."""
 
     def exited(self, report: ExitReport) -> None:
-        """It is gone, or never came to be.  Exactly once, and last."""
+        """Take note that the child ended or could not be started.  Called once, and last."""
 
 
 class DirectChannel(Protocol):
-    """The task channel of a pool worker, lent to the threads of the master."""
+    """Task channel of a pool worker, lent to the threads of the master."""
 
     def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send a packet, as ``ChildHandle.deliver`` does; OSError if nothing was sent."""
+        """Send a packet, as ``ChildHandle.deliver`` does.  OSError: the packet was not sent."""
 
     def receive(self, timeout: float) -> Message | None:
-        """The next packet that it sends; None after ``timeout`` seconds, EOFError at its end.
+        """Return the worker's next packet, or None after ``timeout`` seconds.
 
-        BrokenPipeError: the end came before what was sent last was on its way.  OSError: a packet
-        came, and the system had no room for it: the worker will be killed.
+        EOFError: the worker ended.  BrokenPipeError: it ended before the last packet to it left.
+        OSError: the system had no room for the packet that came, and the worker will be killed.
         """
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close this end of the channel."""
 
 
 class ChildHandle(Protocol):
-    """What the master holds of one child.  Nothing blocks; ``signal`` and ``recall`` come from
-    anywhere, the rest from the loop's thread.
+    """Handle by which the master controls one child.  No method blocks.
+
+    Any thread may call ``signal`` and ``recall``.  The others run on the loop's thread.
     """
 
     name: str
     host: str
-    """Where it is; empty while it waits for a host."""
+    """Host of the child; empty while the child waits for one."""
     pid: int | None
     start_error: Exception | None
-    """What kept it from being started, where that is not only told by its report."""
+    """Error to raise for a child that could not start, where the exit report is not enough."""
 
     @property
     def node(self) -> str:
-        """The node of its pod; empty where there is none, or while that is not known."""
+        """Node of the child's pod; empty if there is none, or while it is unknown."""
 
     @property
     def waiting(self) -> bool:
-        """Whether it waits for a host."""
+        """True while the child waits for a host."""
 
     @property
     def leaving(self) -> str:
-        """Why its host takes no new work and is about to go; empty if the host stays."""
+        """Reason why the host takes no new work and is about to end; empty if the host stays."""
 
     def start(self) -> None:
-        """Start it; what becomes of that, the observer hears.  Once, on the loop's thread."""
+        """Start the child; the observer gets the outcome.  Called once, on the loop's thread."""
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
-        """Send a packet to its task channel, ``seq`` (eight bytes) in front.
+        """Send a packet to the child's task channel, with ``seq`` (eight bytes) in front.
 
-        False: the child is gone and never saw it, and no report names it among the unread.
+        False: the child is gone and never got the packet.  ``ExitReport.unread`` does not name it.
         """
 
     def lend(self) -> DirectChannel | None:
-        """Its task channel for direct use by one thread at a time, until ``reclaim``.
+        """Return the task channel for direct use by one thread at a time, until ``reclaim``.
 
-        None if it is gone or cannot be lent.  On the loop's thread; the observer hears nothing that
-        it says until then, but of its end.
+        None: the child is gone, or its channel cannot be lent.  Until ``reclaim`` the observer gets
+        no packets, only the child's end.  Runs on the loop's thread.
         """
 
     def reclaim(self) -> None:
-        """Hear what it says again.  On the loop's thread."""
+        """End the lending: the observer gets the packets again.  Runs on the loop's thread."""
 
     def recall(self) -> None:
-        """Recall the packets that it has not read; the observer hears which."""
+        """Take back the packets that the child has not read; ``recalled`` says which."""
 
     def signal(self, signum: int) -> None:
-        """Send it a signal; nothing if it is gone."""
+        """Send the child a signal, unless it is gone."""

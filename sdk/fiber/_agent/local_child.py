@@ -1,7 +1,7 @@
-"""One child of this host, as its agent holds it: its channel, its signals, its end.
+"""A child of this host, as its agent holds it: its channel, its signals, its end.
 
-``recall`` and ``signal`` come from anywhere and only put into the loop's queue; all else is done
-on the loop's thread, but for what whoever uses its channel directly does.
+Any thread may call ``recall`` and ``signal``, which only put a call into the loop's queue.  All
+other methods run on the loop's thread, except those of a lent ``Channel``, which its user calls.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ _SEQ = struct.Struct("<Q")
 
 _NO_ROOM = (TooManyOpenFiles, MemoryError)
 _LOST = (*_NO_ROOM, ValueError, struct.error)
-"""Errors of a packet that was taken from its socket, and that nobody gets."""
+"""Errors that lose a packet: it was taken from its socket and cannot be delivered."""
 
 
 class Owner(Protocol):
-    """What a child needs of the agent that runs it."""
+    """Part of the agent that its children use."""
 
     host: str
     loop: Loop
     progress_table: ProgressTable
 
     def start(self, child: LocalChild) -> None:
-        """Start it.  On the loop's thread."""
+        """Start ``child``.  Runs on the loop's thread."""
 
     def abandon(self, child: LocalChild) -> None:
-        """It was killed before it was born.  On the loop's thread."""
+        """Report the end of ``child``, killed before its fork.  Runs on the loop's thread."""
 
 
 class LocalChild:
-    """One child of this host; a ``ChildHandle``."""
+    """A child of this host; a ``ChildHandle``."""
 
     def __init__(self, owner: Owner, id_: int, spec: ChildSpec, observer: ChildObserver) -> None:
         self.id = id_
@@ -76,7 +76,7 @@ class LocalChild:
         self._lent = False
 
     def start(self) -> None:
-        """Start it; what is asked of it next, in this very turn, finds it there."""
+        """Start the child.  Calls that follow in the same turn of the loop find it registered."""
         self._owner.start(self)
 
     def _make_channel(self) -> None:
@@ -88,12 +88,13 @@ class LocalChild:
             raise
         ours.setblocking(False)
         self.slot = slot
-        # We keep the child's end too: what it has not read when it dies, or when another worker is
-        # idle, is read from there.  The kernel gives each packet to exactly one reader.
+        # The agent keeps the child's end too.  From there it takes back packets that the child has
+        # not read, when the child dies or another worker is idle.  The kernel gives each packet to
+        # exactly one reader.
         self._ours, self._theirs = ours, theirs
 
     def open(self) -> None:
-        """Be ready to hear it."""
+        """Make the task channel of a pool worker and begin to receive from it."""
         if self._spec.tasks:
             self._make_channel()
         if self._ours is not None:
@@ -101,7 +102,7 @@ class LocalChild:
             self._loop.register(self._ours.fileno(), self._receive)
 
     def fork_from(self, zygote: ZygoteLink, hub: HubAddress | None) -> None:
-        """Have ``zygote`` start it; ``hub`` is what it is told of its host's hub."""
+        """Have ``zygote`` start the child; ``hub`` is the address of the host's hub."""
         self.leave_zygote()
         self.zygote = zygote
         zygote.children += 1
@@ -125,13 +126,13 @@ class LocalChild:
         zygote.start(self.id, request, fds)
 
     def leave_zygote(self) -> None:
-        """It is gone, or goes elsewhere."""
+        """Stop counting the child among those of its zygote: it is gone, or gets another one."""
         if self.zygote is not None:
             self.zygote.children -= 1
 
     def _descriptors(self) -> list[int]:
-        """New descriptors for the child: stdout, stderr, task channel, arguments, a large payload,
-        and those of its handles.
+        """Return new descriptors for the child: stdout, stderr, task channel, arguments, a large
+        payload, and those of its handles.
         """
         ours = [] if self._theirs is None else [self._theirs.fileno()]
         if self._spec.arguments is not None:
@@ -152,32 +153,36 @@ class LocalChild:
 
     @property
     def tasks(self) -> bool:
-        """Whether it is a pool worker."""
+        """True for a pool worker."""
         return self._spec.tasks
 
     @property
     def program(self) -> Blob | None:
-        """The files that it needs, until it has them."""
+        """Files of the program that the child needs; None once the child is started."""
         return self._spec.program
 
     def release_descriptors(self) -> None:
-        """It has its own now: the other end must see EOF when the child lets go."""
+        """Close the agent's copies of the child's descriptors, and free its payload.
+
+        Otherwise the other end would not see EOF when the child closes its own copies.
+        """
         self._spec.close()
         self._spec = replace(
             self._spec, payload=b"", payload_at=None, fds=(), program=None, arguments=None
         )
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
-        """Send a packet to the worker; False if it is gone."""
+        """Send a packet to the worker; return False if the worker is gone."""
         outbox = self._outbox
         return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
 
     def lend(self) -> Channel | None:
-        """Its channel for direct use; None if it has none, or no descriptor is left for it."""
+        """Return the channel for direct use; None if there is none, or no descriptor is left."""
         if self._ours is None or self._ours.fileno() < 0:
             return None
         try:
-            # Of its own: what whoever uses it waits for must not be closed and become another's.
+            # A duplicate, since the kernel may reuse the number of a closed descriptor while the
+            # user of the channel waits on it.
             fd = os.dup(self._ours.fileno())
         except OSError:
             return None
@@ -187,28 +192,28 @@ class LocalChild:
         return Channel(sock, self.abort)
 
     def reclaim(self) -> None:
-        """Hear what it says again."""
+        """Receive the child's packets again, after ``lend``."""
         self._lent = False
         self.resume()
 
     def pause(self) -> None:
-        """Hear nothing that it says until ``resume``: it waits before it sends more."""
+        """Receive no packets until ``resume``; the child blocks once the socket is full."""
         if self._ours is not None and self._ours.fileno() >= 0:
             self._loop.pause(self._ours.fileno())
 
     def resume(self) -> None:
-        """Hear what it says again."""
+        """Receive the child's packets again, after ``pause``."""
         if self._ours is not None and self._ours.fileno() >= 0:
             self._loop.resume(self._ours.fileno())
 
     def recall(self) -> None:
-        """Recall unread packets; answered on the loop."""
+        """Take back unread packets; ``observer.recalled`` gets the answer on the loop's thread."""
         self._loop.call_soon(self._send_recalled)
 
     def signal(self, signum: int) -> None:
         """Signal the child through its zygote."""
         if self._loop.broken:
-            self._signal(signum)  # nobody else will
+            self._signal(signum)  # the loop runs no calls
         else:
             self._loop.call_soon(self._signal, signum)
 
@@ -219,16 +224,19 @@ class LocalChild:
             self._owner.abandon(self)
 
     def abort(self, fault: Exception) -> None:
-        """Something to or from it is lost for good: only its end can tell the master so."""
+        """Kill the child because a packet to or from it is lost; its exit report says so."""
         self.fault = self.fault or fault
         self.signal(signal.SIGKILL)
 
     def drain_and_close(self) -> tuple[int, ...]:
-        """It is gone: hear its last words, recall what it never read.  On the loop."""
+        """Pass on the dead child's last packets, close its channel and return the unread packets.
+
+        Runs on the loop's thread.
+        """
         self.release_descriptors()
         if self._ours is None or self._theirs is None:
             return ()
-        if self._outbox is None:  # nobody ever heard it
+        if self._outbox is None:  # the channel was never opened
             self._ours.close()
             self._theirs.close()
             return ()
@@ -246,7 +254,7 @@ class LocalChild:
             self.observer.recalled(self._recall())
 
     def _receive(self) -> None:
-        if not self._lent:  # it came before, and is for whoever uses the channel now
+        if not self._lent:  # an event from before ``lend``: its packet is for the channel's user
             self._hear()
 
     def _hear(self) -> bool:
@@ -255,7 +263,7 @@ class LocalChild:
             message = packet.receive(self._ours, passing=self._spec.passing)
         except (BlockingIOError, EOFError):
             return False
-        except _LOST as error:  # nobody should wait for it
+        except _LOST as error:  # else the master would wait for this packet
             self.abort(error)
             return True
         try:
@@ -283,7 +291,7 @@ class LocalChild:
 
 
 class Channel:
-    """The task channel of a child, for direct use; a ``DirectChannel``."""
+    """Task channel of a child, for direct use; a ``DirectChannel``."""
 
     def __init__(self, sock: socket.socket, abort: Callable[[Exception], None]) -> None:
         self._sock = sock
@@ -292,23 +300,23 @@ class Channel:
         self._poller.register(sock, select.POLLIN)
 
     def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send a packet, or raise OSError."""
+        """Send a packet; raise OSError if that fails."""
         packet.send(self._sock, b"".join((_SEQ.pack(seq), payload)), buffers)
 
     def receive(self, timeout: float) -> Message | None:
-        """The next packet, None after ``timeout`` seconds, EOFError at the end."""
+        """Return the next packet, or None after ``timeout`` seconds; raise EOFError at the end."""
         if not self._poller.poll(timeout * 1000):
             return None
         try:
             return packet.receive(self._sock)
-        except BlockingIOError:  # its agent took it, which is burying the child
+        except BlockingIOError:  # the agent took the packet, since the child died
             return None
         except _NO_ROOM as error:
             self._abort(error)
             raise
 
     def close(self) -> None:
-        """Close this descriptor of it."""
+        """Close this channel's descriptor."""
         self._sock.close()
 
     def __del__(self) -> None:

@@ -1,4 +1,4 @@
-"""The agent's side of its link: does what the master's frames say and tells what becomes of it."""
+"""The agent's side of its link: obeys the master's messages and reports the children's events."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ _KNOWN_HERE = ExitReport._fields.index("pod")
 """Fields of an exit report that an agent knows; the master adds the others."""
 
 _BACKLOG = 4 << 20
-"""Bytes of one child's output, or of one message of it, that wait for the link.  Above that the
-agent reads no more from that child.
+"""Bytes of one child's output, or of one of its messages, that may wait for the link.  Above that
+the agent stops reading from the child.
 """
 
 
 class AgentService:
-    """Serves one master until the link ends; a ``LinkObserver``.  On the loop's thread.
+    """Service of one master until the link ends; a ``LinkObserver``.  Runs on the loop's thread.
 
-    ``on_end`` hears why it ended, and whether the master was lost.
+    ``on_end`` gets the reason of the end, and whether the master was lost.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class AgentService:
         self._ended = False
 
     def send(self, message: messages.Message, on_left: Callable[[], None] | None = None) -> None:
-        """Tell the master; ``on_left`` is called once that is on its way."""
+        """Send a message to the master; call ``on_left`` once the message has left."""
         self._hub_link.flush()
         self._transmit(message, on_left)
 
@@ -69,10 +69,10 @@ class AgentService:
         lane = messages.lane(message)
         self._link.send(*messages.pieces(message), lane=lane, on_left=on_left)
 
-    # What comes over the link
+    # Frames and events of the link
 
     def on_frame(self, frame: Frame) -> None:
-        """Do what the master says."""
+        """Handle a message of the master."""
         message = messages.decode(frame)
         if isinstance(message, messages.Start):
             self._start(message)
@@ -86,17 +86,17 @@ class AgentService:
             self._hub_link.on_frame(message)
         elif isinstance(message, messages.Deliver | messages.Signal | messages.Recall):
             child = self._children.get(message.child)
-            if child is not None:  # otherwise its end and this crossed
+            if child is not None:  # otherwise the child ended while the message travelled
                 child.handle(message)
 
     def on_suspect(self) -> None:
-        """The master is silent; work goes on."""
+        """Do nothing while the master is silent: work goes on."""
 
     def on_trusted(self) -> None:
-        """It is back."""
+        """Do nothing when the master answers again."""
 
     def on_lost(self, reason: str) -> None:
-        """The master is gone for good."""
+        """End the service: the master is lost for good."""
         self._hub.unlink(None, reason)
         self._lost = not (self._stopping or self._leaving)
         self.stop(f"lost the master: {reason}", 0)
@@ -143,18 +143,18 @@ class AgentService:
         )
 
     def forget(self, child: int) -> None:
-        """That one is gone."""
+        """Forget a child that is gone; if the agent ends and this was the last child, finish."""
         del self._children[child]
         if (self._stopping or self._leaving) and not self._children:
             self._loop.call_soon(self._end)
 
     @property
     def leaving(self) -> bool:
-        """Whether this agent takes no new work."""
+        """True once this agent takes no new work."""
         return self._leaving
 
     def leave(self, reason: str, grace: float) -> None:
-        """Take no new work; end when what runs has ended, by force after ``grace`` seconds.
+        """Take no new work, end after the last child; kill the children after ``grace`` seconds.
 
         Children that are prepared for SIGTERM get it now, as the first process of a pod does.
         """
@@ -170,7 +170,7 @@ class AgentService:
         self._loop.call_later(grace, self.stop, reason, 0)
 
     def stop(self, reason: str, grace: float) -> None:
-        """End the children, by force after ``grace`` seconds, and then the agent."""
+        """End the children, by SIGKILL after ``grace`` seconds, and then the agent."""
         if self._stopping:
             return
         self._stopping = True
@@ -196,7 +196,7 @@ class AgentService:
 
 
 class _Observed:
-    """One child, heard for the master; a ``ChildObserver``."""
+    """A child of the master, whose events go to the master; a ``ChildObserver``."""
 
     def __init__(self, service: AgentService, number: int) -> None:
         self._service = service
@@ -207,25 +207,25 @@ class _Observed:
         self._capture: Capture | None = None
         self._child: LocalChild | None = None
         self.drained = False
-        """Whether it is killed because its host has to go."""
+        """True if the child is killed because its host has to end."""
 
     def start(self, agent: Agent, loop: Loop, spec: ChildSpec) -> None:
-        """Start it."""
+        """Start the child."""
         try:
             self._capture = Capture(loop, self.wrote, self.busy)
             spec = replace(spec, stdio=self._capture.stdio, passing=True)
             self._child = agent.child(spec, self)
             self._child.start()
         except Exception as error:
-            # Whatever keeps a child from starting here, the one who asked is the master.
+            # Every error is reported to the master, which asked for the child.
             self.refuse(agent.host, error)
 
     def refuse(self, host: str, why: object, cause: Cause = Cause.REFUSED) -> None:
-        """It is not started."""
+        """Report to the master that the child could not be started."""
         self.exited(ExitReport(1, f"could not be started: {why}", host=host, cause=cause))
 
     def leave(self) -> None:
-        """Give back what it has not begun, and signal it if it is prepared for that."""
+        """Take back a worker's unread batches, or send SIGTERM to a process prepared for it."""
         child = self._child
         if child is None:
             return
@@ -235,10 +235,10 @@ class _Observed:
             child.signal(signal.SIGTERM)
 
     def handle(self, message: messages.Deliver | messages.Signal | messages.Recall) -> None:
-        """What the master wants of it."""
+        """Do what a message of the master asks of this child."""
         child = self._child
         if child is None:
-            return  # it could not be started, and the master is being told
+            return  # the child could not be started, and its report is on the way
         if isinstance(message, messages.Deliver):
             self._delivered += 1
             buffers = [memoryview(buffer) for buffer in message.buffers]
@@ -257,17 +257,17 @@ class _Observed:
             child.recall()
 
     def started(self, pid: int) -> None:
-        """It exists."""
+        """Report to the master that the child runs."""
         if self._capture is not None:
             self._capture.started()
         self._service.send(messages.Started(self._number, pid))
 
     def received(self, message: packet.Message) -> None:
-        """Pass a packet on."""
+        """Send the child's packet to the master."""
         size = sum([buffer.nbytes for buffer in message.buffers])
         on_left = None
         if size > _BACKLOG and self._child is not None:
-            # Its next results stay with it, instead of filling the memory of this host.
+            # Keep the next results in the child, so that they do not fill the memory of this host.
             self._child.pause()
             on_left = self._child.resume
         said = messages.FromChild(self._number, message.payload, message.buffers)
@@ -275,14 +275,14 @@ class _Observed:
         message.release()
 
     def recalled(self, seqs: list[int]) -> None:
-        """Pass the answer on."""
+        """Send the answer to a recall to the master."""
         self._service.send(messages.Recalled(self._number, tuple(seqs)))
 
     def draining(self) -> None:
-        """Its host is this one, which tells the master itself."""
+        """Do nothing: this agent itself tells the master that its host is about to end."""
 
     def exited(self, report: ExitReport) -> None:
-        """Its last lines, then its end."""
+        """Send the child's last output, then its exit report."""
         if self.drained and report.exitcode == -signal.SIGKILL:
             report = report._replace(cause=Cause.DRAINED)
         log = self._capture.finish() if self._capture is not None else ()
@@ -292,15 +292,15 @@ class _Observed:
         self._service.forget(self._number)
 
     def wrote(self, text: str) -> None:
-        """Pass its output on."""
+        """Send the child's output to the master."""
         self._output += len(text)
         left = partial(self._output_left, len(text))
         self._service.send(messages.Output(self._number, text), left)
 
     def busy(self) -> bool:
-        """Return whether so much output waits for the link that no more should be read.
+        """Return whether so much output waits for the link that the agent must stop reading it.
 
-        Output waits for the child's own large results.  Other children's output does not.
+        Output waits behind large results of the same child, but not of other children.
         """
         return self._output > _BACKLOG
 
