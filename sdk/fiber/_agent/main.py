@@ -39,11 +39,11 @@ _TERMINATION_GRACE = "FIBER_AGENT_TERMINATION_GRACE"
 _LINKED = "FIBER_AGENT_LINKED"
 
 _DEFAULT_GRACE = 15.0
-"""Seconds from SIGTERM to the end by force, where the environment does not say."""
+"""Seconds from SIGTERM to the end by force, if the environment does not say."""
 
 _CLEANING_UP = 5.0
-"""Seconds of the grace that are kept for the last results, the end of the children and of the link;
-a quarter of the grace where that is less.
+"""Seconds of the grace that are kept for the last results and the ends of children and link; no
+more than a quarter of the grace.
 """
 
 _DRAINED = "Drained: its host was told to end (SIGTERM)"
@@ -68,7 +68,7 @@ _LEFT = 5.0
 """Seconds to end the processes that tasks left behind."""
 
 _REFUSED_PAUSE = 0.5
-"""Seconds before a master that refused this agent is asked again, or another in its place."""
+"""Seconds from the refusal of a master until the agent dials again."""
 
 
 class Main:
@@ -76,9 +76,9 @@ class Main:
 
     def __init__(self) -> None:
         self._environment = dict(os.environ)
-        # Children of the same user shall not read its memory.
+        # Children run as the same user and must not read the memory of the agent.
         is_hidden = leftovers.hide_this_process()
-        self._credentials = _read(_required(_CREDENTIALS))  # before anything is started
+        self._credentials = _read(_required(_CREDENTIALS))  # before any process starts
         self._name = self._credentials.name
         if not is_hidden:
             self._complain(_OPEN)
@@ -93,8 +93,8 @@ class Main:
         self._linked = os.environ.pop(_LINKED, "")
         self._parent = _pid(_PARENT)
         if self._parent is not None:
-            # What the parent leaves has to be removed when it dies.  If this process is stopped
-            # then, the kernel may hang up on it before it lets it go on.
+            # When the parent dies, this process removes the parent's directory.  If this process is
+            # stopped then, the kernel may send SIGHUP before it lets the process go on.
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
             go_on_without_parent()
         self._loop = Loop()
@@ -102,36 +102,36 @@ class Main:
         self._status = 0
         self._again = False
         self._told_to_end = False
-        # From here on there is a directory, which SIGTERM must not leave behind.
+        # From here on there is a directory, which must be removed at a SIGTERM too.
         signal.signal(signal.SIGTERM, self._on_sigterm)
         self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
         self._agent = Agent(self._loop, self._name, self._hub)
 
     def run(self) -> int:
-        """Serve until the end; the exit status."""
-        current_process().name = self._name  # which its records bear
+        """Serve until the end; return the exit status."""
+        current_process().name = self._name  # for log records
         _logs.show(config.current().log_level)
         _logs.debug("agent with pid %d", os.getpid())
         self._dialer = self._dial()
         self._wake_by_signals()
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # what an earlier life, or who began it, did
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # an earlier life or the starter blocks some
         self._end_with_parent()
         self._loop.run()
         self._dialer.close()
         self._agent.close()
         self._hub.close()
-        # From here on it is for the next life, which hears of it when it is ready to.
+        # From here on a SIGTERM is for the next life, which unblocks the signal once it is ready.
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
         if self._again and not self._is_told_to_end():
-            # Nothing of what the last master did or left may reach the next one.
+            # No process or file of the last master may reach the next one.
             why_not = self._unfit_for_another()
             if why_not is not None:
                 self._complain(why_not)
                 return 1
             command = _next_life()
             self._hand_on_credentials()
-            # What comes above takes seconds, in which another thread may have taken the signal.
+            # The lines above take seconds, in which another thread may have taken the signal.
             if not self._is_told_to_end():
                 os.execve(sys.executable, command, self._environment)
         signal.set_wakeup_fd(-1)
@@ -191,7 +191,7 @@ class Main:
         if self._lost_grace is None or not isinstance(error, LinkError):
             self._status = 1
         elif self._waits_until is None or self._timeout():
-            # It was there and refused us: it is ending, or took our name for another's.
+            # The master answered and refused: it is ending, or took the name for another agent's.
             self._again = True
             self._loop.call_later(_REFUSED_PAUSE, self._loop.stop)
             return
@@ -213,7 +213,7 @@ class Main:
         self._link.close(reason, linger=linger, then=self._loop.stop)
 
     def _is_told_to_end(self) -> bool:
-        """Also by a signal that another thread took, and of which Python has not told us yet."""
+        """Return whether SIGTERM came, also if another thread took it and no handler ran yet."""
         try:
             taken = self._signals[0].recv(4096)
         except BlockingIOError:
@@ -222,11 +222,15 @@ class Main:
         return self._told_to_end
 
     def _wake_by_signals(self) -> None:
-        """A signal that strikes just before the loop sleeps is noted by Python, and slept over."""
+        """Have signals wake the loop.
+
+        Python only notes a signal that comes just before the loop sleeps, and the loop would sleep
+        on.
+        """
         reader, writer = socket.socketpair()
         for end in (reader, writer):
             end.setblocking(False)
-        self._signals = reader, writer  # for as long as this lives
+        self._signals = reader, writer  # keeps both ends open
         self._loop.register(reader.fileno(), lambda: reader.recv(4096))
         signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
 
@@ -250,7 +254,7 @@ class Main:
         self._loop.register(watched, self._parent_died)
 
     def _parent_died(self) -> NoReturn:
-        # At once and by force: nobody is left to tell or to wait for.
+        # At once and by force: the parent was the master of this agent.
         directory = os.environ.get(_INHERITS)
         if directory:
             remove_directory(directory)
@@ -258,9 +262,9 @@ class Main:
 
 
 def _next_life() -> list[str]:
-    """The command line of an agent that imports nothing that a task may have put in its way.
+    """Return the command of an agent that cannot import modules that a task has written.
 
-    The environment is for its children: the interpreter of the agent itself ignores it.
+    The environment is for its children.  The agent's own interpreter ignores it.
     """
     leftovers.keep_search_path()
     flags = zygote_process.flags()
@@ -278,7 +282,7 @@ def _read(credentials: str) -> Credentials:
         return Credentials.from_descriptor(descriptor)
     if os.path.isabs(credentials):
         return Credentials.from_file(credentials)
-    raise ConfigError(  # and does not repeat what may be a secret in the wrong place
+    raise ConfigError(  # without the value, which may be a misplaced secret
         f"{_CREDENTIALS} ({len(credentials)} characters) is neither an absolute path nor fd:N. It "
         "says where the credentials are, a file for instance, and does not hold them."
     )
@@ -313,7 +317,7 @@ def _pid(variable: str) -> int | None:
 
 
 def _required(variable: str) -> str:
-    # The children, who run anybody's code, shall not have it.
+    # Removed from the environment that the children get: they run foreign code.
     value = os.environ.pop(variable, "")
     if not value:
         raise ConfigError(
@@ -324,7 +328,7 @@ def _required(variable: str) -> str:
 
 
 def main() -> int:
-    """Run one agent to its end; the exit status."""
+    """Run one agent to its end; return the exit status."""
     keep_memory()
     try:
         return Main().run()

@@ -1,8 +1,8 @@
 """The loop of a pool worker: read a batch, run its tasks, send the results.
 
-A worker reads one message at a time, so that what it has not read can be taken back from the
-kernel.  Before each task (or, for very short ones, each few) it notes in shared memory where it
-is, so that its death names the task.
+A worker reads one message at a time, so that its agent can take unread messages back from the
+kernel.  Before each task, or each stride of very short tasks, it notes its position in shared
+memory.  So if the worker dies, the agent knows the task.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from fiber._wire import work
 from fiber._wire.packet import Message
 
 FUNCTIONS = 128
-"""Functions that a worker remembers."""
+"""Number of functions that a worker remembers."""
 
 SMALL = frozenset({int, float, bool, type(None)})
-"""What a call may return to be answered at once."""
+"""Types of values that a single call sends without BatchResults."""
 
 _Function = Callable[..., Any]
 
 _REPLIED = object()
-"""In place of a function: the batch was replied to."""
+"""Marker in place of a function: a reply to the batch was sent already."""
 
 
 def run(
@@ -43,7 +43,7 @@ def run(
     initargs: Iterable[Any],
     retryable: tuple[type[BaseException], ...],
 ) -> None:
-    """The target of a pool worker's process."""
+    """Run a pool worker: the target of its process."""
     channel = child.task_channel()
     if initializer is not None:
         try:
@@ -67,7 +67,7 @@ def run(
 
 
 class Worker:
-    """Runs batches.  ``progress``: two shared words, sequence number and index of what runs."""
+    """Runner of batches.  ``progress``: two shared words, batch and index of the running task."""
 
     def __init__(
         self, channel: Sender, progress: memoryview, retryable: tuple[type[BaseException], ...] = ()
@@ -80,19 +80,19 @@ class Worker:
         self._interruptible = False
 
     def close(self) -> None:
-        """End its second thread, if it has one."""
+        """End the watchdog thread, if it runs."""
         self._watchdog.stop()
 
     def interrupt(self, signum: int, frame: object) -> None:
-        """The handler of SIGINT: KeyboardInterrupt in the task that runs, and nowhere else.
+        """Raise KeyboardInterrupt in a running task; the handler of SIGINT.
 
-        Between tasks it would lose a batch, or half of its results.
+        Between tasks the exception would lose a batch, or half of its results.
         """
         if self._interruptible:
             raise KeyboardInterrupt
 
     def handle(self, message: Message) -> bool:
-        """Run and answer one message; False if it says to stop."""
+        """Run and answer one message; return False if it is STOP."""
         started = time.perf_counter()
         payload = message.payload
         (seq,) = work.SEQ.unpack_from(payload)
@@ -126,7 +126,7 @@ class Worker:
                 return
             buffers.clear()
         batch = self._start(seq, items, started, taken, eager=not head.stride)
-        del items  # what is not kept is gone by the time that the last of them is done
+        del items  # the iterator frees the items at its end
         self._note(seq)
         self._run(batch, function, head, started)
         batch.flush()
@@ -134,7 +134,7 @@ class Worker:
     def _run_call(
         self, seq: int, body: memoryview, buffers: list[memoryview], started: float
     ) -> None:
-        """A single call: the way of every ``apply``, and the shortest."""
+        """Run and answer a single call, by the shortest way, which every ``apply`` takes."""
         self._note(seq)
         taken: Taken = []
         try:
@@ -142,10 +142,10 @@ class Worker:
             ((data, _),) = work.unpack_calls(body, 1)
             (function, args, kwargs), taken = loads(*work.found(data, buffers))
             del data
-            buffers.clear()  # what is not used is gone
+            buffers.clear()  # frees unused buffers during the call
             value = function(*args, **kwargs)
             self._interruptible = False
-            del function, args, kwargs  # what is not kept is gone
+            del function, args, kwargs  # frees them before the value is pickled
         except BaseException as error:
             self._interruptible = False
             if isinstance(error, SystemExit):
@@ -162,7 +162,7 @@ class Worker:
         else:
             batch = self._start(seq, (), started, taken, eager=True)
             batch.add(value)
-            del value  # it may be large, and is pickled
+            del value  # it may be large, and is pickled already
             batch.flush()
 
     def _start(
@@ -189,7 +189,10 @@ class Worker:
     def _function(
         self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview]
     ) -> Any:
-        """The function of a batch, whatever it is: to call it may be the error; or _REPLIED."""
+        """Return the function of a batch, or _REPLIED.
+
+        The function may be any object.  If it cannot be called, the first task fails.
+        """
         functions = self._functions
         if head.size:
             inline = None if head.size == work.BESIDE else body[: head.size]
@@ -215,7 +218,7 @@ class Worker:
     def _run(
         self, batch: BatchResults, function: _Function, head: work.Head, started: float
     ) -> None:
-        # Chunks that the user asked for stay whole; anything else can be taken apart.
+        # Chunks that the user asked for stay whole.  The watchdog may split other batches.
         if batch.total > 1 and head.unit == 1:
             self._watchdog.begin(batch)
         if head.stride > 1:
@@ -230,7 +233,7 @@ class Worker:
         self._watchdog.end()
 
     def _run_eagerly(self, batch: BatchResults, function: _Function) -> None:
-        """One task after the other: its place noted, its result kept as it is right after it."""
+        """Run the tasks one by one; note each position; make each result safe to send at once."""
         progress, values, numbers = self._progress, batch.values, work.NUMBERS
         for index, item in enumerate(batch.remaining):
             progress[1] = index
@@ -246,13 +249,13 @@ class Worker:
             if type(value) in numbers:
                 values.append(value)
             elif batch.add(value):
-                value = None  # it may be large, and is pickled
+                value = None  # it may be large, and is pickled already
                 batch.flush()
 
     def _run_singly(
         self, batch: BatchResults, function: _Function, head: work.Head, started: float
     ) -> None:
-        """One task after the other: its place noted, its result looked at once all are there."""
+        """Run the tasks one by one; note each position; encode the results later, together."""
         progress, values = self._progress, batch.values
         for index, item in enumerate(batch.remaining):
             progress[1] = index
@@ -278,7 +281,7 @@ class Worker:
         head: work.Head,
         started: float,
     ) -> None:
-        """Several tasks at a time, at the speed of ``map``; chunks end where they should."""
+        """Run several tasks at a time, at the speed of ``map``; no stride crosses a chunk's end."""
         values, unit = batch.values, head.unit
         while True:
             done = self._progress[1] = len(values)
@@ -291,7 +294,7 @@ class Worker:
                 batch.return_unstarted()
 
     def _extend(self, batch: BatchResults, results: Iterator[Any], size: int) -> bool:
-        """Run the tasks of one stride; False if they were the last ones."""
+        """Run the tasks of one stride; return False if no tasks are left."""
         values = batch.values
         stop = len(values) + size
         while True:
@@ -301,7 +304,7 @@ class Worker:
                 self._interruptible = False
             except BaseException as error:
                 self._interruptible = False
-                # Otherwise SIGINT came after the last of them.
+                # Otherwise SIGINT came after the last task.
                 if batch.started() > len(values) and self._failed(batch, error):
                     raise
                 continue
@@ -309,17 +312,17 @@ class Worker:
                 return True
             if batch.started() == len(values):
                 return False
-            # ``extend`` takes a task's StopIteration for the end of all.
+            # ``extend`` takes a task's StopIteration for the end of the iterator.
             batch.fail(StopIteration())
 
     def _failed(self, batch: BatchResults, error: BaseException) -> bool:
-        """Take a task's error; return whether it ends this process, as in multiprocessing."""
+        """Record a task's error; return whether it ends this process, as in multiprocessing."""
         if isinstance(error, SystemExit):
-            _report_exit(error)  # first: the program may end as soon as it hears of it
+            _report_exit(error)  # first: the result may end the program
         batch.fail(error)
         if not isinstance(error, SystemExit):
             return False
-        # The results of earlier tasks count.
+        # Send the results of earlier tasks.
         self._watchdog.end()
         if not batch.eager:
             batch.encode_new()
@@ -328,7 +331,7 @@ class Worker:
 
 
 def _report_exit(error: SystemExit) -> None:
-    """Name the task that ends this worker: its caller's program may end without a word."""
+    """Print which task ends this worker: the program may end without a message."""
     import traceback  # rarely needed, and long to import
 
     frames = [frame for frame in traceback.walk_tb(error.__traceback__) if not _is_ours(frame[0])]
@@ -340,7 +343,7 @@ def _report_exit(error: SystemExit) -> None:
         (frame, line), *_ = frames
         code = frame.f_code
         task = f"the task {code.co_qualname}() ({code.co_filename}:{line})"
-    with contextlib.suppress(Exception):  # stderr is the program's
+    with contextlib.suppress(Exception):  # the program may have closed stderr
         print(
             f"fiber: {task} called sys.exit({error.code!r}). That ends its worker, and SystemExit "
             "ends the program that asks for the result. Return from the task, or raise another "
@@ -359,7 +362,7 @@ def _spread(function: _Function) -> _Function:
 
 
 class _Caller:
-    """Runs pickled calls, whose buffers lie one after the other in ``buffers``."""
+    """Runner of pickled calls, whose buffers follow one another in ``buffers``."""
 
     def __init__(self, buffers: list[memoryview], taken: Taken) -> None:
         self._buffers = iter(list(buffers))

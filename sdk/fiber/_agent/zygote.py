@@ -1,19 +1,28 @@
-"""The process that all children of an agent are forked from.
+"""The zygote: the process from which all children of an agent are forked.
 
-It never opens a socket of nng, starts no thread and runs no task, so that forking it is safe; it
-imports once what its children need, so that forking is cheap.  As their parent it reaps them and
-sends them signals (a pid that only we can reap cannot be someone else's).  It ends, and they with
-it, when its agent's process does.
+The zygote opens no nng socket, starts no thread and runs no task, so that forking it is safe.  It
+imports once what its children need, so that forking is cheap.  As their parent it reaps the
+children and sends them signals: no other process can get a pid that only the zygote can reap.  The
+zygote and its children end when the agent's process ends.
 
-Packets from the agent: ``(SETUP, ancestors, imports, cleanup directory, program's folder)``, first
-and once, with the descriptors of the progress table and, if there is a folder, of what belongs in
-it; ``(START, child, start request)``, ``(SIGNAL, child, signum)``,
-``(DESCRIPTORS, child)`` (more descriptors for its START, which follows), ``(QUIT,)``.
-Packets to it: ``(STARTED, child, pid)``, ``(FAILED, child, text)``, ``(EXITED, child, exit code)``
-with the Python stacks of a child that has written them (``last_words.py``),
-``(FORK_UNSAFE, child, imports)``: this zygote's imports made forking unsafe, start that child in a
-zygote that makes ``imports`` alone.  ``(FAILED, None, text)``: the next child of those asked for;
-its request is lost.
+Packets from the agent:
+
+* ``(SETUP, ancestors, imports, cleanup directory, program's folder)``: first and once, with the
+  descriptors of the progress table and, if there is a folder, of the archive to unpack there
+* ``(START, child, start request)``
+* ``(DESCRIPTORS, child)``: more descriptors for the START of that child, which follows
+* ``(SIGNAL, child, signum)``
+* ``(QUIT,)``
+
+Packets to the agent:
+
+* ``(STARTED, child, pid)``
+* ``(FAILED, child, text)``; ``child`` is None if the request was lost: then it is about the first
+  child that is not answered yet
+* ``(EXITED, child, exit code)``, and the Python stacks if the child has written them
+  (``last_words.py``)
+* ``(FORK_UNSAFE, child, imports)``: this zygote's imports made forking unsafe.  The agent starts
+  that child in a zygote that imports ``imports`` alone.
 """
 
 from __future__ import annotations
@@ -44,16 +53,15 @@ STARTED, FAILED, EXITED, FORK_UNSAFE = range(4)
 _SHUTDOWN_SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 GRACE = 0.75
-"""Seconds that children have, after the agent's process died, to notice it and end by themselves.
-"""
+"""Seconds after the death of the agent's process in which children may end by themselves."""
 
 
 class Zygote:
-    """One loop over descriptors: the agent's requests, deaths of children, deaths of ancestors.
+    """Loop over descriptors: the agent's requests, deaths of children, deaths of ancestors.
 
-    ``ancestors``: pidfds of the agent's process, which comes first, and of those that started it.
+    ``ancestors``: pidfds of the agent's process, which comes first, and of its ancestors.
     ``imports``: modules to import before the first fork; None for the program's main module and
-    those that the first child names.
+    the modules that the first child names.
     """
 
     def __init__(
@@ -66,7 +74,7 @@ class Zygote:
         program: tuple[int, str] | None = None,
     ) -> None:
         self._program = program
-        """What is to be unpacked before the first child, and where to."""
+        """Archive to unpack before the first child, and its folder; None once that is done."""
         self._control = control
         self._progress_table = progress_table
         self._ancestors = ancestors
@@ -76,18 +84,18 @@ class Zygote:
         self._pid = os.getpid()
         self._pids: dict[int, int] = {}  # child -> pid
         self._children: dict[int, int] = {}  # pid -> child
-        self._words: dict[int, int] = {}  # pid -> where it writes the stacks of a crash
-        self._overdue: dict[int, float] = {}  # pid -> when it is killed, if it has not died before
-        self._descriptors: tuple[int, list[int]] = (0, [])  # child, what came ahead for it
+        self._words: dict[int, int] = {}  # pid -> file for the stacks of a crash
+        self._overdue: dict[int, float] = {}  # pid -> time of its SIGKILL, if it is still alive
+        self._descriptors: tuple[int, list[int]] = (0, [])  # child, descriptors before its START
         self._sigchld, self._sigchld_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self._poller = select.poll()
         for fd in (control.fileno(), self._sigchld, *ancestors):
             self._poller.register(fd, select.POLLIN)
 
     def run(self) -> bool:
-        """Serve until told to quit or an ancestor is gone, then kill what is left.
+        """Serve until QUIT or the end of an ancestor, then kill the children.
 
-        Whether it was told to.
+        Return whether QUIT came.
         """
         self._listen_to_signals()
         while True:
@@ -102,20 +110,20 @@ class Zygote:
             except (EOFError, ConnectionError):
                 # A dying process closes its descriptors a moment before it counts as dead.
                 ready.update(self._ancestors)
-            # All generations below an ancestor start to count at the same moment.
+            # The zygotes of all generations below a dead ancestor begin GRACE at the same moment.
             if not ready.isdisjoint(self._ancestors):
                 self._kill_children(GRACE)
                 return False
 
     def _listen_to_signals(self) -> None:
-        # A program's thread that blocks signals hands that on to what it starts.
+        # A thread of the program that blocks signals passes its mask on to new processes.
         signal.pthread_sigmask(signal.SIG_SETMASK, ())
-        # Ctrl-C in a terminal is the master's alone.  SIGTERM to us would orphan the children.
+        # Ctrl-C in a terminal is for the master alone.  SIGTERM here would orphan the children.
         for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(signum, signal.SIG_IGN)
-        # A terminal with `stty tostop` stops whole groups that are not its own when they print.
+        # A terminal with `stty tostop` stops background process groups that print.
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
-        # A child ignores it until it has undone all of this: signals.py tells its birth by that.
+        # A new child ignores TELL until it has undone this function's work: see signals.py.
         signal.signal(last_words.TELL, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.set_wakeup_fd(self._sigchld_in, warn_on_full_buffer=False)
@@ -138,7 +146,7 @@ class Zygote:
         return bool(request[0] != QUIT)
 
     def _early_descriptors(self, child: int) -> list[int]:
-        """What came ahead for it; what is left of a START that never came is closed."""
+        """Return the descriptors that came before the START; close those of another child."""
         (owner, fds), self._descriptors = self._descriptors, (0, [])
         if owner == child:
             return fds
@@ -156,8 +164,8 @@ class Zygote:
             self._reply(FORK_UNSAFE, child, self._unfit and self._unfit.safe)
             _close_all(fds)
             return
-        # Until the child has undone it, it ignores what we ignore: a signal sent to it right after
-        # its birth has to wait, not to be lost.
+        # The child ignores what the zygote ignores until it resets the handlers.  Blocked, a signal
+        # that comes right after the fork waits instead of being lost.
         signal.pthread_sigmask(signal.SIG_BLOCK, _SHUTDOWN_SIGNALS)
         words = last_words.make_file()
         try:
@@ -186,19 +194,19 @@ class Zygote:
             os.close(archive)
 
     def _is_fork_safe(self, start: StartRequest) -> bool:
-        """Whether this process may be forked, after it has imported what it shall."""
+        """Do the imports at the first call; return whether forking this process is safe."""
         if self._is_to_import:
             self._is_to_import = False
             self._unfit = preload(child_module.read_preparation(start), self._imports)
-            self._listen_to_signals()  # an import may have set its own
-            # Once for a program: a zygote of its children would only repeat it.
+            self._listen_to_signals()  # an import may have changed the handlers
+            # Once for a program: zygotes that its children start would only repeat it.
             is_first = self._imports is None and len(self._ancestors) == 1
             if is_first and self._unfit is not None and self._unfit.reason:
                 print(f"fiber: {self._unfit.reason}", file=sys.stderr, flush=True)
         return self._unfit is None
 
     def _run_child(self, start: StartRequest, fds: list[int], words: int) -> NoReturn:
-        """In the forked process: drop what is the zygote's and run the child."""
+        """Close the zygote's descriptors in the forked process, and run the child."""
         code = 1
         try:
             signal.set_wakeup_fd(-1)
@@ -215,7 +223,7 @@ class Zygote:
             resource.setrlimit(resource.RLIMIT_NOFILE, start.open_files)
             code = child_module.run(start, fds, self._progress_table, self._ancestors[0], words)
         except BaseException:
-            # The user's own errors do not come here: these are of the system, or Fiber's.
+            # Errors of the user's code are handled before.  This one is the system's or Fiber's.
             import traceback  # rarely needed, and long to import
 
             traceback.print_exc()
@@ -262,13 +270,13 @@ class Zygote:
         self._pids.pop(child, None)
         exitcode = os.waitstatus_to_exitcode(status)
         if self._overdue.pop(pid, None) is not None and exitcode == -last_words.TELL:
-            exitcode = -signal.SIGKILL  # it was to be killed in any case
+            exitcode = -signal.SIGKILL  # TELL is how the agent begins to kill it
         words = self._words.pop(pid, -1)
         stack = last_words.read(words) if words >= 0 else ""
         self._reply(EXITED, child, exitcode, *([stack] if stack else []))
 
     def _reply(self, *answer: Any) -> None:
-        # An agent that is gone shows on its own descriptor.
+        # The loop sees the end of the agent on its pidfd.
         with contextlib.suppress(OSError):
             packet.send(self._control, pickle.dumps(answer))
 
@@ -286,7 +294,7 @@ class Zygote:
 
 
 def _kill(pid: int, signum: int) -> None:
-    # A child that runs a set-user-ID program by now is out of our reach, but not the others.
+    # The kernel refuses signals to a child that now runs a set-user-ID program.
     with contextlib.suppress(PermissionError):
         os.kill(pid, signum)
 
@@ -297,28 +305,28 @@ def _close_all(fds: list[int]) -> None:
 
 
 def main(control: int, agent: int) -> None:
-    """Entry point of the zygote's process; ``agent`` is the pid of the one that started it."""
-    # Python and JAX warn of any thread, and of any fork.  Ours come after a trial (preload.py).
+    """Run the zygote's process; ``agent`` is the pid of the process that started it."""
+    # Python and JAX warn at a fork beside threads.  The zygote forks after a trial (preload.py).
     warnings.filterwarnings("ignore", message=".*multi-threaded.*fork", category=DeprecationWarning)
     warnings.filterwarnings(
         "ignore", r"os\.fork\(\) was called", RuntimeWarning, r"fiber\._agent\."
     )
     os.set_inheritable(control, False)
     child_module.go_on_without_parent()
-    # A program that raised its limit after it started us may send more than ours.
+    # A program that raised its limit after it started the zygote may send more descriptors.
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     if agent == 1:
-        # In a container nobody else would reap them: the agent waits for what it started only.
+        # In a container orphans would stay unreaped: process 1, the agent, waits for its own only.
         child_module.become_subreaper()
-    # What every child needs, while the program that started us early is busy with its own imports.
+    # Every child needs this.  Meanwhile the program, which starts zygotes early, does its imports.
     import fiber._agent.worker  # noqa: F401
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=control) as sock:
         try:
             message = packet.receive(sock, descriptors=True)
         except (EOFError, ConnectionError):
-            return  # nothing was ever asked of it
+            return  # the program needed no zygote
         fds, message.fds = message.fds, []
         _, *setup = packet.loads(message)
         _run_zygote(sock, fds, *setup)
@@ -332,10 +340,11 @@ def _run_zygote(
     cleanup_directory: str | None,
     folder: str | None,
 ) -> None:
-    """Be the zygote that was asked for.
+    """Run a zygote as SETUP asks, and clean up after it.
 
-    ``ancestors``: pids, the agent's first.  ``cleanup_directory``: to be removed should they die
-    before they can do so themselves.  ``folder``: to be made for the program's files, and removed.
+    ``ancestors``: pids, the agent's first.  ``cleanup_directory``: directory that the zygote
+    removes if an ancestor dies.  ``folder``: folder for the program's files, which the zygote makes
+    and removes.
     """
     progress_table, *archive = fds
     watched = _pidfds(ancestors)
@@ -350,16 +359,16 @@ def _run_zygote(
         ).run()
     ours = folder if told_to else cleanup_directory
     if ours is not None:
-        # Rarely needed, and whoever waits for the first child waits for our imports.
+        # Rarely needed; an import above would delay the first child.
         from fiber._hub.directory import remove_directory
 
         remove_directory(ours)
 
 
 def _pidfds(ancestors: tuple[int, ...]) -> list[int]:
-    """Pidfds; none if one of them died before we could watch it."""
+    """Return the pidfds of ``ancestors``; an empty list if one of them is dead."""
     try:
         watched = [os.pidfd_open(pid) for pid in ancestors]
     except ProcessLookupError:
         return []
-    return watched if os.getppid() == ancestors[0] else []  # its pid may be another's by now
+    return watched if os.getppid() == ancestors[0] else []  # the pid may be reused

@@ -1,4 +1,4 @@
-"""The agent's side of a zygote: starts its process, asks for children, hears of them."""
+"""The agent's side of a zygote: starts the process, requests children, receives their events."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _QUIT_TIMEOUT = 10.0
 
 
 class ZygoteObserver(Protocol):
-    """Hears what a zygote says; on the loop's thread."""
+    """Receiver of a zygote's packets.  Called on the loop's thread."""
 
     def on_reply(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
-        """What became of a child."""
+        """Handle an event of a child."""
 
     def on_zygote_exit(self, link: ZygoteLink) -> None:
-        """The zygote died, and its children with it.  Once, and last."""
+        """Handle the death of the zygote and its children.  Called once, and last."""
 
 
 class ZygoteLink:
-    """Our side of one zygote process."""
+    """Link of an agent to one zygote process."""
 
     def __init__(
         self,
@@ -47,23 +47,25 @@ class ZygoteLink:
         program: Blob | None = None,
         folder: str | None = None,
     ) -> None:
-        """``imports``: as in ``zygote.Zygote``.  ``program``: files that the zygote unpacks to
+        """Start the zygote's process.
+
+        ``imports``: as in ``zygote.Zygote``.  ``program``: files that the zygote unpacks to
         ``folder``, for its children.
         """
         self.program = program
         self.folder = folder
         self.retired = False
-        """No further child is to live in it."""
+        """True once the zygote gets no further children."""
         self.children = 0
-        """Those that are to live on in it."""
+        """Number of children that the zygote has or was asked for."""
         self._observer = observer
         self._loop = loop
         self._gone = threading.Event()
         self._has_replied = False
         self._asked: deque[int] = deque()
-        """Children that it was asked for and has not answered; it answers in their order."""
+        """Children that the zygote has not answered for yet, in the order of its answers."""
         with naming_the_limit("starting the zygote"):
-            fds = [os.dup(progress_table)]  # what is sent is closed
+            fds = [os.dup(progress_table)]  # the outbox closes what it sends
             try:
                 if program is not None:
                     fds.append(os.dup(program.fileno()))
@@ -73,13 +75,14 @@ class ZygoteLink:
                 raise
         self._sock.setblocking(False)
         self._outbox = Outbox(loop, self._sock)
-        # Made at the last moment: from here on the zygote removes it, whoever is killed.
+        # The directory is made at the last moment: from here on the zygote removes it if the agent
+        # is killed.
         setup = (zygote.SETUP, lineage(), imports, cleanup_directory(), folder)
         self._outbox.send(pickle.dumps(setup), fds=fds)
         loop.register(self._sock.fileno(), self._receive)
 
     def start(self, child: int, request: StartRequest, fds: list[int]) -> None:
-        """Ask for a child that gets ``fds``, which are this object's from now on."""
+        """Request a child that gets ``fds``, which this object closes."""
         self._asked.append(child)
         while len(fds) > packet.MAX_DESCRIPTORS:
             some, fds = fds[: packet.MAX_DESCRIPTORS], fds[packet.MAX_DESCRIPTORS :]
@@ -87,22 +90,22 @@ class ZygoteLink:
         self._outbox.send(pickle.dumps((zygote.START, child, tuple(request)), protocol=5), fds=fds)
 
     def retire(self) -> None:
-        """End it; it has no children, and gets none any more."""
+        """End the zygote, which has no children, and request no more children from it."""
         self.retired = True
         self.send(zygote.QUIT)
 
     def send(self, *request: Any) -> None:
-        """Ask for something else.  On the loop's thread, as ``start``."""
+        """Send another request.  Runs on the loop's thread, as ``start``."""
         self._outbox.send(pickle.dumps(request))
 
     def quit(self) -> None:
-        """End it and its children, and wait for that; on any thread but the loop's."""
+        """End the zygote and its children, and wait.  Must not be called on the loop's thread."""
         if self._has_replied:
             self._loop.call_soon(self.send, zygote.QUIT)
             if not self._loop.running:
                 self.send(zygote.QUIT)
         else:
-            # It has no child yet and may be importing the program's main module for ever.
+            # The zygote has no child yet, and may import the program's main module for ever.
             self._process.kill()
         try:
             self._process.wait(_QUIT_TIMEOUT)
@@ -110,7 +113,7 @@ class ZygoteLink:
             self._process.kill()
             self._process.wait()
         if self._loop.running:
-            # Its last words tell of its children.
+            # The zygote's last packets report the ends of its children.
             self._gone.wait(_QUIT_TIMEOUT)
         else:
             self._outbox.close()
@@ -133,7 +136,7 @@ class ZygoteLink:
         self._observer.on_reply(self, self._completed(reply))
 
     def _completed(self, reply: tuple[Any, ...]) -> tuple[Any, ...]:
-        """``reply`` with the child that it is about."""
+        """Return ``reply`` with the child that it is about, if the zygote could not name it."""
         kind, child, *rest = reply
         if kind != zygote.EXITED and self._asked and child in (None, self._asked[0]):
             child = self._asked.popleft()

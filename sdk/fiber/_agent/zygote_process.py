@@ -1,8 +1,8 @@
-"""The process of a zygote, from the program's side; it may be started before anything needs it.
+"""The process of a zygote, from the program's side, which may start it before it is needed.
 
-To start an interpreter and import what children need takes as long as the program takes to import
-the rest of Fiber.  So the first process or pool starts its zygote first, and this module imports
-next to nothing.
+Starting an interpreter with the imports that children need takes as long as the program takes to
+import the rest of Fiber.  So the first process or pool starts its zygote first, and this module
+imports as little as possible.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from typing import Any, NamedTuple, cast
 
 
 class ZygoteProcess(NamedTuple):
-    """A started process and our end of the socket over which it is told what to do."""
+    """A started process, and the agent's end of its control socket."""
 
     process: subprocess.Popen[bytes]
     sock: socket.socket
 
 
 interpreter_flags: list[str] | None = None
-"""Flags for new interpreters; None: those of this one."""
+"""Flags for new interpreters; None for the flags of this one."""
 
 _early: ZygoteProcess | None = None
 
 
 def start_early() -> None:
-    """Start one for the next ``launch``."""
+    """Start a zygote's process for the next ``launch``."""
     global _early
     if _early is None:
         _early = _start()
@@ -38,14 +38,14 @@ def start_early() -> None:
 
 
 def launch() -> ZygoteProcess:
-    """The one that was started early, or a new one."""
+    """Return the process that was started early, or a new one."""
     global _early
     ready, _early = _early, None
     return ready or _start()
 
 
 def discard_early() -> None:
-    """End the one that was started early and that nobody came for."""
+    """End the process that was started early, if ``launch`` has not taken it."""
     global _early
     unused, _early = _early, None
     if unused is not None:
@@ -55,7 +55,7 @@ def discard_early() -> None:
 
 
 def interpreter_arguments(executable: str, statement: str) -> list[str]:
-    """The command line of a fresh interpreter with our flags that can import this package."""
+    """Return the command of an interpreter with these flags that can import this package."""
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     code = f"import sys; sys.path.insert(0, {root!r}); {statement}"
     return [executable, *flags(), "-c", code]
@@ -69,9 +69,9 @@ def flags() -> list[str]:
 
 
 def is_standard_stream(fd: int) -> bool:
-    """Whether the program still has its standard stream ``fd``."""
-    # Python makes no descriptor inheritable by itself: one that is not has taken the number of a
-    # stream that the program closed.
+    """Return whether the program still has its standard stream ``fd``."""
+    # Standard streams are inheritable, and Python makes other descriptors non-inheritable.  So a
+    # non-inheritable one has taken the number of a stream that the program closed.
     try:
         return os.get_inheritable(fd)
     except OSError:
@@ -81,7 +81,7 @@ def is_standard_stream(fd: int) -> bool:
 def _start() -> ZygoteProcess:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
-        # The zygote waits for what it is told: socket.setdefaulttimeout() is for the user's own.
+        # The zygote waits for packets without the timeout that socket.setdefaulttimeout() sets.
         theirs.setblocking(True)
         return ZygoteProcess(_run(theirs.fileno()), ours)
     except BaseException:
@@ -92,8 +92,8 @@ def _start() -> ZygoteProcess:
 
 
 def _run(control: int) -> subprocess.Popen[bytes]:
-    # A program that closed its standard streams may have their numbers under ours; the zygote and
-    # its children must not.
+    # If the program closed its standard streams, this socket may have one of their numbers.  The
+    # zygote and its children need these numbers for streams.
     fd = fcntl.fcntl(control, fcntl.F_DUPFD_CLOEXEC, 3)
     try:
         return subprocess.Popen(
@@ -104,9 +104,9 @@ def _run(control: int) -> subprocess.Popen[bytes]:
             stdin=subprocess.DEVNULL,
             stdout=_null_if_closed(1),
             stderr=_null_if_closed(2),
-            # Ctrl-C in the terminal is for the program's own group.  A session of its own would
-            # make the kernel's scheduler share the processors between program and children by half
-            # (sched_autogroup), however many children there are.
+            # Ctrl-C in the terminal is for the program's group.  Not a new session: the kernel's
+            # scheduler (sched_autogroup) would give it half of the processors, the program the
+            # other half, however many children there are.
             process_group=0,
         )
     finally:
@@ -118,11 +118,11 @@ def _null_if_closed(fd: int) -> int | None:
 
 
 def _forget_early() -> None:
-    # It is the child of the process that we were forked from.
+    # The early process is a child of the process that this one was forked from.
     global _early
     if _early is not None:
         _early.sock.close()
-        _early.process.returncode = 0  # what its destructor would warn of is not our child
+        _early.process.returncode = 0  # keeps its destructor from a warning
         _early = None
 
 
