@@ -1,1 +1,1 @@
-"""What runs beside the children of one host: agent, zygote, and the child's own first steps."""
+"""Agent, zygote and child: the processes that run the children of one host."""

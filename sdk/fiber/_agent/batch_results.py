@@ -1,8 +1,8 @@
 """The results of one batch of a pool worker: collected, made safe to send, sent in pieces.
 
-Two threads meet here: the one that runs the tasks appends, the watchdog (``watchdog.py``) may send
-what is there.  A value counts as there once it is in ``values``; what belongs to it is stored
-before.
+Two threads use them.  The thread that runs the tasks appends results; the watchdog
+(``watchdog.py``) may send those that are there.  A value counts once it is in ``values``, so its
+pickle and buffers are stored before.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from fiber._hub.remote import Taken, confirm
 from fiber._wire import packet, work
 
 _MANY_BUFFERS = packet.MAX_BUFFERS - work.BUFFERS - 1
-"""Buffers above which another value's may be too many for a message."""
+"""Buffers above which those of one more value may be too many for a message."""
 
 
 class Sender(Protocol):
-    """The sending side of a channel."""
+    """Sending side of a channel."""
 
     def send(self, payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room."""
 
 
 class BatchResults:
-    """The results of batch ``seq``: of ``total`` tasks; ``remaining`` yields those to begin, with
-    which ``taken`` came from other hosts.
+    """Results of batch ``seq``, which has ``total`` tasks.
 
-    With ``eager``, each value is safe to send as soon as it is in ``values``; without, values come
-    straight from the tasks, and ``encode_new`` makes them so.
+    ``remaining`` yields the tasks to begin.  ``taken`` are the remote objects that came with them.
+    With ``eager``, each value is safe to send as soon as it is in ``values``.  Without, ``values``
+    gets the tasks' results as they are, and ``encode_new`` makes them safe.
     """
 
     __slots__ = (
@@ -84,9 +84,9 @@ class BatchResults:
         self._retryable = retryable
 
     def add(self, value: Any) -> bool:
-        """Take the next task's value as it is now: a later task may change the object.
+        """Take the next task's value in its present state: a later task may change the object.
 
-        True: call ``flush`` before the next task, which may write to the value's own memory.
+        True: call ``flush`` before the next task, which may write to the value's memory.
         """
         if work.is_plain_value(value):
             self.values.append(value)
@@ -103,7 +103,7 @@ class BatchResults:
         self.values.append(None)
 
     def encode_new(self) -> None:
-        """Make safe to send what came since the last time."""
+        """Make the values since the last call safe to send."""
         first, values = self._encoded_up_to, self.values
         if not work.is_plain(values[first:]):
             for at in range(first, len(values)):
@@ -137,19 +137,19 @@ class BatchResults:
         self._encoded.append((position, kind, data or None, len(buffers)))
 
     def started(self) -> int:
-        """How many tasks have begun."""
+        """Return the number of tasks that have begun."""
         with self._lock:
             return self.total - length_hint(self.remaining)
 
     def flush(self) -> None:
-        """Send what can be sent."""
+        """Send the results that are safe to send."""
         with self._lock:
             self._send(None)
 
     def return_unstarted(self) -> None:
-        """Send what can be sent, and give back every task that has not begun."""
+        """Send the results that are safe to send; give back the tasks that have not begun."""
         with self._lock:
-            # Taking them from the iterator is atomic: either the running thread gets a task or we.
+            # Taking tasks from the iterator is atomic: each goes to this thread or to the other.
             left = len(list(self.remaining))
             self.total -= left
             self._send(self.total if left else None)
@@ -160,7 +160,7 @@ class BatchResults:
             return
         odd = [(at - first, kind, data, n) for at, kind, data, n in self._encoded if at < stop]
         buffers = self._buffers[: sum(entry[3] for entry in odd)]
-        if stop >= self.total:  # what the tasks were lent ends with the last of them
+        if stop >= self.total:  # the tasks' grants end with the last task
             confirm(self._taken)
         now = time.perf_counter()
         head = (self.seq, first, kept, now - self._last_sent)
@@ -171,7 +171,7 @@ class BatchResults:
         except ConnectionError:
             raise
         except (OSError, MemoryError) as error:
-            # No memory or no descriptor for it here; to say so takes little of either.
+            # There is no memory or descriptor for the results.  The error needs little of either.
             odd = [(at, work.ERROR, encode_error(error), 0) for at in range(stop - first)]
             self._channel.send(pickle.dumps((*head, [None] * len(odd), odd), 5))
         self._sent, self._last_sent = stop, now
@@ -179,7 +179,7 @@ class BatchResults:
 
 
 def _pickle_unusual(value: Any) -> tuple[bytes, list[memoryview]]:
-    """What plain pickle refuses."""
+    """Pickle a value that plain pickle refuses."""
     try:
         # Sockets and the like need multiprocessing's reducers, which only its pickler knows.
         return bytes(ForkingPickler.dumps(value)), []

@@ -1,9 +1,9 @@
-"""Sending back what was defined in a ``__main__`` that travels by value.
+"""Pickles of objects whose classes came by value from the program's ``__main__``.
 
-What a notebook, ``python -c`` or a script defines reaches workers that cannot import it by value,
-through cloudpickle.  It must not come back so: the program would get copies of its own classes,
-which ``isinstance`` and ``except`` do not know.  So classes and functions of ``__main__`` go back
-by name, and the program finds its own.
+Classes and functions of a notebook, ``python -c`` or a script travel by value, through cloudpickle,
+to workers that cannot import them.  On the way back they must not travel by value: the program
+would get copies of its classes, which fail ``isinstance`` and ``except``.  So classes and functions
+of ``__main__`` go back by name, and the program looks up the originals.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ def dumps(
 
 
 def find(name: str, tracker_id: str | None) -> Any:
-    """What ``__main__`` calls ``name``.
+    """Return the object that ``__main__`` calls ``name``.
 
-    Here, or in a process between here and there, it may have come by value itself: then it is what
-    cloudpickle knows by ``tracker_id``.
+    In this process a class may itself have come by value.  Then cloudpickle knows it by
+    ``tracker_id``.
     """
     if tracker_id is not None and (known := _classes_by_tracker_id().get(tracker_id)) is not None:
         return known
@@ -50,7 +50,7 @@ def find(name: str, tracker_id: str | None) -> Any:
 
 
 def pickler(file: io.BytesIO, reducers: dict[type, Any]) -> pickle.Pickler:
-    """Make a pickler as ``dumps`` has it, with reducers that go before its others."""
+    """Return a pickler as in ``dumps``; ``reducers`` take precedence over its other reducers."""
     made: pickle.Pickler = _by_reference()(file, pickle.HIGHEST_PROTOCOL, reducers)
     return made
 
@@ -72,7 +72,7 @@ def _by_reference() -> Any:
                 cast("Any", ForkingPickler)._extra_reducers,
             )
             self.dispatch_table = ChainMap(*own, cloudpickle.Pickler.dispatch_table)
-            super().__init__(file, protocol, buffer_callback)  # which reads the table once
+            super().__init__(file, protocol, buffer_callback)  # reads the table, once
 
         def reducer_override(self, obj: Any) -> Any:
             if isinstance(obj, type | FunctionType) and obj.__module__ == "__main__":
@@ -85,7 +85,7 @@ def _by_reference() -> Any:
 
 
 def _tracker_id(obj: Any) -> str | None:
-    """What cloudpickle calls a class that came by value, in every process that it came through."""
+    """Return cloudpickle's id of a class that came by value, the same in every process."""
     from cloudpickle import cloudpickle
 
     marks = getattr(cloudpickle, "_DYNAMIC_CLASS_TRACKER_BY_CLASS", {})

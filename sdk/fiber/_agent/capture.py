@@ -1,4 +1,4 @@
-"""The output of a child of a remote agent: read line by line, passed on, its end remembered."""
+"""Capture of a remote child's output: read by lines, passed on, its last lines kept."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ LAST_LINES = 20
 
 _CHUNK = 1 << 16
 _LONGEST = 1 << 13
-"""A line without an end is passed on in pieces of this many bytes."""
+"""Bytes after which a line without an end is passed on in pieces."""
 
 
 class Capture:
-    """A pipe for one child's stdout and stderr.  On the loop's thread."""
+    """Pipe for one child's stdout and stderr.  Runs on the loop's thread."""
 
     def __init__(self, loop: Loop, write: Callable[[str], None], busy: Callable[[], bool]) -> None:
         self._loop = loop
@@ -35,21 +35,21 @@ class Capture:
 
     @property
     def stdio(self) -> tuple[int, int]:
-        """What the child gets as stdout and stderr."""
+        """Descriptors for the child's stdout and stderr."""
         return self._writer, self._writer
 
     def started(self) -> None:
-        """The child has its own descriptor now."""
+        """Close the writing end: the child has its own now."""
         if self._writer >= 0:
             os.close(self._writer)
             self._writer = -1
 
     def finish(self) -> tuple[str, ...]:
-        """The child is gone: read what is left and return its last lines."""
+        """Read the rest of a dead child's output; return its last lines."""
         if not self._closed:
             self._closed = True
             self._loop.unregister(self._reader)
-            # What was there when it died; something that it started may write on for ever.
+            # No more than the pipe's size: a process that the child started may write for ever.
             left = fcntl.fcntl(self._reader, fcntl.F_GETPIPE_SZ)
             while left > 0 and (size := self._read()):
                 left -= size
@@ -78,7 +78,7 @@ class Capture:
         if data:
             self._pass_on(data)
         elif not self._closed:
-            # Nobody holds it any more, though the child may still run: nothing will come.
+            # All writers have closed the pipe, though the child may still run.
             self._loop.unregister(self._reader)
         return len(data)
 

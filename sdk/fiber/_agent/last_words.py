@@ -1,7 +1,7 @@
-"""The Python stacks of a child that crashes, or runs for too long.
+"""Python stacks of a child that crashes or runs for too long.
 
 The zygote makes a memory file for each child.  faulthandler writes the stacks of all threads there,
-from native code too, and the zygote reads them when the child is gone.
+also at a crash in native code, and the zygote reads them when the child is gone.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ TELL = signal.SIGRTMAX - 3
 """Signal to a child: write the stacks, then die."""
 
 GRACE = 0.5
-"""Seconds that a child has for that before it is killed."""
+"""Seconds from TELL to SIGKILL."""
 
 LIMIT = 1 << 14
-"""Bytes of the stacks that are kept."""
+"""Bytes of the stacks that the zygote keeps."""
 
 _HERE = os.path.dirname(__file__)
 
@@ -37,10 +37,10 @@ def make_file() -> int:
 
 
 def write_to(fd: int) -> None:
-    """In a child: have faulthandler write to ``fd`` on TELL, and on crashes if it is not in use."""
+    """Have faulthandler write to ``fd`` on TELL, and on crashes unless the user enabled it."""
     import faulthandler
 
-    with suppress(OSError, RuntimeError, ValueError):  # the child can do without
+    with suppress(OSError, RuntimeError, ValueError):  # stacks are optional
         signal.signal(TELL, signal.SIG_DFL)
         faulthandler.register(TELL, file=fd, all_threads=True, chain=True)
         if not faulthandler.is_enabled():
@@ -62,7 +62,7 @@ def read(fd: int) -> str:
 
 
 def _without_our_frames(lines: Iterable[str]) -> list[str]:
-    """Drop what called the code of the user, and a list of modules."""
+    """Drop Fiber's frames around the user's code, and the list of extension modules."""
     kept = []
     ours = False
     for line in lines:

@@ -17,11 +17,11 @@ _DEPENDENCIES = ("cloudpickle", "cryptography", "pynng")
 """Packages that an agent may import late."""
 
 _PAUSE = 0.01
-"""Seconds between two looks at processes that end."""
+"""Seconds between two checks of processes that end."""
 
 
 def hide_this_process() -> bool:
-    """Have the kernel keep others of this user from memory and descriptors of this process.
+    """Have the kernel hide memory and descriptors of this process from the user's other processes.
 
     Return whether the kernel does.  A seccomp profile may refuse it.
     """
@@ -30,7 +30,7 @@ def hide_this_process() -> bool:
 
 
 def keep_search_path() -> None:
-    """Import from now on only from places that have modules of this process, Python's own first.
+    """Restrict ``sys.path`` to places that have modules of this process, Python's own first.
 
     A task may write a module to the working directory or to a folder of ``PYTHONPATH``.
     """
@@ -47,7 +47,7 @@ def keep_search_path() -> None:
 
 
 def _place_of(file: str, places: list[str]) -> str:
-    """The innermost of the places that the file is in; empty if it is in none."""
+    """Return the innermost of the places that the file is in; empty if it is in none."""
     within = [place for place in places if file.startswith(place.rstrip(os.sep) + os.sep)]
     return max(within, key=len, default="")
 
@@ -55,8 +55,8 @@ def _place_of(file: str, places: list[str]) -> str:
 def end(timeout: float) -> bool:
     """Kill all descendants; return whether none is left after ``timeout`` seconds.
 
-    This process must be a subreaper, or the first one of its container: a process whose parent ends
-    becomes its child then, however it was started.
+    This process must be a subreaper, or process 1 of its container.  Then orphaned descendants
+    become its children.
     """
     deadline = time.monotonic() + timeout
     while True:

@@ -1,7 +1,7 @@
-"""Whether the kernel has killed a process of this control group for want of memory.
+"""Detection of processes that the kernel killed because this control group was out of memory.
 
-A child that is killed so looks like any other that got a SIGKILL.  Control groups count such
-deaths, in both versions, and a container sees its own where it has them mounted.
+Such a child looks like any other that got a SIGKILL.  Control groups of both versions count these
+deaths.  A container sees the count of its control group if that is mounted.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ _UNITS = (("Gi", 1 << 30), ("Mi", 1 << 20), ("Ki", 1 << 10))
 
 
 class MemoryLimit:
-    """Watches the control group that this process is in."""
+    """Memory limit of the control group that this process is in."""
 
     def __init__(self, root: str = _ROOT, membership: str = _MEMBERSHIP) -> None:
         self._events, self._maximum = _files(root, membership)
         self._kills = self._count()
 
     def was_exceeded(self) -> bool:
-        """Whether the kernel has killed for it since this was asked last."""
+        """Return whether the kernel has killed a process for memory since the last call."""
         before, self._kills = self._kills, self._count()
         return self._kills > before
 
     def describe(self) -> str:
-        """The limit as Kubernetes writes it, in a sentence."""
+        """Return a sentence with the limit as Kubernetes writes it."""
         limit = _read(self._maximum).strip()
         if limit.isdigit():
             return f"its memory limit is {_quantity(int(limit))}"
@@ -40,13 +40,13 @@ class MemoryLimit:
 
 
 def _files(root: str, membership: str) -> tuple[str, str]:
-    """What counts the deaths, and what holds the limit."""
+    """Return the paths of the file that counts the deaths and the file with the limit."""
     groups = {}
     for line in _read(membership).splitlines():
         _, controllers, group = line.split(":", 2)
         groups[controllers] = group.rstrip("/")
     found = []
-    # In a namespace of its own a group is the root of what is mounted, whatever its name.
+    # In a separate cgroup namespace the group is the root of the mount, under any name.
     for group in (groups.get("", ""), ""):
         found.append((f"{root}{group}/memory.events", f"{root}{group}/memory.max"))
     for group in (groups.get("memory", ""), ""):

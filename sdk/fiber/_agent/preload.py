@@ -1,9 +1,9 @@
-"""Imports that a zygote makes once for its children, and whether it may be forked after them.
+"""Imports that a zygote makes once for its children, and the check that forking stays safe.
 
-Only the thread that forks lives on in the child.  A lock that another thread held, or a pool of
-threads that a library counts on, then makes the child wait for ever.  Some libraries know that:
-the threads of OpenBLAS end before a fork and start again when they are needed.  Those of XLA (JAX)
-and of GNU's OpenMP do not.  A trial fork tells them apart: threads that are there after it count.
+Only the thread that forks lives on in the child.  If another thread held a lock, or a library needs
+its pool of threads, the child then waits for ever.  Some libraries prepare for a fork: the threads
+of OpenBLAS end before it and start again when they are needed.  Those of XLA (JAX) and of GNU's
+OpenMP do not.  A trial fork tells the two apart: threads that exist after it make forking unsafe.
 """
 
 from __future__ import annotations
@@ -25,32 +25,35 @@ from typing import Any, NamedTuple
 from fiber._agent import child
 
 _TRIAL_TIMEOUT = 10.0
-"""Seconds that the process of a trial fork has to end."""
+"""Seconds in which the process of a trial fork must end."""
 
 _SETTLING = 0.1
-"""Seconds until the kernel has forgotten a thread that was joined."""
+"""Seconds until a joined thread is gone from /proc."""
 
 _MAIN = "__mp_main__"
 
 
 class Imports(NamedTuple):
-    """Modules to import, and the environment variables to do it with."""
+    """Modules to import, and the environment variables for their import."""
 
     modules: tuple[str, ...]
     environ: dict[bytes, bytes]
 
 
 class Unfit(NamedTuple):
-    """Why a zygote must not be forked."""
+    """Reason why a zygote must not be forked."""
 
     reason: str
-    """For the user; empty where importing the main module fails, as each child will report."""
+    """Text for the user; empty if importing the main module fails, which each child reports."""
     safe: Imports
-    """Imports for the next zygote: the first of the program, up to what starts threads."""
+    """Imports for the next zygote: those of the program before the one that starts threads."""
 
 
 def preload(data: dict[str, Any], only: Imports | None) -> Unfit | None:
-    """Import ``only``, or else what ``data`` names and the main module; None if forking is safe."""
+    """Import ``only``, or the modules in ``data`` and the main module.
+
+    Return None if forking is safe after that.
+    """
     if only is not None:
         os.environb.clear()
         os.environb.update(only.environ)
@@ -70,18 +73,18 @@ class _Step(NamedTuple):
 
     modules: tuple[str, ...]
     line: int
-    """Line of the main module; 0 for an import that is not its own."""
+    """Line in the main module; 0 for an import from elsewhere."""
     seconds: float
     environ: dict[bytes, bytes]
 
 
 class _Preloader:
-    """Imports modules, and looks after each of them for threads that a fork would break."""
+    """Importer of modules that checks after each one for threads that a fork would break."""
 
     def __init__(self) -> None:
         self._threads = 1
         if not self._is_fit():
-            # Threads of any interpreter here: the next zygote would have them as well.
+            # Every interpreter here starts these threads, so the next zygote would have them too.
             self._threads = _count_threads()
         self._culprit: str | None = None
         self._names = ""
@@ -108,13 +111,13 @@ class _Preloader:
         try:
             with child.inheriting(), self._checking_imports(main):
                 child.prepare_main(data)
-        except BaseException:  # a child meets, and reports, it
+        except BaseException:  # a child meets it too, and reports it
             self._has_failed = True
         self._seconds += time.perf_counter() - begin
         self._check(main)
 
     def verdict(self) -> Unfit | None:
-        """None if this process may be forked."""
+        """Return why this process must not be forked; None if it may be."""
         if self._culprit is None:
             return None
         end = _end_of_leading_imports(self._file)
@@ -163,18 +166,18 @@ class _Preloader:
                 builtins.__import__ = original
 
     def _note(self, modules: tuple[str, ...], line: int, seconds: float) -> None:
-        """Note an import, as safe or as what starts threads."""
+        """Record an import, as safe or as the one that starts threads."""
         if self._check(modules[0]):
             self._steps.append(_Step(modules, line, seconds, dict(os.environb)))
 
     def _check(self, culprit: str) -> bool:
-        """Return whether a fork is still safe; if it no longer is, ``culprit`` is the reason."""
+        """Return whether a fork is still safe.  If that ends, record ``culprit`` as the reason."""
         if self._culprit is None and not self._is_fit():
             self._culprit, self._names = culprit, _names_of_threads()
         return self._culprit is None
 
     def _is_fit(self) -> bool:
-        """Return whether no thread is there that a fork would break."""
+        """Return whether a fork would break no thread."""
         return _count_threads() <= self._threads or (
             _trial_fork_ends() and _comes_down_to(self._threads)
         )
@@ -183,8 +186,8 @@ class _Preloader:
 def _end_of_leading_imports(path: str) -> int:
     """Return the last line of the file's first imports, before code that could change later ones.
 
-    An import may depend on all that the main module did before.  Here those are only imports, and
-    changes of variables that the next zygote is given.
+    An import may depend on everything that the main module did before it.  These first imports
+    depend only on imports, and on variables that the next zygote gets.
     """
     import ast  # rarely needed, and long to import
 
@@ -226,7 +229,7 @@ def _comes_down_to(threads: int) -> bool:
 
 
 def _trial_fork_ends() -> bool:
-    """Fork, which makes some libraries end their threads; whether the new process could end."""
+    """Fork, so that some libraries end their threads; return whether the new process ended."""
     try:
         pid = os.fork()
     except OSError:
@@ -245,7 +248,7 @@ def _trial_fork_ends() -> bool:
 
 
 def _names_of_threads() -> str:
-    """Names of all threads but the first, whose name those without one have too."""
+    """Return the names of threads, without that of the first, which unnamed threads share."""
     names = {thread.name for thread in threading.enumerate()} - {threading.main_thread().name}
     for task in os.listdir("/proc/self/task"):
         with contextlib.suppress(OSError), open(f"/proc/self/task/{task}/comm") as comm:

@@ -1,7 +1,7 @@
-"""The program's files on a host that has not the file system of the program.
+"""The program's files on a host that does not share the program's file system.
 
-The master packs them (``fiber._backends.shipping``); a zygote unpacks them to a folder of its own
-before it imports anything from there, and removes it when it ends.
+The master packs the files (``fiber._backends.shipping``).  A zygote unpacks them to a new folder
+before it imports anything from there, and removes the folder when it ends.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ _INSTALLED = ("site-packages", "dist-packages")
 
 
 class ProgramPaths(NamedTuple):
-    """Where in the folder the places are that the program knows, as relative paths."""
+    """Paths of the program's folders and files, relative to the folder that holds them."""
 
     before_library: tuple[str, ...]
-    """What is on ``sys.path`` before the standard library, as a script's own folder."""
+    """Entries of ``sys.path`` before the standard library, such as a script's folder."""
     before_installed: tuple[str, ...]
-    """What is there after it; here it comes before all that is installed."""
+    """Entries after the standard library; here they come before all installed packages."""
     directory: str
-    """The working directory."""
+    """Working directory."""
     main: str | None
-    """The file of the main module, if children import that by its path."""
+    """File of the main module, if children import that by its path."""
 
 
 def places(paths: ProgramPaths, folder: str) -> dict[str, Any]:
-    """The entries of a child's preparation that say where things are."""
+    """Return the entries of a child's preparation that hold paths."""
 
     def here(names: tuple[str, ...]) -> list[str]:
         return [os.path.join(folder, name) for name in names]
@@ -50,7 +50,7 @@ def places(paths: ProgramPaths, folder: str) -> dict[str, Any]:
 
 
 def _own_path(folder: str) -> tuple[list[str], list[str]]:
-    """This interpreter's own ``sys.path``: up to the standard library, and what is installed."""
+    """Return this interpreter's ``sys.path`` in two parts: standard library, installed packages."""
     own = [path for path in sys.path if path and not path.startswith(folder + os.sep)]
     names = map(os.path.basename, own)
     end = next((index for index, name in enumerate(names) if name in _INSTALLED), len(own))
@@ -58,12 +58,12 @@ def _own_path(folder: str) -> tuple[list[str], list[str]]:
 
 
 def unpack(archive: int, folder: str) -> None:
-    """Make ``folder`` of what is in the file ``archive``: folders, plain files, links within it.
+    """Unpack the file ``archive`` to a new ``folder``: folders, plain files, links within it.
 
-    ValueError for anything else.  Whoever fails leaves no folder.
+    ValueError: the archive has something else.  After an error there is no folder.
     """
     import shutil
-    import tarfile  # only where a program is sent
+    import tarfile  # needed only if a program was sent
 
     os.mkdir(folder, 0o700)
     try:
@@ -88,7 +88,7 @@ def _extract(members: tarfile.TarFile, folder: str) -> None:
             links.append((member.linkname, path))
         else:
             raise ValueError(f"{member.name!r} is neither a file nor a folder nor a link")
-    # Last: no file is written through one, wherever it leads.
+    # Links come last, so that no file is written through a link.
     for target, path in links:
         os.symlink(target, path)
 

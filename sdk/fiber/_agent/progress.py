@@ -1,6 +1,6 @@
-"""The progress table: shared memory in which each pool worker says which task it is running.
+"""The progress table: shared memory in which each pool worker notes its running task.
 
-When a worker dies, its agent reads here which task to blame.  Saying so is one store into memory.
+When a worker dies, its agent reads here which task to blame.  A note costs a store into memory.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _SLOTS = 1 << 16  # sparse: only pages that are used exist
 
 
 class ProgressTable:
-    """Slots of one agent.  The memory is shared with its children by descriptor."""
+    """Slots of one agent's children, which share the memory by its descriptor."""
 
     def __init__(self, fd: int | None = None) -> None:
         self.fd = os.memfd_create("fiber-progress", os.MFD_CLOEXEC) if fd is None else fd
@@ -31,7 +31,7 @@ class ProgressTable:
         self._next = itertools.count()
 
     def claim(self) -> int:
-        """A slot for a new child, cleared."""
+        """Return a cleared slot for a new child."""
         try:
             slot = self._free.pop()  # in one step: several threads may be here
         except IndexError:
@@ -45,20 +45,20 @@ class ProgressTable:
         return slot
 
     def release(self, slot: int) -> None:
-        """The child is gone; its slot may be used again."""
+        """Free the slot of a child that is gone."""
         self._free.append(slot)
 
     def slot(self, slot: int) -> memoryview:
-        """Two words: sequence number (0: none) and index."""
+        """Return the two words of a slot: sequence number (0: none) and index."""
         return self._words[slot * _SLOT : (slot + 1) * _SLOT]
 
     def running(self, slot: int) -> tuple[int, int] | None:
-        """What the child of this slot was last running."""
+        """Return the sequence number and index that the child noted last, or None."""
         view = self.slot(slot)
         return (view[0], view[1]) if view[0] else None
 
     def close(self) -> None:
-        """Unmap it."""
+        """Unmap the memory and close its descriptor."""
         self._words.release()
         self._memory.close()
         os.close(self.fd)

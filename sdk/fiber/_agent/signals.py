@@ -1,4 +1,4 @@
-"""Whether a process is prepared for a signal, as the kernel shows it."""
+"""Check whether a process is prepared for a signal, from the kernel's status file."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from fiber._agent.last_words import TELL
 def is_expected(pid: int, signum: int) -> bool:
     """Return whether process ``pid`` handles, blocks or ignores ``signum``.
 
-    False for a signal that would only end it, for a process that cannot be looked at, and for a
-    child that still has what its zygote handles, blocks and ignores: TELL is ignored there.
+    False if the signal would end the process, if the process cannot be inspected, and for a child
+    that still has its zygote's handlers, recognized by TELL, which zygotes ignore.
     """
     try:
         with open(f"/proc/{pid}/status") as status:

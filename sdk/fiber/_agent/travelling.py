@@ -1,10 +1,9 @@
-"""How an exception travels: as its own class with its attributes, its traceback as text.
+"""Pickles of exceptions: an exception keeps its class and attributes, its traceback is text.
 
 pickle rebuilds an exception by calling its class with ``args``.  That fails, or changes the
-message, where ``__init__`` takes other arguments than those it passes on.  Such an exception is
-made here by its native base alone, and gets its arguments and attributes afterwards.  A
-``__reduce__`` in Python, or one registered with copyreg, is used where it makes the exception
-again.
+message, if ``__init__`` takes other arguments than those it passes on.  This module makes such an
+exception by its native base alone, and sets its arguments and attributes afterwards.  A
+``__reduce__`` in Python, or a function registered with copyreg, is used if it works.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from fiber._exceptions import add_note, fields_of, group_of, make, set_fields
 from fiber._hub.handles import collecting_grants
 
 LINKS = 8
-"""Causes and contexts that travel with an exception."""
+"""Number of causes and contexts that travel with an exception."""
 
 _NATIVE = (BuiltinFunctionType, MethodDescriptorType, WrapperDescriptorType)
 
@@ -34,7 +33,7 @@ _MakePickler = Callable[[io.BytesIO, dict[type, Any]], pickle.Pickler]
 
 
 def encode_error(error: BaseException) -> bytes:
-    """Pickle an error, with its traceback as text, so that it surely unpickles."""
+    """Pickle an error, with its traceback as text, in a form that always unpickles."""
     return pickle.dumps(Travelling(error))
 
 
@@ -50,15 +49,15 @@ def format_error(error: BaseException) -> str:
 
 
 class Travelling:
-    """Stands for an exception in a pickle: unpickling gives the exception itself.
+    """Placeholder of an exception in a pickle: unpickling returns the exception itself.
 
-    Its ``__cause__`` is then multiprocessing's RemoteTraceback; causes and contexts are the
-    ``__context__`` of that.
+    The ``__cause__`` of the result is multiprocessing's RemoteTraceback.  Causes and contexts are
+    in the ``__context__`` of that.
     """
 
     def __init__(self, error: BaseException) -> None:
         self.text = format_error(error)
-        # Its frames keep alive what the task had.
+        # The frames would keep the task's objects alive.
         BaseException.with_traceback(error, None)
         self._shown = _shown(error)
         notes = _attribute(error, "__notes__")
@@ -73,7 +72,7 @@ class Travelling:
 
     @property
     def whole(self) -> bool:
-        """False if the exception itself cannot be sent, but an error that shows it."""
+        """False if the exception cannot be sent, and an error that shows it is sent instead."""
         return self._data is not None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -82,7 +81,7 @@ class Travelling:
 
 
 def unsendable(reason: object, value: object) -> Exception:
-    """multiprocessing's error for a value that does not pickle."""
+    """Return multiprocessing's error for a value that does not pickle."""
     from multiprocessing.pool import MaybeEncodingError  # type: ignore[attr-defined]
 
     error: Exception = MaybeEncodingError(_Text(_shown(reason)), _Text(_shown(value)))
@@ -153,7 +152,7 @@ def _attribute(error: BaseException, name: str) -> Any:
 
 
 def _pickled(error: BaseException) -> tuple[bytes | None, str]:
-    """A pickle that was seen to unpickle; or None, and why there is none."""
+    """Return a pickle that was checked to unpickle; or None, and the reason."""
     reason = ""
     for pickler, incomplete in (
         (_by_name, False),
@@ -162,7 +161,7 @@ def _pickled(error: BaseException) -> tuple[bytes | None, str]:
     ):
         try:
             return _Pickling(pickler, incomplete=incomplete).checked(error), ""
-        except BaseException as refusal:  # which would keep this frame, and the error's
+        except BaseException as refusal:  # kept as text: it would keep frames alive
             reason = _shown(refusal)
     return None, reason
 
@@ -175,7 +174,7 @@ def _by_name(file: io.BytesIO, reducers: dict[type, Any]) -> pickle.Pickler:
 
 
 class _State(NamedTuple):
-    """State of an exception that is made again by its native base."""
+    """State of an exception that its native base rebuilds."""
 
     args: tuple[Any, ...]
     attributes: dict[str, Any]
@@ -191,10 +190,10 @@ class _State(NamedTuple):
 
 
 class _Pickling:
-    """Pickles exceptions, and what has exceptions in it.
+    """Pickler of exceptions, and of objects that contain exceptions.
 
-    With ``incomplete``, an exception travels without those of its parts that cannot, and has a note
-    that says so.  A group has another exception in place of a member that cannot.
+    With ``incomplete``, an exception travels without the parts that cannot travel, and has a note
+    that says so.  A group gets another exception in place of a member that cannot travel.
     """
 
     def __init__(self, pickler: _MakePickler, *, incomplete: bool = False) -> None:
@@ -207,18 +206,19 @@ class _Pickling:
         """Open exceptions that are parts of the one being checked."""
         self._checked: dict[int, tuple[BaseException, _Reduced]] = {}
         self._apart: set[int] | None = None
-        """Groups whose members are being pickled apart; None while pickles are checked."""
+        """Groups whose members are being pickled separately; None while pickles are checked."""
 
     def checked(self, error: BaseException) -> bytes:
         """Pickle ``error``, and unpickle it as a check.
 
-        The members of a group are then pickled apart, as only some may unpickle at the receiver.
+        The members of a group are then pickled separately, as only some may unpickle at the
+        receiver.
         """
         data, has_handles = self._trial(error)
         if isinstance(error, BaseExceptionGroup):
             self._apart = set()
             return self._dumped(error)
-        # The handles in a trial end with it.
+        # The handles in a trial pickle end with the trial.
         return self._dumped(error) if has_handles else data
 
     def _trial(self, obj: Any) -> tuple[bytes, bool]:
@@ -246,7 +246,7 @@ class _Pickling:
         _, (kind, group), state, *_ = reduced
         if not group:
             return reduced
-        self._apart.add(id(error))  # A member may have its group.
+        self._apart.add(id(error))  # A member may contain its group.
         try:
             members = {id(each): _Member(self._dumped(each), _shown(each)) for each in group[1]}
         finally:
@@ -271,9 +271,9 @@ class _Pickling:
         return _rebuilt(kind, group_of(error), state)
 
     def _reduce_checked(self, error: BaseException, state: _State) -> _Reduced:
-        """Reduce an exception to what travels of it.
+        """Reduce an exception to the parts that can travel.
 
-        The outcome is kept: a part is pickled at each check of what it is a part of.
+        The outcome is kept, since a part is pickled again at each check of the whole.
         """
         met, self._met = self._met, set()
         self._open.add(id(error))
@@ -302,7 +302,7 @@ class _Pickling:
         return _with_members(group_of(error), state, sent)
 
     def _without_refused(self, state: _State) -> _State:
-        """Drop the attributes that do not travel, and note them; such arguments become text."""
+        """Drop attributes that cannot travel, and turn such arguments into text; note both."""
         notes = []
         for values in (state.attributes, state.fields):
             for name, value in [*values.items()]:
@@ -328,7 +328,7 @@ class _Pickling:
 
 
 class _Exceptions(dict[type, Callable[[Any], _Reduced]]):
-    """The part of a dispatch table that has every class of exceptions."""
+    """Part of a dispatch table that has every class of exceptions."""
 
     def __init__(self, reduce: Callable[[Any], _Reduced]) -> None:
         self._reduce = reduce
@@ -340,7 +340,7 @@ class _Exceptions(dict[type, Callable[[Any], _Reduced]]):
 
 
 class _Member:
-    """Stands for a member of a group: an error that shows it, where it does not unpickle."""
+    """Placeholder of a member of a group: if it does not unpickle, an error that shows it."""
 
     def __init__(self, data: bytes, shown: str) -> None:
         self._parts = data, shown
@@ -359,7 +359,7 @@ def _received_member(data: bytes, shown: str) -> BaseException:
 def _with_members(
     group: tuple[Any, ...], state: _State, members: Mapping[int, object]
 ) -> tuple[tuple[Any, ...], _State]:
-    """Put ``members`` in the places of those with these ids."""
+    """Put ``members`` in the places of the earlier members with these ids."""
     args = tuple(
         type(arg)(members.get(id(each), each) for each in arg)
         if type(arg) in (list, tuple)
@@ -378,7 +378,7 @@ def _rebuilt(kind: type, group: tuple[Any, ...], state: _State) -> _Reduced:
 
 def _set_state(error: BaseException, state: tuple[Any, ...]) -> None:
     args, attributes, fields, for_setstate = state
-    # A class that came by value has lost its slots: they are attributes there, and slots here.
+    # A class that came by value has no slots: they are attributes there, and slots here.
     set_fields(error, {**attributes, **fields})
     if for_setstate:
         cast("Any", error).__setstate__(attributes)
@@ -392,8 +392,8 @@ def _set_state(error: BaseException, state: tuple[Any, ...]) -> None:
 def _state_for_setstate(error: BaseException) -> dict[str, Any] | None:
     """Return the attributes that a ``__setstate__`` in Python takes; None if it takes none.
 
-    One that belongs to a ``__getstate__`` or a ``__reduce__`` of the class takes what these give,
-    which need not be a dictionary.
+    If the class has a ``__getstate__`` or a ``__reduce__`` too, its ``__setstate__`` takes their
+    result, which need not be a dictionary.
     """
     kind = type(error)
     if isinstance(kind.__setstate__, _NATIVE) or _has_own_reduce(kind):
@@ -405,7 +405,7 @@ def _state_for_setstate(error: BaseException) -> dict[str, Any] | None:
 
 
 def _needs_rebuilding(error: BaseException) -> bool:
-    """Return whether pickle's own way may run code in Python, or lose a member."""
+    """Return whether plain pickle may run code in Python, or lose a field."""
     kind = type(error)
     methods = (kind.__new__, kind.__init__, kind.__reduce__)
     return (
@@ -437,19 +437,19 @@ _registered: Mapping[type, Callable[[Any], _Reduced]] = ChainMap(
 
 def _fields(error: BaseException) -> dict[str, Any]:
     fields = fields_of(error)
-    # Where an attribute was looked for: pickle leaves it out, too.
+    # ``obj`` is where an attribute was looked up.  pickle leaves it out, too.
     return {name: value for name, value in fields.items() if name not in ("args", "obj")}
 
 
 def _shown(value: object) -> str:
     try:
         return repr(value)
-    except BaseException:  # an error message must not fail for it
+    except BaseException:  # an error message must not fail because of a repr
         return object.__repr__(value)
 
 
 class _Text:
-    """Has a text for its repr."""
+    """Object with a given repr."""
 
     def __init__(self, text: str) -> None:
         self._text = text

@@ -1,8 +1,8 @@
-"""A pool worker's second thread: no task and no result waits behind a slow task of its own batch.
+"""The watchdog: a pool worker's second thread, which splits slow batches.
 
-Short tasks travel many a message, and one of them may turn out long, or wait for something that
-the program does once it has the result of another.  So when a batch has run for a while, what it
-has so far is sent, and what it has not begun is given back for others to run.
+A message carries many short tasks.  One of them may turn out long, or wait until the program has
+the result of another.  So when a batch has run for a while, the watchdog sends its results and
+gives back the tasks that have not begun, for other workers.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import time
 from fiber._agent.batch_results import BatchResults
 
 SPLIT_EAGER_AFTER = 10e-3
-"""Seconds that a batch may run before it is taken apart, if its results are wanted one by one."""
+"""Seconds that a batch may run before it is split, if its results are wanted one by one."""
 
 SPLIT_AFTER = 40e-3
-"""The same for other batches.  Both are some times what a message was meant to carry."""
+"""The same for other batches.  Both are a few times the work that a message should carry."""
 
 
 class Watchdog:
-    """Watches over one batch after the other.  Sleeps while there is none."""
+    """Watchdog over one batch after the other, whose thread sleeps while there is none."""
 
     def __init__(self) -> None:
         self._batch: BatchResults | None = None
@@ -31,7 +31,7 @@ class Watchdog:
         self._stopped = False
 
     def begin(self, batch: BatchResults) -> None:
-        """``batch`` starts to run."""
+        """Watch ``batch``, which starts to run."""
         self._batch = batch
         if self._asleep:
             self._asleep = False
@@ -41,19 +41,19 @@ class Watchdog:
             threading.Thread(target=self._run, name="fiber-watchdog", daemon=True).start()
 
     def end(self) -> None:
-        """It has run."""
+        """Stop watching the batch, which has run."""
         self._batch = None
 
     def stop(self) -> None:
-        """There will be no more."""
+        """End the thread."""
         self._stopped = True
         self._wake.put(None)
 
     def _run(self) -> None:
         seen = None
         while not self._stopped:
-            # Nothing to watch, or nothing more to do for it.  What begins between these lines is
-            # seen by the second; what begins later puts something in.
+            # Sleep if no batch runs, or its split is done.  The second line sees a batch that began
+            # after the first.  A batch that begins later puts a wake-up in the queue.
             self._asleep = True
             if self._batch is None or self._batch.seq == seen:
                 self._wake.get()
@@ -62,14 +62,14 @@ class Watchdog:
                 seen = batch.seq
                 try:
                     batch.return_unstarted()
-                except OSError:  # the executor is gone, and this process will follow
+                except OSError:  # the executor is gone, and this process will end too
                     return
                 del batch  # its results must not live until the next batch
 
     def _wait_for_slow_batch(self) -> BatchResults | None:
-        """Wait for a batch that runs for too long; None if they end before that.
+        """Wait for a batch that runs for too long; return None once no batch runs.
 
-        On a busy machine it may not have begun: a worker keeps one task at least.
+        On a busy machine a batch may not have begun yet.  A worker keeps at least one task.
         """
         while (batch := self._batch) is not None:
             time.sleep(SPLIT_EAGER_AFTER if batch.eager else SPLIT_AFTER)
