@@ -1,11 +1,11 @@
-"""How often the tasks of one job may be lost with their workers, and how often each was.
+"""Counts of tasks that were lost with their workers, and the bounds of these counts.
 
-A task that is lost runs again.  Two counts bound that, since they have different causes:
+A lost task runs again.  Two bounds limit that, for two causes of the loss:
 
 * **Deaths.**  The task may have killed its worker.  It runs again at most ``retries`` times.
 * **Disruptions.**  The cluster ended the worker: a drain, an eviction, a preemption, a lost node.
-  The task is not to blame, so this uses up no retry.  ``disruptions`` bounds it all the same:
-  a task that is longer than any worker lives would run again without end.
+  The task is not to blame, so this uses up no retry.  ``disruptions`` bounds it nevertheless:
+  a task that takes longer than any worker lives would run again without end.
 
 Pure.
 """
@@ -16,21 +16,21 @@ from typing import NamedTuple
 
 
 class Limits(NamedTuple):
-    """How often one task may run again, by what ended its worker."""
+    """Number of times that one task may run again, by the cause of its worker's end."""
 
     retries: int = 3
     disruptions: int = 20
 
 
 class Counts(NamedTuple):
-    """How often one task was lost."""
+    """Number of times that one task was lost."""
 
     deaths: int
     disruptions: int
 
 
 class Charges:
-    """What the tasks of one job, known by their indices, are charged with."""
+    """Losses that are charged to the tasks of one job, by their indices."""
 
     __slots__ = ("deaths", "disruptions", "limits")
 
@@ -40,7 +40,7 @@ class Charges:
         self.disruptions: dict[int, int] = {}
 
     def charge(self, task: int, *, disrupted: bool = False) -> bool:
-        """Count one more run that came to nothing; False if that was the last one allowed."""
+        """Count one more lost run; return False if the task may not run again."""
         counts = self.disruptions if disrupted else self.deaths
         limit = self.limits.disruptions if disrupted else self.limits.retries
         counts[task] = count = counts.get(task, 0) + 1

@@ -1,9 +1,9 @@
-"""How much work one message carries, and how many messages one worker is given ahead.
+"""Size of messages to workers, and whether a worker gets one ahead.
 
-Pure: numbers in, numbers out.  A message should carry some milliseconds of work, so that its cost
-disappears beside it: tasks of a second travel one by one, tasks of a microsecond by the thousand.
-That a message may turn out to carry far more is the worker's business: it gives back what it has
-not begun (``_agent/watchdog.py``).
+Pure: numbers in, numbers out.  A message should carry some milliseconds of work, so that its own
+cost hardly counts.  Tasks of a second travel one by one, tasks of a microsecond by the thousand.
+If a message turns out to carry far more work, the worker gives back the tasks that it has not begun
+(``_agent/watchdog.py``).
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ PROMPT = 4e-3
 """The same for tasks whose results are wanted one by one, as they are ready."""
 
 FLOOR = 250e-6
-"""Seconds of work that one message carries even where less would spread it more evenly."""
+"""Seconds of work that one message carries even if less would spread the work more evenly."""
 
 GROWTH = 8
-"""A message carries at most this many times the tasks of the largest one that was measured."""
+"""Bound of a message's tasks, as a multiple of the largest message that was measured."""
 
 RESUMED = 64
-"""What a function that ran before is trusted with at first, counted as a measured message."""
+"""Tasks of the largest measured message, at first, of a function that ran in earlier jobs."""
 
 LIMIT = 1 << 12
-"""Tasks in one message, however short they are."""
+"""Bound of the tasks in one message, however short they are."""
 
 SLOW = 50e-3
-"""Tasks of this many seconds do not queue behind another: the gap between two cannot be seen."""
+"""Seconds from which on tasks do not queue: the gap between two such tasks is negligible."""
 
 SHORTEST = 1e-9
-"""Seconds that a task takes at least; clocks are not better than that."""
+"""Smallest seconds of a task; clocks are not more exact."""
 
 STRIDE_SECONDS = 200e-6
 STRIDE_LIMIT = 1024
@@ -42,12 +42,12 @@ class Pace:
     __slots__ = ("largest", "seconds")
 
     def __init__(self, earlier: Pace | None = None) -> None:
-        """Start from nothing, or from what was known of the same function, trusted a little."""
+        """Start without an estimate, or with an earlier one of the same function."""
         self.seconds: float | None = earlier.seconds if earlier else None
         self.largest: int = min(earlier.largest, RESUMED) if earlier else 0
 
     def observe(self, tasks: int, seconds: float) -> None:
-        """Take in that ``tasks`` of them took ``seconds`` together."""
+        """Update the estimate: ``tasks`` of them took ``seconds`` together."""
         if not tasks:
             return
         # One very long task must not make the next thousand travel alone for long.
@@ -56,7 +56,7 @@ class Pace:
         self.largest = max(self.largest, tasks)
 
     def batch_size(self, waiting: int, workers: int, unit: int = 1, target: float = TARGET) -> int:
-        """Tasks to send next: whole units of ``unit``, at least one, at most what is ``waiting``.
+        """Return how many tasks to send next: whole units, at least one, at most ``waiting`` tasks.
 
         About ``target`` seconds of work, but no more than half of a worker's fair share of what
         waits, so that all end together.
@@ -69,30 +69,30 @@ class Pace:
         return min(units * unit, waiting)
 
     def message_size(self, target: float = TARGET) -> int:
-        """Tasks that one message carries where there are plenty."""
+        """Return the tasks of one message if plenty are waiting."""
         seconds = self.seconds
         if seconds is None or seconds > target:
             return 1
         return min(int(target / seconds), GROWTH * self.largest, LIMIT)
 
     def may_queue(self, waiting: int) -> bool:
-        """Whether to send something to a worker that has something to do already.
+        """Return whether to send a message to a worker that is busy already.
 
-        Not slow tasks, which another worker may run sooner; and nothing that takes less time than
-        its message: it waits for more, until a worker asks for it by being idle.
+        False for slow tasks, which another worker may run sooner.  False for tasks that take less
+        time than their message: they wait for more tasks, or for an idle worker.
         """
         return self.seconds is None or FLOOR / waiting <= self.seconds < SLOW
 
     @property
     def short(self) -> bool:
-        """Whether tasks are known to take less than what is worth a message."""
+        """True if a task is known to take less time than a message is worth."""
         return self.seconds is not None and self.seconds < FLOOR
 
     def stride(self) -> int:
-        """Tasks that a worker runs for each note of where it is.
+        """Return the tasks that a worker runs between two notes of its progress.
 
-        The notes tell which task killed it.  Of several very short ones between two notes all
-        are suspects, and running them again one by one costs nothing.
+        The notes tell which task killed the worker.  All tasks between two notes are suspects.
+        They are very short, so running them again one by one costs little.
         """
         if self.seconds is None:
             return 1
@@ -100,5 +100,5 @@ class Pace:
 
 
 def default_chunksize(tasks: int, workers: int) -> int:
-    """The chunk that multiprocessing takes when the user gives none: four for each worker."""
+    """Return multiprocessing's default chunk size, which makes four chunks for each worker."""
     return -(-tasks // (4 * workers)) or 1

@@ -1,4 +1,4 @@
-"""How many agents there should be, and which of those that are idle can go.
+"""Number of agents that there should be, and the idle agents to release.
 
 Pure: ``now`` is an argument.
 """
@@ -12,27 +12,27 @@ from typing import Any, NamedTuple
 from fiber._engine.placement import Placement
 
 LINGER = 2.0
-"""Seconds for which agents that have not joined yet are wanted after what they were wanted for is
-gone: a worker that died is started again by its pool, a program goes on to its next pool."""
+"""Seconds for which agents that have not joined stay wanted once no child needs them.  Soon a pool
+may replace a worker that died, or the program may start its next pool."""
 
 
 class Desired(NamedTuple):
-    """What there should be from now on."""
+    """Number of agents wanted from now on, and the agents to release."""
 
     agents: int
     release: list[Any]
-    """Agents that got no child for long enough and get none from now on."""
+    """Agents that were idle for long enough and get no children from now on."""
     wake_at: float
-    """When to ask again at the latest; infinity if there is no need."""
+    """Time to ask again at the latest; infinity if there is no need."""
 
 
 class Demand:
-    """The agents that the children of ``placement`` want, ``maximum`` at most.
+    """Demand for agents by the children of ``placement``, ``maximum`` at most.
 
-    More are wanted as soon as children wait for whom those that are there have no room; an agent
-    goes when it was idle for ``idle_timeout`` seconds, but for the last ``floor`` ones, which
-    somebody else wants: they stay and are not asked for.  So what is ever given up is an idle
-    agent, by name, or one that has not joined.
+    More agents are wanted as soon as children wait for which the present agents have no room.  An
+    agent is released after ``idle_timeout`` idle seconds.  The last ``floor`` agents stay,
+    since others want them.  When they are overdue, this demand does not count them.  So it gives up
+    only idle agents, by name, and agents that have not joined.
     """
 
     def __init__(
@@ -47,12 +47,12 @@ class Demand:
         self._less_since: float | None = None
 
     def retire(self, agent: Any) -> None:
-        """Another is to take its place: let it go as soon as it is idle."""
+        """Release an agent as soon as it is idle, since another is to replace it."""
         self._placement.withhold(agent, "retired")
         self._retiring.add(agent)
 
     def decide(self, now: float) -> Desired:
-        """What there should be; who is to be released counts as gone."""
+        """Return the demand at ``now``; agents to release count as gone."""
         release = self._release_retired()
         overdue = self._overdue(now)
         spare = max(len(self._placement.loads) - self.floor, 0)
@@ -91,7 +91,7 @@ class Demand:
         )
 
     def _wake_at(self, spared: int) -> float:
-        """When to look again: at the next idle agent, or when what lingers is given up."""
+        """Return when to ask again: when the next idle agent is due, or LINGER is over."""
         oldest = next(itertools.islice(self._placement.idle.values(), spared, None), math.inf)
         due = oldest + self._idle_timeout
         return due if self._less_since is None else min(due, self._less_since + LINGER)

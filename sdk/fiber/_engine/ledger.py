@@ -1,4 +1,4 @@
-"""Which task is where: the paper's task queue and pending table in one pure object.
+"""Places of all tasks: the paper's task queue and pending table in one pure object.
 
 ::
 
@@ -7,11 +7,11 @@
                 └─ put_back, split, ──┘
                    lose, retry
 
-* A **task** is one call, known by its job and its index in it.  At every moment it waits, is in
-  exactly one batch, or is done.
-* A **batch** is a contiguous slice of one job's tasks, sent to one worker in one message and known
-  by its sequence number.  Results count only if they come from the worker that has the batch, and
-  only from where the last ones ended.  Late and repeated ones are ignored, others are WrongAnswers.
+* A **task** is one call, identified by its job and its index in the job.  At every moment it
+  waits, is in exactly one batch, or is done.
+* A **batch** is a contiguous slice of one job's tasks, sent to one worker in one message.  Its
+  sequence number identifies it.  Results count only from the worker that has the batch, and only
+  in order.  Late and repeated results are ignored; others raise WrongAnswer.
 * A **worker** has at most one batch that it runs and one that it has not read yet.
 
 No clock and no I/O: ``now`` is an argument, the caller sends what ``assign`` returns.  Not
@@ -33,7 +33,7 @@ from fiber._engine.spans import Span, Waiting
 from fiber._engine.tasks import Batch, Job, Loss, Receipt, Worker, WrongAnswer
 
 LOOKAHEAD = 4
-"""Jobs whose turn it is that may be passed over for one whose tasks may queue."""
+"""Number of jobs that may lose their turn to a job whose tasks may queue."""
 
 _by_seq = attrgetter("seq")
 
@@ -41,7 +41,7 @@ __all__ = ["PATIENCE", "Batch", "Job", "Ledger", "Loss", "Receipt", "Span", "Wor
 
 
 class Ledger:
-    """The ledger of one pool.
+    """Ledger of one pool.
 
     ``starting``, kept by the caller, is the number of workers that will be added soon.
     """
@@ -72,21 +72,21 @@ class Ledger:
         alone: bool = False,
         exact: bool = False,
     ) -> Job:
-        """A new job; ``limits`` says how often a task of it runs again.
+        """Open a new job; ``limits`` says how often a task of it runs again.
 
-        ``unit``: its tasks are given out in contiguous chunks of at least this many.  ``alone``:
-        each travels alone, to an idle worker, with nothing queued behind it.  Without retries
-        they always do: a crash must not leave in doubt whether another task ran.  ``exact``:
-        results are wanted one by one, and the worker notes each task that it begins.
+        ``unit``: smallest chunk of contiguous tasks in a batch.  ``alone``: each task travels
+        alone, to an idle worker, with no batch queued behind it.  Without retries all tasks do:
+        a crash must not leave in doubt whether another task ran.  ``exact``: results are wanted
+        one by one, and the worker notes each task that it begins.
         """
         job = Job(owner, pace or Pace(), limits, unit, alone, exact)
         self.jobs.add(job)
         return job
 
     def feed(self, job: Job, items: Sequence[Any]) -> None:
-        """More tasks for ``job``; ``items`` is sliced as it is sent and must not change.
+        """Add tasks to ``job``; ``items`` is sliced when it is sent and must not change.
 
-        A list is taken over: the ledger may append to it.
+        The ledger takes over a list and may append to it.
         """
         if job not in self.jobs or not len(items):
             return
@@ -95,9 +95,9 @@ class Ledger:
         self._list(job)
 
     def pin(self, job: Job, worker: Worker | None, item: Any) -> None:
-        """One more task for ``job``, for this worker and no other; None: for one still to come.
+        """Add a task to ``job`` for this worker alone; None: for a later worker.
 
-        If the worker is lost, one that comes after it takes its place.
+        If the worker is lost, a later worker gets the task.
         """
         span = Span(job.fed, [item], alone=True, pin=True)
         self._fed(job, 1)
@@ -113,21 +113,21 @@ class Ledger:
         self._load.sort_pinned(worker)
 
     def close(self, job: Job) -> bool:
-        """No more tasks will be fed; True if the job is finished by that."""
+        """Close the job to further tasks; return True if that finishes it."""
         job.closed = True
         return self._finish(job)
 
     def unfinished(self, job: Job) -> list[Any]:
-        """The items of its tasks that are not done."""
+        """Return the items of the job's tasks that are not done."""
         spans = [batch.rest() for batch in job.batches]
         pinned = itertools.chain(self._unassigned_pins, *(worker.pinned for worker in job.pins))
         spans += [span for owner, span in pinned if owner is job]
         return [*job.waiting.items(), *itertools.chain.from_iterable(s.items for s in spans)]
 
     def cancel(self, job: Job) -> list[Worker]:
-        """Forget a job: nothing of it is sent or counted any more.
+        """Forget a job: its tasks are not sent, and its results do not count.
 
-        Returns the workers that hold unread batches of it, worth a recall.
+        Return the workers that hold unread batches of it, which are worth a recall.
         """
         job.waiting = Waiting()
         if job in self.jobs:
@@ -152,7 +152,7 @@ class Ledger:
         return holders
 
     def pause(self, job: Job, paused: bool) -> None:
-        """Give out none of its tasks but those that come back, or go on with all."""
+        """Pause a job, except its tasks that were given out before, or resume it."""
         job.paused = paused
         if not paused:
             self._paused.discard(job)
@@ -164,7 +164,7 @@ class Ledger:
     # Workers
 
     def add(self, key: Any, now: float, left: int | None = None) -> Worker:
-        """A worker that is ready for work, ``left`` units of it (None: any number)."""
+        """Add a worker that is ready for ``left`` units of work (None: any number)."""
         worker = Worker(key, left)
         worker.since = now
         self.workers.add(worker)
@@ -173,7 +173,7 @@ class Ledger:
         return worker
 
     def _adopt(self, worker: Worker) -> None:
-        """Give it the pinned tasks of a lost worker: one of each job, as every worker has."""
+        """Give a new worker the pinned tasks of a lost one, at most one of each job."""
         left = []
         for job, span in self._unassigned_pins:
             if any(job is pinned[0] for pinned in worker.pinned):
@@ -183,7 +183,7 @@ class Ledger:
         self._unassigned_pins = left
 
     def leave(self, worker: Worker) -> bool:
-        """Give ``worker`` nothing more.  False, and nothing changed, if it is busy."""
+        """Give ``worker`` no more tasks; return False, and change nothing, if it is busy."""
         if worker.queue or worker.pinned:
             return False
         self.retire(worker)
@@ -191,7 +191,7 @@ class Ledger:
         return True
 
     def spent(self) -> list[Worker]:
-        """Workers that did all that they may do, each once; they are given nothing more."""
+        """Return workers that did all units they may do, each once; they get no more tasks."""
         if not self._load.spent:
             return []
         spent, self._load.spent = list(self._load.spent), {}
@@ -200,7 +200,7 @@ class Ledger:
         return spent
 
     def retire(self, worker: Worker) -> None:
-        """Give it nothing more, since it is about to go; a later one gets what is pinned to it."""
+        """Give a leaving worker no more tasks; a later worker gets the tasks pinned to it."""
         worker.leaving = True
         self._unassigned_pins += worker.pinned
         worker.pinned.clear()
@@ -208,45 +208,45 @@ class Ledger:
         self._load.sort(worker)
 
     def newcomers_wanted(self) -> int:
-        """How many tasks only a new worker may run."""
+        """Return how many tasks only a new worker may run."""
         return len(self._unassigned_pins)
 
     def jobs_for_newcomers(self) -> set[Job]:
-        """The jobs that have such tasks."""
+        """Return the jobs with tasks that only a new worker may run."""
         return {job for job, _ in self._unassigned_pins}
 
     def idle(self) -> list[Worker]:
-        """Workers with nothing to do, the one that has been so for longest first."""
+        """Return the idle workers, the longest idle first."""
         return list(self._load.idle)
 
     def idle_count(self) -> int:
-        """How many they are."""
+        """Return the number of idle workers."""
         return len(self._load.idle)
 
     def longest_idle(self) -> Worker | None:
-        """The first of them."""
+        """Return the worker that has been idle for longest."""
         return next(iter(self._load.idle), None)
 
     def has_capacity(self) -> bool:
-        """Whether somebody could be given something."""
+        """Return whether some worker has room for a batch."""
         return bool(self._load.idle or self._load.queueable)
 
     def demand(self) -> int:
-        """Tasks that run, or wait for a worker and not for somebody who takes results of their job.
+        """Return how many tasks run or wait for a worker, without those that a pause holds back.
 
-        Of cancelled ones, the batches that still hold up a worker.
+        A cancelled batch that a worker still has counts as one.
         """
         held_back = sum([job.never_given for job in self._paused]) if self._paused else 0
         return self._open_tasks - held_back + len(self._cancelled)
 
     def waits(self) -> bool:
-        """Whether there are tasks that some worker could be given."""
+        """Return whether there are tasks that some worker may get."""
         return bool(self._turns or self._pins)
 
-    # Giving
+    # Assigning
 
     def assign(self, now: float) -> Batch | None:
-        """The next batch to send, or None when nobody may be given anything.
+        """Return the next batch to send; None if no worker may get one.
 
         Idle workers come first; jobs take turns.
         """
@@ -261,7 +261,7 @@ class Ledger:
             waits = job.has_next
             worker = self._worker_for(job, passed) if waits else None
             if worker is None and waits:
-                passed += 1  # it keeps its place, and a worker from being given more
+                passed += 1  # the job keeps its turn and reserves a worker
                 continue
             del turns[passed]
             batch = self._cut(job, worker, now) if worker is not None else None
@@ -280,17 +280,17 @@ class Ledger:
         return self._send(job, worker, span, now)
 
     def _worker_for(self, job: Job, passed: int) -> Worker | None:
-        """Who may be given tasks of ``job``.
+        """Return a worker that may get tasks of ``job``.
 
-        ``passed`` jobs whose turn it was wait for a worker that has nothing else to do, so as many
-        of those that will have it soon are spared.
+        ``passed`` earlier jobs wait for an idle worker.  So as many of the workers that will be
+        idle soon are spared for them.
         """
         idle = self._load.last_idle()
         if idle is not None:
             return idle
         if job.waiting.first_alone() or not job.pace.may_queue(len(job.waiting)):
             return None
-        # What a worker that is about to start can run should not queue behind something else.
+        # Tasks that a starting worker can run should not queue behind a batch of another.
         if self.starting and len(job.waiting) <= self.starting:
             return None
         return self._load.queueable_after(passed)
@@ -301,7 +301,7 @@ class Ledger:
         if waiting > 1:
             workers = len(self.workers) + self.starting
             size = job.pace.batch_size(waiting, workers, job.unit, job.target)
-        if job.paused:  # what follows what came back may have grown together with it
+        if job.paused:  # the returned tasks may be in one span with held-back ones
             size = min(size, job.reached - job.waiting.first())
         if worker.left is not None:
             size = min(size, worker.left * job.unit)
@@ -328,13 +328,13 @@ class Ledger:
     # Lending
 
     def next_seq(self) -> int:
-        """A sequence number that nobody else has; on any thread."""
+        """Return a new sequence number.  Any thread may call this."""
         return next(self._seq)
 
     def lend(self, worker: Worker) -> bool:
-        """Leave an idle worker to a caller, who gives it calls directly; False if it is not idle.
+        """Lend an idle worker to a caller, who sends it calls directly; return False if it is busy.
 
-        As Ray's callers do with a worker that they lease.
+        Ray's callers lease workers in the same way.
         """
         if worker not in self._load.idle or worker.left is not None:
             return False
@@ -343,19 +343,19 @@ class Ledger:
         return True
 
     def expect_late(self, worker: Worker, seq: int) -> None:
-        """Let a worker answer a call that its caller has given up."""
+        """Accept the answer of a worker to a call that its caller has given up."""
         worker.had.append(seq)
 
     def return_idle(self, worker: Worker, now: float) -> None:
-        """A lent worker is back, and has nothing to do."""
+        """Take back a lent worker, which is idle."""
         worker.lent = False
         worker.since = now
         self._load.sort(worker)
 
     def return_busy(self, worker: Worker, seq: int, job: Job | None, item: Any, now: float) -> None:
-        """A lent worker is back while it runs a call that was sent as ``seq``.
+        """Take back a lent worker that runs the call sent as ``seq``.
 
-        From now on that is a task of ``job``, or nobody's if that is None.
+        From now on the call is a task of ``job``; None: its result does not count.
         """
         worker.lent = False
         start = 0
@@ -367,12 +367,12 @@ class Ledger:
             self._cancelled.add(batch)
         self._hold(batch, now)
 
-    # Taking
+    # Receiving
 
     def held(self, worker: Worker, seq: int) -> Batch | None:
-        """Return the batch that ``worker`` speaks of, or None if that is over.
+        """Return the batch that ``worker`` answers for, or None if the batch is over.
 
-        Raises WrongAnswer if the worker never had it.
+        Raise WrongAnswer if the worker never had it.
         """
         batch = self.batches.get(seq)
         if batch is not None and batch.worker is worker:
@@ -393,10 +393,10 @@ class Ledger:
         seconds: float = 0.0,
         kept: int | None = None,
     ) -> Receipt | None:
-        """``count`` results of batch ``seq``, its tasks from ``offset`` on; None: they don't count.
+        """Take ``count`` results of batch ``seq``, from task ``offset`` on, which took ``seconds``.
 
-        Raises WrongAnswer if ``worker`` cannot have them.  They took ``seconds``.  ``kept``: the
-        worker keeps only that many tasks of the batch, and gives the rest back.
+        Return None if they do not count.  Raise WrongAnswer if ``worker`` cannot have them.
+        ``kept``: the worker keeps that many tasks of the batch, and gives the others back.
         """
         batch = self.held(worker, seq)
         if batch is None or not batch.take(offset, count, kept):
@@ -442,13 +442,13 @@ class Ledger:
             batch.job.batches.pop(batch, None)
 
     def retry(self, receipt: Receipt, index: int) -> bool:
-        """Run a task again whose result is not good enough.  False: it had its tries."""
+        """Run a task again because of its result; return False if it has no tries left."""
         job = receipt.job
         if job not in self.jobs and not job.finished:
             return False  # cancelled
         if not job.charges.charge(index):
             return False
-        if job not in self.jobs:  # what was its last task is not done after all
+        if job not in self.jobs:  # the job was finished by this task
             self.jobs.add(job)
             self._open_tasks += job.fed - job.done
         self._did(job, -1)
@@ -460,7 +460,7 @@ class Ledger:
         return True
 
     def put_back(self, worker: Worker, seqs: Iterable[int], now: float) -> None:
-        """The answer to a recall: ``worker`` never read these batches."""
+        """Take back batches that ``worker`` never read: the answer to a recall."""
         worker.recalled = False
         held = (self.batches.get(seq) for seq in seqs)
         mine = [batch for batch in held if batch is not None and batch.worker is worker]
@@ -472,14 +472,14 @@ class Ledger:
             self._load.sort(worker)
 
     def drop_waiting(self, job: Job, wanted: Callable[[Any], bool]) -> None:
-        """Tasks that wait and are not ``wanted`` any more are done by that."""
+        """Count waiting tasks that are no longer ``wanted`` as done."""
         self._did(job, job.drop_waiting(wanted))
         self._finish(job)
 
     def split(self, seq: int, now: float) -> Receipt | None:
-        """The worker cannot read the message: send its tasks again, one by one.
+        """Send the tasks of a batch that its worker cannot unpickle again, one by one.
 
-        A batch of one is the culprit: then its task is done, and the receipt says whose it is.
+        A batch of one task is at fault: its task is then done, and the receipt names it.
         """
         batch = self.batches.get(seq)
         if batch is None:
@@ -493,9 +493,9 @@ class Ledger:
         return None
 
     def expire(self, seq: int) -> Receipt | None:
-        """The task of batch ``seq``, sent alone, ran out of time: it is done, if it counts.
+        """End the task of batch ``seq``, sent alone, after its time limit: it is done if it counts.
 
-        Its worker, which still runs it, is given nothing more.
+        Its worker, which still runs it, gets no more tasks.
         """
         batch = self.batches.get(seq)
         if batch is None:
@@ -510,17 +510,17 @@ class Ledger:
         return Receipt(job, batch.start, 1, batch)
 
     def imbalanced(self) -> bool:
-        """Whether somebody has nothing to do while others have more than they can do at once."""
+        """Return whether a worker is idle while another has an unread batch."""
         return bool(self._load.idle and self._load.recallable)
 
     def recall(self, now: float) -> list[Worker]:
-        """Workers to ask for the batch that they have not read, since others have nothing to do."""
+        """Return the workers whose unread batch is to be recalled for idle workers."""
         if any(job.has_next for job in self._turns):
             return []
         return self._load.recall(now)
 
     def next_recall(self) -> float | None:
-        """When ``recall`` could next return something, if nothing else happens."""
+        """Return the time of the next recall, if no event comes before; None if there is none."""
         return self._load.next_recall()
 
     # Losing
@@ -532,11 +532,11 @@ class Ledger:
         running: tuple[int, int] | None,
         disrupted: bool = False,
     ) -> list[Loss]:
-        """``worker`` is gone; its tasks wait again, and what it was running is charged with that.
+        """Remove a worker that is gone: its tasks wait again, and its running task is charged.
 
-        ``unread``: batches that it never read.  ``running``: batch and offset of the task it was
-        in; if that says nothing, it was in the first batch that it may have read.  ``disrupted``:
-        the cluster ended it.  Returns the tasks that had their tries; they are done by that.
+        ``unread``: batches that it never read.  ``running``: batch and offset of its running task;
+        if that is unknown, the first batch that it may have read counts.  ``disrupted``: the
+        cluster ended it.  Return the tasks that have no tries left; they are done.
         """
         self.workers.discard(worker)
         guilty = worker.in_progress(set(unread), running)

@@ -1,4 +1,4 @@
-"""Who may be given work: the ready workers, by how much each holds."""
+"""Ready workers, sorted by how much work each has."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ import itertools
 from fiber._engine.tasks import Worker
 
 PATIENCE = 2e-3
-"""Seconds that a worker's current batch may take before idle ones ask for what lies behind it."""
+"""Seconds that a worker may take for a batch before the unread one behind it is recalled."""
 
 
 class WorkersByLoad:
-    """The ready workers.  Dicts serve as sets that remember the order of insertion.
+    """Ready workers in sets, which are dicts in order to keep the order of insertion.
 
-    ``idle`` hold nothing, ``idle_pinned`` are those of them that have pinned tasks to run.
-    ``queueable`` hold one batch, and could be given another.  ``recallable`` hold two, of which the
-    second could be recalled, and is in those of ``recalled``.  ``spent`` did all that they may do.
-    Who is lent or leaves is in none of them.
+    ``idle``: workers without a batch; ``idle_pinned``: those of them that have pinned tasks.
+    ``queueable``: workers with one batch that may get another.  ``recallable``: workers with two
+    batches, whose second one may be recalled; ``recalled``: those whose second one was recalled.
+    ``spent``: workers that did all units they may do.  Lent and leaving workers get no batches
+    and are neither idle nor queueable.
     """
 
     def __init__(self) -> None:
@@ -28,7 +29,7 @@ class WorkersByLoad:
         self.spent: dict[Worker, None] = {}
 
     def sort(self, worker: Worker) -> None:
-        """Put ``worker`` where one that holds as much as it does belongs."""
+        """Move ``worker`` to the sets for the work that it has now."""
         self.idle.pop(worker, None)
         self.idle_pinned.pop(worker, None)
         self.queueable.pop(worker, None)
@@ -55,22 +56,22 @@ class WorkersByLoad:
             self.queueable[worker] = None
 
     def sort_pinned(self, worker: Worker) -> None:
-        """The same when its pinned tasks have changed, and nothing else."""
+        """Do the same if only the pinned tasks of ``worker`` have changed."""
         if worker.pinned and worker in self.idle:
             self.idle_pinned[worker] = None
         else:
             self.idle_pinned.pop(worker, None)
 
     def last_idle(self) -> Worker | None:
-        """The worker that became idle last: its memory is warm, and the others may leave."""
+        """Return the worker that became idle last: its memory is warm, and the others may leave."""
         return next(reversed(self.idle), None)
 
     def queueable_after(self, spared: int) -> Worker | None:
-        """The worker that will need something to do first, sparing some that will before it."""
+        """Return the queueable worker that will be idle first, after ``spared`` others."""
         return next(itertools.islice(self.queueable, spared, None), None)
 
     def recall(self, now: float) -> list[Worker]:
-        """Workers to ask for what they have not read, one for each idle one; marks them."""
+        """Return the workers whose unread batch to recall, one for each idle one; mark them."""
         victims = [worker for worker in self._candidates() if now >= worker.since + PATIENCE]
         for worker in victims:
             worker.recalled = True
@@ -78,7 +79,7 @@ class WorkersByLoad:
         return victims
 
     def next_recall(self) -> float | None:
-        """When ``recall`` could next return something, if nothing else happens."""
+        """Return the time of the next recall, if no event comes before; None if there is none."""
         return min((worker.since + PATIENCE for worker in self._candidates()), default=None)
 
     def _candidates(self) -> list[Worker]:

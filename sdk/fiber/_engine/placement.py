@@ -1,4 +1,4 @@
-"""Which agent runs the next child.
+"""Choice of the agent that runs the next child.
 
 Pure: ``now`` is an argument.  No step's cost grows with the number of agents or children.
 """
@@ -17,58 +17,58 @@ Child = TypeVar("Child", bound=Hashable)
 class Placement(Generic[Agent, Child]):
     """Agents with ``slots`` places each, and the children that wait for one, in order.
 
-    ``spread``: the agent with the fewest children takes the next one, and those that are
-    ``expected`` are left their share.  Otherwise the one with the
-    most that has room, so that others become idle and can go; an idle one is taken only if no other
-    has room, and then the one that has been idle for the shortest time.
+    ``spread``: the agent with the fewest children gets the next one, and agents that are
+    ``expected`` will get their share.  Otherwise the agent with room that has the most children
+    gets it, so that others become idle and can be released.  Then an idle agent gets a child only
+    if no other agent has room; among idle ones the last to become idle is chosen.
     """
 
     def __init__(self, slots: float, *, spread: bool) -> None:
         self.slots = slots
         self.expected = 0
-        """How many agents are about to join."""
-        # From the front an ordinary dict passes over all that was ever deleted there.
+        """Number of agents that are about to join."""
+        # Not a dict: its iteration passes over every entry that was deleted at the front.
         self.waiting: OrderedDict[Child, None] = OrderedDict()
         self.children = 0
-        """How many children run on agents."""
+        """Number of children that run on agents."""
         self.loads: dict[Agent, int] = {}
-        """How many each agent has."""
+        """Number of children of each agent."""
         self.idle: OrderedDict[Agent, float] = OrderedDict()
-        """Agents without children and since when, the longest idle first."""
+        """Agents without children and the times since when, the longest idle first."""
         self._spread = spread
         self._withheld: dict[Agent, set[str]] = {}
-        """Those that are given none, and why: each for a reason or more."""
+        """Agents that get no children, with their reasons: at least one each."""
         self._with_room: dict[int, OrderedDict[Agent, None]] = {}
-        """Those that can be given children, by how many they have."""
+        """Agents that have room for children, by the number of children that they have."""
         self._room = 0.0
 
     @property
     def room(self) -> float:
-        """How many more children could be placed now."""
+        """Number of further children that could be placed now."""
         return self._room if self._with_room else 0.0
 
     # Agents
 
     def add(self, agent: Agent, now: float) -> None:
-        """It has joined."""
+        """Add an agent that has joined."""
         self.loads[agent] = 0
         self.idle[agent] = now
         self._list(agent)
 
     def remove(self, agent: Agent) -> None:
-        """It is gone, and its children with it."""
+        """Remove an agent that is gone, with its children."""
         self._unlist(agent)
         self._withheld.pop(agent, None)
         self.children -= self.loads.pop(agent)
         self.idle.pop(agent, None)
 
     def withhold(self, agent: Agent, why: str) -> None:
-        """Give it no children for as long as there is this reason, or another one."""
+        """Give the agent no children until ``restore`` was called for each reason."""
         self._unlist(agent)
         self._withheld.setdefault(agent, set()).add(why)
 
     def restore(self, agent: Agent, why: str) -> None:
-        """This is no reason any more."""
+        """End a reason of ``withhold``."""
         reasons = self._withheld.get(agent)
         if reasons is None:
             return
@@ -80,15 +80,15 @@ class Placement(Generic[Agent, Child]):
     # Children
 
     def wait(self, child: Child) -> None:
-        """It waits for a place."""
+        """Add a child that waits for an agent."""
         self.waiting[child] = None
 
     def leave(self, child: Child) -> bool:
-        """It waits no longer; False if it did not."""
+        """Remove a waiting child; return False if it does not wait."""
         return self.waiting.pop(child, self) is None
 
     def place(self) -> tuple[Child, Agent] | None:
-        """The child that has waited longest, and its agent from now on; None if none has room."""
+        """Place the child that has waited longest; return it and its agent, or None."""
         if not self.waiting or not self._with_room:
             return None
         agent = self._best()
@@ -101,7 +101,7 @@ class Placement(Generic[Agent, Child]):
         return child, agent
 
     def ended(self, agent: Agent, now: float) -> None:
-        """One of its children is gone."""
+        """Take note that one of the agent's children is gone."""
         self._change(agent, -1)
         if not self.loads[agent]:
             self.idle[agent] = now
@@ -112,7 +112,7 @@ class Placement(Generic[Agent, Child]):
         return next(iter(agents)) if load or self._spread else next(reversed(agents))
 
     def _share(self) -> int:
-        """How many children each agent has once the expected ones are there."""
+        """Return how many children each agent gets once the expected agents have joined."""
         agents = len(self.loads) + self.expected
         return -(-(self.children + len(self.waiting)) // agents)
 

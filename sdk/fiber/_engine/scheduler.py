@@ -1,4 +1,4 @@
-"""What a pool does next: events in, decisions out.
+"""Decisions of a pool: events in, decisions out.
 
 ::
 
@@ -7,13 +7,13 @@
     gone, expire ─────────┘       decide(now)     ├─► start     workers to start
     close, terminate                              ├─► dismiss   workers to tell to end
                                                   ├─► end       workers to end at once
-                                                  ├─► failed    jobs without hope, and why
+                                                  ├─► failed    jobs that cannot run, and why
                                                   └─► wake_at   when to ask again at the latest
 
-An event only changes what is known; ``decide`` says all that follows, so that no event can forget
-to send what can be sent now, to replace or dismiss a worker, or to end a pool that has nothing left
-to do.  No clock, no thread, no socket.  Not thread-safe: the executor (``fiber._runtime.executor``)
-calls it on one thread.
+An event only changes the state.  ``decide`` returns everything that follows from the state.  So no
+event can forget to send a batch, to replace or dismiss a worker, or to end a pool without work.  No
+clock, no thread, no socket.  Not thread-safe: the executor (``fiber._runtime.executor``) calls it
+on one thread.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from fiber._engine.worker_set import Member, WorkerSet
 
 
 class Decisions(NamedTuple):
-    """What follows from what happened."""
+    """Actions for the executor."""
 
     assign: list[Batch]
     recall: list[Worker]
     start: int
     dismiss: list[Member]
     end: list[Member]
-    """To end at once, since the pool gives up."""
+    """Workers to end at once, since the pool gives up."""
     failed: list[tuple[Job, BaseException]]
     wake_at: float
-    """When to decide again if nothing happens; infinity if there is no need."""
+    """Time to decide again if no event comes before; infinity if there is no need."""
     over: bool
-    """The pool has ended: nobody is left, and nothing will come."""
+    """True once the pool has ended: no workers are left, and no tasks will come."""
 
 
 class Scheduler:
-    """Decides for one pool of ``minimum`` to ``maximum`` workers.
+    """Scheduler of one pool of ``minimum`` to ``maximum`` workers.
 
     A worker ends after ``max_tasks`` units of work (None: never), and above the minimum after
-    ``idle_timeout`` seconds with nothing to do.  ``ledger`` knows the tasks, ``workers`` who there
-    is: read them, and change them by the methods here, but for what concerns single tasks and
-    batches (``receive``, ``retry``, ``split`` and so on), which is the ledger's own.
+    ``idle_timeout`` idle seconds.  ``ledger`` has the tasks, ``workers`` the workers.  Callers may
+    read both, and change them by the methods here.  Methods for single tasks and batches
+    (``receive``, ``retry``, ``split`` and so on) are called on the ledger.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Scheduler:
         self.closing = False
         self.terminated = False
         self.lent = 0
-        """Workers that callers use directly."""
+        """Number of workers that are lent to callers."""
         self._max_tasks = max_tasks
         self._idle_timeout = idle_timeout
         self._gave_up = False
@@ -73,18 +73,18 @@ class Scheduler:
     # Tasks
 
     def pin_everywhere(self, job: Job, item: Any) -> None:
-        """A task of ``job`` for every worker that there is, or that is starting."""
+        """Feed ``job`` a task for every worker that stays, also for those that are starting."""
         for member in self.workers.staying():
             self.ledger.pin(job, member.worker, item)
 
     # Workers
 
     def starting(self, member: Member) -> None:
-        """One of those to start is about to be."""
+        """Add a worker that is about to be started."""
         self.workers.add(member)
 
     def ready(self, member: Member, now: float) -> None:
-        """It is ready for work, unless it was told to go or is gone: it may be heard of late."""
+        """Take note that a worker is ready; ignored if it was asked to end, or is gone."""
         if member in self.workers.members and not member.leaving and member.worker is None:
             self.workers.ready(member, self.ledger.add(member, now, self._max_tasks))
 
@@ -98,9 +98,9 @@ class Scheduler:
         disrupted: bool = False,
         failure: StartFailure | None = None,
     ) -> list[Loss]:
-        """It is gone, with or without having been told to; tasks that it had run again elsewhere.
+        """Remove a worker that is gone, for any reason; its tasks wait again.
 
-        Returns those that had their tries.  ``unread``, ``running`` and ``disrupted`` as for
+        Return the tasks that have no tries left.  ``unread``, ``running`` and ``disrupted`` as for
         ``Ledger.lose``, ``failure`` as for ``WorkerSet.gone``.
         """
         self.workers.gone(member, now, failure)
@@ -111,9 +111,9 @@ class Scheduler:
         return self.ledger.lose(member.worker, unread, running, disrupted=disrupted)
 
     def drain(self, member: Member) -> bool:
-        """Give it nothing more, since its host is about to go; False if it leaves already.
+        """Give no more tasks to a worker whose host is about to end; False if it leaves already.
 
-        Another takes its place at once.  It ends once it has run what it has begun.
+        Another worker takes its place at once.  The old one ends after the tasks that it has begun.
         """
         if member not in self.workers.members or member.leaving:
             return False
@@ -123,24 +123,24 @@ class Scheduler:
         return True
 
     def let_go(self, member: Member) -> None:
-        """It is about to die by the executor's hand."""
+        """Count a worker as leaving: the executor is about to kill it."""
         self.workers.let_go(member)
 
     def lend(self, worker: Worker) -> bool:
-        """Leave an idle worker to callers; False if it is needed, or not idle."""
+        """Lend an idle worker to callers; return False if it is needed, or not idle."""
         if self.closing or self.ledger.waits() or not self.ledger.lend(worker):
             return False
         self.lent += 1
         return True
 
     def return_idle(self, worker: Worker, now: float) -> None:
-        """A lent worker is back."""
+        """Take back a lent worker, which is idle."""
         if worker.lent:
             self._returned(worker)
             self.ledger.return_idle(worker, now)
 
     def return_busy(self, worker: Worker, seq: int, job: Job | None, item: Any, now: float) -> None:
-        """A lent worker is back and runs what was sent as ``seq``: see the ledger."""
+        """Take back a lent worker that runs the call sent as ``seq``: see the ledger."""
         if worker.lent:
             self._returned(worker)
             self.ledger.return_busy(worker, seq, job, item, now)
@@ -152,20 +152,20 @@ class Scheduler:
     # The end
 
     def close(self) -> None:
-        """No more jobs will come."""
+        """Close the pool: no more jobs will come."""
         self.closing = True
 
     def terminate(self) -> Sequence[Member]:
-        """Nothing more is to be done; the workers to end, all of them."""
+        """End the pool without its remaining tasks; return all workers, to be ended."""
         self.closing = self.terminated = True
         for member in self.workers.staying():
             self.workers.let_go(member)
         return list(self.workers.members)
 
-    # What follows
+    # Decisions
 
     def decide(self, now: float) -> Decisions:
-        """All that follows from what happened until now; what it says is taken as done."""
+        """Return the actions that follow from all events until now, and count them as done."""
         ledger, workers = self.ledger, self.workers
         ledger.starting = workers.starting
         failed, end = self._give_up()
@@ -192,14 +192,14 @@ class Scheduler:
         return Decisions(assign, recall, start, dismiss, end, failed, wake_at, over)
 
     def needs_lent(self) -> bool:
-        """Whether workers that are lent, and not in use, would have something to do."""
+        """Return whether the pool needs lent workers that their callers do not use."""
         return bool(self.lent) and (self.closing or self.ledger.waits())
 
     def _demand(self) -> int:
         return self.ledger.demand() + self.lent
 
     def _missing(self, now: float, wake_at: float) -> tuple[int, float]:
-        """How many workers to start, and when to look again."""
+        """Return how many workers to start, and when to decide again."""
         if self._done():
             return 0, wake_at
         missing = self.workers.missing(self._demand(), self.ledger.newcomers_wanted())
@@ -210,12 +210,12 @@ class Scheduler:
         return start, wake_at
 
     def _done(self) -> bool:
-        """Whether no new worker is of any use."""
+        """Return whether the pool needs no new workers."""
         over = self.terminated or self.workers.error is not None
         return over or (self.closing and not self.ledger.jobs)
 
     def _thin_out(self, now: float, dismiss: list[Member]) -> float:
-        """Let go who has been idle for long; when the next one will have been."""
+        """Dismiss workers that were idle for too long; return when the next one is due."""
         while (idle := self.ledger.longest_idle()) is not None:
             if self.workers.size <= self.workers.wanted(self._demand()):
                 break
@@ -227,7 +227,7 @@ class Scheduler:
         return math.inf
 
     def _give_up(self) -> tuple[list[tuple[Job, BaseException]], list[Member]]:
-        """Jobs that wait for workers which do not start, and whom to end since all is lost."""
+        """Return the jobs that fail since workers do not start, and the workers to end then."""
         trouble, error = self.workers.trouble, self.workers.error
         if trouble is None or self.terminated:
             return [], []
@@ -242,7 +242,7 @@ class Scheduler:
         return [(job, error) for job in self.ledger.jobs], end
 
     def _not_needed(self) -> list[Member]:
-        """Workers of a closed pool that has nothing left for them."""
+        """Return the workers to dismiss from a closed pool without jobs."""
         if self.ledger.jobs or not self.workers.size:
             return []
         idle = [worker.key for worker in self.ledger.idle() if self.ledger.leave(worker)]

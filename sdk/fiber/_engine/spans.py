@@ -1,4 +1,4 @@
-"""Tasks that wait: slices of a job, kept whole so that a million tasks cost as much as one."""
+"""Waiting tasks: slices of a job, kept whole so that a million tasks cost as much as one."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 COMPACT = 1024
-"""Given-out items at the front of a growing list that are kept before it is trimmed."""
+"""Given-out items at the front of a growing list above which the list is trimmed."""
 
 
 class Span:
     """Tasks ``start``, ``start + 1``, ... with their ``items``.
 
-    ``alone``: they travel one a message; ``pin``: only one certain worker may run them.
+    ``alone``: each travels in a separate message; ``pin``: only one certain worker may run them.
     """
 
     __slots__ = ("alone", "items", "pin", "start")
@@ -27,17 +27,17 @@ class Span:
         self.pin = pin
 
     def part(self, first: int, stop: int, *, alone: bool = False) -> Span:
-        """The tasks from ``first`` to before ``stop``, as indexes of the job."""
+        """Return the tasks from ``first`` to before ``stop``, as indexes of the job."""
         items = self.items[first - self.start : stop - self.start]
         return Span(first, items, alone or self.alone, self.pin)
 
     def singly(self) -> list[Span]:
-        """Each task as a span that travels alone."""
+        """Return each task as a span that travels alone."""
         first = self.start
         return [self.part(at, at + 1, alone=True) for at in range(first, first + len(self.items))]
 
     def around(self, suspects: range) -> list[Span]:
-        """In pieces: what lies before the suspects, each of them alone, what lies behind."""
+        """Return in pieces: tasks before the suspects, each suspect alone, tasks after them."""
         if not suspects:
             return [self] if len(self.items) else []
         pieces, stop = [], self.start + len(self.items)
@@ -50,7 +50,7 @@ class Span:
 
 
 class _Stock:
-    """A span being given out from its front, and growing at its end while tasks come in."""
+    """Span that is given out from its front, and grows at its end while tasks come in."""
 
     __slots__ = ("alone", "items", "position", "start")
 
@@ -70,7 +70,7 @@ class _Stock:
         return span
 
     def grow(self, span: Span) -> bool:
-        """Take in what comes next, if it fits on without a copy of what is there."""
+        """Append ``span`` if it fits on without a copy of the items; return whether it does."""
         if (
             not isinstance(self.items, list)
             or self.alone != span.alone
@@ -86,7 +86,7 @@ class _Stock:
 
 
 class Waiting:
-    """The waiting tasks of one job, in the order in which they will be given out."""
+    """Waiting tasks of one job, in the order in which they will be given out."""
 
     __slots__ = ("_count", "_stocks")
 
@@ -98,32 +98,32 @@ class Waiting:
         return self._count
 
     def items(self) -> Iterator[Any]:
-        """What the waiting tasks are made from."""
+        """Yield the items of the waiting tasks."""
         for stock in self._stocks:
             yield from stock.items[stock.position :]
 
     def first(self) -> int:
-        """The index of the next task."""
+        """Return the index of the next task."""
         stock = self._stocks[0]
         return stock.start + stock.position
 
     def first_alone(self) -> bool:
-        """The next task travels alone."""
+        """Return whether the next task travels alone."""
         return self._stocks[0].alone
 
     def append(self, span: Span) -> None:
-        """More tasks, behind all others."""
+        """Add tasks behind all others."""
         self._count += len(span.items)
         if not self._stocks or not self._stocks[-1].grow(span):
             self._stocks.append(_Stock(span))
 
     def appendleft(self, span: Span) -> None:
-        """Tasks that come back, ahead of all others."""
+        """Add tasks that come back ahead of all others."""
         self._count += len(span.items)
         self._stocks.appendleft(_Stock(span))
 
     def take(self, size: int) -> Span:
-        """The next tasks: at most ``size``, contiguous, one if it travels alone."""
+        """Take the next tasks: at most ``size``, contiguous, one if it travels alone."""
         stock = self._stocks[0]
         span = stock.cut(1 if stock.alone else min(size, len(stock)))
         if not len(stock):

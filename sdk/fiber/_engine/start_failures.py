@@ -1,4 +1,4 @@
-"""When to try again to start a process, and when to give up: for workers and for agents.
+"""Times to try a start again, and to give up, after failed starts of workers or agents.
 
 Pure: ``now`` is an argument.
 """
@@ -11,15 +11,15 @@ from typing import NamedTuple
 from fiber.errors import FiberError, StartError
 
 RAISED_PATIENCE = 1.0
-"""Seconds for which processes may fail to start by their own doing, as by an initializer that
-raises, before that is the answer."""
+"""Seconds for which processes may fail to start by their own fault, such as an initializer that
+raises, before the failure is final."""
 
 KILLED_PATIENCE = 10.0
-"""Seconds for which starting processes may be killed, or refused by the system: spot nodes and OOM
-killers come in waves, and go."""
+"""Seconds for which starting processes may be killed, or refused by the system, before the failure
+is final.  Losses of spot nodes and OOM kills come in waves and pass."""
 
 TRIES = 3
-"""Starts that must have failed, however long it took."""
+"""Number of starts that must have failed before the failure is final, however long that takes."""
 
 FIRST_PAUSE, LAST_PAUSE = 0.05, 1.0
 """Seconds from one wave of failures to the next try, doubled from wave to wave."""
@@ -28,18 +28,18 @@ LAST_PAUSE_AT_WORK = 60.0
 """Longest pause, in seconds, while other processes are at work."""
 
 SAID_AFTER = 2.0
-"""Seconds of failures after which the user is told."""
+"""Seconds of failures after which the user gets a message."""
 
 
 class StartFailure(NamedTuple):
-    """Why a process was gone before it was ready."""
+    """Reason why a process was gone before it was ready."""
 
     who: str
     reason: str
     text: str = ""
     """Message of the process."""
     killed: bool = False
-    """By a signal, or the system had no room for it: it may have done nothing wrong."""
+    """True if a signal ended it, or the system had no room for it: it may not be at fault."""
     cause: BaseException | None = None
     final: FiberError | None = None
     """Error that keeps every process from starting: another try is of no use."""
@@ -63,13 +63,13 @@ class StartFailures:
         self.count = 0
         self.pause = 0.0
         self._since = 0.0
-        self._raises = 0  # those of the failures that were the processes' own doing
+        self._raises = 0  # failures by the processes' own fault
         self._raising_since = 0.0
         self._wave_at = 0.0
         self._said = False
 
     def add(self, failure: StartFailure, now: float, *, at_work: bool) -> None:
-        """Note one more; ``at_work`` says whether other processes work."""
+        """Count one more failure; ``at_work`` says whether other processes work."""
         if not self.count:
             self._since = now
             self._raises = 0
@@ -77,11 +77,11 @@ class StartFailures:
         if not failure.killed:
             self._raising_since = self._raising_since if self._raises else now
             self._raises += 1
-        if not self.pause or now >= self.try_at(at_work=at_work):  # else it is of the same wave
+        if not self.pause or now >= self.try_at(at_work=at_work):  # else it is in this wave
             self.hold(min(max(2 * self.pause, FIRST_PAUSE), LAST_PAUSE_AT_WORK), now)
 
     def hold(self, pause: float, now: float) -> None:
-        """Start nothing for a while."""
+        """Start no process for ``pause`` seconds."""
         self.pause = pause
         self._wave_at = now
 
@@ -91,12 +91,12 @@ class StartFailures:
         return self._wave_at + min(self.pause, last)
 
     def forget(self) -> None:
-        """End the series: one has started.  The pause is the caller's to end."""
+        """End the series, since a process has started.  The caller ends the pause."""
         self.count = 0
         self._said = False
 
     def last(self, failure: StartFailure, now: float, begin: float = -math.inf) -> bool:
-        """Return whether failures have lasted too long with this one, counted from ``begin``."""
+        """Return whether failures, counted from ``begin``, have now lasted too long."""
         if failure.final is not None:
             tries, since, patience = TRIES, now, 0.0
         elif failure.killed:
@@ -113,5 +113,5 @@ class StartFailures:
         return True
 
     def lasted(self, now: float) -> float:
-        """Return the seconds since the first of the series."""
+        """Return the seconds since the first failure of the series."""
         return now - self._since

@@ -11,15 +11,15 @@ from fiber._engine.chunks import PROMPT, TARGET, Pace
 from fiber._engine.spans import Span, Waiting
 
 HAD = 16
-"""Batches that a worker had last and that it may still answer for."""
+"""Number of last batches that a worker may still answer for, once they are over."""
 
 
 class WrongAnswer(Exception):
-    """An answer that its worker cannot have given in good faith; the text says why."""
+    """Error for an answer that an honest worker cannot give; the text says why."""
 
 
 class Job:
-    """The tasks of one call."""
+    """Tasks of one call."""
 
     __slots__ = (
         "alone",
@@ -48,35 +48,35 @@ class Job:
         self.exact = exact
         self.alone = alone or limits.retries == 0
         self.waiting = Waiting()
-        self.batches: dict[Batch, None] = {}  # those of its tasks that were given out
-        self.pins: dict[Worker, None] = {}  # who holds pinned tasks of it
+        self.batches: dict[Batch, None] = {}  # batches of it that workers have
+        self.pins: dict[Worker, None] = {}  # workers that have pinned tasks of it
         self.charges = Charges(limits)
         self.fed = 0
         self.done = 0
         self.closed = False
         self.reached = 0  # the index behind the last task that was given out
-        self.listed = False  # whether it is in the ledger's round of turns
-        self.paused = False  # whether its tasks wait until somebody takes results of it
+        self.listed = False  # True while it is in the ledger's queue of turns
+        self.paused = False  # True while its tasks wait until its results are read
 
     @property
     def target(self) -> float:
-        """Seconds of work that a message of it should carry."""
+        """Seconds of work that one of the job's messages should carry."""
         return PROMPT if self.exact else TARGET
 
     @property
     def has_next(self) -> bool:
-        """Whether a task of it may be given out."""
+        """True if one of the job's tasks may be given out."""
         waiting = self.waiting
         return bool(waiting) and not (self.paused and waiting.first() >= self.reached)
 
     @property
     def never_given(self) -> int:
-        """How many of its tasks nobody was given yet."""
+        """Number of the job's tasks that were never given out."""
         return self.fed - self.reached
 
     @property
     def finished(self) -> bool:
-        """No task will come any more, and all that came are done."""
+        """True once no more tasks will come and all tasks are done."""
         return self.closed and self.done == self.fed
 
     def drop_waiting(self, wanted: Callable[[Any], bool]) -> int:
@@ -97,7 +97,7 @@ class Job:
     ) -> tuple[list[Span], list[Loss]]:
         """Charge the ``suspects`` in ``rest``, tasks of a lost worker.
 
-        Returns the spans that run again and the tasks that had their tries, the last ones first.
+        Return the spans that run again and the tasks that have no tries left, the last ones first.
         """
         again, losses = [], []
         for span in reversed(rest.around(suspects)):
@@ -110,11 +110,12 @@ class Job:
 
 
 class Batch:
-    """A slice of a job's tasks in one message.
+    """Slice of a job's tasks in one message.
 
-    ``job`` is None once its results are not wanted; ``received`` counts those that came, the last
-    of them from ``_received_from`` on; ``stride`` is the number of tasks between two notes of the
-    worker's progress.  ``has_function`` is False if the message relies on the worker's memory.
+    ``job`` is None once the results do not count.  ``received`` is the number of results; the last
+    message of results began at ``_received_from``.  ``stride`` is the number of tasks between two
+    notes of the worker's progress.  ``has_function`` is False if the worker must remember the
+    function.
     """
 
     __slots__ = (
@@ -147,9 +148,9 @@ class Batch:
         self._received_from = 0
 
     def take(self, offset: int, count: int, kept: int | None) -> bool:
-        """Take ``count`` results from ``offset`` on; False if they are the last ones once more.
+        """Take ``count`` results from ``offset`` on; return False if they repeat the last ones.
 
-        Raises WrongAnswer for results that cannot come next.
+        Raise WrongAnswer for results that cannot come next.
         """
         stop, size = offset + count, len(self.items)
         if count and offset == self._received_from and stop == self.received:
@@ -159,7 +160,7 @@ class Batch:
                 f"it sent results {offset} to {stop} of batch {self.seq}, which has {size} tasks "
                 f"and {self.received} results"
             )
-        # One that keeps none would have its tasks run again without end, and no run would count.
+        # A worker that keeps none could have its tasks run again without end, uncharged.
         if kept is not None and not max(stop, 1) <= kept <= size:
             raise WrongAnswer(f"it kept {kept} of {size} tasks of batch {self.seq}, {stop} done")
         self._received_from, self.received = offset, stop
@@ -167,20 +168,20 @@ class Batch:
 
     @property
     def stop(self) -> int:
-        """The index behind its last task."""
+        """Index after the last task."""
         return self.start + len(self.items)
 
     @property
     def units(self) -> int:
-        """What this batch counts for maxtasksperchild."""
+        """Units that this batch counts for maxtasksperchild."""
         return -(-len(self.items) // self.unit)
 
     def rest(self) -> Span:
-        """The tasks without a result."""
+        """Return the tasks without a result."""
         return self.part(self.start + self.received, self.stop)
 
     def part(self, first: int, stop: int) -> Span:
-        """The tasks from index ``first`` to before ``stop``."""
+        """Return the tasks from index ``first`` to before ``stop``."""
         return Span(self.start, self.items, self.alone, self.pin).part(first, stop)
 
     def cut(self, kept: int) -> Span:
@@ -190,7 +191,7 @@ class Batch:
         return rest
 
     def suspects(self, running: tuple[int, int] | None) -> range:
-        """Tasks one of which was running: all without a result, if nothing else is known."""
+        """Return tasks one of which was running: without better knowledge all without a result."""
         first, stop = self.start + self.received, self.stop
         if running is None or running[0] != self.seq:
             return range(first, stop)
@@ -199,7 +200,7 @@ class Batch:
 
 
 class Worker:
-    """What one worker holds.  ``left``: units that it may still be given (maxtasksperchild)."""
+    """Batches of one worker.  ``left``: units that it may still get (maxtasksperchild)."""
 
     __slots__ = ("had", "key", "leaving", "left", "lent", "pinned", "queue", "recalled", "since")
 
@@ -209,20 +210,20 @@ class Worker:
         self.queue: deque[Batch] = deque()
         self.had: deque[int] = deque(maxlen=HAD)  # batches that are over
         self.pinned: deque[tuple[Job, Span]] = deque()
-        self.since = 0.0  # when it began what it does now
+        self.since = 0.0  # time when it became idle, or began its current batch
         self.recalled = False
         self.leaving = False
         self.lent = False  # a caller uses it directly
 
     def in_progress(self, unread: set[int], running: tuple[int, int] | None) -> Batch | None:
-        """The batch that it was in when it died: it reads one at a time."""
+        """Return the batch that the worker ran when it died; a worker reads one at a time."""
         read = [batch for batch in self.queue if batch.seq not in unread]
         named = [batch for batch in read if running is not None and batch.seq == running[0]]
         return next(iter(named or read), None)
 
 
 class Receipt(NamedTuple):
-    """``size`` results that count: tasks of ``job`` from index ``start`` on."""
+    """Results that count: those of ``size`` tasks of ``job`` from index ``start`` on."""
 
     job: Job
     start: int
@@ -230,12 +231,12 @@ class Receipt(NamedTuple):
     batch: Batch
 
     def item(self, index: int) -> Any:
-        """What the task ``index`` was made from."""
+        """Return the item of the task ``index``."""
         return self.batch.items[index - self.batch.start]
 
 
 class Loss(NamedTuple):
-    """A task that was running in too many workers when they were lost."""
+    """Task that was running in too many workers when they were lost."""
 
     job: Job
     task: int

@@ -1,4 +1,4 @@
-"""How many workers a pool has and should have, and whether it is any use to start more.
+"""The workers of a pool: how many there are, how many are wanted, and when to start more.
 
 Pure: ``now`` is an argument.
 """
@@ -12,28 +12,27 @@ from fiber._engine.tasks import Worker
 from fiber.errors import FiberError
 
 IDLE_DEATHS = 3
-"""Workers more than the pool's maximum that may die with nothing to do before they are replaced
-slowly."""
+"""Deaths of idle workers, above the pool's maximum, after which they are replaced slowly."""
 
 IDLE_PAUSE = 1.0
-"""Seconds before one is replaced then."""
+"""Seconds between replacements then."""
 
 
 class Member(Protocol):
-    """A worker's process, from before it is started until it is gone."""
+    """Process of a worker, from before its start until it is gone."""
 
     worker: Worker | None
-    """Its entry in the ledger, once it is ready."""
+    """Worker's entry in the ledger, once the worker is ready."""
     leaving: bool
-    """It was told to go, or will be at once."""
+    """True once the process was asked to end, or is about to be."""
 
 
 class WorkerSet:
-    """The workers of a pool, ``minimum`` to ``maximum`` of them.
+    """Workers of a pool, ``minimum`` to ``maximum`` of them.
 
-    ``members`` are those whose processes are being started or run, ``size`` counts those that are
-    to stay, ``starting`` those of them that are not ready.  ``trouble`` says why none starts, once
-    that lasts; with nobody at work it is also the ``error``, and there is no point in going on.
+    ``members`` are the workers whose processes start or run.  ``size`` counts members that stay,
+    ``starting`` those of them that are not ready.  ``trouble`` says why no worker starts, once
+    that lasts.  If no worker is ready either, it is also the ``error``, and the pool gives up.
     """
 
     def __init__(self, minimum: int, maximum: int) -> None:
@@ -45,39 +44,42 @@ class WorkerSet:
         self.trouble: FiberError | None = None
         self.error: FiberError | None = None
         self._failures = StartFailures()
-        self._alone_since = 0.0  # when the last one at work was lost
+        self._alone_since = 0.0  # when the last ready worker was lost
         self._idle_deaths = 0
 
     @property
     def failures(self) -> int:
-        """How many have failed to start since the last that did."""
+        """Number of failed starts since the last success."""
         return self._failures.count
 
     def staying(self) -> list[Member]:
-        """Those that were not told to go."""
+        """Return the members that were not asked to end."""
         return [member for member in self.members if not member.leaving]
 
     def wanted(self, demand: int) -> int:
-        """How many workers there should be for so many tasks."""
+        """Return how many workers there should be for so many tasks."""
         return min(max(demand, self.minimum), self.maximum)
 
     def missing(self, demand: int, newcomers: int) -> int:
-        """Workers to start for so many tasks, ``newcomers`` of which only new workers may run."""
+        """Return how many workers to start for so many tasks.
+
+        Only new workers may run ``newcomers`` of the tasks.
+        """
         missing = self.wanted(demand) - self.size
         return max(missing, min(newcomers - self.starting, self.maximum - self.size), 0)
 
     def startable(self, missing: int, now: float) -> int:
-        """How many of them to start now: after failures one, and only once the pause is over."""
+        """Return how many to start now; after failures it is one, once the pause is over."""
         if not self._failures.pause:
             return missing
         return min(missing, 1) if now >= self._try_at() and not self._trying() else 0
 
     def next_try(self) -> float | None:
-        """When the pause after failures is over; None while one is tried, or there is none."""
+        """Return when the pause after failures ends; None without one, or during a try."""
         return self._try_at() if self._failures.pause and not self._trying() else None
 
     def _trying(self) -> bool:
-        """Whether one that is to show that workers can start again is under way."""
+        """Return whether a worker starts as a try after failures."""
         return bool(self.failures and self.starting)
 
     def _at_work(self) -> bool:
@@ -86,16 +88,16 @@ class WorkerSet:
     def _try_at(self) -> float:
         return self._failures.try_at(at_work=self._at_work())
 
-    # What happens to them
+    # Events
 
     def add(self, member: Member) -> None:
-        """It is about to be started."""
+        """Add a worker that is about to be started."""
         self.members[member] = None
         self.size += 1
         self.starting += 1
 
     def ready(self, member: Member, worker: Worker) -> None:
-        """It is ready to work."""
+        """Take note that a worker is ready."""
         member.worker = worker
         self.starting -= 1
         self._failures.forget()
@@ -104,22 +106,22 @@ class WorkerSet:
             self._failures.pause = 0.0
 
     def did_something(self) -> None:
-        """Some worker had a result."""
+        """Take note that a worker sent a result."""
         if self._idle_deaths:
             self._idle_deaths = 0
             if not self.failures:
                 self._failures.pause = 0.0
 
     def let_go(self, member: Member) -> None:
-        """It is not to stay; the caller sees to it that it hears of that, or dies."""
+        """Count a worker as leaving; the caller asks it to end, or kills it."""
         self._uncount(member)
         member.leaving = True
 
     def gone(self, member: Member, now: float, failure: StartFailure | None) -> None:
-        """Its process is gone, or was never there.
+        """Remove a worker whose process is gone, or could not be started.
 
-        ``failure`` says why, if it was not ready; None if it could not help it, as when its host
-        is lost.
+        ``failure`` says why, if the worker was not ready.  None: the worker is not to blame, as
+        when its host is lost.
         """
         if member not in self.members:
             return
@@ -148,7 +150,7 @@ class WorkerSet:
                 self.error = self.trouble
 
     def news(self, failure: StartFailure, now: float) -> str:
-        """What to tell a person who waits, once when failures last; else nothing."""
+        """Return a text for the user, once for each series of failures that lasts; else empty."""
         if self.error or not self._failures.are_news(now):
             return ""
         return (
