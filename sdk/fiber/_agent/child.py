@@ -121,9 +121,9 @@ def die_with_parent(parent: int) -> None:
 
 
 def go_on_without_parent() -> None:
-    """Have the kernel let this process go on, if it is stopped, when its parent dies.
+    """Have the kernel continue this process, if it is stopped, when its parent dies.
 
-    The kernel does so by itself only for process groups that were stopped before that moment.  A
+    Without this, the kernel continues only process groups that were stopped before that moment.  A
     stop that takes effect just after it would last for ever.
     """
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)

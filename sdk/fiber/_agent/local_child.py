@@ -162,7 +162,7 @@ class LocalChild:
         return self._spec.program
 
     def release_descriptors(self) -> None:
-        """Close the agent's copies of the child's descriptors, and free its payload.
+        """Close the agent's copies of the child's handles, and free its payload.
 
         Otherwise the other end would not see EOF when the child closes its own copies.
         """

@@ -177,7 +177,7 @@ class _Preloader:
         return self._culprit is None
 
     def _is_fit(self) -> bool:
-        """Return whether a fork would break no thread."""
+        """Return whether this process is without threads that a fork would break."""
         return _count_threads() <= self._threads or (
             _trial_fork_ends() and _comes_down_to(self._threads)
         )

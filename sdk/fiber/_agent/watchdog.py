@@ -17,7 +17,7 @@ SPLIT_EAGER_AFTER = 10e-3
 """Seconds that a batch may run before it is split, if its results are wanted one by one."""
 
 SPLIT_AFTER = 40e-3
-"""The same for other batches.  Both are a few times the work that a message should carry."""
+"""Seconds for other batches.  Both are a few times the work that a message should carry."""
 
 
 class Watchdog:

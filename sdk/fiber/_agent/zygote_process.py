@@ -104,9 +104,9 @@ def _run(control: int) -> subprocess.Popen[bytes]:
             stdin=subprocess.DEVNULL,
             stdout=_null_if_closed(1),
             stderr=_null_if_closed(2),
-            # Ctrl-C in the terminal is for the program's group.  Not a new session: the kernel's
-            # scheduler (sched_autogroup) would give it half of the processors, the program the
-            # other half, however many children there are.
+            # Ctrl-C in the terminal is for the program's group.  With a new session, the kernel's
+            # scheduler (sched_autogroup) would give half of the processors to the program and
+            # half to its children, however many there are.
             process_group=0,
         )
     finally:

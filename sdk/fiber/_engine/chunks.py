@@ -12,7 +12,7 @@ TARGET = 16e-3
 """Seconds of work that one message should carry."""
 
 PROMPT = 4e-3
-"""The same for tasks whose results are wanted one by one, as they are ready."""
+"""Seconds of work of one message if results are wanted one by one, as they are ready."""
 
 FLOOR = 250e-6
 """Seconds of work that one message carries even if less would spread the work more evenly."""
@@ -30,7 +30,7 @@ SLOW = 50e-3
 """Seconds from which on tasks do not queue: the gap between two such tasks is negligible."""
 
 SHORTEST = 1e-9
-"""Smallest seconds of a task; clocks are not more exact."""
+"""Lower bound of a task's seconds; clocks are not more exact."""
 
 STRIDE_SECONDS = 200e-6
 STRIDE_LIMIT = 1024

@@ -56,7 +56,7 @@ class WorkersByLoad:
             self.queueable[worker] = None
 
     def sort_pinned(self, worker: Worker) -> None:
-        """Do the same if only the pinned tasks of ``worker`` have changed."""
+        """Update ``idle_pinned`` if only the pinned tasks of ``worker`` have changed."""
         if worker.pinned and worker in self.idle:
             self.idle_pinned[worker] = None
         else:

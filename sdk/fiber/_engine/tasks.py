@@ -54,7 +54,7 @@ class Job:
         self.fed = 0
         self.done = 0
         self.closed = False
-        self.reached = 0  # the index behind the last task that was given out
+        self.reached = 0  # index after the last task that was given out
         self.listed = False  # True while it is in the ledger's queue of turns
         self.paused = False  # True while its tasks wait until its results are read
 

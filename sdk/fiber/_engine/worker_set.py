@@ -15,7 +15,7 @@ IDLE_DEATHS = 3
 """Deaths of idle workers, above the pool's maximum, after which they are replaced slowly."""
 
 IDLE_PAUSE = 1.0
-"""Seconds between replacements then."""
+"""Seconds between slow replacements."""
 
 
 class Member(Protocol):
