@@ -1,4 +1,4 @@
-"""What one step of many environments takes and gives: actions, observations, rewards, endings."""
+"""Arrays of one step of many environments: actions, observations, rewards, endings."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from fiber._hub.protocol import ObjectKind
 from fiber.vector.columns import Allocate, Array, Carver, Rows, columns_of
 
 Packed: TypeAlias = tuple[Any, Array | None, Array | None, Array | None]
-"""What travels of results: observations, rewards, terminations, truncations."""
+"""Results to send: observations, rewards, terminations, truncations."""
 
 
 class Shape(NamedTuple):
-    """What the arrays depend on."""
+    """Spaces and numbers on which the arrays depend."""
 
     observation_space: Space[Any]
-    """Of one environment."""
+    """Observation space of one environment."""
     action_space: Space[Any]
-    """Of one environment."""
+    """Action space of one environment."""
     num_envs: int
-    """How many environments."""
+    """Number of environments."""
     workers: int
 
     def size(self) -> int:
@@ -35,7 +35,7 @@ class Shape(NamedTuple):
 
 
 class StepArrays:
-    """The arrays of ``shape.num_envs`` environments, a row for each."""
+    """Arrays of ``shape.num_envs`` environments, a row for each."""
 
     def __init__(self, shape: Shape, allocate: Allocate) -> None:
         self.actions = columns_of(shape.action_space, shape.num_envs, allocate)
@@ -44,20 +44,20 @@ class StepArrays:
         self.terminations = allocate((shape.num_envs,), np.bool_)
         self.truncations = allocate((shape.num_envs,), np.bool_)
         self.at_work = allocate((shape.workers,), np.int64)
-        """One more than the row that each worker is busy with; what tells it if the worker dies."""
+        """Row that each worker is busy with, plus one; 0 if none.  It shows where a worker died."""
 
     @classmethod
     def private(cls, shape: Shape) -> StepArrays:
-        """Arrays of this process alone."""
+        """Return arrays of this process alone."""
         return cls(shape, np.zeros)
 
     @classmethod
     def of_memory(cls, shape: Shape, memory: memoryview) -> StepArrays:
-        """Arrays in memory that others have, too."""
+        """Return arrays in memory that other processes share."""
         return cls(shape, Carver(memory))
 
     def part(self, first: int, count: int) -> StepArrays:
-        """Those of the environments from ``first`` on: the same memory."""
+        """Return the arrays of ``count`` environments from ``first`` on, in the same memory."""
         part = object.__new__(StepArrays)
         part.actions = self.actions.part(first, count)
         part.observations = self.observations.part(first, count)
@@ -71,15 +71,16 @@ class StepArrays:
     def put(
         self, row: int, observation: Any, reward: Any, terminated: bool, truncated: bool
     ) -> None:
-        """Note what a step of one environment gave."""
+        """Store the results of a step of one environment."""
         self.observations.put(row, observation)
         self.rewards[row] = reward
         self.terminations[row] = terminated
         self.truncations[row] = truncated
 
     def pack(self, rows: Rows, *, shared: bool) -> Packed | None:
-        """What travels of the results in ``rows``, to someone who has the same arrays if they are
-        ``shared``; None if nothing has to.
+        """Return what must be sent of the results in ``rows``; None if nothing must.
+
+        ``shared``: the receiver has the same arrays.
         """
         observations = self.observations.pack(rows, shared=shared)
         if shared:
@@ -87,7 +88,7 @@ class StepArrays:
         return observations, self.rewards[rows], self.terminations[rows], self.truncations[rows]
 
     def unpack(self, rows: Rows, packed: Packed | None) -> None:
-        """Set what another process has packed."""
+        """Store the results that another process has packed."""
         if packed is None:
             return
         observations, rewards, terminations, truncations = packed
@@ -99,7 +100,7 @@ class StepArrays:
 
 
 class SharedMemory:
-    """A block of the heap that goes to other processes of this host."""
+    """Block of the heap that other processes of this host share."""
 
     def __init__(self, block: heap.Block) -> None:
         self._block = block
@@ -108,7 +109,7 @@ class SharedMemory:
 
     @classmethod
     def allocate(cls, size: int) -> SharedMemory:
-        """Memory of ``size`` bytes, all zero."""
+        """Return memory of ``size`` bytes, all zero."""
         return cls(heap.allocate(size))
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -18,49 +18,50 @@ from fiber.vector.in_band import in_band
 
 Array: TypeAlias = npt.NDArray[Any]
 Rows: TypeAlias = Sequence[int] | slice
-"""Which rows; a slice for those that lie side by side."""
+"""Rows of a column; a slice where they lie side by side."""
 
 Allocate: TypeAlias = Callable[[tuple[int, ...], Any], Array]
-"""Makes the array of a shape and type."""
+"""Function that makes the array of a shape and type."""
 
 ALIGNMENT = 64
-"""Of arrays in shared memory, in bytes: no two of them are in one line of a processor's cache."""
+"""Alignment of arrays in shared memory, in bytes: each begins in its own line of the cache."""
 
 
 class Columns(Protocol):
-    """What all kinds have in common."""
+    """Interface of all kinds of columns."""
 
     def put(self, row: int, value: Any) -> None:
         """Set one environment's value."""
 
     def take_back(self, row: int) -> None:
-        """Restore the value before the last ``put``, of all parts that might not be pickled."""
+        """Restore the value before the last ``put``, for all parts that might not pickle."""
 
     def get(self, row: int) -> Any:
-        """One environment's value, which nothing that happens later changes."""
+        """Return the value of one environment, which later steps do not change."""
 
     def fits(self, batch: Any, count: int) -> bool:
-        """Whether ``fill`` takes this batch of ``count`` values without changing any."""
+        """Tell whether ``fill`` takes this batch of ``count`` values without changing any."""
 
     def fill(self, rows: Rows, batch: Any) -> None:
         """Set the values of many environments from a batch of them."""
 
     def batch(self, rows: Rows) -> Any:
-        """Those values, as Gymnasium batches them: views of the arrays where ``rows`` is a slice,
-        else copies.
+        """Return the values of ``rows`` as Gymnasium batches them.
+
+        They are views of the arrays where ``rows`` is a slice, else copies.
         """
 
     def pack(self, rows: Rows, *, shared: bool) -> Any:
-        """What has to travel for another process to have these values.
+        """Return what must be sent so that another process has these values.
 
-        ``shared``: it has the arrays, and None is enough where there are only arrays.
+        ``shared``: that process has the same arrays.  Then None is enough for arrays.
         """
 
     def unpack(self, rows: Rows, packed: Any) -> None:
         """Set the values that another process has packed."""
 
     def part(self, first: int, count: int) -> Columns:
-        """The columns of the environments from ``first`` on: of the same arrays."""
+        """Return the columns of ``count`` environments from ``first`` on, in the same arrays."""
 
 
 class ArrayColumn:
@@ -254,14 +255,14 @@ def columns_of(space: Space[Any], count: int, allocate: Allocate) -> Columns:
 
 
 class Carver:
-    """Cuts arrays out of memory; without any it only adds up how much they need."""
+    """Allocator of arrays in given memory.  Without memory it only adds up their sizes."""
 
     def __init__(self, memory: memoryview | None = None) -> None:
         self._memory = memory
         self.size = 0
 
     def __call__(self, shape: tuple[int, ...], dtype: Any) -> Array:
-        """The next array."""
+        """Return the next array."""
         length = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         begin, self.size = self.size, self.size + -(-length // ALIGNMENT) * ALIGNMENT
         if self._memory is None:

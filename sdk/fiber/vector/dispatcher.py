@@ -1,4 +1,4 @@
-"""Which environments were told what, what came back, and what becomes of those that failed."""
+"""Dispatch of commands to environments, their answers, and the replacement of failed ones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STEP = Pending("step")
 
 
 class Dispatcher:
-    """Tells workers what to do.  Environments are known by their numbers.
+    """Dispatcher of commands to workers.  Environments are known by their numbers.
 
     ``restart``: environments whose worker has died are made anew.  Those of a worker that the
     cluster ends are in any case, ``disruptions`` times in a row.
@@ -124,17 +124,17 @@ class Dispatcher:
     # Answers
 
     def wait(self, timeout: float | None = None) -> None:
-        """Until all environments have answered; raises what the first that failed has raised."""
+        """Wait until all environments have answered; raise the error of the first that failed."""
         self._wait(lambda: not any(worker.pending for worker in self._workers), timeout)
         self._ready.clear()
 
     def wait_for(self, count: int, timeout: float | None = None) -> list[int]:
-        """The numbers of the ``count`` environments that answered first."""
+        """Return the numbers of the ``count`` environments that answered first."""
         self._wait(lambda: len(self._ready) >= count or bool(self._failures), timeout)
         return [self._ready.popleft() for _ in range(count)]
 
     def results(self, timeout: float | None = None) -> list[Any]:
-        """What the methods of ``call`` returned, in its order."""
+        """Return the results of ``call``, in its order."""
         calls = self._calls
         self._wait(lambda: all(group.worker.results is not None for group in calls), timeout)
         by_position: dict[int, Any] = {}
@@ -143,11 +143,11 @@ class Dispatcher:
         return [by_position[position] for position in range(len(by_position))]
 
     def under_way(self) -> int:
-        """How many environments have not answered, or were not asked for their answer."""
+        """Return the number of environments whose answer has not come, or was not collected."""
         return len(self._ready) + sum(len(worker.pending) for worker in self._workers)
 
     def busy(self, numbers: Iterable[int]) -> int | None:
-        """The first of these of which ``under_way`` is true; None if there is none."""
+        """Return the first of ``numbers`` that ``under_way`` counts; None if there is none."""
         ready = set(self._ready)
         for number in numbers:
             worker = self._worker_of[number]
@@ -156,13 +156,13 @@ class Dispatcher:
         return None
 
     def notes(self, numbers: Iterable[int] | None = None) -> list[tuple[int, Note]]:
-        """What the environments had to say: all of them in order, or some as they are given."""
+        """Return the notes of all environments in order, or of ``numbers`` in their order."""
         if numbers is None:
             numbers = sorted(self._notes)
         return [(number, self._notes.pop(number)) for number in numbers if number in self._notes]
 
     def abandon(self) -> None:
-        """Nobody waits any more for what was asked for."""
+        """Ignore the answers to all commands so far."""
         for worker in self._workers:
             worker.give_up()
         self._calls = []
@@ -171,7 +171,7 @@ class Dispatcher:
         self._failures.clear()
 
     def name(self, number: int) -> str:
-        """An environment, for a person."""
+        """Return the name of an environment, for messages."""
         return f"environment {number}, of worker {self._worker_of[number].name!r}"
 
     def _all_there(self) -> bool:
@@ -279,7 +279,7 @@ class Dispatcher:
         worker.set_deadline()
 
     def _blame(self, worker: WorkerProcess, error: Exception) -> None:
-        """An answer is here and cannot be unpickled: nobody knows of which environments it was."""
+        """Note an answer that cannot be unpickled.  Its environments are not known."""
         whose = f"{worker.whose()}, of worker {worker.name!r},"
         add_note(error, f"an answer of {whose} cannot be unpickled")
         if worker.hello is None:
@@ -305,7 +305,7 @@ class Dispatcher:
     # Ends
 
     def _mourn(self, worker: WorkerProcess) -> None:
-        """A worker's process is gone."""
+        """Note that the process of a worker has ended."""
         if worker.error is not None:
             return  # it said why
         error = worker.death(self._at_work(worker))
@@ -313,7 +313,7 @@ class Dispatcher:
             self._lose(worker, error)
             return
         if self._is_called(worker):
-            # Nobody knows what of the call was done.
+            # It is not known which methods of the call ran.
             worker.results = []
             self._failures.append((worker.setup.first, error))
         self._warn(f"{worker.whose()} made anew: {error}")
@@ -331,7 +331,7 @@ class Dispatcher:
         why: str,
         error: Exception,
     ) -> None:
-        """Start another process for its environments; without one, ``error`` is what is told."""
+        """Start another process for the worker's environments; if that fails, report ``error``."""
         try:
             let_go(worker)
             worker.hello, worker.deadline = None, None
@@ -345,7 +345,7 @@ class Dispatcher:
         return any(group.worker is worker and worker.results is None for group in self._calls)
 
     def _lose(self, worker: WorkerProcess, error: Exception) -> None:
-        """There is no worker for its environments any more."""
+        """Give up the worker, and its environments with it."""
         worker.error = error
         worker.results = []
         worker.give_up()
@@ -406,20 +406,20 @@ def _reset_command(
 
 
 def _only_reports_losses(message: Answer | Results) -> bool:
-    """Whether its environments have done nothing but say that their episodes were lost."""
+    """Tell whether the environments only reported that their episodes were lost."""
     if not isinstance(message, Answer) or message.rows is None:
         return False
     return all(note.lost for note in message.notes) and len(message.notes) == len(message.rows)
 
 
 class _Group(NamedTuple):
-    """The part of a command that is one worker's."""
+    """Part of a command for one worker."""
 
     worker: WorkerProcess
     rows: Sequence[int] | None
     positions: Sequence[int]
-    """Of its environments in what the caller gave."""
+    """Positions of the worker's environments in the arguments of the caller."""
 
     def each(self) -> Sequence[int]:
-        """The rows, one by one."""
+        """Return the rows one by one."""
         return range(len(self.worker.numbers)) if self.rows is None else self.rows

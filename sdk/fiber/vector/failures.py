@@ -10,11 +10,11 @@ from fiber._agent.travelling import encode_error
 from fiber._exceptions import add_note
 
 ATTEMPTS = 3
-"""How often in a row what fails is made anew before it has done anything."""
+"""Number of times in a row that an environment is made anew without having done anything."""
 
 
 class Failure(NamedTuple):
-    """What one environment raised."""
+    """Error that one environment raised."""
 
     row: int
     doing: str
@@ -23,16 +23,16 @@ class Failure(NamedTuple):
 
     @classmethod
     def of(cls, row: int, doing: str, error: BaseException) -> Failure:
-        """In a worker: ``error`` was raised by the environment in ``row``."""
+        """Return the failure of the environment in ``row``.  Called in its worker."""
         return cls(row, doing, encode_error(error))
 
     def exception(self, whose: str) -> Exception:
-        """What to raise: the exception itself, with a note of the environment that it is of."""
+        """Return the exception to raise, with a note that names the environment."""
         error: Exception = pickle.loads(self.error)
         add_note(error, f"{self.doing} of {whose}")
         return error
 
 
 def summary(error: BaseException) -> str:
-    """The last line of its traceback."""
+    """Return the last line of the traceback of ``error``."""
     return "".join(traceback.format_exception_only(error)).strip()

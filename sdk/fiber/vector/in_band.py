@@ -1,4 +1,4 @@
-"""What a worker sends for good."""
+"""Pickling of values that their receiver may keep."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class _InBand:
 
 
 def in_band(value: _Value) -> _Value:
-    """What is pickled for ``value`` in a message so that its receiver has memory of its own for it.
+    """Return a stand-in for ``value`` in a message.  The receiver gets its own copy of the arrays.
 
-    Otherwise large arrays lie beside the pickle, and a learner reads them where the worker wrote
-    them (``Connection._recv_pickled``).  That is for what it copies at once, and not for what its
-    user may keep.
+    Otherwise large arrays lie beside the pickle, and the learner reads them where the worker wrote
+    them (``Connection._recv_pickled``).  That is right for arrays that the learner copies at once,
+    and wrong for values that its user may keep.
     """
     return cast(_Value, _InBand(value))

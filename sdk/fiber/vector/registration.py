@@ -33,9 +33,9 @@ def make_vec(
 def register(id: str, **vector_kwargs: Any) -> None:
     """Have ``gymnasium.make_vec`` make a ``VectorEnv`` of this environment.
 
-    From here on ``gymnasium.make_vec(id, num_envs)`` and its ``vectorization_mode=
-    "vector_entry_point"`` do, in this process, also where the environment came with a vector entry
-    point of its own.  ``vector_kwargs`` are ``VectorEnv``'s options: with a vector entry point
+    From then on ``gymnasium.make_vec(id, num_envs)`` and its ``vectorization_mode=
+    "vector_entry_point"`` do so in this process, also if the environment came with another vector
+    entry point.  ``vector_kwargs`` are the options of ``VectorEnv``: with a vector entry point
     ``gymnasium.make_vec`` takes none.
     """
     gymnasium.spec(id).vector_entry_point = partial(_make_registered, id, vector_kwargs)
@@ -52,7 +52,7 @@ def _make(
     wrappers: Sequence[Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]],
     kwargs: dict[str, Any],
 ) -> gymnasium.Env[Any, Any]:
-    """One environment, in its worker."""
+    """Make one environment, in its worker."""
     env = gymnasium.make(id, **kwargs)
     for wrapper in wrappers:
         env = wrapper(env)

@@ -1,4 +1,4 @@
-"""One environment in its worker: steps, resets by itself when an episode ends, is made anew."""
+"""Environment in its worker: it steps, resets itself after an episode, and is made anew."""
 
 from __future__ import annotations
 
@@ -14,27 +14,26 @@ MakeEnv: TypeAlias = Callable[[], Env[Any, Any]]
 
 
 class Final(NamedTuple):
-    """How an episode ended whose environment was reset in the same step."""
+    """End of an episode whose environment was reset in the same step."""
 
     observation: Any
     info: dict[str, Any]
 
 
 class Note(NamedTuple):
-    """What a step or reset of one environment gave besides what is in the arrays."""
+    """Result of a step or reset of one environment, without what is in the arrays."""
 
     row: int
     info: dict[str, Any]
     final: Final | None = None
     lost: str | None = None
-    """Why the environment was made anew, and its episode cut short."""
+    """Reason why the environment was made anew and its episode cut short."""
 
 
 class Slot:
-    """An environment, and what its autoreset has to remember.
+    """Environment, with the state of its autoreset.
 
-    ``lost`` says that an episode was under way in an environment that is no more: the next step
-    reports it as truncated.
+    After ``lose``, the next step reports the episode of the lost environment as truncated.
     """
 
     def __init__(self, row: int, make: MakeEnv, mode: AutoresetMode) -> None:
@@ -51,7 +50,7 @@ class Slot:
         self._same_step = mode is AutoresetMode.SAME_STEP
 
     def step(self, action: Any, arrays: StepArrays) -> Note | None:
-        """One step; the note is None if there is nothing to say."""
+        """Make one step.  The note is None if there is nothing to report."""
         if self._lost is not None:
             return self._truncate(arrays)
         return self._step(action, arrays)
@@ -67,16 +66,16 @@ class Slot:
         return self._note(info, lost=lost)
 
     def call(self, name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
-        """What a method of the environment returns, or the value of an attribute."""
+        """Return the result of a method of the environment, or the value of an attribute."""
         attribute = self.env.get_wrapper_attr(name)
         return attribute(*args, **kwargs) if callable(attribute) else attribute
 
     def get_attr(self, name: str) -> Any:
-        """An attribute of a wrapper or of the environment."""
+        """Return an attribute of a wrapper or of the environment."""
         return self.env.get_wrapper_attr(name)
 
     def has_attr(self, name: str) -> bool:
-        """Whether there is one."""
+        """Tell whether a wrapper or the environment has an attribute."""
         return self.env.has_wrapper_attr(name)
 
     def set_wrapper_attr(self, name: str, value: Any) -> None:
@@ -88,7 +87,7 @@ class Slot:
         setattr(self.env, name, value)
 
     def is_wrapped(self, wrapper_class: type[Wrapper[Any, Any, Any, Any]]) -> bool:
-        """Whether such a wrapper is around the environment."""
+        """Tell whether a wrapper of this class is around the environment."""
         env = self.env
         while isinstance(env, Wrapper) and not isinstance(env, wrapper_class):
             env = env.env
@@ -99,15 +98,15 @@ class Slot:
         self.env.close()
 
     def lose(self, why: str) -> None:
-        """Its episode cannot go on."""
+        """Note that the episode of the environment is lost."""
         self._lost = why
 
     def make_anew(self, why: str) -> None:
-        """Another environment in place of this one, whose episode is lost."""
+        """Replace the environment by a new one.  Its episode is lost."""
         try:
             self.env.close()
         except Exception:
-            pass  # it failed before, and what it holds goes with it
+            pass  # it had failed before, and is dropped now
         self.env = self._make()
         self.lose(why)
 

@@ -23,7 +23,7 @@ ObservationMode: TypeAlias = str | tuple[Space[Any], Space[Any]]
 
 
 class Spaces(NamedTuple):
-    """As ``gymnasium.vector.VectorEnv`` calls them."""
+    """Spaces by their names in ``gymnasium.vector.VectorEnv``."""
 
     single_observation_space: Space[Any]
     observation_space: Space[Any]

@@ -1,4 +1,4 @@
-"""What both vector environments are made of: Gymnasium's and stable-baselines3's."""
+"""Base of both vector environments, Gymnasium's and stable-baselines3's."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class SubEnvironments:
     ) -> None:
         """Begin to step some environments, or all, with a batch of actions for them.
 
-        ``split`` makes a list of the batch; ``together``: nobody asks for the first that are done.
+        ``split`` makes a list of the batch.  ``together``: the caller waits for all of them.
         """
         count = len(self.arrays.rewards) if numbers is None else len(numbers)
         columns = self.arrays.actions

@@ -1,4 +1,4 @@
-"""How long an environment may take."""
+"""Time limit for the calls of an environment."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from types import FrameType
 
 
 class TimeLimit:
-    """Raises ``multiprocessing.TimeoutError`` in what is done inside it, if that takes too long.
+    """Context that raises ``multiprocessing.TimeoutError`` in a block that takes too long.
 
-    By an alarm (SIGALRM), so only in a main thread, and only where Python code runs or a system
-    call waits: native code that does not return is left to others to end.  The alarm is repeated,
-    since what it raised may have been caught.
+    It uses an alarm (SIGALRM).  So it works only in a main thread, and only while Python code runs
+    or a system call waits: it does not end native code that never returns.  The alarm is repeated,
+    since the block may have caught the error.
     """
 
     def __init__(self, seconds: float) -> None:

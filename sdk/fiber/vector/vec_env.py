@@ -136,27 +136,27 @@ class VecEnv(vec_env.VecEnv):
         return self.env_method("render")
 
     def has_attr(self, attr_name: str) -> bool:
-        """Whether all environments have an attribute."""
+        """Tell whether all environments have an attribute."""
         return all(self._call("has_attr", None, attr_name))
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of each environment, or of those of ``indices``."""
+        """Return an attribute of each environment, or of those of ``indices``."""
         return self._call("get_attr", indices, attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute."""
+        """Set an attribute of each environment, or of those of ``indices``."""
         self._call("set_attr", indices, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """What a method of each environment returns."""
+        """Call a method of each environment, or of those of ``indices``; return the results."""
         return self._call("call", indices, method_name, method_args, method_kwargs)
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Indices = None
     ) -> list[bool]:
-        """Whether such a wrapper is around each environment."""
+        """Tell of each environment whether a wrapper of this class is around it."""
         return self._call("is_wrapped", indices, wrapper_class)
 
     def _call(self, method: str, indices: Indices, *arguments: Any) -> list[Any]:
@@ -176,7 +176,7 @@ class VecEnv(vec_env.VecEnv):
         self._waited(self._dispatcher.wait)
 
     def _waited(self, wait: Callable[[], Any]) -> Any:
-        """What ``wait`` returns.  Failed or interrupted, it is as if nobody had asked."""
+        """Return the result of ``wait``.  If it fails or is interrupted, give up the command."""
         try:
             return wait()
         except BaseException:
@@ -199,7 +199,7 @@ def _info(note: Note, info: dict[str, Any]) -> dict[str, Any]:
 
 
 def _make(make: Callable[[], Any]) -> gymnasium.Env[Any, Any]:
-    """An environment in its worker."""
+    """Make an environment, in its worker."""
     env: Any = make()
     if not isinstance(env, gymnasium.Env):
         # One of the old gym. Not imported for others: it takes seconds, as torch comes with it.

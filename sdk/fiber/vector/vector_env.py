@@ -141,29 +141,28 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             self._state = AsyncState.WAITING_RESET
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
-        """What ``reset`` returns; TimeoutError after ``timeout`` seconds."""
+        """Return the result of ``reset``; TimeoutError after ``timeout`` seconds."""
         self._finish(AsyncState.WAITING_RESET, timeout)
         return self._observations(), self._infos(self._dispatcher.notes())
 
     def step(self, actions: Any) -> Step:
         """Step all environments: observations, rewards, terminations, truncations and infos.
 
-        Interrupted (Ctrl-C), it is given up, as everything that is waited for: what the
-        environments do of it is not returned.
+        If it is interrupted (Ctrl-C), the step is given up: its results are not returned.
         """
         with self._given_up_if_interrupted():
             self.step_async(actions)
             return self.step_wait()
 
     def step_async(self, actions: Any) -> None:
-        """Begin to step: for ``step_wait``."""
+        """Begin to step.  ``step_wait`` returns the result."""
         self._check_idle("step_async")
         with self._given_up_if_interrupted():
             self._sub_environments.step(None, actions, self._each_action, together=True)
             self._state = AsyncState.WAITING_STEP
 
     def step_wait(self, timeout: float | None = None) -> Step:
-        """What ``step`` returns; TimeoutError after ``timeout`` seconds."""
+        """Return the result of ``step``; TimeoutError after ``timeout`` seconds."""
         self._finish(AsyncState.WAITING_STEP, timeout)
         arrays = self._arrays
         return (
@@ -187,11 +186,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             self._sub_environments.step(numbers, actions, self._each_action, together=False)
 
     def recv(self, batch_size: int | None = None, timeout: float | None = None) -> Step:
-        """What ``step`` returns, of the ``batch_size`` environments that are ready first.
+        """Return the results of ``step`` of the ``batch_size`` environments that are ready first.
 
-        ``infos["env_id"]`` has their numbers; everything else has its rows in the same order.  By
-        default all are waited for that were told something.  TimeoutError after ``timeout``
-        seconds: then nothing is lost, and the next ``recv`` goes on.
+        ``infos["env_id"]`` has their numbers.  All else has its rows in the same order.  By default
+        it waits for all environments that are stepping or resetting.  TimeoutError after
+        ``timeout`` seconds: then nothing is lost, and the next ``recv`` goes on.
         """
         self._check_running()
         under_way = self._dispatcher.under_way()
@@ -218,29 +217,29 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     # Calls
 
     def render(self) -> tuple[Any, ...]:
-        """A frame of each environment."""
+        """Return a frame of each environment."""
         return self.call("render")
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """What a method of each environment returns, or the value of an attribute."""
+        """Call a method of each environment, or read an attribute; return the results."""
         with self._given_up_if_interrupted():
             self.call_async(name, *args, **kwargs)
             return self.call_wait()
 
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
-        """Begin such a call: for ``call_wait``."""
+        """Begin a call.  ``call_wait`` returns the results."""
         self._check_idle("call_async")
         if name in ("reset", "step", "close"):
             raise ValueError(f"call {name}() of the vector environment, not of each environment")
         self._call("call", [(name, args, kwargs)] * self.num_envs)
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """What ``call`` returns; TimeoutError after ``timeout`` seconds."""
+        """Return the results of ``call``; TimeoutError after ``timeout`` seconds."""
         self._check_waiting(AsyncState.WAITING_CALL)
         return tuple(self._awaited(lambda: self._dispatcher.results(timeout)))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of each environment."""
+        """Return an attribute of each environment."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
@@ -290,7 +289,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def _infos(
         self, notes: Sequence[tuple[int, Note]], numbers: Sequence[int] | None = None
     ) -> dict[str, Any]:
-        """What environments had to say, as Gymnasium has it; a row for each of ``numbers``."""
+        """Return the infos of environments as Gymnasium has them, a row for each of ``numbers``."""
         infos: dict[str, Any] = {}
         if not notes:
             return infos
@@ -373,7 +372,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         self._received = None
 
     def _awaited(self, wait: Callable[[], _Result]) -> _Result:
-        """What ``wait`` returns; if it fails, nothing more is waited for."""
+        """Return the result of ``wait``.  If it fails, the command is given up."""
         try:
             result = wait()
         except BaseException:
@@ -384,7 +383,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     @contextlib.contextmanager
     def _given_up_if_interrupted(self) -> Iterator[None]:
-        """Who is interrupted does not know what was told and heard."""
+        """Give up the command if the block is interrupted: its state is not known then."""
         try:
             yield
         except (KeyboardInterrupt, SystemExit):

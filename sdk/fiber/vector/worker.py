@@ -1,7 +1,7 @@
-"""The worker: a process with many environments, which steps them as it is told.
+"""Worker: a process that steps many environments by command.
 
-A command is a tuple ``(operation, generation, rows, ...)``.  It has one answer or, where
-``together`` is not asked for, several: what is done does not wait for an environment that is slow.
+A command is a tuple ``(operation, generation, rows, ...)``.  With ``together`` it has one answer.
+Else it may have several, so that finished environments do not wait for a slow one.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from fiber.vector.slot import MakeEnv, Note, Slot
 from fiber.vector.time_limit import TimeLimit
 
 REPORT_AFTER, REPORT_AFTER_ELSEWHERE = 200e-6, 2e-3
-"""Seconds that what is done may wait for more, so that many quick steps make one message: to a
-learner of this host, and to one for which a message crosses links.
+"""Seconds that finished environments may wait for more, so that many quick steps make one message.
+The first is for a learner on this host, the second for one on another host.
 """
 
 WEIGHT = 0.1
-"""Of the last step in how long one of an environment is expected to take."""
+"""Weight of the last step in the expected duration of an environment's step."""
 
 
 _UNPICKLABLE = "an answer that cannot be pickled"
 
 
 class Setup(NamedTuple):
-    """What a worker is to be."""
+    """Description of a worker."""
 
     worker: int
     first: int
-    """The number of its first environment; rows count from there."""
+    """Number of the worker's first environment.  Rows count from there."""
     makes: Sequence[MakeEnv]
     autoreset: AutoresetMode
     restart: bool
-    """Whether an environment that raises is made anew."""
+    """True if an environment that raises is made anew."""
     timeout: float | None
     """Seconds for the making, a step or a reset of one environment."""
 
 
 class Hello(NamedTuple):
-    """What a worker says first."""
+    """First message of a worker."""
 
     host: str
     metadata: dict[str, Any]
@@ -60,31 +60,31 @@ class Hello(NamedTuple):
 
 
 class Begin(NamedTuple):
-    """What it is told then."""
+    """First message to a worker, after its ``Hello``."""
 
     shape: Shape
-    """That of its own environments, or of all if there is ``memory``."""
+    """Shape for the worker's environments, or for all of them if there is ``memory``."""
     memory: SharedMemory | None
     last: Packed | None = None
-    """What was last seen of the environments of a worker that this one stands in for."""
+    """Last results of the worker that this one replaces."""
     lost: str | None = None
-    """What became of that worker."""
+    """Reason why the replaced worker ended."""
 
 
 class Answer(NamedTuple):
-    """What it says of steps and resets."""
+    """Answer of a worker to steps and resets."""
 
     generation: int
     rows: Sequence[int] | None
-    """Which environments are done; None for all of the worker's."""
+    """Rows of the finished environments; None means all of the worker."""
     packed: Packed | None
     notes: Sequence[Note]
     failures: Sequence[Failure]
-    """Of environments that are not among ``rows``."""
+    """Failures of environments that are not among ``rows``."""
 
 
 class Results(NamedTuple):
-    """What it says of a call."""
+    """Answer of a worker to a call of methods."""
 
     generation: int
     values: list[Any]
@@ -92,15 +92,15 @@ class Results(NamedTuple):
 
 
 def serve(connection: Connection, setup: Setup) -> None:
-    """The target of a worker process."""
+    """Serve a learner: the target of a worker process."""
     slots: list[Slot] = []
     try:
         if _make_all(connection, setup, slots):
             Worker(connection, setup, slots, connection.recv()).run()
     except (EOFError, BrokenPipeError):
-        pass  # whoever wanted them stepped is gone, or has closed them
+        pass  # the learner has ended, or has closed the environments
     finally:
-        with contextlib.ExitStack() as ends:  # all are closed, whatever one of them raises
+        with contextlib.ExitStack() as ends:  # all are closed, also if one raises
             for slot in reversed(slots):
                 ends.callback(slot.close)
 
@@ -123,7 +123,7 @@ def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
     metadata, mode = in_band(dict(env.metadata)), env.render_mode
     try:
         connection.send(Hello(client.host(), metadata, mode, in_band(spaces)))
-    except Exception as error:  # whatever it raised
+    except Exception as error:  # pickling runs code of the environments
         row = next((row for row, pair in enumerate(spaces) if not _pickles(pair)), 0)
         connection.send(Failure.of(row, "spaces or metadata that cannot be pickled", error))
         return False
@@ -131,7 +131,7 @@ def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
 
 
 class Worker:
-    """Does what it is told until its connection ends."""
+    """Loop that carries out commands until the connection ends."""
 
     def __init__(
         self, connection: Connection, setup: Setup, slots: Sequence[Slot], begin: Begin
@@ -141,10 +141,10 @@ class Worker:
         self._slots = slots
         self._all = range(len(slots))
         self._expected = [0.0] * len(slots)
-        """Seconds that a step of each environment takes: a mean that forgets."""
+        """Expected seconds of a step of each environment: a moving average."""
         self._losses: dict[int, int] = {}
-        """How often in a row an environment was made anew and has done nothing."""
-        self._limit = _limit(setup)  # after the making, which may have set an alarm of its own
+        """Times in a row that an environment was made anew and has done nothing, by row."""
+        self._limit = _limit(setup)  # after the making, which may have set another alarm
         self._shared = begin.memory is not None
         self._report_after = REPORT_AFTER if self._shared else REPORT_AFTER_ELSEWHERE
         if begin.memory is None:
@@ -153,7 +153,7 @@ class Worker:
             arrays = StepArrays.of_memory(begin.shape, begin.memory.view)
             self._arrays = arrays.part(setup.first, len(slots))
         self._arrays.unpack(slice(None), begin.last)
-        # Where nobody else sees it, it does no harm.
+        # In private arrays no other process reads it.
         self._at_work = self._arrays.at_work
         if begin.lost is not None:
             for slot in slots:
@@ -165,13 +165,13 @@ class Worker:
         }
 
     def run(self) -> None:
-        """Until EOFError: the end of the connection."""
+        """Carry out commands until the connection ends, with EOFError."""
         while True:
             operation, *arguments = self._connection.recv()
             self._operations[operation](*arguments)
 
     def _tell(self, message: Answer | Results) -> None:
-        # That it has arrived is known when the next command comes.
+        # The next command shows that the message has arrived.
         self._connection._send_unconfirmed(message)
 
     # Operations
@@ -179,7 +179,7 @@ class Worker:
     def _step(
         self, generation: int, rows: Sequence[int] | None, actions: Any, together: bool
     ) -> None:
-        """``actions``: None where they are in the arrays already, a list, or packed."""
+        """Step environments.  ``actions``: None if the arrays have them, a list, or packed."""
         arrays, slots = self._arrays, self._slots
         if isinstance(actions, list):
             chosen = dict(zip(self._each(rows), actions, strict=True))
@@ -216,7 +216,7 @@ class Worker:
         method: str,
         arguments: Sequence[tuple[Any, ...]],
     ) -> None:
-        """A method of each slot: the results are what it returns."""
+        """Call a method of each slot, and send the results."""
         values: dict[int, Any] = {}
         failures = []
         worker, at_work = self._setup.worker, self._at_work
@@ -235,7 +235,7 @@ class Worker:
                 failures.append(Failure.of(row, _UNPICKLABLE, refusal))
             self._tell(Results(generation, in_band(list(values.values())), failures))
 
-    # What they have in common
+    # Parts of all operations
 
     def _each(self, rows: Sequence[int] | None) -> Sequence[int]:
         return self._all if rows is None else rows
@@ -248,8 +248,10 @@ class Worker:
         doing: str,
         together: bool,
     ) -> None:
-        """An operation of each environment; what is done is told as soon as the next one is
-        expected to keep it waiting, or at the end if they are wanted ``together``.
+        """Do an operation with each environment, and send the results.
+
+        Results are sent as soon as the next environment is expected to delay them, or at the end if
+        they are wanted ``together``.
         """
         clock = time.perf_counter
         send = partial(self._send, operation, doing)
@@ -286,7 +288,7 @@ class Worker:
         report: _Report,
         failed: str = "",
     ) -> None:
-        """Try again with a new environment, if that is wished; else tell what ``failed``."""
+        """Try again with a new environment, if that is wished; else report the failure."""
         losses = self._losses.get(row, 0) + 1
         if self._setup.restart and losses <= ATTEMPTS:
             self._losses[row] = losses
@@ -336,7 +338,7 @@ class Worker:
 
 
 class _Report:
-    """What is done of a command and was not told yet."""
+    """Finished part of a command that was not sent yet."""
 
     __slots__ = ("due", "failures", "generation", "notes", "rows")
 
@@ -348,7 +350,7 @@ class _Report:
         self.due = 0.0
 
     def add(self, row: int, note: Note | None) -> None:
-        """An environment is done."""
+        """Add an environment that is done."""
         self.rows.append(row)
         if note is not None:
             self.notes.append(note)
@@ -359,7 +361,7 @@ class _Report:
         self.notes = [note for note in self.notes if note.row != row]
 
     def answer(self, arrays: StepArrays, *, whole: bool, shared: bool) -> Answer:
-        """What is told; ``whole``: all environments of the worker are in it."""
+        """Return the answer to send.  ``whole``: it has all environments of the worker."""
         packed = arrays.pack(slice(None) if whole else self.rows, shared=shared)
         rows = None if whole else self.rows
         notes = in_band(self.notes) if self.notes else ()
@@ -367,7 +369,7 @@ class _Report:
 
 
 def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
-    """``made``: the ids of the environments before it, which are all still there."""
+    """Refuse an environment whose id is in ``made``: the ids of those that were made before."""
     newest = id(slot.env.unwrapped)
     if newest in made:
         raise ValueError(

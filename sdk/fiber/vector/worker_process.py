@@ -1,4 +1,4 @@
-"""A worker as its learner sees it: its process, its connection, what it was told."""
+"""Worker on the side of the learner: its process, its connection and its commands."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ NEWS = 2.0
 """Seconds that the news of a process's end may take after that of its connection."""
 
 GRACE = 5.0
-"""Seconds beyond what its environments may take, after which a worker is taken for stuck."""
+"""Seconds beyond the limits of its environments after which a worker counts as stuck."""
 
 LIMITS_OF_A_RESTART = 4
-"""How often ``timeout`` may pass for an environment that is made anew: the step, the end of the old
-one, the making of the new one, its step.
+"""Number of times that ``timeout`` may pass for an environment that is made anew: for its step, its
+end, the making of the new one, and the step of that.
 """
 
 
 class Pending(NamedTuple):
-    """What an environment was told and has not answered."""
+    """Command that an environment has not answered yet."""
 
     operation: str
     seed: int | None = None
@@ -37,40 +37,40 @@ class Pending(NamedTuple):
 
 
 class WorkerProcess:
-    """A worker, whose process is started anew if it dies."""
+    """Worker whose process is started anew if it dies."""
 
     process: Process
     connection: Connection
     arrays: StepArrays
-    """Those of its environments, once all have said hello."""
+    """Arrays of the worker's environments, once all workers have said hello."""
 
     def __init__(self, setup: Setup, context: BaseContext, owner: str) -> None:
         self.setup = setup
         self.name = f"{owner}-worker-{setup.worker}"
         self.numbers = range(setup.first, setup.first + len(setup.makes))
-        """Its environments."""
+        """Numbers of the worker's environments."""
         self._context = context
         self._wishes = largest(map(resources_of, setup.makes))
         self.hello: Hello | None = None
         self.generation = 0
-        """Of commands: what came before it, nobody waits for any more."""
+        """Number of the present generation of commands.  Answers to earlier ones are ignored."""
         self.pending: dict[int, Pending] = {}
-        """By row."""
+        """Unanswered commands by row."""
         self.results: list[Any] | None = None
-        """Of the call of methods that it was told last; None while that is awaited."""
+        """Results of the last call of methods; None while they are awaited."""
         self.deadline: float | None = None
         self.stuck = False
-        """Killed, since the deadline was over."""
+        """True if the worker was killed because its deadline had passed."""
         self.deaths = 0
-        """Of its processes since it answered anything, but for those that the cluster ended."""
+        """Number of its processes that died since the last answer, and not by the cluster."""
         self.disruptions = 0
-        """Of its processes that the cluster ended, or that moved, since it answered anything."""
+        """Number of its processes that the cluster ended, or that moved, since the last answer."""
         self.disrupted = False
-        """Whether the cluster ended the process before this one."""
+        """True if the cluster ended the process before this one."""
         self.lost: str | None = None
-        """What became of the process before this one."""
+        """Reason why the process before this one ended."""
         self.error: Exception | None = None
-        """Why there is none any more."""
+        """Error for which the worker was given up."""
 
     def start(self) -> None:
         """Start the process."""
@@ -96,7 +96,7 @@ class WorkerProcess:
         return str(popen.leaving)
 
     def whose(self) -> str:
-        """Its environments, for a person."""
+        """Return the names of the worker's environments, for messages."""
         first, last = self.numbers[0], self.numbers[-1]
         return f"environment {first}" if first == last else f"environments {first} to {last}"
 
@@ -142,13 +142,13 @@ class WorkerProcess:
         )
 
     def give_up(self) -> None:
-        """Nobody waits any more for what it was told."""
+        """Ignore the answers to all commands so far."""
         self.generation += 1
         self.pending.clear()
         self.deadline = None
 
     def set_deadline(self) -> None:
-        """It has been told something, or has answered: until when it has to answer the rest."""
+        """Set the time by which the worker must have answered the remaining commands."""
         timeout, told = self.setup.timeout, len(self.pending)
         self.deadline = None
         if timeout is not None and told:
@@ -156,8 +156,10 @@ class WorkerProcess:
             self.deadline = time.monotonic() + limits * timeout + GRACE
 
     def kill_if_stuck(self) -> None:
-        """Its own alarm ends what takes too long, unless that keeps the interpreter, or the process
-        is stopped or out of reach.
+        """Kill the worker if its deadline has passed.
+
+        Mostly the worker's own alarm ends a slow environment.  That fails where native code holds
+        the interpreter, and where the process is stopped or out of reach.
         """
         if self.deadline is not None and self.deadline < time.monotonic():
             self.deadline = None
@@ -166,14 +168,14 @@ class WorkerProcess:
             popen.kill_with_stack()
 
     def hang_up(self, *, kill: bool) -> None:
-        """Have it end: now, or when it hears that nobody listens."""
+        """Close the connection, at which the worker ends.  ``kill`` ends it at once."""
         self.connection.close()
         if kill:
             with contextlib.suppress(ValueError):  # closed just before Ctrl-C
                 self.process.kill()
 
     def close(self, timeout: float | None) -> None:
-        """Wait for its end; kill it when ``timeout`` is over."""
+        """Wait for the end of the process; kill it after ``timeout`` seconds."""
         self.connection.close()
         end(self.process, timeout)
 
@@ -187,7 +189,7 @@ class WorkerProcess:
 
 
 def end(process: Process, timeout: float | None) -> None:
-    """Wait for the end of a process; kill it when ``timeout`` is over."""
+    """Wait for the end of a process; kill it after ``timeout`` seconds."""
     with contextlib.suppress(ValueError):  # closed just before Ctrl-C
         process.join(timeout)
         if process.exitcode is None:

@@ -1,4 +1,4 @@
-"""The workers of a vector environment, and what any of them says."""
+"""Workers of a vector environment, and the messages of all of them."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from fiber.vector.worker_process import WorkerProcess, end
 
 
 class Ended:
-    """In place of a message: there will be no more from this process."""
+    """Mark in place of a message: this process sends no more."""
 
 
 class Unreadable(NamedTuple):
-    """In place of a message that cannot be unpickled here."""
+    """Mark in place of a message that cannot be unpickled here."""
 
     error: Exception
 
 
 class WorkerSet:
-    """Starts workers and listens to them all."""
+    """Set of workers that are started and listened to."""
 
     def __init__(self, workers: Sequence[WorkerProcess]) -> None:
         self._workers = workers
         self._started: list[WorkerProcess] = []
-        """Those whose process has to be closed."""
+        """Workers whose process must be closed."""
         self._released: list[Process] = []
         """Processes that were told to end while they were well."""
         self._ended: deque[WorkerProcess] = deque()
-        """Those of whose end we have heard, and not told."""
+        """Workers whose end was noticed, and not reported yet."""
         self._poller = select.epoll()
         self._heard_by: dict[int, WorkerProcess] = {}
-        """By descriptor."""
+        """Workers by descriptor."""
 
     def __iter__(self) -> Iterator[WorkerProcess]:
         return iter(self._workers)
@@ -48,20 +48,20 @@ class WorkerSet:
         """Start a worker's process, and listen to it."""
         worker.start()
         self._started.append(worker)
-        # A process that an environment has started may hold the connection open beyond the end of
-        # the worker: that is told by the sentinel.
+        # A process that an environment has started may hold the connection open after the end of
+        # the worker.  The sentinel shows that end.
         for descriptor in (worker.connection.fileno(), worker.process.sentinel):
             self._heard_by[descriptor] = worker
             self._poller.register(descriptor, select.EPOLLIN)
 
     def drop(self, worker: WorkerProcess) -> None:
-        """Let go of a process that has ended."""
+        """Close a process that has ended."""
         self._forget(worker)
         worker.close(0)
         self._started.remove(worker)
 
     def release(self, worker: WorkerProcess) -> None:
-        """Let go of a process that is well: it closes its environments, and ends."""
+        """Have a live process close its environments and end."""
         self._forget(worker)
         self._ended = deque(each for each in self._ended if each is not worker)
         worker.hang_up(kill=False)
@@ -70,21 +70,21 @@ class WorkerSet:
         self._started.remove(worker)
 
     def send(self, worker: WorkerProcess, data: bytes) -> None:
-        """Send a pickled command; if the worker is gone, that is the next thing to be heard."""
+        """Send a pickled command.  If the worker has ended, ``receive`` reports that next."""
         try:
             worker.connection.send_bytes(data)
         except OSError:
             self._ended.append(worker)
 
     def receive(self, timeout: float) -> list[tuple[WorkerProcess, Any]]:
-        """What workers say; nothing after ``timeout`` seconds."""
+        """Return messages of workers; none after ``timeout`` seconds."""
         heard: list[tuple[WorkerProcess, Any]] = []
         for descriptor, _ in self._poller.poll(0 if self._ended else timeout):
             worker = self._heard_by[descriptor]
             if descriptor == worker.process.sentinel:
                 heard += [(worker, message) for message in _rest(worker)]
                 self._ended.append(worker)
-            elif worker not in self._ended:  # else all that it said was heard already
+            elif worker not in self._ended:  # else all its messages were received already
                 try:
                     heard.append((worker, _received(worker)))
                 except (EOFError, OSError):
@@ -96,7 +96,7 @@ class WorkerSet:
         return heard
 
     def close(self, timeout: float | None) -> None:
-        """Wait until they have ended; kill those that have not when ``timeout`` is over."""
+        """Wait until all workers have ended; kill the others after ``timeout`` seconds."""
         deadline = None if timeout is None else time.monotonic() + timeout
 
         def left() -> float | None:
@@ -115,7 +115,7 @@ class WorkerSet:
         self._poller.close()
 
     def _forget(self, worker: WorkerProcess) -> bool:
-        """Listen to it no more; False if that is so already."""
+        """Stop listening to a worker; return False if that had happened before."""
         descriptors = [fd for fd, other in self._heard_by.items() if other is worker]
         for descriptor in descriptors:
             del self._heard_by[descriptor]
@@ -124,7 +124,7 @@ class WorkerSet:
 
 
 def _received(worker: WorkerProcess) -> Any:
-    """What a worker says next; EOFError or OSError at its end."""
+    """Return the next message of a worker; EOFError or OSError at its end."""
     message = worker.connection._recv_pickled()
     try:
         return packet.loads(message)
@@ -133,7 +133,7 @@ def _received(worker: WorkerProcess) -> Any:
 
 
 def _rest(worker: WorkerProcess) -> list[Any]:
-    """What a worker had said before it ended."""
+    """Return the messages that a worker sent before it ended."""
     messages = []
     try:
         while worker.connection.poll():
