@@ -110,7 +110,7 @@ class _Place(Protocol):
 
     @property
     def name(self) -> str:
-        """How its user calls it."""
+        """Name under which the module's code uses the object."""
 
     def read(self, module: ModuleType) -> object:
         """Return what it refers to now."""
@@ -185,7 +185,7 @@ class _Binding(NamedTuple):
 
 @dataclass
 class _State:
-    """What is in effect in one module, and how many Adoptions want it to be."""
+    """Bindings in effect in one module, and the number of Adoptions that hold them."""
 
     bindings: dict[_Place, _Binding] = field(default_factory=dict)
     holders: int = 0
@@ -218,7 +218,7 @@ def _resolve(module: str | ModuleType) -> ModuleType:
 
 
 def _plan(module: ModuleType, fiber: Any, *, adopted: bool) -> dict[_Place, _Binding]:
-    """What to rebind in the module, or AdoptionError with everything that is in the way."""
+    """Return what to rebind in the module; AdoptionError with everything that is in the way."""
     survey = _Survey(module, fiber)
     if survey.problems:
         raise AdoptionError(_refusal(module, survey.problems))
@@ -352,7 +352,7 @@ def _start_method(context: BaseContext) -> str | None:
 
 
 def _equivalent(value: Any, taken: str, fiber: Any) -> object:
-    """What Fiber has in the place of the value; LookupError if nothing."""
+    """Return what Fiber has in place of the value; LookupError if it has nothing."""
     try:
         if isinstance(value, BaseContext):
             return fiber.get_context(_start_method(value))
@@ -379,7 +379,7 @@ def _is_shared(value: object, taken: str, fiber: Any) -> bool:
 
 
 def _leftover(value: object, fiber: Any) -> str | None:
-    """What stays multiprocessing's where a value cannot be rebound; None if nothing does."""
+    """Return the name of what stays multiprocessing's in the module; None if nothing does."""
     if taken := _taken(value):
         return None if _is_shared(value, taken, fiber) else taken
     kind = type(value)

@@ -1,4 +1,4 @@
-"""One frozen configuration per program.
+"""Configuration of a program: one frozen object.
 
 From the weakest source to the strongest: defaults, `[tool.fiber]` in the nearest
 pyproject.toml upward from the working directory, environment variables (`FIBER_BACKEND` for
@@ -30,13 +30,13 @@ __all__ = ["Config", "current", "guard", "init", "install", "load", "use"]
 
 
 class _Rule(NamedTuple):
-    """What a key accepts; `check` gives the value to keep or raises ValueError."""
+    """Rule for the values of a key.  `check` returns the value to keep, or raises ValueError."""
 
     expects: str
     check: Callable[[object], object]
     from_text: Callable[[str], object] = str
     is_path: bool = False
-    """Whether a text is a path, relative to the folder of the file that it stands in."""
+    """True if a text is a path, relative to the folder of the file that it stands in."""
 
 
 def _choice(*choices: str) -> _Rule:
@@ -579,7 +579,7 @@ def _read_toml(path: str) -> dict[str, Any]:
 
 
 class _Module(ModuleType):
-    """This module, whose attributes with the names of keys are the configuration in force."""
+    """Class of this module.  Attributes with the names of keys are the configuration in force."""
 
     def __getattr__(self, name: str) -> object:
         if name in _KEYS:

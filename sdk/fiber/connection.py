@@ -86,7 +86,7 @@ _PF_EXITING = 0x4
 
 
 class Connection(Generic[_Sent_contra, _Received_co]):
-    """One end of a pipe.  EOFError when the last holder of the other end has closed it or died."""
+    """End of a pipe.  EOFError when the last holder of the other end has closed it or died."""
 
     def __init__(self, channel: Channel, readable: bool = True, writable: bool = True) -> None:
         if isinstance(channel, int):
@@ -175,7 +175,7 @@ class Connection(Generic[_Sent_contra, _Received_co]):
         return len(data)
 
     def poll(self, timeout: float | None = 0.0) -> bool:
-        """Whether there is something to receive (or the end), waiting up to ``timeout`` seconds."""
+        """Tell whether ``recv`` would return or raise at once, after up to ``timeout`` seconds."""
         channel = self._channel
         if channel is None or not self._readable:
             raise self._misuse("write-only")
@@ -217,17 +217,17 @@ class Connection(Generic[_Sent_contra, _Received_co]):
 
     @property
     def closed(self) -> bool:
-        """Whether this end was closed."""
+        """True if this end was closed."""
         return self._channel is None
 
     @property
     def readable(self) -> bool:
-        """Whether it can receive."""
+        """True if this end can receive."""
         return self._readable
 
     @property
     def writable(self) -> bool:
-        """Whether it can send."""
+        """True if this end can send."""
         return self._writable
 
     def __enter__(self) -> Self:
@@ -274,7 +274,7 @@ def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
 
 
 def how_it_ended(process: Any) -> str | None:
-    """How a process of ours, whose end of a connection has closed, ended; None if it has not."""
+    """Return how a child ended whose end of a connection has closed; None if it still runs."""
     popen = getattr(process, "_popen", None)
     if popen is None:
         return None

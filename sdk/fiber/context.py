@@ -394,10 +394,10 @@ class BaseContext:
         methods.preload[:] = module_names
 
     def freeze_support(self) -> None:
-        """Nothing: frozen executables exist on Windows only."""
+        """Do nothing: frozen executables exist on Windows only."""
 
     def allow_connection_pickling(self) -> None:
-        """Nothing: connections always pickle."""
+        """Do nothing: connections always pickle."""
 
     def get_logger(self) -> logging.Logger:
         """multiprocessing's logger, which Fiber shares."""

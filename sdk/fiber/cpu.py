@@ -1,4 +1,4 @@
-"""How many CPUs this process may use, which in a container is not what the host has."""
+"""Number of CPUs that this process may use, which in a container is not that of the host."""
 
 from __future__ import annotations
 

@@ -360,7 +360,7 @@ _ADVICE_BY_WORD = {
     "WrongAnswer": "only Fiber itself writes to the channel of a worker. Look for code in the task "
     "or its libraries that does so, or that writes to descriptors which are not its own.",
 }
-"""By the first word of the reason: Kubernetes' for the end of a pod, or Fiber's."""
+"""Advice by the first word of the reason: Kubernetes' for the end of a pod, or Fiber's."""
 
 
 def _advice(exitcode: int | None, reason: str, stack: str) -> str:

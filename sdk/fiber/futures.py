@@ -145,7 +145,7 @@ class Executor(concurrent.futures.Executor):
         disruptions: int | None = None,
         timeout: float | None = None,
     ) -> Executor:
-        """This executor, with options for what is submitted through what this returns.
+        """Return this executor with options for the tasks that are submitted through the result.
 
         ``executor.options(memory="8Gi", retries=0).submit(f)``, as Ray spells it.  The options
         from ``cpu`` to ``tolerations`` are wishes as in ``fiber.meta``; tasks with different wishes
@@ -262,7 +262,7 @@ class Executor(concurrent.futures.Executor):
 
 
 ProcessPoolExecutor = Executor
-"""What concurrent.futures' users look for."""
+"""Name of the executor for programs that were written for concurrent.futures."""
 
 
 def _close_queues(queues: dict[Engine, CallQueue]) -> None:

@@ -10,11 +10,11 @@ _configuration: bytes | None = None
 
 
 def keep(pickled: bytes) -> None:
-    """In a child: the pickled ``Config`` of its parent."""
+    """Keep the pickled ``Config`` of the parent, in a child."""
     global _configuration
     _configuration = pickled
 
 
 def configuration() -> bytes | None:
-    """What was kept."""
+    """Return the pickled ``Config`` of the parent; None in a program."""
     return _configuration

@@ -79,14 +79,14 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         self._given = executor
         self._own: _Own | None = None
         self._workers: Executor | None = None
-        """That of the loops that run."""
+        """Executor of the loops that run."""
         self._arguments: MemmappedArguments | None = None
         self._loops: deque[None] = deque()
-        """One for each: a loop over another's generator has the same backend."""
+        """An entry for each loop that runs: nested generators share one backend."""
         self._unfinished: set[Future[Any]] = set()
 
     def effective_n_jobs(self, n_jobs: int | None) -> int:
-        """How many tasks run at a time."""
+        """Return the number of tasks that run at a time."""
         if n_jobs == 0:
             raise ValueError("n_jobs == 0 in Parallel has no meaning")
         if n_jobs is None:
@@ -127,10 +127,10 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         return future
 
     apply_async = submit
-    """Its name before joblib 1.5."""
+    """Name of ``submit`` before joblib 1.5."""
 
     def retrieve_result_callback(self, out: Future[Any]) -> Any:
-        """What became of a batch."""
+        """Return the results of a batch, or raise its error."""
         return out.result()
 
     def abort_everything(self, ensure_ready: bool = True) -> None:
@@ -179,7 +179,7 @@ class _Own:
         self.executor = Executor(workers, **prepared)
 
     def was_made_with(self, wanted: tuple[Any, ...]) -> bool:
-        """Whether another one would be the same."""
+        """Tell whether a new executor with these arguments would be the same."""
         try:
             return bool(self._made_with == wanted)
         except Exception:  # as arrays have it that are compared
@@ -187,7 +187,7 @@ class _Own:
 
 
 _kept: deque[_Own] = deque()
-"""That of the last loop, for the next one: starting workers takes longer than many a loop."""
+"""Executor of the last loop, kept for the next: starting workers often takes longer than a loop."""
 
 
 def _take(wanted: tuple[Any, ...]) -> _Own | None:
@@ -208,7 +208,7 @@ def _keep(own: _Own) -> None:
 def _prepare(
     threads: dict[str, str], initializer: Callable[..., object] | None, initargs: Iterable[Any]
 ) -> None:
-    """In a worker: leave its neighbours their processors; ``threads`` are joblib's variables."""
+    """Limit the threads of this worker to its share; ``threads`` are joblib's variables."""
     os.environ.update(threads)
     try:
         from threadpoolctl import threadpool_limits

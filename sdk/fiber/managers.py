@@ -233,7 +233,7 @@ class BaseManager(mp_managers.BaseManager):
 
     @staticmethod
     def _end(process: Process, known: list[Any], *rest: Any) -> None:
-        """What ``shutdown`` does, and the program's end, and the garbage collector."""
+        """End the server: in ``shutdown``, at the program's end, or from the garbage collector."""
         if runtime().loop.on_thread():  # collected there: the loop must not wait for itself
             threading.Thread(target=BaseManager._end, args=(process, known, *rest)).start()
             return
@@ -280,17 +280,17 @@ class SharedMemoryManager(BaseManager):
 
 
 class _MemoryNames:
-    """In the server of a SharedMemoryManager: what it removes when it ends."""
+    """Names that the server of a SharedMemoryManager removes when it ends."""
 
     def __init__(self) -> None:
         self._names: list[str] = []
 
     def host(self) -> str:
-        """Where it is."""
+        """Return the host of the server."""
         return hub_client.host()
 
     def append(self, name: str) -> None:
-        """Remove this, too."""
+        """Add a name to remove."""
         if not self._names:
             Finalize(None, _unlink_all, (self._names,), exitpriority=10)
         self._names.append(name)
@@ -347,7 +347,7 @@ class AsyncManager(BaseManager):
     def register(
         cls, typeid: str, callable: Any = None, proxytype: Any = None, *args: Any, **options: Any
     ) -> None:
-        """As ``BaseManager.register``; ``proxytype`` is ``AsyncBaseProxy`` or a subclass."""
+        """Register a type as ``BaseManager.register`` does; proxies are ``AsyncBaseProxy``."""
         super().register(typeid, callable, proxytype or AsyncBaseProxy, *args, **options)
 
 

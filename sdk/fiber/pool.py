@@ -167,10 +167,10 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> AsyncResult[_T]:
-        """As ``apply``, but return at once with a result to wait for.
+        """Call as ``apply`` does, but return at once with a result to wait for.
 
-        In another thread ``callback`` is called with the result, or ``error_callback`` with what
-        was raised; both must be quick, since all of a pool's callbacks wait for each other.
+        Another thread calls ``callback`` with the result, or ``error_callback`` with the error.
+        Both must be quick, since the callbacks of a pool run one after the other.
         """
         self._check_running(func)
         result = AsyncResult(self, callback, error_callback)
@@ -273,7 +273,7 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> MapResult[_T]:
-        """As ``map_async``, for ``starmap``."""
+        """Call as ``starmap`` does, but return at once with a result to wait for."""
         result = MapResult(self, callback, error_callback)
         self._map_async(work.STAR, func, iterable, chunksize, timeout, result)
         return result
@@ -430,7 +430,7 @@ class Pool:
         return list(self._executor.workers.processes())
 
     def _repopulate_pool(self) -> None:
-        """Nothing: workers are replaced as they go."""
+        """Do nothing: workers are replaced when they end."""
 
     def _check_running(self, func: Callable[..., Any] | None = None) -> None:
         self._check_owner()

@@ -60,7 +60,7 @@ class Process(BaseProcess):
         return Popen(self, zygote_method(self._start_method), self._on_exit())
 
     def _on_exit(self) -> Callable[[], None]:
-        """What its ``Popen`` calls once ``returncode`` is set."""
+        """Return the function that its ``Popen`` calls once ``returncode`` is set."""
         return partial(_ended.append, weakref.ref(self))
 
     def start(self) -> None:
@@ -83,14 +83,14 @@ class Process(BaseProcess):
             _mp._children.add(self)  # type: ignore[attr-defined]
         except BaseException:
             if popen is not None:
-                popen.kill()  # an interruption: nobody has been told of it
+                popen.kill()  # an interruption: its caller does not know of it
             raise
         if self._popen.returncode is not None:  # its end came first, and found nothing to drop
             _mp._children.discard(self)  # type: ignore[attr-defined]
 
 
 def _drop_ended() -> None:
-    """What multiprocessing's ``_cleanup`` does by asking every child, whatever became of it."""
+    """Forget ended children.  multiprocessing's ``_cleanup`` asks every child instead."""
     while _ended:
         try:
             process = _ended.popleft()()
@@ -143,7 +143,7 @@ class PoolProcess(Process):
 
     @property
     def sentinel(self) -> int:
-        """As in multiprocessing."""
+        """Descriptor that becomes ready when the process ends, as in multiprocessing."""
         self._check_closed()  # type: ignore[attr-defined]
         assert self._handle is not None
         return self._handle.exit_descriptor()
@@ -156,7 +156,7 @@ def process_type(method: str) -> type[Process]:
 
 
 def _disown() -> None:
-    """In a process forked by someone else: the other one's processes are not its to end."""
+    """Forget the children of the parent, in a process that was forked without Fiber."""
     children: set[BaseProcess] = _mp._children  # type: ignore[attr-defined]
     children -= {child for child in children if isinstance(child, Process)}
 

@@ -135,22 +135,22 @@ class Queue(Generic[_T]):
         return self.get(False)
 
     def qsize(self) -> int:
-        """How many items were put and not yet gotten.
+        """Return the number of items that were put and not yet gotten.
 
-        Of a queue without a maximum, those that wait in another process for room are not counted.
+        In a queue without a maximum, items that wait in another process for room do not count.
         """
         return self._feeder.size()
 
     def empty(self) -> bool:
-        """Whether ``get`` would wait."""
+        """Tell whether ``get`` would wait."""
         return not self._inbox.poll(0)
 
     def full(self) -> bool:
-        """Whether ``put`` would wait."""
+        """Tell whether ``put`` would wait."""
         return self._slots.full()
 
     def close(self) -> None:
-        """This process puts and gets no more.  What it has put still gets sent."""
+        """Put and get no more in this process.  Items that it has put are still sent."""
         self._closed = True
         self._reader.close()
         self._feeder.close()
@@ -208,7 +208,7 @@ class JoinableQueue(Queue[_T]):
                 self._unfinished.take(0)
 
     def task_done(self) -> None:
-        """One item is dealt with; ValueError if all were before."""
+        """Note that an item is done; ValueError if all were done before."""
         if not self._unfinished.take(0):
             raise ValueError("task_done() called too many times")
         if not self._unfinished.wait(0):
@@ -241,15 +241,15 @@ class SimpleQueue(Generic[_T]):
         return item
 
     def empty(self) -> bool:
-        """Whether ``get`` would wait."""
+        """Tell whether ``get`` would wait."""
         return not self._poll()
 
     def _poll(self, timeout: float | None = 0.0) -> bool:
-        """What some libraries call to wait with a timeout."""
+        """Wait up to ``timeout`` seconds for an item.  Some libraries call this method."""
         return self._reader.poll(timeout)
 
     def close(self) -> None:
-        """This process puts and gets no more."""
+        """Put and get no more in this process."""
         self._reader.close()
         self._writer.close()
 
@@ -293,11 +293,11 @@ class SimpleQueuePush(Generic[_T]):
         return item
 
     def empty(self) -> bool:
-        """Whether ``get`` would wait."""
+        """Tell whether ``get`` would wait."""
         return not self._joined().poll()
 
     def close(self) -> None:
-        """This process puts and gets no more."""
+        """Put and get no more in this process."""
         self._writer.close()
         self._door.close()
         if self._reader is not None:

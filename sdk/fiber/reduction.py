@@ -1,4 +1,4 @@
-"""How objects become bytes: plain pickle first, cloudpickle where that fails.
+"""Pickling of objects: plain pickle first, cloudpickle where that fails.
 
 multiprocessing's ``ForkingPickler`` and its registered reducers are used as they are, so that what
 pickles there pickles here.  Lambdas, closures and classes of an interactive session, which do not
@@ -57,7 +57,7 @@ __all__ = [
 AbstractReducer = mp_reduction.AbstractReducer
 
 REFUSALS = (TypeError, pickle.PicklingError)
-"""What picklers raise for what they cannot do."""
+"""Errors that picklers raise for objects that they cannot pickle."""
 
 _DEPTH = 20
 _BREADTH = 1000
@@ -70,7 +70,7 @@ class InheritedDescriptor:
         self._index = index
 
     def detach(self) -> int:
-        """In the child: the descriptor itself, once."""
+        """Return the descriptor itself, in the child and once."""
         return child.take_descriptor(self._index)
 
 
@@ -78,14 +78,12 @@ class InheritedSegment(InheritedDescriptor):
     """The same for shared memory, of which each block has a handle."""
 
     def detach(self) -> int:
-        """In the child: a duplicate of the descriptor, for each of them."""
+        """Return a duplicate of the descriptor, in the child."""
         return child.duplicate_descriptor(self._index)
 
 
 class Spawning:
-    """What multiprocessing calls the spawning popen: collects descriptors while a Process is
-    pickled.
-    """
+    """Collector of descriptors while a Process is pickled: multiprocessing's "spawning popen"."""
 
     DupFd = InheritedDescriptor
 
@@ -103,12 +101,12 @@ class Spawning:
         return inherited
 
     def duplicate_for_child(self, fd: int) -> int:
-        """Send ``fd`` along; the index under which the child finds it."""
+        """Send ``fd`` along; return the index under which the child finds it."""
         self.fds.append(opened(os.dup, fd))
         return len(self.fds) - 1
 
     def forget(self) -> None:
-        """It is pickled anew, in another way."""
+        """Drop what was collected: the object is pickled anew, in another way."""
         self.fds.clear()
         self._segments.clear()
         handles.undo_pickling()
@@ -269,7 +267,7 @@ class RemoteSpawning:
         )
 
     def forget(self) -> None:
-        """It is pickled anew, in another way."""
+        """Drop what was collected: the object is pickled anew, in another way."""
         handles.undo_pickling()
 
     DupFd = duplicate_for_child
@@ -313,7 +311,7 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
 
 
 def encode_revocable(obj: Any) -> tuple[bytes, list[memoryview], Callable[[], None]]:
-    """As ``encode``, for what may not be sent: call the third value in this case."""
+    """Encode an object that may not be sent.  Call the third value in that case."""
     pickling = handles.begin_pickling()
     try:
         return *_encode(obj), pickling.take_back
@@ -337,7 +335,7 @@ def _encode(obj: Any) -> tuple[bytes, list[memoryview]]:
 
 
 def encode_reusable(obj: Any) -> tuple[bytes, list[memoryview], handles.GrantSet | None]:
-    """As ``encode``, for what may be unpickled several times, as a task that runs again.
+    """Encode an object that may be unpickled several times, such as a task that runs again.
 
     Connections and queues in it can be unpickled for as long as the third value is kept.
     """
@@ -355,8 +353,9 @@ def dump(obj: Any, file: Any, protocol: int | None = None) -> None:
 
 
 def main_is_out_of_reach() -> bool:
-    """Whether those who read our pickles cannot import our ``__main__``, or must not: it goes by
-    value.
+    """Tell whether objects of ``__main__`` must travel by value.
+
+    They must if the processes that read our pickles cannot import ``__main__``, or must not.
     """
     if _readers_are_remote or "ps1" in vars(sys):  # what an interactive session adds has no file
         return True
@@ -367,7 +366,7 @@ def main_is_out_of_reach() -> bool:
 
 @lru_cache(maxsize=1)
 def _importable(name: str | None, file: str | None) -> bool:
-    """Whether a main module can be imported as ``__mp_main__``: by name if it has one."""
+    """Tell whether a main module can be imported as ``__mp_main__``, by name if it has one."""
     if name is not None:
         # To import the one of a package, folder or archive is to run it: few have a guard.
         return name.rpartition(".")[2] != "__main__"

@@ -136,7 +136,7 @@ def with_resources(function: _F, wishes: Resources) -> _F:
 
 
 def largest(wishes: Iterable[Resources]) -> Resources:
-    """Of each resource the most that any of them wishes, and the nodes that suit them all.
+    """Return the largest wish for each resource, and the nodes that suit all wishes.
 
     They have no pool. ValueError if two wish different values of one label of a node.
     """
@@ -162,7 +162,7 @@ def largest(wishes: Iterable[Resources]) -> Resources:
 
 
 def merged(inner: Resources, outer: Resources) -> Resources:
-    """What ``inner`` wishes and ``outer`` adds or wishes otherwise."""
+    """Return the wishes of ``inner``, with those of ``outer`` added or in their place."""
     return Resources(
         cpu=inner.cpu if outer.cpu is None else outer.cpu,
         memory=inner.memory if outer.memory is None else outer.memory,

@@ -1,4 +1,4 @@
-"""What a pool's calls return: results to wait for, and iterators over results.
+"""Results of a pool's calls: objects to wait for, and iterators.
 
 As in ``multiprocessing.pool``, with what that leaves open promised: a result of a pool that is
 terminated or cannot go on raises an error instead of waiting for ever.
@@ -26,7 +26,7 @@ from fiber._runtime.work_items import WorkItem
 __all__ = ["ApplyResult", "AsyncResult", "IMapIterator", "IMapUnorderedIterator", "MapResult"]
 
 SLICEABLE = (tuple, range, str, bytes)
-"""What is mapped as it is: nobody changes it, and parts of it are cheap."""
+"""Types that are mapped without a copy: they do not change, and slices of them are cheap."""
 
 _T = TypeVar("_T")
 _ErrorCallback = Callable[[BaseException], object]
@@ -73,11 +73,11 @@ class ApplyResult(Generic[_T]):
         self._settling = threading.RLock()
 
     def ready(self) -> bool:
-        """Whether the call has completed."""
+        """Tell whether the call has completed."""
         return self._awaited().is_set()
 
     def successful(self) -> bool:
-        """Whether it completed without raising; ValueError if it has not completed."""
+        """Tell whether the call completed without raising; ValueError if it has not completed."""
         if not self.ready():
             raise ValueError(f"{self!r} not ready")
         return type(self._settled()) is not Failure
@@ -109,11 +109,11 @@ class ApplyResult(Generic[_T]):
         return False
 
     def has_room(self) -> bool:
-        """Always: whoever wants it wants all of it."""
+        """Return True: the caller wants all results at once."""
         return True
 
     def lift_bound(self) -> None:
-        """There is none."""
+        """Do nothing: there is no bound."""
 
     def set_done(self) -> None:
         """All outcomes are there: call back, then let those go on who wait."""
@@ -126,7 +126,7 @@ class ApplyResult(Generic[_T]):
             self._complete()
 
     def set_exception(self, error: BaseException) -> None:
-        """There will be no outcome."""
+        """Fail the call with ``error``."""
         self._outcome = Failure(error)
         self._mixed = False
         self.set_done()
@@ -248,17 +248,17 @@ class _Buffer:
         self.items: deque[Any] = deque()
         self.finished = False
         self.stream: InputStream | None = None
-        """What reads no more than is consumed, if that was asked for."""
+        """Reader that reads no more than is consumed, if that was asked for."""
         self.pool: Keeper | None = pool
         self.resume: Callable[[], None] | None = None
-        """Has the executor look whether there is room, after ``add_results`` asked for no more."""
+        """Function that asks the executor for more, after ``add_results`` asked for no more."""
         self._waiters = Waiters()
         self._abandoned = False
         self._bounded = True
         self._passed = 0  # results that were put into ``items``
         self._held = 0  # bytes, of which some may have been taken since it was last looked
         self._sizes: deque[tuple[int, int]] = deque()
-        """How many results were passed on up to some point, and bytes of those since the last."""
+        """Pairs: number of results passed on so far, and bytes of those since the pair before."""
         self._resume_at = -1  # results that are left then; -1: nothing is held back
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
@@ -281,7 +281,7 @@ class _Buffer:
         self._sizes.append((self._passed, size))
 
     def consumed(self) -> int:
-        """How many the user took; on the loop's thread."""
+        """Return the number of results that the user took.  On the loop's thread."""
         return self._passed - len(self.items)
 
     def _is_full(self) -> bool:
@@ -300,7 +300,7 @@ class _Buffer:
         return self._held >= HELD
 
     def has_room(self) -> bool:
-        """Whether half of what was held back for is read, or nobody will read it."""
+        """Tell whether half of the held results were read, or the reader has gone."""
         if self._abandoned:
             self._drop()
         elif self._resume_at < len(self.items):
@@ -314,7 +314,7 @@ class _Buffer:
         self._resume_at = -1
 
     def abandon(self) -> None:
-        """Nobody will read results: keep none, and hold back no task for them.  From anywhere."""
+        """Drop the results, and hold back no task for them: the reader has gone.  From anywhere."""
         self._abandoned = True
         if self.resume is not None:
             self.resume()
@@ -343,7 +343,7 @@ class _Buffer:
         self._waiters.wake()
 
     def set_exception(self, error: BaseException) -> None:
-        """There will be no more outcomes."""
+        """End the results with ``error``."""
         self.items.append(Failure(error))
         self.set_done()
 

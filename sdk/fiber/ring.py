@@ -39,7 +39,7 @@ def current() -> Member:
 
 
 class _End(NamedTuple):
-    """What members are told of one that has ended."""
+    """Message to members about one that has ended."""
 
     rank: int
     lost: bool
@@ -102,7 +102,7 @@ class Member:
         return received
 
     def _await_end(self, rank: int) -> NoReturn:
-        """Its connection has closed: the reason, or the loss that made it end, is on its way."""
+        """Wait for the reason why a member ended, whose connection has closed, and raise it."""
         while rank not in self._ends:
             self._hear()
         first = next((end for end in self._ends.values() if end.lost), self._ends[rank])
@@ -188,7 +188,7 @@ def _attend(channels: list[Connection]) -> list[Any]:
 
 
 def _outcome(rank: int, channel: Connection) -> tuple[_End, Any, BaseException | None]:
-    """How a member ended, its result, and what is to be raised."""
+    """Return how a member ended, its result, and the error to raise."""
     try:
         result, error = channel.recv()
     except ConnectionClosed as closed:
@@ -204,7 +204,7 @@ def _outcome(rank: int, channel: Connection) -> tuple[_End, Any, BaseException |
 
 
 def _tell(end: _End, running: dict[int, Connection], size: int) -> None:
-    """All hear of a loss, neighbours of any end."""
+    """Send a loss to all members, and any other end to the neighbours."""
     neighbours = {(end.rank - 1) % size, (end.rank + 1) % size}
     for rank in running if end.lost else neighbours & running.keys():
         with contextlib.suppress(BrokenPipeError, ConnectionClosed):
@@ -222,7 +222,7 @@ def _run(
     initializer: Callable[..., object] | None,
     initargs: tuple[Any, ...],
 ) -> None:
-    """What the process of a member does."""
+    """Run a member: the target of its process."""
     global _member
     _member = member
     try:

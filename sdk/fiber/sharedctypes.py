@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     Locked: TypeAlias = Literal[True] | LockLike
     """Values of ``lock=`` for an object that is to have a lock."""
     Size: TypeAlias = int | Sequence[Any]
-    """How many elements an array has, or their values."""
+    """Number of elements of an array, or their values."""
 
     _CT = TypeVar("_CT", bound=_CData)
 _T = TypeVar("_T")

@@ -1,4 +1,4 @@
-"""What is sent of the program to workers on other machines, and what is not.
+"""Files of the program that are sent to workers on other machines, and those that are not.
 
     print(fiber.shipping.listing())
 
@@ -53,7 +53,7 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """What a program's workers get, and what they do not get.  ``str()`` is a table of it."""
+    """Files that workers get, and files that they do not get.  ``str()`` is a table of them."""
 
     sent: tuple[Sent, ...]
     left_out: tuple[LeftOut, ...]
@@ -65,7 +65,7 @@ class Listing:
 
     @property
     def too_large(self) -> bool:
-        """Whether a pool would refuse to send that much, with ``ProgramTooLarge``."""
+        """True if a pool would refuse to send that much, with ``ProgramTooLarge``."""
         return self.size > program_files.LIMIT or len(self.sent) > program_files.MOST_FILES
 
     def __repr__(self) -> str:

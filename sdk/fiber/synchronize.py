@@ -48,11 +48,11 @@ __all__ = [
 _T = TypeVar("_T")
 
 RECHECK = 1.0
-"""Seconds after which whoever waits for a bell looks for itself: its ringer may have died."""
+"""Seconds after which a waiter looks for itself: the process that should wake it may have died."""
 
 
 class SemLock:
-    """What all locks and semaphores are: tokens that are acquired and released.
+    """Base of all locks and semaphores: tokens that are acquired and released.
 
     They pickle at any time and not only while a process is started: through a queue, as a task's
     argument.  What a process has when it dies is released for it, with a RuntimeWarning that names
@@ -351,7 +351,7 @@ class Barrier(threading.Barrier):
             raise threading.BrokenBarrierError
 
     def _bury(self) -> int:
-        """How many members died; they wait no more, and are not counted."""
+        """Stop counting members that died; return their number."""
         died = self._cond._waiters.bury() + self._members.bury()
         if died:
             self._members.set(1, self._members.held())
@@ -401,7 +401,7 @@ class Event:
         self._bell: SharedCounter = LocalCounter.create()
 
     def is_set(self) -> bool:
-        """Whether the flag is set."""
+        """Tell whether the flag is set."""
         return self._flag.wait(0)
 
     def set(self) -> None:
