@@ -21,7 +21,7 @@ Words: TypeAlias = tuple[Any, ...]
 among the values, if they are mixed, are ``Pickled`` ones; ``size`` is that of the message."""
 
 OTHER = object()
-"""In place of a result: the message is something else."""
+"""Mark in place of a result: the message is something else."""
 
 
 def single(message: Message, seq: int) -> Any:

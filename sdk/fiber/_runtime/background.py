@@ -49,7 +49,7 @@ class BackgroundThread:
         return True
 
     def runs_here(self) -> bool:
-        """Whether it runs the caller, who then must not wait for what it would do next."""
+        """Tell whether the caller runs on this thread, and so must not wait for it."""
         return threading.current_thread() is self._thread
 
     def stop(self, then: Callable[[], object] | None = None) -> None:

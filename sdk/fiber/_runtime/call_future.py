@@ -42,17 +42,17 @@ class CallFuture(Future[_T]):
         self._threads = executor.threads
         self._queue = queue
         self._undecided = bytearray(1)  # which the collector has no work with
-        """Whoever takes it out decides: to give the call to a worker, or to cancel it."""
+        """Token of a decision.  The side that takes it out runs the call, or cancels it."""
         self._claimed: bool | None = None
 
     def __await__(self) -> Generator[Any, None, _T]:
-        """Its result; who is cancelled while waiting for it cancels it."""
+        """Await the result.  A task that is cancelled meanwhile cancels the call."""
         import asyncio  # who awaits has it already, and it takes long to import
 
         return asyncio.wrap_future(self).__await__()
 
     def cancel(self) -> bool:
-        """As in concurrent.futures; ``wait`` and ``as_completed`` hear of it in a moment."""
+        """Cancel as in concurrent.futures.  ``wait`` and ``as_completed`` notice it in a moment."""
         if not (self._decide() or self.cancelled()):
             return False
         super().cancel()
@@ -60,11 +60,11 @@ class CallFuture(Future[_T]):
         return True
 
     def cancelled(self) -> bool:
-        """As in concurrent.futures, without its lock: the loop asks."""
+        """Tell whether the call was cancelled.  It takes no lock, as the loop asks too."""
         return self._claimed is False or self._state in (CANCELLED, CANCELLED_AND_NOTIFIED)
 
     def result(self, timeout: float | None = None) -> _T:
-        """As in concurrent.futures; each call raises a new exception."""
+        """Return the result as in concurrent.futures.  Each call raises a new exception."""
         error = self._error(timeout)
         if error is not None:
             raise fresh(error)
@@ -72,7 +72,7 @@ class CallFuture(Future[_T]):
         return result  # type: ignore[no-any-return]
 
     def exception(self, timeout: float | None = None) -> BaseException | None:
-        """As in concurrent.futures; each call returns a new exception."""
+        """Return the exception as in concurrent.futures.  Each call returns a new one."""
         error = self._error(timeout)
         return error and fresh(error)
 
@@ -94,7 +94,7 @@ class CallFuture(Future[_T]):
     # What the executor says, on the loop's thread
 
     def claim(self) -> bool:
-        """It is about to run, unless it was cancelled."""
+        """Claim the call for a worker; return False if it was cancelled."""
         if self._claimed is None:
             self._claimed = self._decide()
             if self._claimed:
@@ -117,17 +117,17 @@ class CallFuture(Future[_T]):
         return False
 
     def set_done(self) -> None:
-        """It was with its outcome."""
+        """Do nothing: a call is done with its outcome."""
 
     def has_room(self) -> bool:
-        """Always: whoever wants it wants all of it."""
+        """Return True: one outcome always has room."""
         return True
 
     def lift_bound(self) -> None:
-        """There is none."""
+        """Do nothing: there is no bound."""
 
     def set_exception(self, exception: BaseException | None) -> None:
-        """There will be no outcome, or this is it."""
+        """Set an exception as the outcome, or in place of one."""
         if self.claim() and exception is not None:
             error = translated(exception, self._executor)
             self._locked(partial(super().set_exception, error))
@@ -191,7 +191,7 @@ def translated(error: BaseException, executor: Executor) -> BaseException:
 
 
 def broken(error: BaseException) -> BrokenProcessPool:
-    """What those hear whose calls no worker will run, because of ``error``."""
+    """Return the exception of calls that no worker will run, because of ``error``."""
     raised = BrokenProcessPool(f"the executor is broken: {error}")
     raised.__cause__ = error
     return raised

@@ -35,12 +35,12 @@ class CallQueue:
             work.CALLS, exact=True, timeout=timeout, limits=limits, cancellable=cancellable
         )
         self.called: deque[Call] = deque()
-        """Those that the loop has not taken.  Any thread appends."""
+        """Calls that the loop has not taken.  Any thread appends."""
         self.stale = False
-        """Whether the loop is about to drop those that were cancelled."""
+        """True while the loop is about to drop cancelled calls."""
         self.watched = False
-        """Whether the loop is about to look for more, and need not be told.  Only the loop says so:
-        whoever is interrupted while calling leaves it as it is."""
+        """True while the loop is about to look for more calls, and need not be told.  Only the loop
+        sets it, so an interrupted caller leaves it as it is."""
 
 
 class Calls:
@@ -65,14 +65,14 @@ class Calls:
         self._refusal = refusal
         self._advance = advance
         self._queues: dict[CallQueue, None] = {}
-        """Those with open jobs."""
+        """Queues with open jobs."""
         self._without_options = CallQueue()
         self._took = -math.inf
 
     # Any thread
 
     def put(self, call: Call, queue: CallQueue | None = None) -> None:
-        """One more call; None: without options."""
+        """Add a call.  Without ``queue`` it has no options."""
         if queue is None:
             queue = self._without_options
         queue.called.append(call)
@@ -106,7 +106,7 @@ class Calls:
             self._close(queue)
 
     def cancel_all(self) -> None:
-        """Nobody wants those any more that no worker was given, where they can be cancelled."""
+        """Cancel the calls that no worker was given, where they can be cancelled."""
         self.take_all()
         for queue in self._queues:
             if queue.item.cancellable and queue.item.job is not None:

@@ -1,4 +1,4 @@
-"""What the first process or pool of a program does before it imports the rest of Fiber."""
+"""First steps of a program's first process or pool, before the rest of Fiber is imported."""
 
 from __future__ import annotations
 

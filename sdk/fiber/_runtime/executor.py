@@ -74,7 +74,7 @@ class Executor:
         self.options = options
         self.threads = UserThreads(thread)
         self.ended = Latch()
-        """Nobody is left."""
+        """Set when the last worker has ended."""
         self._host = host
         self._elastic = host.elastic
         self._loop: Loop = host.loop
@@ -134,7 +134,7 @@ class Executor:
         """The calls of single functions."""
         self._wake: Timer | None = None
         self._ended_by: BaseException | None = None
-        """What those hear whose calls are not done when the pool is terminated."""
+        """Error of calls that are not done when the pool is terminated."""
         self._acting = False
         self._again = False
 
@@ -183,7 +183,7 @@ class Executor:
         timeout: float | None = None,
         queue: CallQueue | None = None,
     ) -> None:
-        """One call of a function; ``queue`` has the options of several, ``timeout`` this one's."""
+        """Submit a call.  ``queue`` has options of several calls, ``timeout`` is its own."""
         call = pickle_call(future, function, args, kwargs, self.reject)
         if call is None:
             return
@@ -232,7 +232,7 @@ class Executor:
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
 
     def reject(self, future: Future, error: BaseException) -> None:
-        """What was asked for cannot begin; its future hears so on the loop, as of all else."""
+        """Fail ``future``, whose call cannot begin.  It is set on the loop's thread, as always."""
         self._check()
         self._loop.call_soon(future.set_exception, error)
 
@@ -264,13 +264,13 @@ class Executor:
         self._loop.call_soon(self._start_reading, item, iterable)
 
     def finish(self, item: WorkItem, error: BaseException | None = None) -> None:
-        """Its stream has no more tasks; ``error``, if any, takes the place of the next one."""
+        """End the stream of ``item``.  An ``error`` takes the place of the next task."""
         self._loop.call_soon(self._finish, item, error)
 
     def cancel(self, item: WorkItem) -> None:
-        """Nobody wants the rest of it any more; what runs is left to end.
+        """Drop the tasks of ``item`` that have not begun.  Running tasks go on.
 
-        Nothing if it was never submitted, or is done.
+        Do nothing if the item was never submitted, or is done.
         """
         self._loop.call_soon(self._cancel, item)
 
@@ -279,7 +279,7 @@ class Executor:
         self._loop.call_soon(self._resume, item)
 
     def cancel_all(self, error: BaseException) -> None:
-        """Nobody wants what has not begun any more: cancel calls, end maps with ``error``."""
+        """Drop all tasks that have not begun: cancel calls, and end maps with ``error``."""
         self._loop.call_soon(self._cancel_all, error)
 
     def close(self) -> None:
@@ -297,7 +297,7 @@ class Executor:
         self.threads.join()
 
     def on_loop(self) -> bool:
-        """Whether this is the loop's thread, which must not wait."""
+        """Tell whether the caller runs on the loop's thread, which must not wait."""
         return self._loop.on_thread()
 
     @property
@@ -575,7 +575,7 @@ class Executor:
             handle.exited(ExitReport(UNKNOWN, str(error)))
 
     def _end(self) -> None:
-        """Nobody is left."""
+        """Finish: the last worker has ended."""
         if self.ended.is_set():
             return
         if self._wake is not None:

@@ -41,7 +41,7 @@ class ExecutorGroup:
         util.Finalize(self, _close_all, args=(self._executors,))
 
     def executor_for(self, function: Callable[..., Any], wishes: Resources) -> Executor:
-        """What runs ``function``; an error if nothing does any more."""
+        """Return the executor for ``function``; raise an error after shutdown."""
         if os.getpid() != self._owner:
             raise RuntimeError(
                 f"this executor belongs to process {self._owner}: a copy of it that came here by a "
@@ -78,11 +78,11 @@ class ExecutorGroup:
             return executor
 
     def executors(self) -> list[Executor]:
-        """Those that there are."""
+        """Return the present executors."""
         return list(self._executors.values())
 
     def processes(self) -> list[BaseProcess]:
-        """Those of all workers."""
+        """Return the processes of all workers."""
         return [process for each in self.executors() for process in each.workers.processes()]
 
     def shut_down(self, wait: bool, cancel: bool) -> None:
@@ -127,5 +127,5 @@ def _finish(reference: weakref.ref[Executor]) -> None:
 
 
 def refusal() -> RuntimeError:
-    """What concurrent.futures says to who comes after ``shutdown``."""
+    """Return the error of concurrent.futures for a call after ``shutdown``."""
     return RuntimeError("cannot schedule new futures after shutdown")

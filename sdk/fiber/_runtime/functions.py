@@ -41,7 +41,7 @@ class Function:
 
 
 def name_of(function: Any) -> str:
-    """What a person calls a function."""
+    """Return the name of a function, for messages."""
     return getattr(function, "__qualname__", None) or repr(function)
 
 

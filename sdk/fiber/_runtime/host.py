@@ -1,4 +1,4 @@
-"""What a pool needs of the runtime of its process: so little that a test has it in a few lines."""
+"""Interface of the runtime for pools, small enough for a fake of a few lines."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Loop(Protocol):
     """The part of ``fiber._transport.loop.Loop`` that pools use."""
 
     def now(self) -> float:
-        """Monotonic seconds."""
+        """Return the time in seconds of a monotonic clock."""
 
     def on_thread(self) -> bool:
-        """Whether the caller is the loop's own thread."""
+        """Tell whether the caller runs on the loop's thread."""
 
     def depend(self, dependent: Any) -> None:
         """Tell ``dependent`` if the loop fails."""
@@ -44,15 +44,15 @@ class Host(Protocol):
 
     @property
     def loop(self) -> Loop:
-        """Its loop."""
+        """Event loop of the process."""
 
     @property
     def elastic(self) -> bool:
-        """Whether hosts are made for what is started."""
+        """True if hosts are made for new processes."""
 
     @property
     def config(self) -> Any:
-        """Its configuration, of which ``start_timeout`` is wanted."""
+        """Configuration of the program.  Pools read ``start_timeout``."""
 
     def start(
         self,

@@ -38,7 +38,7 @@ class InputStream:
         consumed: Callable[[], int] = lambda: 0,
     ) -> None:
         self.ended = False
-        """Nothing is read any more."""
+        """True once reading has ended."""
         self._unit = unit
         self._limit = None if limit is None else max(limit, unit)
         self._consumed = consumed
@@ -114,7 +114,7 @@ class InputStream:
     # The executor
 
     def take(self) -> list[Any]:
-        """What has been read."""
+        """Take the items that were read."""
         items = self._items
         taken = [items.popleft() for _ in range(len(items))]
         self._taken += len(taken)
@@ -143,7 +143,7 @@ class InputStream:
         return limit - (self._granted - self._consumed())
 
     def lift_limit(self) -> None:
-        """Whoever waits for all to be done cannot consume."""
+        """Read without a limit: a caller that waits for all results consumes none."""
         self._limit = None
 
     def end(self) -> None:

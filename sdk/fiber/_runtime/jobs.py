@@ -86,12 +86,12 @@ class Jobs:
         return found
 
     def resume(self, item: WorkItem) -> None:
-        """Its results are being read again."""
+        """Go on with ``item``, whose results are being read again."""
         if item.job is not None and item.future is not None and item.future.has_room():
             self._ledger.pause(item.job, False)
 
     def lift_limits(self) -> None:
-        """Nobody will consume any more, or read results."""
+        """Lift all limits: no results are read from now on."""
         for job in self._ledger.jobs:
             if job.owner.future is not None:
                 job.owner.future.lift_bound()
@@ -102,7 +102,7 @@ class Jobs:
                 self.top_up(item)
 
     def end_stream(self, item: WorkItem, error: BaseException | None) -> None:
-        """It has no more tasks; ``error``, if any, takes the place of the next one."""
+        """End the stream of ``item``.  An ``error`` takes the place of the next task."""
         job = item.job
         if item not in self._streams or item.stream is None or job is None:
             return  # failed or cancelled meanwhile
@@ -193,7 +193,7 @@ class Jobs:
                 future.set_done()
 
     def fail(self, job: Job, error: BaseException) -> None:
-        """Nothing that is not done of a job will be."""
+        """Fail all tasks of a job that are not done."""
         item: WorkItem | None = job.owner
         if item is None:
             return
@@ -207,7 +207,7 @@ class Jobs:
         self._over(item)
 
     def cancel(self, item: WorkItem) -> list[Worker]:
-        """Nobody wants the rest of it; workers to ask for what they have not read of it."""
+        """Drop the rest of ``item``; return the workers to recall its unread tasks from."""
         if item.job is None or item.job.owner is not item:
             return []  # it was never submitted, or is done
         holders = self._ledger.cancel(item.job)

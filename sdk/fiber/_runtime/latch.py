@@ -23,7 +23,7 @@ from fiber._transport.loop import DOZE
 
 
 class Waiters:
-    """Those who wait, each with a lock of its own."""
+    """Waiters, each with its own lock."""
 
     __slots__ = ("_locks",)
 
@@ -38,7 +38,7 @@ class Waiters:
         return lock
 
     def leave(self, lock: threading.Lock) -> None:
-        """It is not waited for any more."""
+        """Stop waiting with ``lock``."""
         with contextlib.suppress(ValueError):  # it is being released this very moment
             self._locks.remove(lock)
 
@@ -63,11 +63,11 @@ class Latch:
         self._waiters = Waiters()
 
     def is_set(self) -> bool:
-        """Whether it has happened."""
+        """Tell whether the event has happened."""
         return self._set
 
     def set(self) -> None:
-        """It happens now; on any thread, in a finalizer or signal handler too."""
+        """Set the event.  On any thread, also in a finalizer or a signal handler."""
         self._set = True  # noted first: who joins later sees it
         self._waiters.wake()
 

@@ -99,7 +99,7 @@ class Launcher:
             handle.kill()
 
     def close(self) -> None:
-        """Nobody is left."""
+        """Cancel timers: the last worker has ended."""
         self._ending.clear()
         if self._kill is not None:
             self._kill.cancel()

@@ -45,7 +45,7 @@ NO_OP_MESSAGE = work.pack_calls([(pickle.dumps((bool, (), {})), ())])
 
 
 class Pending:
-    """In place of an outcome: there is none yet."""
+    """Mark in place of an outcome that has not come."""
 
 
 UNAVAILABLE = Pending()
@@ -198,7 +198,7 @@ class Leases:
         return False
 
     def close(self) -> None:
-        """Nobody is left."""
+        """Cancel the timer: the last worker has ended."""
         if self._check is not None:
             self._check.cancel()
 
@@ -239,7 +239,7 @@ class Leases:
                 self._return_abandoned(handle)
 
     def _return_abandoned(self, handle: WorkerHandle) -> None:
-        """It may be running something that nobody wants any more."""
+        """Return a worker that may still run a call whose caller has gone."""
         assert handle.worker is not None
         assert handle.child is not None
         self._scheduler.ledger.expect_late(handle.worker, handle.asked)

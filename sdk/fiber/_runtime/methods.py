@@ -14,7 +14,7 @@ START_METHODS = ("forkserver", "spawn", "fork")
 """``forkserver`` and ``fork`` both fork from Fiber's zygote; the default comes first."""
 
 chosen: str | None = None
-"""What ``set_start_method`` set, or the first use settled."""
+"""Start method that ``set_start_method`` set, or that the first use settled."""
 
 preload: list[str] = []
 """Modules that the zygote imports before it forks."""
@@ -33,7 +33,7 @@ def choose(method: str | None) -> None:
 
 
 def inherit(method: str | None, modules: list[str]) -> None:
-    """In a child: what its parent had set."""
+    """Take over the settings of the parent, in a child."""
     choose(method)
     preload[:] = modules
 

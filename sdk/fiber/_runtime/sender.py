@@ -113,7 +113,7 @@ class Sender:
             self._unsent.add(seq)  # its worker is gone, as will be heard
 
     def _unsendable(self, batch: Batch, error: BaseException) -> None:
-        """This concerns the tasks of this batch only."""
+        """Fail the tasks of a batch that cannot be sent, and no others."""
         self._unsent.discard(batch.seq)
         self.settled(batch.seq)
         self.split(batch.seq, Failure(error))
@@ -133,7 +133,7 @@ class Sender:
             self._jobs.put(receipt, [failure])
 
     def dropped(self, batch: Batch) -> None:
-        """Its worker has it no more, and has run nothing of it; ``reassign`` it soon."""
+        """Note a batch that its worker gave back unread.  ``reassign`` it soon."""
         self._unsent.add(batch.seq)
 
     def reassign(self, batch: Batch) -> None:

@@ -36,7 +36,7 @@ _EXIT_PRIORITY = -100  # after multiprocessing has ended daemons and joined the 
 
 
 class Runtime:
-    """What a program needs to run processes: one loop thread and one backend."""
+    """State of a program that runs processes: one loop thread and one backend."""
 
     def __init__(self) -> None:
         self.config = config.current()
@@ -74,7 +74,7 @@ class Runtime:
 
     @property
     def elastic(self) -> bool:
-        """Whether hosts are made for what is started."""
+        """True if hosts are made for new processes."""
         return self.backend.elastic
 
     def start(
@@ -119,7 +119,7 @@ class Runtime:
         return made
 
     def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, Program | None]:
-        """What each child sets up, and the files that it needs; ``anew`` as in ``Shipping``."""
+        """Return the set-up of a child, and its files; ``anew`` as in ``Shipping``."""
         data = self._spawn_data(f"process {process.name!r}")
         same_host = self.backend.same_host
         data["authkey"] = bytes(data["authkey"])
@@ -143,7 +143,7 @@ class Runtime:
         return pickle.dumps(data), program
 
     def _spawn_data(self, who: str) -> dict[str, Any]:
-        """What multiprocessing has every child know of this program."""
+        """Return the preparation data that multiprocessing gives every child."""
         # pdb leaves its program a main module without one, which multiprocessing does not expect.
         vars(sys.modules["__main__"]).setdefault("__spec__", None)
         try:
@@ -171,7 +171,7 @@ class Runtime:
 
 
 class ChildOwner(ChildObserver, Protocol):
-    """Who has a child started, and is to have it at hand from the first moment on."""
+    """Owner of a child, which can reach the child from its first moment on."""
 
     def begin(self, child: ChildHandle) -> None:
         """Note how to reach it, and start it.  On the loop's thread, before all else."""
@@ -189,7 +189,7 @@ class _Releasing:
         self._grants = grants
 
     def exited(self, report: ExitReport) -> None:
-        """It is gone."""
+        """Note that the child has ended."""
         self._grants.release()
         self._observer.exited(report)
 
@@ -212,7 +212,7 @@ def _make_backend(runtime: Runtime) -> Backend:
 
 
 def _is_on_cluster(settings: config.Config) -> bool:
-    """Whether a program that chose no backend is in a pod that may make others."""
+    """Tell whether a program that chose no backend runs in a pod that may make others."""
     if settings.backend != "auto" or "KUBERNETES_SERVICE_HOST" not in os.environ:
         return False
     from fiber._backends.kubernetes.detection import serves_pools
@@ -229,7 +229,7 @@ def _make_shipping(backend: Backend) -> Shipping | None:
 
 
 def _modules_of(process: Any) -> list[str]:
-    """What the zygote may import once for all: where class and target live, and our own modules."""
+    """Return the modules that the zygote may import for all children."""
     target = getattr(process, "_target", None)
     names = {type(process).__module__, str(getattr(target, "__module__", ""))}
     names = {name for name in names if not name.startswith("fiber._runtime.")}  # they stay here
@@ -244,8 +244,8 @@ _OURS = ("fiber.connection", "fiber.queues", "fiber.synchronize", "fiber._agent.
 _lock = threading.RLock()  # a finalizer may come back here while one is made
 _runtime: Runtime | None = None
 _may_link = True
-"""Whether this process may have agents: nng, which carries links, aborts a forked copy of a process
-that has used it.  Such a copy runs its processes beside it."""
+"""True if this process may have agents.  nng, which carries links, aborts a forked copy of a
+process that has used it.  Such a copy runs its processes on its own host."""
 
 
 def runtime() -> Runtime:
@@ -283,7 +283,7 @@ def shutdown() -> None:
 
 
 def _forget() -> None:
-    """In a process forked by someone else: the loop's thread did not come along."""
+    """Forget the runtime after a fork without Fiber: the loop's thread is not in the copy."""
     global _runtime, _lock, _may_link
     _runtime, _lock = None, threading.RLock()
     _may_link = _may_link and "fiber._transport.nng" not in sys.modules

@@ -1,4 +1,4 @@
-"""What is asked of a pool, calls and maps, and how it becomes messages.
+"""Work items of a pool, which are calls and maps, and their messages.
 
 As in ``concurrent.futures``, a work item holds what to run and the future that gets the outcome;
 here one item may be a map of a million tasks.
@@ -21,7 +21,7 @@ from fiber._wire import packet, work
 
 
 class Future(Protocol):
-    """Where the outcomes of a work item, or of one call, go.  Called on the loop's thread."""
+    """Receiver of the outcomes of a work item, or of one call.  Called on the loop's thread."""
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Outcomes of the tasks from ``start`` on.  Each task's comes once, in any order.
@@ -32,33 +32,33 @@ class Future(Protocol):
         """
 
     def has_room(self) -> bool:
-        """Whether it takes more again, after it has asked for no more."""
+        """Tell whether it takes more outcomes, after it has asked for no more."""
 
     def lift_bound(self) -> None:
         """Take all that comes: whoever would read them waits for the rest."""
 
     def set_done(self) -> None:
-        """All tasks have theirs."""
+        """Note that all tasks have their outcomes."""
 
     def set_exception(self, error: BaseException) -> None:
-        """There will be no more, because of ``error``."""
+        """End the outcomes with ``error``."""
 
 
 class Cancellable(Future, Protocol):
     """The future of a call that may be cancelled until it is given to a worker."""
 
     def claim(self) -> bool:
-        """It is about to be; False if it was cancelled.  May be asked again."""
+        """Claim the call for a worker; False if it was cancelled.  May be called again."""
 
     def cancel(self) -> bool:
-        """Nobody wants it any more; False if it was claimed."""
+        """Cancel the call; False if it was claimed."""
 
     def cancelled(self) -> bool:
-        """Whether nobody does."""
+        """Tell whether the call was cancelled."""
 
 
 class Call:
-    """One function call, pickled: a task by itself."""
+    """Pickled function call, which is one task."""
 
     __slots__ = ("blocking", "buffers", "data", "future", "grants", "name")
 
@@ -76,7 +76,7 @@ class Call:
         self.buffers = buffers
         self.future = future
         self.blocking = False
-        """Whether a thread does nothing but wait for it."""
+        """True if a thread only waits for the outcome."""
 
     def copy_buffers(self) -> None:
         """Keep what was passed as it is now: the caller goes on before it is sent."""
@@ -84,7 +84,7 @@ class Call:
             self.buffers = packet.kept(self.buffers)
 
     def message(self) -> bytes:
-        """It alone as a message, its buffers beside."""
+        """Return a message with this call alone.  Its buffers go beside it."""
         return work.pack_calls([(self.data, self.buffers)])
 
 
@@ -131,15 +131,15 @@ class WorkItem:
         self.limits = limits
         """None: as its pool says."""
         self.cancellable = cancellable
-        """Whether the futures of its calls are."""
+        """True if the futures of its calls can be cancelled."""
         self.job: Job | None = None
         """Once the executor has taken it."""
         self.stream: InputStream | None = None
         self.grants: list[GrantSet] = []
-        """What lets workers unpickle the pipes and queues among the items."""
+        """Grants with which workers unpickle the pipes and queues among the items."""
 
     def task_name(self, task: int, item: Any) -> str:
-        """How errors call a task."""
+        """Return the name of a task, for messages."""
         if isinstance(item, Call):
             return f"the call of {item.name}()"
         assert self.function is not None
@@ -170,7 +170,7 @@ def _blame_call(
     kwargs: Mapping[str, Any],
     error: Exception,
 ) -> Exception:
-    """What the caller hears of a call that does not pickle."""
+    """Return the error of a call that does not pickle."""
     name = name_of(function)
     if not isinstance(args, Sequence) or not isinstance(kwargs, Mapping):
         args, kwargs = (), {}
@@ -181,17 +181,17 @@ def _blame_call(
 
 
 def is_wanted(call: Any) -> bool:
-    """Whether a call that waits was not cancelled; who waits for one that was hears so."""
+    """Tell whether a waiting call was not cancelled.  If it was, its waiters are notified."""
     return not call.future.cancelled() or call.future.claim()
 
 
 def claim(batch: Batch) -> bool:
-    """Whether all calls of a batch are still wanted: then none can be cancelled any more."""
+    """Claim all calls of a batch; return False if one was cancelled."""
     return all(call.future.claim() for call in batch.items)
 
 
 def blame_items(item: WorkItem, batch: Batch, error: Exception) -> Exception:
-    """What the caller hears of tasks that cannot be sent."""
+    """Return the error of tasks that cannot be sent."""
     if len(batch.items) != 1 or item.function is None:
         return error
     name = item.task_name(batch.start, batch.items[0])
@@ -199,7 +199,7 @@ def blame_items(item: WorkItem, batch: Batch, error: Exception) -> Exception:
 
 
 def pickles_without_user_code(item: WorkItem, batch: Batch) -> bool:
-    """Whether ``encode`` may run where the user's code must not."""
+    """Tell whether ``encode`` runs none of the user's code for this batch."""
     items = batch.items
     return item.kind == work.CALLS or type(items) in (range, str, bytes) or work.is_plain(items)
 

@@ -1,4 +1,4 @@
-"""One worker of a pool, as the pool sees it."""
+"""Worker on the side of its pool."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from fiber.errors import FiberError
 
 
 class Supervisor(Protocol):
-    """Who hears what becomes of workers; on the loop's thread."""
+    """Observer of workers.  Its methods run on the loop's thread."""
 
     def on_message(self, handle: WorkerHandle, message: Message) -> None:
-        """A packet from a worker."""
+        """Take a packet from a worker."""
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
         """The worker will never see these."""
@@ -38,37 +38,37 @@ class Supervisor(Protocol):
 
 
 class WorkerHandle:
-    """One worker's process as its pool sees it; also the ``Popen`` behind its Process object.
+    """Process of a worker on the side of its pool; also the ``Popen`` behind its Process object.
 
     The scheduler knows it as a ``Member`` of the pool's worker set.
     """
 
     sentinel = -1
-    """What a Process asks for when it starts; a real one is made if it is wanted."""
+    """Placeholder that a Process reads when it starts.  A real sentinel is made if it is wanted."""
 
     def __init__(self, supervisor: Supervisor, host: Any) -> None:
         self.process: BaseProcess | None = None
         """Once it is started."""
         self.child: ChildHandle | None = None
         self.worker: Worker | None = None
-        """Its entry in the ledger, once it is ready."""
+        """Entry of the worker in the ledger, once it is ready."""
         self.known: dict[int, None] = {}
-        """Functions that it was sent."""
+        """Functions that were sent to the worker."""
         self.complaint = ""
-        """What its initializer, or its birth, failed with."""
+        """Error of its initializer, or of its start."""
         self.fault = ""
         """Wrong answer for which the pool has killed it."""
         self.asked = 0
-        """The last call that a caller sent it directly."""
+        """Number of the last call that a caller sent it directly."""
         self.leaving = False
-        """It was told to go, or will be at once."""
+        """True if it was told to leave, or will be at once."""
         self.unwanted = False
-        """It was told to end at once, whatever it does."""
+        """True if it was told to end at once, also in the middle of a task."""
         self.tasks = 0
-        """How many it has done."""
+        """Number of tasks that it has done."""
         self.returncode: int | None = None
         self.shared: SharedArguments | None = None
-        """What it is started with, as all workers of its pool."""
+        """Arguments that all workers of its pool are started with."""
         self._supervisor = supervisor
         self._host = host
         self._pid: int | None = None
@@ -96,7 +96,7 @@ class WorkerHandle:
     # What the agent says, on the loop's thread
 
     def begin(self, child: ChildHandle) -> None:
-        """It is started."""
+        """Note that the child is being started."""
         self.child = child
         child.start()
         if self.leaving:  # it was told to before it could be reached
@@ -105,25 +105,25 @@ class WorkerHandle:
                 self.kill()
 
     def started(self, pid: int) -> None:
-        """It has a pid."""
+        """Note the pid of the process."""
         _logs.debug("worker %s has pid %d on host %s", self.name, pid, self.host)
         self._pid = pid
         self._born.set()
 
     def received(self, message: Message) -> None:
-        """It sent a packet."""
+        """Take a packet from the worker."""
         self._supervisor.on_message(self, message)
 
     def recalled(self, seqs: list[int]) -> None:
-        """It will never see these."""
+        """Note batches that the worker will never see."""
         self._supervisor.on_recalled(self, seqs)
 
     def draining(self) -> None:
-        """Its host is about to go."""
+        """Note that the host of the worker is about to go."""
         self._supervisor.on_draining(self)
 
     def exited(self, report: ExitReport) -> None:
-        """It is gone."""
+        """Note that the worker has ended."""
         if self.fault and report.cause == Cause.CHILD:
             report = report._replace(reason=f"WrongAnswer: {self.fault}, and Fiber killed it")
         _logs.debug("worker %s ended: %s", self.name, report.describe())
@@ -138,7 +138,7 @@ class WorkerHandle:
         self._supervisor.on_exit(self, report)
 
     def start_failure(self, report: ExitReport) -> StartFailure:
-        """What its end says of the start of workers, if it was not ready."""
+        """Return what its end tells about the start of workers, if it was not ready."""
         text = self.complaint or "\n".join(report.log)
         reason = "it raised an error" if self.complaint else report.reason
         killed = report.cause == Cause.REFUSED or (not self.complaint and report.exitcode < 0)
@@ -155,7 +155,7 @@ class WorkerHandle:
 
     @property
     def pid(self) -> int | None:
-        """Its pid; waits until it has one."""
+        """Pid of the process.  Waits until there is one."""
         if self._pid is None and not self._host.loop.on_thread():
             self._born.wait(self._host.config.start_timeout)
         return self._pid

@@ -1,4 +1,4 @@
-"""Which resources the workers of a pool get, where hosts are made for them."""
+"""Resources of the workers of a pool, where hosts are made for them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class WorkerResources:
 
     @property
     def chosen(self) -> Resources:
-        """What workers get; from now on these."""
+        """Resources that workers get.  The first use settles them."""
         return self._chosen.setdefault("resources", self._own)
 
     def choose_for(self, function: Callable[..., Any]) -> None:

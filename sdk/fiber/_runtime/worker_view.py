@@ -1,4 +1,4 @@
-"""What a person can see of a pool's workers."""
+"""View of a pool's workers for users."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from fiber._runtime.latch import Latch
 
 
 class WorkerInfo(NamedTuple):
-    """One worker, as it was when asked."""
+    """State of a worker at one moment."""
 
     name: str
-    """Of its process."""
+    """Name of its process."""
     host: str
-    """Where it runs, on Kubernetes the name of its pod; empty while it waits for one."""
+    """Host that it runs on, on Kubernetes the name of its pod; empty while it waits for one."""
     node: str
-    """The node of its pod; empty elsewhere, or while that is not known."""
+    """Node of its pod; empty without Kubernetes, or while the node is not known."""
     pid: int | None
-    """There; None while it is not started."""
+    """Pid on that host; None while it is not started."""
     state: str
     """``waiting`` for a host, ``starting``, ``idle``, ``busy`` or ``leaving``."""
     tasks: int
-    """How many it has done."""
+    """Number of tasks that it has done."""
 
 
 class WorkerView:
@@ -73,7 +73,7 @@ class WorkerView:
                 latch.set()
 
     def end(self) -> None:
-        """There will be none any more."""
+        """Note that there will be no more workers."""
         self._over = True
         self.changed()
 
