@@ -33,9 +33,9 @@ _GRAIN = 0.001
 class _State(enum.Enum):
     OPEN = enum.auto()
     CLOSING = enum.auto()
-    """This side has closed the link.  Queued frames still leave."""
+    """Closed by this side.  Queued frames still leave."""
     LEAVING = enum.auto()
-    """This side has said good-bye and waits for the answer."""
+    """Waiting for the answer to the good-bye of this side."""
     ENDED = enum.auto()
 
 

@@ -1,0 +1,61 @@
+"""Docstrings begin with a verb (functions) or a noun, as CONTRIBUTING.md asks.
+
+A reader must guess the noun of one that begins with a pronoun or a question word.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+LEFT = {
+    "operator/fiber_operator": 213,
+    "sdk/fiber": 9,
+    "sdk/fiber/_agent": 0,
+    "sdk/fiber/_backends": 170,
+    "sdk/fiber/_engine": 0,
+    "sdk/fiber/_hub": 137,
+    "sdk/fiber/_managers": 48,
+    "sdk/fiber/_runtime": 22,
+    "sdk/fiber/_sync": 24,
+    "sdk/fiber/_transport": 0,
+    "sdk/fiber/_wire": 0,
+    "sdk/fiber/vector": 0,
+}
+"""Docstrings that still begin badly, by folder.  The numbers only fall."""
+
+BADLY = re.compile(
+    "(As|By|For|Has|Here|How|In|Is|It|Its|Nobody|Nothing|Of|On|One|Such|That|There|These|They|This"
+    r"|Those|To|What|Whatever|When|Where|Whether|Which|Who|Whoever|With|Without)\b"
+)
+
+
+@pytest.mark.parametrize("folder", LEFT)
+def test_docstrings_begin_with_a_verb_or_a_noun(folder: str) -> None:
+    found = list(_begin_badly(ROOT / folder, deep=folder != "sdk/fiber"))
+    assert len(found) <= LEFT[folder], "\n".join(found)
+
+
+def _begin_badly(folder: Path, deep: bool) -> Iterator[str]:
+    paths = sorted(folder.rglob("*.py") if deep else folder.glob("*.py"))
+    assert paths
+    for path in paths:
+        for line, text in _docstrings(ast.parse(path.read_text(encoding="utf-8"))):
+            if BADLY.match(text.strip()):
+                yield f"{path.relative_to(ROOT)}:{line}: {text.strip().splitlines()[0]}"
+
+
+def _docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield docstrings, and the strings below attributes and constants."""
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        for statement in body if isinstance(body, list) else ():
+            match statement:
+                case ast.Expr(value=ast.Constant(value=str(text))):
+                    yield statement.lineno, text
