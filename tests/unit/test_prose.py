@@ -20,7 +20,7 @@ LEFT = {
     "sdk/fiber/_agent": 0,
     "sdk/fiber/_backends": 170,
     "sdk/fiber/_engine": 0,
-    "sdk/fiber/_hub": 137,
+    "sdk/fiber/_hub": 0,
     "sdk/fiber/_managers": 48,
     "sdk/fiber/_runtime": 22,
     "sdk/fiber/_sync": 24,

@@ -1,4 +1,4 @@
-"""This process and its hub: which one that is, and streams to it and through it to others.
+"""Access of this process to its hub, and by streams through it to other hubs.
 
 The hub lives in the agent of its host.  The processes that the agent starts are told its address
 and key when they are born.  A stream blocks, and is for one thread at a time.
@@ -53,7 +53,7 @@ class LocalHub(Protocol):
 
     @property
     def address(self) -> HubAddress:
-        """Where other processes of this host find it; NoHub if they cannot."""
+        """Address of the hub for other processes of this host; NoHub if they cannot reach it."""
 
     @property
     def known_address(self) -> HubAddress | None:
@@ -66,23 +66,23 @@ class LocalHub(Protocol):
         """The descriptors of an object that it keeps."""
 
     def on_loop(self) -> bool:
-        """Whether the caller is the thread that serves it."""
+        """Tell whether the caller runs on the thread that serves the hub."""
 
 
 def set_hub_address(address: HubAddress) -> None:
-    """This process's hub is elsewhere on its host."""
+    """Note the address of this host's hub, which another process has."""
     global _address, _local_hub
     _address, _local_hub = address, None
 
 
 def set_local_hub(hub: LocalHub | None) -> None:
-    """This process is the hub's own; None: it is no longer."""
+    """Note that this process has the hub of its host; None: it has ended."""
     global _local_hub
     _local_hub = hub
 
 
 def set_hub_starter(starter: Callable[[], object]) -> None:
-    """How a program that needs a hub, and was told of none, makes the runtime that has one."""
+    """Set the function that makes a runtime with a hub, for a program that needs one."""
     global _starter
     _starter = starter
 
@@ -101,7 +101,7 @@ def local_hub() -> LocalHub | None:
 
 
 def hub_address() -> HubAddress:
-    """How other processes of this host reach its hub; NoHub if they cannot."""
+    """Return the address of this host's hub for its processes; NoHub if they cannot reach it."""
     hub = local_hub()
     if hub is not None:
         return hub.address
@@ -135,7 +135,7 @@ def _refuse_on_loop() -> None:
 
 
 def _after_fork() -> None:
-    """In a process forked by someone else: the hub did not come along, but can be reached."""
+    """Reach the hub as another process, after a fork without Fiber: the copy does not have it."""
     global _local_hub, _address
     if _local_hub is not None:
         _address, _local_hub = _local_hub.known_address, None
@@ -151,7 +151,7 @@ os.register_at_fork(after_in_child=_after_fork)
 
 
 class Reply:
-    """What a hub answered."""
+    """Answer of a hub."""
 
     __slots__ = ("fds", "number", "parts", "status", "values")
 
@@ -162,7 +162,7 @@ class Reply:
         self.fds, message.fds = message.fds, []
 
     def close_descriptors(self) -> None:
-        """Nobody wants them."""
+        """Close the descriptors of the answer, which are not wanted."""
         for fd in self.fds:
             os.close(fd)
 
@@ -227,7 +227,7 @@ class HubStream:
         return None if number is None else self._reply(number, None)
 
     def give_up(self, operation: Op) -> None:
-        """Nobody wants the answer to the last request, which is such an operation.
+        """Give up the answer to the last request, which was this operation.
 
         What it waits for should not be taken for us; what was, ``settle`` finds, and the hub takes
         back a token.
@@ -254,7 +254,7 @@ class HubStream:
         self._send(form.pack(operation, self._next(), *values))
 
     def receive(self) -> Reply:
-        """What comes next, asked for or not; Unreachable with the hub's reason at the end."""
+        """Receive the next message; Unreachable with the hub's reason at the end."""
         try:
             message = packet.receive(self._sock, descriptors=True)
         except (EOFError, ConnectionError) as error:
@@ -270,7 +270,7 @@ class HubStream:
 
     @property
     def has_answered(self) -> bool:
-        """Whether the last request that has an answer has got it."""
+        """True if the last request was answered."""
         return self._asked > 0 and self._unsettled is None
 
     def fileno(self) -> int:

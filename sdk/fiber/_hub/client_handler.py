@@ -36,11 +36,11 @@ from fiber._hub.streams import NullHandler, Stream
 from fiber._wire.packet import Message
 
 _NAME_BYTES = 80
-"""Of who holds a lock, as it is shown."""
+"""Longest name of the holder of a lock, in bytes."""
 
 
 class HandlerHub(Protocol):
-    """What a handler needs of its hub."""
+    """Part of the hub that a handler needs."""
 
     key: bytes
     registry: Registry
@@ -59,7 +59,7 @@ class RequestRefused(Exception):
 
 
 class PendingRequest:
-    """One request; answered once."""
+    """Request that is answered once."""
 
     __slots__ = ("_granted", "_handler", "_number")
 
@@ -80,7 +80,7 @@ class PendingRequest:
 
     @property
     def number(self) -> int:
-        """What the requester calls it."""
+        """Number of the request on its stream."""
         return self._number
 
 
@@ -101,7 +101,7 @@ class ClientHandler:
         """The number of the request that got a token last, if anybody may still give it up."""
         self._place: int | None = None
         self._claimed = False
-        """Whether the counter was lowered for a client that has not said that it knows."""
+        """True if the counter was lowered for a client that has not confirmed it."""
         stream.handler = self
 
     def on_message(self, message: Message) -> None:
@@ -126,7 +126,7 @@ class ClientHandler:
         """Replies fit again; there is at most one at a time."""
 
     def on_closed(self, reason: str) -> None:
-        """Whoever used it has ended."""
+        """Note that the user of the stream has ended."""
         if self._holder is not None:
             self._semaphore().abandon(self._holder)
             self._holder = None
@@ -526,7 +526,7 @@ class _Joining:
         self._handler.stream.send(reply, (), [os.dup(block.segment.fileno())])
 
     def refused(self, reason: str) -> None:
-        """There is nothing to hand over."""
+        """Close the stream, as there is nothing to hand over."""
         self._handler.close(reason)
 
 

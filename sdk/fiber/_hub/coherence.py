@@ -1,4 +1,4 @@
-"""How copies of shared memory on several hosts are kept in step: the arithmetic, without any I/O.
+"""Arithmetic that keeps copies of shared memory on several hosts in step, without I/O.
 
 Hosts that share a block form a tree, whose root is the block's home.  Each side of a link between
 two of them has a *twin* of the block: what both sides agree on.  Before anything else is sent over
@@ -44,7 +44,7 @@ class Run(NamedTuple):
 
 
 class Twin:
-    """What one side of a link knows of a block that both share; both begin with zeros.
+    """State of one side of a link for a block that both sides share.  Both begin with zeros.
 
     ``follows``: whether the other side is nearer to the block's home.
     """
@@ -56,7 +56,7 @@ class Twin:
         self._unacknowledged: deque[bytes] = deque()
 
     def collect(self) -> Iterator[bytes]:
-        """What to send, as patches in this order: what the other side does not know yet."""
+        """Yield the patches to send, in order: changes that the other side does not know."""
         patch = b""
         for extent in _differences(self._agreed, self._memory):
             patch += extent

@@ -43,7 +43,7 @@ class Dealer:
         self._item: Message | None = None
 
     def start(self) -> None:
-        """On a thread of its own, which keeps no program from ending."""
+        """Start dealing on a daemon thread."""
         threading.Thread(target=self._run, name="fiber-dealer", daemon=True).start()
 
     def _run(self) -> None:
@@ -98,7 +98,7 @@ class Dealer:
             answer.close()
 
     def _deal(self, item: Message) -> bool:
-        """Whether there was a reader with room."""
+        """Deal an item to a reader with room; return False if there was none."""
         for _ in range(len(self._readers)):
             reader = self._readers.popleft()
             try:

@@ -20,7 +20,7 @@ def note_memory(directory: str, name: str) -> None:
 
 
 def forget_memory(directory: str, name: str) -> None:
-    """It is removed."""
+    """Forget a name that was removed."""
     with contextlib.suppress(FileNotFoundError):
         os.unlink(os.path.join(directory, _NOTE + name))
 

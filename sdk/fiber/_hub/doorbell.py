@@ -1,4 +1,4 @@
-"""How whoever changed shared memory has its host's hub look, which may wait for that for others."""
+"""Doorbell of a hub: a process that changed shared memory rings, and the hub looks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 
 class Doorbell:
-    """Of one hub.  On the loop's thread, but for ``ring``."""
+    """Doorbell of one hub.  Runs on the loop's thread, but for ``ring``."""
 
     def __init__(self, call_soon: Callable[..., None]) -> None:
         self._call_soon = call_soon
@@ -17,7 +17,7 @@ class Doorbell:
         self._listeners.add(listener)
 
     def forget(self, listener: Callable[[], None]) -> None:
-        """It is not to be called again."""
+        """Stop calling ``listener``."""
         self._listeners.discard(listener)
 
     def ring(self) -> None:
@@ -25,6 +25,6 @@ class Doorbell:
         self._call_soon(self.rung)
 
     def rung(self) -> None:
-        """They look now."""
+        """Call all listeners."""
         for listener in tuple(self._listeners):
             listener()

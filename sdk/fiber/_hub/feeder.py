@@ -1,4 +1,4 @@
-"""How items get from a queue's ``put`` into its channel, and how many there are."""
+"""Feeding of a queue: from ``put`` into its channel, and the count of items."""
 
 from __future__ import annotations
 
@@ -78,11 +78,11 @@ class Slots:
         return inbox.recv_counting(self._free, wait=wait)
 
     def used(self, waiting: int) -> int:
-        """How many items there are; so many of them wait in this process."""
+        """Return the number of items, of which ``waiting`` wait in this process."""
         return max(0, self._maximum - self._free.value())
 
     def full(self) -> bool:
-        """Whether there is no place."""
+        """Tell whether no place is free."""
         return not self._free.wait(0) and not self._recover()
 
     def _recover(self) -> bool:
@@ -110,7 +110,7 @@ class ItemCount:
         self._sent: SharedCounter = LocalCounter.create()
 
     def take(self, timeout: float | None, taken: list[Any]) -> bool:
-        """There is always a place."""
+        """Take a place, of which there is always one."""
         taken.append(1)
         return True
 
@@ -136,7 +136,7 @@ class ItemCount:
         return message
 
     def used(self, waiting: int) -> int:
-        """How many items there are; so many of them wait in this process."""
+        """Return the number of items, of which ``waiting`` wait in this process."""
         return self._sent.value() + waiting
 
     def full(self) -> bool:
@@ -198,7 +198,7 @@ class Feeder:
             self._start_thread()
 
     def size(self) -> int:
-        """How many items there are in the channel and here."""
+        """Return the number of items in the channel and in this process."""
         while True:
             moves = self._moves
             size = self._slots.used(len(self._unsent))

@@ -50,7 +50,7 @@ class InheritedDescriptor(Protocol):
     """Stands for a descriptor that goes along with a start message."""
 
     def detach(self) -> int:
-        """In the started process: the descriptor."""
+        """Return the descriptor, in the started process."""
 
 
 class HubHandle(NamedTuple):
@@ -65,11 +65,11 @@ class HubHandle(NamedTuple):
         return f"HubHandle(home={self.home!r})"
 
     def here(self) -> bool:
-        """Whether the hub is on this host."""
+        """Tell whether the hub is on this host."""
         return self.home.host == client.host()
 
     def fetch(self) -> list[Descriptor]:
-        """On the hub's host: its descriptors."""
+        """Return the object's descriptors, on the host of the hub."""
         hub = client.local_hub()
         if hub is not None and hub.key == self.home.key:
             try:
@@ -97,12 +97,12 @@ class BlockHandle(NamedTuple):
     extent: Extent
 
     def elsewhere(self) -> HubHandle | None:
-        """How to reach the hub of its host, if that is not this one."""
+        """Return the handle at the hub of another host; None for a block of this host."""
         segment = self.segment
         return segment if isinstance(segment, HubHandle) and not segment.here() else None
 
     def block(self) -> Block:
-        """On its own host: the block."""
+        """Return the block, on its own host."""
         segment = self.segment
         (owner,) = _descriptors(segment)
         return block_of(owner, *self.extent)
@@ -127,7 +127,7 @@ class EndHandle(NamedTuple):
 
 
 def _descriptors(handle: Handle) -> list[Descriptor]:
-    """On its own host: what it stands for."""
+    """Return the descriptors of a handle, on its own host."""
     return handle.fetch() if isinstance(handle, HubHandle) else [own(handle.detach())]
 
 
@@ -135,7 +135,7 @@ def _descriptors(handle: Handle) -> list[Descriptor]:
 
 
 def channel(handle: Handle | EndHandle) -> SharedChannel:
-    """Where a handle was unpickled: the channel that it stands for."""
+    """Return the channel of an unpickled handle."""
     if isinstance(handle, EndHandle):
         return handle.end()
     if isinstance(handle, HubHandle) and not handle.here():
@@ -144,7 +144,7 @@ def channel(handle: Handle | EndHandle) -> SharedChannel:
 
 
 def counter(handle: Handle) -> SharedCounter:
-    """Where a handle was unpickled: the counter that it stands for."""
+    """Return the counter of an unpickled handle."""
     if isinstance(handle, HubHandle) and not handle.here():
         return RemoteCounter(*handle)
     return LocalCounter(*_descriptors(handle))
@@ -154,7 +154,7 @@ def counter(handle: Handle) -> SharedCounter:
 
 
 def handle_for(end: Any) -> Handle | EndHandle:
-    """What to pickle in place of a channel or counter."""
+    """Return the handle to pickle in place of a channel or counter."""
     if isinstance(end, RemoteEnd):
         return EndHandle(end.kind, _grants().for_remote(end), None, end.extent)
     if isinstance(end, RemoteObject):
@@ -197,7 +197,7 @@ def _inherited_segment(spawning: Any, block: Block) -> InheritedDescriptor:
 
 
 def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
-    """What to pickle in place of a block of this host; ``kind`` is what its hub makes of it."""
+    """Return the handle to pickle in place of a block of this host, as an object of ``kind``."""
     block.give()
     extent = Extent(block.offset, block.size)
     spawning = _spawning_here()
@@ -208,7 +208,7 @@ def handle_for_block(kind: ObjectKind, block: Block) -> BlockHandle:
 
 
 def handle_for_remote_block(end: RemoteObject, extent: Extent) -> BlockHandle:
-    """What to pickle in place of a block of another host."""
+    """Return the handle to pickle in place of a block of another host."""
     return BlockHandle(_grants().for_remote(end), extent)
 
 
@@ -234,7 +234,7 @@ class GrantSet:
         self._kept: list[object] = []
 
     def __bool__(self) -> bool:
-        """Whether there is anything to release."""
+        """True if there is anything to release."""
         return bool(self._direct or self._streams or self._kept)
 
     def keep(self, thing: object) -> None:
@@ -263,7 +263,7 @@ class GrantSet:
         return HubHandle(end.home, *reply.values)
 
     def release(self) -> None:
-        """Nobody unpickles the handles any more."""
+        """End the grants: the handles are not unpickled from now on."""
         direct, self._direct = self._direct, {}
         streams, self._streams = self._streams, {}
         self._kept.clear()
@@ -363,7 +363,7 @@ def _release_remote(end: RemoteObject, grant: bytes) -> None:
 
 
 class Pickling:
-    """One pickling: where its handles get their grants, and how to take back those for one use.
+    """Pickling of an object: it gives grants to handles, and takes back those for one use.
 
     It counts until it is ``done`` or forgotten, so whoever is interrupted at any line leaves none.
     """
@@ -377,7 +377,7 @@ class Pickling:
         self.done = False
 
     def take_back(self) -> None:
-        """It did not work out: what was granted meanwhile, nobody will ever use."""
+        """End the grants of a pickling that failed."""
         if self.grants is not None:
             self.grants.release()
         while self.undo:
@@ -400,7 +400,7 @@ def ring() -> None:
 
 
 class _ThisThread(threading.local):
-    """What this thread is pickling, if it said so: the innermost last."""
+    """Picklings of this thread, the innermost last."""
 
     def __init__(self) -> None:
         self.picklings: list[weakref.ref[Pickling]] = []
@@ -433,7 +433,7 @@ def _current() -> Pickling | None:
 
 
 def undo_pickling() -> None:
-    """What is being pickled is about to be pickled in another way."""
+    """Take back the present pickling, which begins anew in another way."""
     pickling = _current()
     if pickling is not None:
         pickling.take_back()
@@ -447,7 +447,7 @@ def _undo_by(step: Callable[[], None]) -> None:
 
 
 def _grants() -> GrantSet | _SingleUse:
-    """Where the handle that is being pickled gets its grant."""
+    """Return the source of grants for the handle that is being pickled."""
     pickling = _current()
     if pickling is None:
         return _single_use

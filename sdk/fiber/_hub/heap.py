@@ -30,10 +30,10 @@ LARGE = 1 << 16
 """Bytes from which on a block has a segment to itself."""
 
 ALIGNMENT = 64
-"""Of every block, in bytes: no two of them are in one line of a processor's cache."""
+"""Alignment of blocks, in bytes: each begins in its own line of the processor's cache."""
 
 SIZES = tuple(ALIGNMENT << doubled for doubled in range(LARGE.bit_length() - 6))
-"""Of small blocks, in bytes: one of another size gets the next larger one's place."""
+"""Sizes of small blocks, in bytes.  A block of another size gets a place of the next larger one."""
 
 # A mapping needs no descriptor of its own beside ours; before Python 3.13 it has one.
 _UNTRACKED: dict[str, Any] = {"trackfd": False} if sys.version_info >= (3, 13) else {}
@@ -48,13 +48,13 @@ class Segment:
         self._owner = owner
         status = os.fstat(owner.fileno())
         self.inode = status.st_ino
-        """What tells it from all others of this host, while it exists."""
+        """Number that no other segment of this host has, while this one exists."""
         self.size = status.st_size
         self._map = mmap.mmap(owner.fileno(), self.size, **_UNTRACKED)
         self.address = ctypes.addressof(ctypes.c_char.from_buffer(self._map))
 
     def fileno(self) -> int:
-        """Its descriptor, which stays the segment's."""
+        """Return the descriptor, which the segment keeps."""
         return self._owner.fileno()
 
     def view(self, offset: int, size: int) -> memoryview:
@@ -81,17 +81,17 @@ class Block:
 
     @property
     def view(self) -> memoryview:
-        """Its memory, to read and write, as bytes."""
+        """Memory of the block, as bytes to read and write."""
         return self.segment.view(self.offset, self.size)
 
     @property
     def address(self) -> int:
-        """Where it lies in this process."""
+        """Address of the block in this process."""
         return self.segment.address + self.offset
 
     @property
     def identity(self) -> tuple[int, int]:
-        """What tells it from all other blocks of this host, in every process."""
+        """Identity that no other block of this host has, the same in every process."""
         return self.segment.inode, self.offset
 
     def give(self) -> None:
@@ -101,7 +101,7 @@ class Block:
 
 
 class _Place:
-    """Where a small block lies; used again once that is forgotten, unless others have it too."""
+    """Place of a small block.  It is reused after the block, unless other processes have it."""
 
     __slots__ = ("_forks", "_home", "_offset", "_segment", "given")
 

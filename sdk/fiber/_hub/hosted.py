@@ -29,11 +29,11 @@ class Watcher(Protocol):
     """Wants to know when a channel becomes readable."""
 
     def ready(self) -> None:
-        """It is.  Not called again until the watcher asks again."""
+        """Note that it is ready.  Called once for each time that the watcher asks."""
 
 
 class HostedChannel:
-    """One end of a channel."""
+    """End of a channel that the hub serves."""
 
     def __init__(self, poller: Poller, channel: LocalChannel) -> None:
         self._poller = poller
@@ -44,7 +44,7 @@ class HostedChannel:
         self._watchers: set[Watcher] = set()
 
     def fileno(self) -> int:
-        """Its descriptor."""
+        """Return the descriptor."""
         return self._channel.fileno()
 
     def send(self, waiter: Waiter, parts: Sequence[memoryview]) -> None:
@@ -71,7 +71,7 @@ class HostedChannel:
             self._watch()
 
     def readable(self) -> bool:
-        """Whether there is a message or the end."""
+        """Tell whether there is a message or the end."""
         return self._channel.poll(0)
 
     def watch(self, watcher: Watcher) -> None:
@@ -83,7 +83,7 @@ class HostedChannel:
             self._watch()
 
     def withdraw(self, waiter: Waiter) -> bool:
-        """It waits no more; False if it did not."""
+        """Stop waiting; return False if ``waiter`` did not wait."""
         for queue in (self._receivers, self._pollers):
             if waiter in queue:
                 queue.remove(waiter)
@@ -97,7 +97,7 @@ class HostedChannel:
         return False
 
     def forget(self, watcher: Watcher) -> None:
-        """It wants to know nothing more."""
+        """Stop watching for ``watcher``."""
         self._watchers.discard(watcher)
         self._watch()
 
@@ -206,7 +206,7 @@ class HostedCounter:
         self._changes: dict[Waiter, int] = {}
 
     def fileno(self) -> int:
-        """Its descriptor."""
+        """Return the descriptor."""
         return self._counter.fileno()
 
     def add(self, n: int) -> None:
@@ -237,7 +237,7 @@ class HostedCounter:
         self._event(IN)
 
     def withdraw(self, waiter: Waiter) -> bool:
-        """It waits no more; False if it did not."""
+        """Stop waiting; return False if ``waiter`` did not wait."""
         found = self._changes.pop(waiter, None) is not None
         for queue in (self._takers, self._waiters):
             if waiter in queue:
@@ -276,7 +276,7 @@ class HostedMemory:
     """Shared memory, which is kept there: what changes does not travel on these streams."""
 
     def withdraw(self, waiter: Waiter) -> bool:
-        """Nobody waits for it."""
+        """Return False: nothing waits for it."""
         return False
 
     def close(self) -> None:

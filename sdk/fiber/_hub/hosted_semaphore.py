@@ -23,7 +23,7 @@ _RELEASE_AGAIN = 0.005
 
 
 class HostedSemaphore:
-    """On the loop's thread."""
+    """Semaphore that the hub serves.  Runs on the loop's thread."""
 
     def __init__(self, loop: Loop, doorbell: Doorbell, block: Block) -> None:
         self._loop = loop
@@ -59,11 +59,11 @@ class HostedSemaphore:
         self.release()
 
     def value(self) -> int:
-        """How often it can be acquired now."""
+        """Return how often it can be acquired now."""
         return self._semaphore._get_value()
 
     def withdraw(self, waiter: Waiter) -> bool:
-        """It waits no more; False if it did not."""
+        """Stop waiting; return False if ``waiter`` did not wait."""
         for entry in self._waiters:
             if entry[0] is waiter:
                 self._waiters.remove(entry)
@@ -71,7 +71,7 @@ class HostedSemaphore:
         return False
 
     def close(self) -> None:
-        """Nobody elsewhere uses it any more."""
+        """Stop serving it: no process of another host uses it."""
         self._waiters.clear()
         self._stop_listening()
 

@@ -1,4 +1,4 @@
-"""Who waits at a condition of this host, as its hub sees it."""
+"""Wait list of a condition of this host, on the side of its hub."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LOOK = 1.0
 
 
 class HostedWaitList:
-    """On the loop's thread."""
+    """Wait list that the hub serves.  Runs on the loop's thread."""
 
     def __init__(self, loop: Loop, doorbell: Doorbell, block: Block) -> None:
         self._loop = loop
@@ -34,11 +34,11 @@ class HostedWaitList:
             self._loop.call_later(_LOOK, self._look)
 
     def withdraw(self, waiter: Waiter) -> bool:
-        """It waits no more; False if it did not."""
+        """Stop waiting; return False if ``waiter`` did not wait."""
         return self._sleepers.pop(waiter, None) is not None
 
     def close(self) -> None:
-        """Nobody elsewhere uses it any more."""
+        """Stop serving it: no process of another host uses it."""
         self._sleepers.clear()
         self._doorbell.forget(self._serve)
 

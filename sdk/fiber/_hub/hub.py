@@ -50,7 +50,7 @@ _ACCEPT_AGAIN = 0.1
 
 
 class Hub:
-    """On the loop's thread, but for what says that any thread may call it."""
+    """Hub of a host.  Runs on the loop's thread, but for methods marked "any thread"."""
 
     def __init__(self, loop: Loop, host: str, directory: str | None = None) -> None:
         self.host = host
@@ -70,7 +70,7 @@ class Hub:
 
     @property
     def address(self) -> HubAddress:
-        """Where other processes of this host find the hub; NoHub if there can be no socket.
+        """Address of the hub for other processes of this host; NoHub if there can be no socket.
 
         Any thread.
         """
@@ -81,7 +81,7 @@ class Hub:
 
     @property
     def address_or_problem(self) -> HubAddress:
-        """What the processes of this host are told at birth.  The first call opens the socket.
+        """Address, or problem, for new processes of this host.  The first call opens the socket.
 
         If that fails it is not tried again: those who clean up after us know the directory, or that
         there is none, from the first child on.  Any thread.
@@ -102,7 +102,7 @@ class Hub:
         return os.path.dirname(address.path) or None if address else None
 
     def on_loop(self) -> bool:
-        """Whether the caller is the thread that serves this hub."""
+        """Tell whether the caller runs on the thread that serves this hub."""
         return self._loop.on_thread()
 
     def dial(self) -> socket.socket:
@@ -144,7 +144,7 @@ class Hub:
         return link
 
     def unlink(self, host: str | None, reason: str) -> None:
-        """That link is over; whoever used it is told ``reason``."""
+        """Forget the link to a host, which has ended, and close its streams with ``reason``."""
         self._router.unlink(host, reason)
         self.replicas.unlink(host, reason)
 

@@ -1,4 +1,4 @@
-"""What the hubs of two hosts say to each other over the link between these."""
+"""Link between the hubs of two hosts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Send = Callable[[OfHubs], None]
 
 
 class HubLink:
-    """One side of it, on the loop's thread.
+    """Side of a link between two hubs.  Runs on the loop's thread.
 
     Whatever else is sent over the link has to be preceded by ``flush``.
     """

@@ -76,7 +76,7 @@ class LocalChannel(UnixChannel):
 
     @property
     def room_events(self) -> int:
-        """Which event of ``fileno()`` says that ``try_send`` is worth another try."""
+        """Event of ``fileno()`` after which ``try_send`` is worth another try."""
         return select.POLLOUT
 
 
@@ -91,7 +91,7 @@ class LocalCounter(UnixCounter):
         """``add``, as a function of C."""
 
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
-        """As ``take``; the claim is noted as well."""
+        """Take one as ``take`` does, and record it in ``claims``."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             claims.add()  # first: who dies in between has noted one too many, not one too few

@@ -52,7 +52,7 @@ _INT = struct.Struct("i")
 
 
 class OneWayEnd(LocalChannel):
-    """One end: a socket, and the backlog that all holders of both ends share."""
+    """End of a one-way channel: a socket, and the backlog that all holders of both ends share."""
 
     __slots__ = ("_words", "backlog")
 
@@ -100,7 +100,7 @@ class Sender(OneWayEnd):
 
     @property
     def room_events(self) -> int:
-        """Which event of ``fileno()`` says that ``try_send`` is worth another try."""
+        """Event of ``fileno()`` after which ``try_send`` is worth another try."""
         return self._room_events or select.POLLOUT
 
     def _send_now(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool | None:

@@ -1,4 +1,4 @@
-"""What is said on a stream to a hub.
+"""Messages on a stream to a hub.
 
 A message is one packet.  Requests and replies are a few numbers; what a user sends or receives lies
 beside them as the packet's buffers, payload first, and nothing here is ever unpickled.
@@ -28,21 +28,21 @@ NO_SECRET = bytes(SECRET_BYTES)
 
 
 class HubAddress(NamedTuple):
-    """How to reach a hub.  The key lets in, and opens no object: that takes a grant."""
+    """Address of a hub.  Its key admits a process; an object needs a grant."""
 
     host: str
     path: str
-    """Of its unix socket; empty if it could not open one."""
+    """Path of its unix socket; empty if it could not open one."""
     key: bytes
     problem: str = ""
-    """Why it could not, and what to do."""
+    """Reason why it could not, and what to do."""
 
     def __repr__(self) -> str:
         return f"HubAddress(host={self.host!r}, path={self.path!r})"
 
 
 class ObjectKind(IntEnum):
-    """What an object is."""
+    """Kind of an object."""
 
     CHANNEL = 1
     COUNTER = 2
@@ -56,18 +56,18 @@ class ObjectKind(IntEnum):
 
 
 class Extent(NamedTuple):
-    """Which part of what a descriptor refers to is the object: a block of a segment."""
+    """Part of a segment that an object is."""
 
     offset: int = 0
     size: int = 0
 
 
 WHOLE = Extent()
-"""Of a channel or counter."""
+"""Extent of a channel or counter."""
 
 
 class GrantFlags(IntFlag):
-    """How long a grant lasts."""
+    """Life of a grant."""
 
     REUSABLE = 1  # beyond its first use
     ENDS_WITH_STREAM = 2  # with the one on which it was asked for
@@ -155,7 +155,7 @@ class Origin(NamedTuple):
         return f"Origin(home={self.home!r}, size={self.size})"
 
     def encode(self) -> bytes:
-        """As it travels between hubs."""
+        """Return the bytes that travel between hubs."""
         return _ORIGIN.pack(*self[1:]) + self.home.encode()
 
     @classmethod
@@ -193,5 +193,5 @@ def gone(reason: str) -> bytes:
 
 
 def text(payload: memoryview) -> str:
-    """What follows the numbers of CONNECT and GONE."""
+    """Return the text after the numbers of CONNECT and GONE."""
     return str(payload[HEAD.size :], "utf-8", "replace")

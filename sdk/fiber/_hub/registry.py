@@ -1,4 +1,4 @@
-"""Which objects of its host a hub keeps for others, and what keeps each of them there.
+"""Registry of the objects that a hub keeps for processes of other hosts.
 
 An object stays as long as someone on another host is attached to it or a grant for it is out.  A
 grant is the permission that travels inside a pickled handle: 128 random bits.  A plain one ends
@@ -79,14 +79,14 @@ class SharedObject:
         return numbers
 
     def end_service(self) -> None:
-        """Nobody is attached any more."""
+        """End the service: no stream is attached."""
         server, self.server = self.server, None
         if server is not None:
             server.close()
 
 
 class Attachment(NamedTuple):
-    """One stream of a user of an object."""
+    """Stream of a user of an object."""
 
     shared: SharedObject
     token: bytes
@@ -121,7 +121,7 @@ class Registry:
         )
         self._grants: dict[bytes, Grant] = {}
         self._users: dict[bytes, list[SharedObject]] = {}
-        """By their tokens; an entry for each stream."""
+        """Objects by the tokens of their users, with an entry for each stream."""
 
     def register(
         self,
@@ -198,11 +198,11 @@ class Registry:
         return self._used_by(token).hosted
 
     def look_up(self, token: bytes, grant: bytes) -> SharedObject:
-        """What somebody is attached to, or is about to be by this grant."""
+        """Return the object that the user is attached to, or may attach to by this grant."""
         return self._used_by(token) if token in self._users else self._granted(grant)
 
     def detach(self, attachment: Attachment) -> None:
-        """One stream less."""
+        """Remove one stream."""
         shared, token = attachment
         streams = self._users[token]
         streams.pop()
@@ -255,7 +255,7 @@ _NOT_THERE = (
 
 
 def _identity(kind: ObjectKind, fd: int) -> int:
-    """What two descriptors of one kernel object have in common, while it exists."""
+    """Return a number that all descriptors of one kernel object share, while it exists."""
     if kind is ObjectKind.COUNTER:
         return _event_counter(fd)
     status = os.fstat(fd)

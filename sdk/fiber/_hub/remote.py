@@ -157,7 +157,7 @@ class RemoteObject:
 
 
 class RemoteChannel(RemoteObject):
-    """One end of a message pipe on another host; a ``SharedChannel``."""
+    """End of a message pipe on another host; a ``SharedChannel``."""
 
     can_try_send = False
 
@@ -231,7 +231,7 @@ class RemoteChannel(RemoteObject):
         return Message(reply.parts[0], reply.parts[1:], [])
 
     def poll(self, timeout: float | None) -> bool:
-        """Whether ``recv`` would return or raise at once."""
+        """Wait until ``recv`` would return or raise at once; False after ``timeout`` seconds."""
         with self.stream() as stream:
             return bool(self._late) or stream.ask(Op.POLL, timeout=timeout).status is Status.OK
 
@@ -305,7 +305,7 @@ class RemoteCounter(RemoteObject):
             return True
 
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
-        """As ``take``; if this process dies before it has the answer, the hub takes it back."""
+        """Take one as ``take`` does.  The hub takes it back if this process dies before."""
         with self.stream() as stream:
             if stream.ask(Op.CLAIM, timeout=timeout).status is not Status.OK:
                 return False

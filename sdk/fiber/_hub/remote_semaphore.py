@@ -20,7 +20,7 @@ from fiber._sync.semaphore import RECURSIVE
 
 
 class RemoteSemaphore(RemoteObject):
-    """With the methods of multiprocessing's ``SemLock``, as ``SharedSemaphore``."""
+    """Semaphore of another host, with the methods of multiprocessing's ``SemLock``."""
 
     def __init__(self, handle: HubHandle, extent: Extent, kind: int, maximum: int) -> None:
         self.extent = extent
@@ -80,21 +80,21 @@ class RemoteSemaphore(RemoteObject):
             self._idle.append(stream)
 
     def _is_mine(self) -> bool:
-        """Whether this thread has it, having been the last in this process to acquire it."""
+        """Tell whether this thread was the last of this process to acquire it, and holds it."""
         return self._depth > 0 and self._owner == threading.get_ident()
 
     def _count(self) -> int:
-        """How often this process has acquired it and not released it."""
+        """Return how often this process has acquired it and not released it."""
         return self._depth
 
     def _get_value(self) -> int:
-        """How often it can be acquired now."""
+        """Return how often it can be acquired now."""
         with self.stream() as stream:
             value: int = stream.ask(Op.TOKENS).values[0]
         return value
 
     def _is_zero(self) -> bool:
-        """Whether nobody can acquire it now."""
+        """Tell whether it cannot be acquired now."""
         return not self._get_value()
 
     def close(self) -> None:

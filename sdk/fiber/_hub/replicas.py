@@ -52,10 +52,10 @@ class Joiner(Protocol):
     """Waits for a block to be here."""
 
     def joined(self, block: Block) -> None:
-        """It is here, as its home knew it a moment ago."""
+        """Take the block, as its home knew it a moment ago."""
 
     def refused(self, reason: str) -> None:
-        """It cannot be had."""
+        """Note that the block cannot be had."""
 
 
 class Replica:
@@ -66,7 +66,7 @@ class Replica:
         self.block = block
         self.memory = block.view
         self.joiners: list[Joiner] = []
-        """Who waits for the contents."""
+        """Joiners that wait for the contents."""
         self.users: set[object] = set()
         """Processes of this host, and links whose other side has joined here."""
         self.upstream: _Share | None = None
@@ -86,7 +86,7 @@ class _Share:
 
 
 class Replicas:
-    """Of one hub."""
+    """Replicas of one hub."""
 
     def __init__(self, host: str, registry: Registry) -> None:
         self._host = host
@@ -123,7 +123,7 @@ class Replicas:
             replica.joiners.append(joiner)
 
     def leave(self, identity: Identity, user: object) -> None:
-        """It is of no use to ``user`` any more."""
+        """Note that ``user`` no longer uses the block."""
         replica = self._replicas.get(identity)
         if replica is None or user not in replica.users:
             return
@@ -187,7 +187,7 @@ class MemoryLink:
         self._joining: dict[int, _Downstream] = {}
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
+        """True if there are shares."""
         return bool(self._shares)
 
     def flush(self) -> None:
@@ -204,7 +204,7 @@ class MemoryLink:
         self._send(Memory(number, _KINDS[kind] + data))
 
     def on_frame(self, frame: Memory) -> None:
-        """What the other side says; ProtocolError for what it never should."""
+        """Take a frame of the other side; ProtocolError if it is wrong."""
         payload = memoryview(frame.payload)
         try:
             kind = _Kind(payload[0])
@@ -225,7 +225,7 @@ class MemoryLink:
         return share
 
     def leave(self, share: _Share) -> None:
-        """Nobody here has a use for it any more."""
+        """Leave a block that no process of this host uses."""
         if self._shares.pop(share.number, None) is not None:
             self._flush(share)
             self._say(share.number, _Kind.LEAVE)
@@ -247,7 +247,7 @@ class MemoryLink:
         self._say(number, _Kind.READY)
 
     def refused(self, downstream: _Downstream, reason: str) -> None:
-        """They cannot be had."""
+        """Refuse the contents to a host that joins."""
         if self._joining.pop(downstream.number, None) is not None:
             self._say(downstream.number, _Kind.READY, reason.encode(errors="replace"))
 

@@ -28,21 +28,21 @@ class Handler(Protocol):
         """A message; borrowed until this returns."""
 
     def on_room(self) -> None:
-        """It was congested and is not any more."""
+        """Note that a congested stream has room again."""
 
     def on_closed(self, reason: str) -> None:
-        """It ended; once, and nothing comes after it.  ``reason`` is empty at an orderly end."""
+        """Note the end.  Called once, and last; ``reason`` is empty at an orderly end."""
 
 
 class Stream(Protocol):
-    """One end of a stream."""
+    """End of a stream."""
 
     handler: Handler
     passes_descriptors: bool
 
     @property
     def congested(self) -> bool:
-        """Whether what was sent piles up; sending more still works."""
+        """True if messages pile up.  Sending more still works."""
 
     def send(
         self,
@@ -93,7 +93,7 @@ class SocketStream:
 
     @property
     def congested(self) -> bool:
-        """Whether what was sent piles up."""
+        """True if messages pile up."""
         return self._waiting_bytes > CONGESTED
 
     def send(

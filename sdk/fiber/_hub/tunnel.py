@@ -38,7 +38,7 @@ Send = Callable[[Frame], None]
 
 
 class TunnelStream:
-    """One end of a tunnel, on the loop's thread."""
+    """End of a tunnel.  Runs on the loop's thread."""
 
     passes_descriptors = False
 
@@ -57,7 +57,7 @@ class TunnelStream:
 
     @property
     def congested(self) -> bool:
-        """Whether the other side takes less than comes."""
+        """True if the other side takes less than is sent."""
         return self._credit <= 0
 
     def send(

@@ -1,4 +1,4 @@
-"""Who waits at a condition, in whichever process of whichever host."""
+"""Wait lists of conditions, for processes of any host."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fiber._sync.wait_list import SIZE, WaitList
 
 
 class RemoteWaitList(RemoteObject):
-    """Of another host; as ``WaitList``.  A place is a stream, so it ends with this process."""
+    """Wait list of another host.  A place is a stream, so it ends with this process."""
 
     def __init__(self, handle: HubHandle, extent: Extent) -> None:
         self.extent = extent
@@ -45,7 +45,7 @@ class RemoteWaitList(RemoteObject):
         place.ask(Op.SLEEP, timeout=timeout)
 
     def leave(self, place: HubStream) -> bool:
-        """Whether it was notified; it is free then."""
+        """Free a place; return whether it was notified."""
         place.settle()
         notified = place.ask(Op.LEAVE).status is Status.OK
         self._idle.append(place)
@@ -62,11 +62,11 @@ class RemoteWaitList(RemoteObject):
         self._ask(Op.NOTIFY, n)
 
     def waiters(self) -> int:
-        """How many wait."""
+        """Return the number of waiters."""
         return self._ask(Op.WAITERS, 0)
 
     def bury(self) -> int:
-        """How many died while they waited, since this was asked last."""
+        """Return how many waiters died since the last call."""
         return self._ask(Op.BURY, 0)
 
     def hold(self, place: HubStream, number: int) -> None:
@@ -78,7 +78,7 @@ class RemoteWaitList(RemoteObject):
         place.ask(Op.TALLY, held, total, form=TWO)
 
     def held(self) -> int:
-        """How many things all owners of places have."""
+        """Return the number of things that all owners of places have."""
         return self._ask(Op.HELD, 0)
 
     def reclaim(self, counter: RemoteCounter) -> int:
@@ -88,7 +88,7 @@ class RemoteWaitList(RemoteObject):
         return value
 
     def get(self, number: int) -> int:
-        """One of the user's two words."""
+        """Return one of the user's two words."""
         value = self._ask(Op.GET, number)
         return value - (1 << 64) if value >> 63 else value
 
