@@ -18,7 +18,7 @@ LEFT = {
     "operator/fiber_operator": 213,
     "sdk/fiber": 9,
     "sdk/fiber/_agent": 0,
-    "sdk/fiber/_backends": 170,
+    "sdk/fiber/_backends": 8,
     "sdk/fiber/_engine": 0,
     "sdk/fiber/_hub": 0,
     "sdk/fiber/_managers": 48,

@@ -1,1 +1,1 @@
-"""Where children run: this process, agents on this machine, pods."""
+"""Backends: children of this process, of agents on this machine, and in pods."""

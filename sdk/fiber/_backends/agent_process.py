@@ -21,13 +21,13 @@ _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 """Seconds from one attempt to start a process to the next, growing."""
 
 _MAY_PASS = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
-"""What keeps the system from starting a process, until others have ended."""
+"""Errors of a system that can start no process until others have ended."""
 
 _STATEMENT = "import runpy; runpy.run_module('fiber.agent', run_name='__main__')"
 
 
 class AgentProcess:
-    """One process, from before its start to after its end.
+    """Process of an agent, from before its start to after its end.
 
     ``on_end`` is called once, on the loop's thread: with how the process ended or why it never
     began, and whether a signal or a lack of resources was the reason.
@@ -46,7 +46,7 @@ class AgentProcess:
 
     @property
     def pid(self) -> int | None:
-        """Its id, once it has begun."""
+        """Id of the process, once it has begun."""
         return None if self._process is None else self._process.pid
 
     def start(self, environment: Mapping[str, str], credentials: Credentials) -> None:
@@ -76,11 +76,11 @@ class AgentProcess:
         self._loop.register(self._watched, self._ended)
 
     def fail(self, reason: str, *, may_pass: bool) -> None:
-        """It will not be started."""
+        """Note that the process will not be started."""
         self._loop.call_soon(self._on_end, reason, may_pass)
 
     def kill(self) -> None:
-        """It is out of reach, though it may run: nothing of it is wanted any more."""
+        """Kill the process, which is out of reach though it may run."""
         self._end(signal.SIGKILL)
 
     def terminate(self) -> None:

@@ -36,13 +36,13 @@ class AgentSet:
     ) -> None:
         self.loop = loop
         self.placement = placement
-        """Which of them runs which child."""
+        """Placement of children on agents."""
         self.agents: dict[str, RemoteAgent] = {}
-        """Those that have joined and are not lost, by name."""
+        """Agents that have joined and are not lost, by name."""
         self.joined = 0
-        """How many ever have."""
+        """Number of agents that ever joined."""
         self.error: Exception | None = None
-        """Why no agent will come."""
+        """Error for which no agent will come."""
         self._successor: Callable[[], AgentSet] | None = None
         self._hub = hub
         self._output = output
@@ -53,7 +53,7 @@ class AgentSet:
 
     @property
     def children(self) -> int:
-        """How many there are, waiting and about to be started ones included."""
+        """Number of children, with those that wait or are about to be started."""
         placement = self.placement
         return placement.children + len(placement.waiting) + len(self._not_started)
 
@@ -76,7 +76,7 @@ class AgentSet:
         self._place()
 
     def withdraw(self, child: RemoteChild) -> bool:
-        """It is not to be started any more; False if it has an agent already."""
+        """Withdraw a child; return False if it has an agent already."""
         waited = self.placement.leave(child)
         if waited:
             self._on_change()
@@ -107,14 +107,14 @@ class AgentSet:
             self.refuse_waiting(error)
 
     def hand_over(self, successor: Callable[[], AgentSet]) -> None:
-        """Whoever waits, or is to be started from now on, is for others: no agent comes here."""
+        """Give waiting and later children to ``successor``: no agent comes here."""
         self._successor = successor
         for child in self._take_waiting():
             self.start(child)
         self._on_change()
 
     def refuse_waiting(self, error: Exception) -> None:
-        """Nobody is to wait any longer."""
+        """Refuse all waiting children with ``error``."""
         for child in self._take_waiting():
             _refuse(child, error)
         self._on_change()
@@ -133,7 +133,7 @@ class AgentSet:
     # What becomes of agents
 
     def lost(self, agent: RemoteAgent, reason: str) -> None:
-        """It is gone."""
+        """Note that an agent is lost."""
         _logs.debug("agent %s is lost: %s", agent.host, reason)
         del self.agents[agent.host]
         if agent in self.placement.loads:
@@ -145,7 +145,7 @@ class AgentSet:
             self._on_change()
 
     def leaving(self, agent: RemoteAgent) -> None:
-        """It takes no new children: as far as room goes, it is gone already."""
+        """Note that an agent takes no new children.  Its room does not count from now on."""
         _logs.debug("agent %s leaves: %s", agent.host, agent.leaving)
         if agent in self.placement.loads:
             self.placement.remove(agent)
@@ -153,18 +153,18 @@ class AgentSet:
         self._on_change()
 
     def child_gone(self, agent: RemoteAgent) -> None:
-        """There is room for another."""
+        """Note that a child of an agent has ended, and left room for another."""
         if agent in self.placement.loads:
             self.placement.ended(agent, self.loop.now())
             self._place()
 
     def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
-        """It gets no children while it is silent."""
+        """Give an agent no children while it is silent."""
         _logs.debug("agent %s is %s", agent.host, "silent" if suspect else "heard again")
         self.withhold(agent, suspect, "silent")
 
     def withhold(self, agent: RemoteAgent, withheld: bool, why: str) -> None:
-        """Whether it is given no children for this reason."""
+        """Withhold children from an agent for this reason, or give it children again."""
         if agent not in self.placement.loads:
             return
         if withheld:

@@ -1,4 +1,4 @@
-"""What a backend is: it turns "I want a child" into one, wherever that runs."""
+"""Interface of a backend, which makes children wherever they run."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ class Backend(Protocol):
 
     name: str
     same_host: bool
-    """Whether its agents run on the program's own host, so that descriptors can be handed over."""
+    """True if its agents run on the program's host, so that descriptors can be handed over."""
 
     same_pids: bool
-    """Whether the pids of its children are those of this host and this PID namespace."""
+    """True if the pids of its children are those of this host and this PID namespace."""
 
     elastic: bool
-    """Whether a host may be made for a child: starting one does not wait for that."""
+    """True if a host may be made for a child.  Starting a child does not wait for its host."""
 
     @property
     def sends_program(self) -> bool:
-        """Whether its agents have not the program's files, which their children need."""
+        """True if its agents need the program's files for their children."""
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
         """A child to be started, at once or when there is room for it; raises what is known to be

@@ -1,4 +1,4 @@
-"""What one agent was sent of the blobs that its children need."""
+"""Sender of the blobs that the children of one agent need."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class BlobSender:
         self._send = send
         self._sent: dict[bytes, weakref.ref[Blob]] = {}
         self._leaving: dict[bytes, int] = {}
-        """How often each blob was sent and has not left."""
+        """Number of times that each blob was sent and has not left."""
         self._waiting: list[tuple[list[bytes], Callable[[], None]]] = []
         """The blobs that a caller needs, and what follows when they have left."""
 

@@ -1,4 +1,4 @@
-"""Which files of a folder the program's children do not need, as its people say.
+"""Rules of ignore files: files of a folder that the program's children do not need.
 
 In ``.gitignore`` and, of the same syntax and stronger, ``.fiberignore``, in that folder, in those
 below and in those above up to the root of the repository.  As in git, the file nearest to a path
@@ -42,7 +42,7 @@ _NEVER_NEEDED = f"""
 node_modules/
 .DS_Store
 """
-"""What versions, tools and editors leave; an ignore file that says ``!name`` has it sent."""
+"""Files that tools and editors leave.  An ignore file with ``!name`` has them sent."""
 
 
 class _Level(NamedTuple):
@@ -59,7 +59,7 @@ class _Level(NamedTuple):
 
 
 class _Decision(NamedTuple):
-    """One line of one file that decides about a path."""
+    """Line of an ignore file that decides about a path."""
 
     ignored: bool
     line: str
@@ -80,7 +80,7 @@ class IgnoreRules:
 
     @classmethod
     def around(cls, folder: str) -> IgnoreRules:
-        """Those that ``folder`` has from the folders around it.
+        """Return the rules that ``folder`` has from the folders around it.
 
         None if they say to ignore that very folder: they were not made for what is run from it.
         """
@@ -93,7 +93,7 @@ class IgnoreRules:
         return rules
 
     def within(self, folder: str) -> IgnoreRules:
-        """Those that hold in ``folder``, which these are around."""
+        """Return the rules that hold in ``folder``, below the folder of these rules."""
         top = folder.rstrip(os.sep)
         found = [_Level(top, name, _compiled(text)) for name, text in _read_all(folder)]
         return IgnoreRules((*self._levels, *found)) if found else self

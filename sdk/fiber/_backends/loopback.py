@@ -78,9 +78,9 @@ class LoopbackBackend:
         self._slots: list[_Slot] = []
         self._by_name: dict[str, _Slot] = {}
         self._departing: dict[str, _Slot] = {}
-        """Those whose agents are about to go, and have been replaced."""
+        """Slots whose agents are about to go, and were replaced."""
         self._vacant: list[_Slot] = []
-        """Those whose agents are lost and not yet replaced."""
+        """Slots whose agents are lost and not replaced yet."""
         self.agents = AgentSet(
             loop,
             hub,
@@ -110,7 +110,7 @@ class LoopbackBackend:
 
     @property
     def sends_program(self) -> bool:
-        """Whether its agents have not the program's files."""
+        """True if its agents need the program's files."""
         return self.elsewhere is not None
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
@@ -192,7 +192,7 @@ class LoopbackBackend:
                 agent.close()
 
     def _ended(self, name: str, reason: str, killed: bool) -> None:
-        """Its process is gone, or was never there."""
+        """Note that the process of an agent has ended, or was never started."""
         agent = self.agents.agents.get(name)
         if agent is not None:
             agent.lose(reason)
@@ -211,7 +211,7 @@ class LoopbackBackend:
             self._fill_vacant()
 
     def _leaving(self, agent: RemoteAgent) -> None:
-        """It is replaced now, and ends by itself."""
+        """Replace an agent that leaves, and ends by itself."""
         if not self._closing:
             self._departing[agent.host] = slot = self._by_name.pop(agent.host)
             self._vacant.append(slot)

@@ -1,4 +1,4 @@
-"""What remote children write, on the master's stderr with the writer's name in front."""
+"""Output of remote children, on the master's stderr with the name of the writer."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class Output:
         self._left_out = 0
         """Lines since the last that was taken."""
         self._line = ""
-        """What is to stand below them."""
+        """Line that stands below the output."""
         self._redraws = False
-        """Whether the thread is to look at that."""
+        """True if the thread must draw that line anew."""
 
     def write(self, who: str, text: str) -> None:
         """Lines of ``who``; returns at once."""

@@ -75,7 +75,7 @@ def _member(name: str, mode: int) -> tarfile.TarInfo:
 
 
 def _read(path: str, torn: list[str]) -> bytes | None:
-    """What is in a file, if it can be in one state, and not of two; None if it cannot be read.
+    """Read a file in one state, and not parts of two states; None if it cannot be read.
 
     A file that changes each time is added to ``torn``.
     """

@@ -1,4 +1,4 @@
-"""Which files of the program are sent, and which are not, and why."""
+"""Selection of the program's files that are sent, with the reasons for those that are not."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _LARGEST = 5
 
 
 class Entry(NamedTuple):
-    """One file, folder or link, as it was when it was found."""
+    """File, folder or link, as it was found."""
 
     path: str
-    """Here.  Its contents are read from there, through a link if need be."""
+    """Path on this host.  The contents are read from there, through a link if need be."""
     mode: int
     size: int = 0
     modified: int = 0
     target: str | None = None
-    """Of a link within a folder; what a link to elsewhere leads to is sent in its place."""
+    """Target of a link within the folder.  For other links their target is sent in their place."""
 
 
 class Why(enum.Enum):
@@ -46,7 +46,7 @@ class Why(enum.Enum):
 
 
 class LeftOut(NamedTuple):
-    """One file, folder or link that is not sent."""
+    """File, folder or link that is not sent."""
 
     path: str
     why: Why
@@ -54,7 +54,7 @@ class LeftOut(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """What is sent, by its name in the archive, and what is left out."""
+    """Files that are sent, by their names in the archive, and files that are left out."""
 
     files: dict[str, Entry]
     left_out: tuple[LeftOut, ...]
@@ -110,7 +110,7 @@ class _Around(NamedTuple):
     top: str
     """The real folder that links may lead to: the first, or where a link has led."""
     trusted: bool = False
-    """Whether somebody asked for a folder of secrets that this one is in."""
+    """True if an ignore file asks for a folder of secrets around this one."""
 
     def within(self, real: str, trusted: bool) -> _Around:
         top = self.top if _is_inside(real, self.top) else real
@@ -118,7 +118,7 @@ class _Around(NamedTuple):
 
 
 class _Walk:
-    """One look at all files of a program."""
+    """Walk over all files of a program."""
 
     def __init__(self, layout: Layout) -> None:
         self.left_out: list[LeftOut] = []
@@ -187,7 +187,7 @@ def _found_in(folder: str) -> list[os.DirEntry[str]]:
 
 
 def _is_readable(entry: Entry) -> bool:
-    """Whether this program can read the file, or list and enter the folder."""
+    """Tell whether this program can read the file, or list and enter the folder."""
     if entry.target is not None:
         return True
     needed = os.R_OK | os.X_OK if stat.S_ISDIR(entry.mode) else os.R_OK
@@ -195,7 +195,7 @@ def _is_readable(entry: Entry) -> bool:
 
 
 def _secret(entry: Entry, real: str) -> str | None:
-    """What the entry holds, if that is secret by its own name or that of what it leads to."""
+    """Return the kind of secret, if the name of the entry or of its target is that of one."""
     if stat.S_ISDIR(entry.mode):
         names = map(os.path.basename, (entry.path, real))
         return next(filter(None, map(secret_files.in_folder, names)), None)

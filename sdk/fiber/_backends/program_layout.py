@@ -1,4 +1,4 @@
-"""Which folders make up the program, and where its children on another machine find them.
+"""Folders that make up the program, and their places on another machine.
 
 * The folder of the main module; for ``-m`` the one that its package is found in.  A session without
   a main module of its own (``-c``, stdin, a notebook, an installed command) has its working
@@ -40,23 +40,23 @@ class Places(dict[str, str]):
         return next((place for place in self if _is_inside(path, place)), None)
 
     def name_of(self, path: str) -> str | None:
-        """What ``path`` is called there; None if it is not sent."""
+        """Return the path there; None if ``path`` is not sent."""
         place = self.place_of(path)
         return None if place is None else self[place] + path[len(place) :]
 
 
 class Layout(NamedTuple):
-    """What is sent, and where it will be."""
+    """Folders and files to send, and their places there."""
 
     places: Places
     program: str
     """The program's folder; of some only a part is sent."""
     files: tuple[str, ...]
-    """What has been imported from the places: children need it whatever rules say."""
+    """Files that were imported from the places.  Children need them, whatever ignore files say."""
     trees: tuple[str, ...]
-    """Folders of ``sys.path`` of which only that is sent."""
+    """Folders of ``sys.path`` of which only these files are sent."""
     session: frozenset[str]
-    """Those of the places that are a session's working directory and nothing else."""
+    """Places that are only the working directory of a session."""
     paths: ProgramPaths
 
 
@@ -67,7 +67,7 @@ class _Module(NamedTuple):
     whole: str
     """The file, or the folder of the package that it is in."""
     name: str
-    """What that has to be called to be imported."""
+    """Name that the main module must have to be imported."""
 
 
 def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Layout:
@@ -131,7 +131,7 @@ def _folder_of(main: str) -> str:
 
 
 def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What is on ``sys.path`` there before and after the standard library."""
+    """Return the entries of ``sys.path`` there, before and after the standard library."""
 
     def there(entries: list[str]) -> list[str]:
         names = [places.name_of(entry) for entry in entries if not _is_installed(entry)]
@@ -165,14 +165,14 @@ def _is_installed(path: str) -> bool:
 
 @lru_cache(maxsize=1)
 def _own_folders() -> frozenset[str]:
-    """Where the interpreter has its own, and Fiber."""
+    """Return the folders of the interpreter, and that of Fiber."""
     kinds = ("stdlib", "platstdlib", "scripts")
     fiber = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     return frozenset({fiber, *map(sysconfig.get_path, kinds)})
 
 
 def _is_nobodys(folder: str) -> bool:
-    """Whether all kinds of things are there, a user's secrets among them."""
+    """Tell whether the folder holds all kinds of things, as a home folder does."""
     home, here = os.path.realpath(os.path.expanduser("~")), os.path.realpath(folder)
     return _is_inside(home, here) or here == os.path.realpath(tempfile.gettempdir())
 
@@ -192,7 +192,7 @@ def _outermost(paths: Iterable[str]) -> list[str]:
 
 
 def _named(paths: Iterable[str]) -> dict[str, str]:
-    """For each a name of its own, as much like the one that it has as can be."""
+    """Return a different name for each path, as close to its own as possible."""
     names: dict[str, str] = {}
     for path in paths:
         name = wanted = os.path.basename(path)

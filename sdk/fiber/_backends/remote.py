@@ -34,16 +34,16 @@ class AgentObserver(Protocol):
     """Hears what becomes of an agent; on the loop's thread."""
 
     def lost(self, agent: RemoteAgent, reason: str) -> None:
-        """It is gone for good; its children are told after this."""
+        """Note that an agent is lost for good.  Its children are told after this."""
 
     def child_gone(self, agent: RemoteAgent) -> None:
-        """One of its children is gone."""
+        """Note that a child of an agent has ended."""
 
     def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
-        """It is silent; or heard again."""
+        """Note that an agent is silent, or is heard again."""
 
     def leaving(self, agent: RemoteAgent) -> None:
-        """It takes no new children."""
+        """Note that an agent takes no new children."""
 
 
 class Starter(Protocol):
@@ -55,7 +55,7 @@ class Starter(Protocol):
         """Have it started, now or as soon as there is room."""
 
     def withdraw(self, child: RemoteChild) -> bool:
-        """It is not to be started any more; False if it has an agent already."""
+        """Withdraw a child; return False if it has an agent already."""
 
 
 class RemoteAgent:
@@ -81,11 +81,11 @@ class RemoteAgent:
         self.ending = ""
         """Why its pod is about to go, where that is known."""
         self.disrupted = False
-        """Whether the end of its pod is the cluster's doing."""
+        """True if the cluster ends its pod."""
         self.leaving = ""
-        """Why it takes no new work and is about to go; empty if it stays."""
+        """Reason why it takes no new work and is about to go; empty if it stays."""
         self.suspect = False
-        """Whether it has been silent for a while."""
+        """True if it has been silent for a while."""
         self._link = link
         self._blobs = BlobSender(loop, self._put)
         self._hub = hub
@@ -129,7 +129,7 @@ class RemoteAgent:
         self.send(messages.Shutdown(_SHUTDOWN_GRACE))
 
     def leave(self, reason: str) -> None:
-        """It is about to go: its workers get nothing more to do."""
+        """Note that the agent is about to go: its workers get no new work."""
         if self.leaving or self.lost is not None:
             return
         self.leaving = reason
@@ -138,7 +138,7 @@ class RemoteAgent:
             child.observer.draining()
 
     def lose(self, reason: str, *, disrupted: bool = False) -> None:
-        """It is gone, and its children with it.  ``disrupted``: the cluster ended it."""
+        """Note that the agent is gone, with its children.  ``disrupted``: the cluster ended it."""
         if self.lost is not None:
             return
         self.lost = reason
@@ -172,7 +172,7 @@ class RemoteAgent:
     # What comes over the link
 
     def on_frame(self, frame: Frame) -> None:
-        """What the agent tells of its children."""
+        """Take a message of the agent about its children."""
         message = messages.decode(frame)
         if isinstance(message, messages.OfHubs):
             self._hub_link.on_frame(message)
@@ -219,9 +219,9 @@ class RemoteChild:
     def __init__(self, starter: Starter, spec: ChildSpec, observer: ChildObserver) -> None:
         self.name = spec.name
         self.is_worker = spec.tasks
-        """Whether it is a pool's."""
+        """True for a worker of a pool."""
         self.host = ""
-        """Where it is; empty while it waits for an agent."""
+        """Host of the child; empty while it waits for an agent."""
         self.pid: int | None = None
         self.start_error: Exception | None = None
         self.observer = observer
@@ -232,7 +232,7 @@ class RemoteChild:
         self._ended_by = 0
         """Fatal signal that was sent to it before it had begun."""
         self._early: list[tuple[int, BytesLike, Sequence[memoryview]]] = []
-        """What to deliver after its Start."""
+        """Packets to deliver after its Start."""
         self._unasked: list[messages.Message] | None = []
         """Signals and recalls, which wait until its Start has left: they would pass a large one."""
         self._delivered = 0
@@ -241,11 +241,11 @@ class RemoteChild:
         self._gone = False
         needed = (_preparation(spec.preparation), spec.program, spec.arguments)
         self.blobs = [blob for blob in needed if blob is not None]
-        """What its agent must have, for as long as it lives."""
+        """Blobs that its agent must have while the child lives."""
         digests = tuple(blob and blob.digest for blob in needed)
         fields = (spec.name, spec.method, spec.tasks, digests)
         self._asked: tuple[bytes, bytes] | None = None
-        """Its Start, until it is started: its agent may be about to go."""
+        """Start of the child, kept until it has started: its agent may be about to go."""
         self._start: tuple[bytes, bytes] | None = pickle.dumps(fields, protocol=5), spec.payload
 
     @property
@@ -255,7 +255,7 @@ class RemoteChild:
 
     @property
     def waiting(self) -> bool:
-        """Whether it has no agent yet."""
+        """True while it has no agent."""
         return self._agent is None and not self._gone
 
     @property
@@ -274,7 +274,7 @@ class RemoteChild:
         starter.start(self)
 
     def place(self, agent: RemoteAgent, number: int) -> None:
-        """It has an agent."""
+        """Place the child on an agent."""
         self._agent, self._number, self.host = agent, number, agent.host
 
     def begin(self) -> None:
@@ -306,7 +306,7 @@ class RemoteChild:
         return True
 
     def lend(self) -> RemoteTaskChannel | None:
-        """Its task channel, for direct use; None if it is gone."""
+        """Return its task channel, for direct use; None if it has ended."""
         if self._gone:
             return None
         self._channel = RemoteTaskChannel(self._loop, self.deliver)
@@ -368,7 +368,7 @@ class RemoteChild:
             self.end(ExitReport(*message[2:]), self._delivered - message.delivered)
 
     def _may_begin_elsewhere(self, end: messages.Exited) -> bool:
-        """Whether its host refused to start it, since the host is about to go.
+        """Tell whether its host refused to start it, since the host is about to go.
 
         A worker's pool has replaced it already.
         """
@@ -376,7 +376,7 @@ class RemoteChild:
         return refused and self._asked is not None and not self._ended_by
 
     def end(self, report: ExitReport, crossed: int = 0) -> None:
-        """It is gone; the last ``crossed`` packets met the news of that on their way."""
+        """Note that the child has ended.  The last ``crossed`` packets came too late for it."""
         self._gone, self._start, self._asked = True, None, None
         self.blobs.clear()
         if self._channel is not None:

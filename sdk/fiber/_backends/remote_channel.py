@@ -75,7 +75,7 @@ class RemoteTaskChannel:
         self._wake()
 
     def drain(self) -> Iterator[Message]:
-        """What nobody has received."""
+        """Yield the messages that were not received."""
         while self._messages:
             yield self._messages.popleft()
 

@@ -29,7 +29,7 @@ class Program(NamedTuple):
 
 
 class Shipping:
-    """What is sent of this program.  Any thread: of several that look, each sees what is there."""
+    """Files of this program to send.  Any thread may look."""
 
     def __init__(self) -> None:
         self._latest: tuple[dict[str, Entry], Program] | None = None
@@ -39,7 +39,7 @@ class Shipping:
 
     @property
     def main_is_sent(self) -> bool:
-        """Whether children can import the main module."""
+        """True if children can import the main module."""
         return main_file() is not None
 
     def program(self, preparation: Mapping[str, Any], *, anew: bool) -> Program:

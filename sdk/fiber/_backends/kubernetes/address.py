@@ -61,7 +61,7 @@ def _node_addresses(api: Api) -> Iterator[str]:
 
 
 def _local_address(target: str) -> str | None:
-    """What this machine would send from; nothing is sent."""
+    """Return the address that this machine would send from.  Nothing is sent."""
     try:
         family, kind, _, _, where = socket.getaddrinfo(target, 9, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, kind) as probe:

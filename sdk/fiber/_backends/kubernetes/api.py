@@ -49,7 +49,7 @@ class _How(TypedDict, total=False):
 
 
 class Api:
-    """One API server and one login.  Any thread may call; calls block and raise ``ApiError``.
+    """Client of one API server with one login.  Any thread; calls block and raise ``ApiError``.
 
     ``timeout`` bounds a call with all its attempts, in seconds: what may pass (no connection, 429,
     5xx) is tried again until then, at 0 never.  Setting ``cancel`` ends a pause between attempts.
@@ -75,7 +75,7 @@ class Api:
 
     @property
     def in_cluster(self) -> bool:
-        """Whether this is a pod that uses its own account."""
+        """True in a pod that uses its own account."""
         return self._session.login.in_cluster
 
     @property
@@ -123,7 +123,7 @@ class Api:
         return self._call(Request("DELETE", path, {}, options), **how)
 
     def watch(self, path: str, selector: Mapping[str, str], resource_version: str) -> Watch:
-        """What changes at ``path`` after ``resource_version``."""
+        """Watch the changes at ``path`` after ``resource_version``."""
         query = {
             **selector,
             "watch": "true",

@@ -1,4 +1,4 @@
-"""What the API server's answers mean, and how that is said to whoever runs the program.
+"""Errors of the API server, and their words for the user of the program.
 
 ::
 
@@ -57,11 +57,11 @@ class Conflict(ApiError):
     """The name is taken, or the object is not the one that was meant."""
 
     repeated = False
-    """Whether an earlier attempt of the same call had no answer, and may have taken the name."""
+    """True if an earlier attempt of the same call had no answer, and may have taken the name."""
 
 
 class Expired(ApiError):
-    """What a watch was to go on from is forgotten: list anew."""
+    """The server has forgotten the version that a watch was to go on from.  List anew."""
 
 
 class Invalid(ApiError):
@@ -80,7 +80,7 @@ class Transient(ApiError):
 
 
 class Unreachable(Transient):
-    """There was no answer, or none of an API server."""
+    """No answer came, or none of an API server."""
 
 
 class ServerError(Transient):
@@ -143,7 +143,7 @@ def _retry_after(headers: Mapping[str, str], body: Body) -> float:
 def explain(
     error: ApiError, doing: str, *, pool: str, namespace: str, server: str
 ) -> FiberPoolError:
-    """What happened, why, and what to do.  ``doing``: "make the FiberPool es", for example."""
+    """Return an error: what happened, why, what to do.  ``doing``: "make the FiberPool es"."""
     reason, advice = _advice(error, namespace, server)
     where = f"cannot {doing} in namespace {namespace!r}"
     return FiberPoolError(

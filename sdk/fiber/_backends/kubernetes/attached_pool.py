@@ -22,13 +22,13 @@ LOST = ("Deleted", "Replaced")
 
 @dataclass(frozen=True)
 class Master:
-    """This program, as ``spec.master`` says it."""
+    """Master as ``spec.master`` describes it: this program."""
 
     host: str
     """The IP address that pods reach it at."""
     port: int
     identity: str
-    """Who it is, for people and for itself: no other program has the same."""
+    """Name of the program, for users and for itself.  No other program has the same."""
     lease_duration: int = 30
     lost_grace: int = 60
 
@@ -51,14 +51,14 @@ class Master:
 
 
 class AttachedPool:
-    """One FiberPool and what its master may do with it.  Calls block and raise ``ApiError``."""
+    """FiberPool on the side of its master.  Calls block and raise ``ApiError``."""
 
     def __init__(
         self, api: Api, found: Body, master: Master, epoch: int, *, kept_by_others: bool = False
     ) -> None:
         self._api = api
         self.kept_by_others = kept_by_others
-        """Whether other programs may be its master before and after this one."""
+        """True if other programs may be its master before and after this one."""
         self.master = master
         self.epoch = epoch
         metadata = found["metadata"]
@@ -70,11 +70,11 @@ class AttachedPool:
         self.connected: Callable[[], int] = lambda: 0
         """Agents that are linked to this program, as its Lease tells; called on any thread."""
         self.generation = int(metadata["generation"])
-        """That of the spec as this program wrote it last."""
+        """Generation of the spec that this program wrote last."""
 
     @property
     def owner(self) -> Body:
-        """What an object names as its owner to go when the pool goes."""
+        """Owner reference for objects that are deleted with the pool."""
         return {
             "apiVersion": names.API_VERSION,
             "kind": names.KIND,
@@ -221,7 +221,7 @@ class AttachedPool:
 
 
 def identity_in(pool: Body) -> str | None:
-    """Who the pool's master is; None if it has none."""
+    """Return the identity of the pool's master; None if it has none."""
     master = pool["spec"].get("master")
     return None if master is None else str(master.get("identity", ""))
 

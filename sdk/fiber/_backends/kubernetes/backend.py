@@ -33,7 +33,7 @@ class KubernetesBackend:
         self._shape = Shape.of(config)
         self._program = Program(config)
         self._pods: dict[tuple[Shape | str, int], Pods] = {}
-        """By what they are like, and how many of these there were before them."""
+        """Pods by their shape or pool, and by the number of such pods before them."""
         self._closing = False
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
@@ -43,7 +43,7 @@ class KubernetesBackend:
         return self._find(key).agents.child(spec, observer)
 
     def _find(self, key: Shape | str) -> Pods:
-        """Those that are in use, or new ones.  No lock: a finalizer may come here too."""
+        """Return the pods in use, or new ones.  There is no lock: a finalizer may call this too."""
         before = 0
         while True:
             pods = self._pods.get((key, before))

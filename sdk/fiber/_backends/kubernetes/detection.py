@@ -1,4 +1,4 @@
-"""Whether a program that chose no backend runs its processes in pods."""
+"""Choice of a backend for a program that chose none: pods or this machine."""
 
 from __future__ import annotations
 

@@ -30,16 +30,16 @@ CLOSE_TIMEOUT = 10.0
 """Seconds that the API server may take to give a pool back."""
 
 _RENEW, _WATCH = "renew the Lease of", "watch"
-"""What cannot be done, in words that the pool follows."""
+"""Actions that may fail, in words that the name of the pool follows."""
 
 
 class Attachment(Protocol):
-    """How a pool comes to have this program as its master, and how that ends."""
+    """Way in which a pool gets this program as its master, and in which that ends."""
 
     name: str
     namespace: str
     doing: str
-    """What ``attach`` does, in words that the pool follows."""
+    """Action of ``attach``, in words that the name of the pool follows."""
     displaced: str
     """Identity of the lost master whose place ``attach`` took; empty if there was none."""
 
@@ -55,7 +55,7 @@ class Attachment(Protocol):
 
 
 class Observer(Protocol):
-    """Who is told, on the loop's thread."""
+    """Observer of a FiberPool.  Its methods run on the loop's thread."""
 
     def connected(self) -> int:
         """Return how many agents are linked; called on any thread."""
@@ -108,7 +108,7 @@ class FiberPoolClient:
         self._over = threading.Event()
         self._ended = threading.Event()
         self._generation = 0
-        """That of the spec which first had this program as its master."""
+        """Generation of the first spec with this program as its master."""
         self._observed = False
         """The operator has seen the pool with this program as its master."""
         self._began = 0.0

@@ -49,7 +49,7 @@ class Informer:
         self._on_trouble = on_trouble
         self._on_fault = on_fault
         self._version: str | None = None
-        """Where the next watch goes on; None: with a list."""
+        """Version from which the next watch goes on; None: begin with a list."""
         self._known = set(known)
         self._failed = False
         """The last attempt brought nothing."""

@@ -62,9 +62,9 @@ class LeaseRenewer:
         self._now = now
         self._renewed = now()
         self._expires = self._renewed + pool.master.lease_duration
-        """When the Lease runs out next, as far as this program knows."""
+        """Time at which the Lease runs out, as far as this program knows."""
         self._refused: float | None = None
-        """Since when.  An API server that was away refuses everybody as it starts."""
+        """Time of the first refusal.  A starting API server refuses everything for a while."""
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fiber-lease", daemon=True)
 

@@ -13,11 +13,11 @@ from fiber._transport.credentials import MasterCredentials
 from fiber_api import names
 
 _EPOCH = 1
-"""It never has another master."""
+"""Epoch of a program's own pool, which never has another master."""
 
 
 class OwnPool:
-    """One pool, from before it is there to after it is gone.
+    """Pool of this program alone, from before it is made until it is deleted.
 
     Its name must never have been used before.
     """
@@ -43,7 +43,7 @@ class OwnPool:
         self.doing = "make"
         self.displaced = ""
         self.remedy = f"kubectl delete fiberpool {self.name} -n {namespace}"
-        """What removes it when ``detach`` does not."""
+        """Command that removes the pool if ``detach`` cannot."""
 
     def attach(self, cancel: threading.Event) -> AttachedPool:
         """Make it, without pods; then its Secret and its Lease, which go when it goes.

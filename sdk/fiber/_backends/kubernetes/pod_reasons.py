@@ -13,17 +13,17 @@ class PodEnd(NamedTuple):
     """The end of a pod, as an ``ExitReport`` and a ``WorkerDied`` tell it."""
 
     reason: str
-    """One word, a colon, and what is known of it: ``OOMKilled: its memory limit is 512Mi``."""
+    """Reason in one word, a colon, and details: ``OOMKilled: its memory limit is 512Mi``."""
     node: str
     """Empty if it never had one."""
     exitcode: int | None = None
-    """As multiprocessing has it; None if no program of it ended, or nobody knows how."""
+    """Exit code as in multiprocessing; None if no program ended, or it is not known how."""
     disrupted: bool = False
-    """Whether that was the cluster's doing, and not its programs'."""
+    """True if the cluster ended the pod, and not its programs."""
 
 
 def pod_end(pod: Mapping[str, Any], container: str = names.WORKER_CONTAINER) -> PodEnd | None:
-    """How ``pod`` ended or is about to; None if it is well, as far as Kubernetes knows.
+    """Return how ``pod`` ended or is about to; None if it is well, as far as Kubernetes knows.
 
     What ended it comes before what became of its programs for that.
     """

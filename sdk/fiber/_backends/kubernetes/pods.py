@@ -75,14 +75,14 @@ class Pods:
             self.agents, output, api, config.pod_timeout, on_begin=self._warn_anew
         )
         self.over = False
-        """Nothing comes of its pool any more, and it was given back."""
+        """True once the pool has failed or ended, and was given back."""
         self._goes_on = False
-        """Who waits then is for the successor."""
+        """True if the children that wait then go to the successor."""
         self._preparation: Preparation | None = None
         self._prepared: PreparedPool | None = None
         self._client: FiberPoolClient | None = None
         self._closing = threading.Event()
-        """Nothing more is to be asked of the API server than the end."""
+        """Set once the API server is asked for nothing but the end."""
         self._decision_is_due = False
         self._timer: Timer | None = None
         self._wanted = 0
@@ -90,7 +90,7 @@ class Pods:
         self._given_up: set[str] = set()
         """Pods that are there and of which nothing is expected any more."""
         self._back_again: RemoteAgent | None = None
-        """Which agent is lost only to be there again."""
+        """Agent that is lost only because it has come again."""
 
     def begin_close(self) -> None:
         """Begin to end; waits for nothing."""
@@ -307,7 +307,7 @@ class Pods:
         self._output.write("fiber", message)
 
     def on_error(self, error: FiberPoolError) -> None:
-        """Nothing comes of the pool any more."""
+        """Note that the pool has failed."""
         # What works with one of our own goes on with another.  One that was lost before it was of
         # any use would be made and lost again and again.
         self._goes_on = bool(self._successor and error.reason in LOST and self.agents.joined)

@@ -1,4 +1,4 @@
-"""What a program does before its FiberPool begins, on a thread: the API server takes its time."""
+"""Preparation of a FiberPool, on a thread, since it waits for the API server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the status of a FiberPool means to the program that waits for its workers."""
+"""Meaning of a FiberPool's status for the program that waits for its workers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Status = Mapping[str, Any]
 
 
 class PoolName(NamedTuple):
-    """Which FiberPool is spoken of."""
+    """Name of a FiberPool."""
 
     name: str
     namespace: str
@@ -31,7 +31,7 @@ class PoolName(NamedTuple):
 
 
 class Way(NamedTuple):
-    """How agents come to this program."""
+    """Way of agents to this program."""
 
     address: str
     """``host:port`` that the pool's Service leads to."""
@@ -137,7 +137,7 @@ def unreachable(pool: PoolName, status: Status, waited: float, way: Way) -> Fibe
 
 
 def _concerns_all(problem: Mapping[str, Any], status: Status) -> bool:
-    """Whether it is an error of every pod that there is, and waits for somebody."""
+    """Tell whether a problem is an error of every pod, and needs a person to mend it."""
     if problem.get("severity") != "Error" or problem.get("reason") not in _WAITS_FOR_SOMEBODY:
         return False
     replicas = status.get("replicas") or 0

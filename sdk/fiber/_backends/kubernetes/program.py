@@ -1,4 +1,4 @@
-"""This program on a cluster: who it is there, where pods reach it, and how its FiberPools begin."""
+"""Program on a cluster: its identity, its address for pods, and the start of its FiberPools."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ class ListenerObserver(Protocol):
     """Hears of agents that dial in, on the loop's thread."""
 
     def on_agent(self, link: Link) -> str | None:
-        """One with the pool's credentials; why it is not wanted, if it is not."""
+        """Take an agent with the pool's credentials, or return why it is not wanted."""
 
     def objection(self, identity: Identity) -> str | None:
-        """Why an agent with this name and uid is not taken; "" if it is, None if not known yet."""
+        """Return why an agent is not taken; "" if it is, None if that is not known yet."""
 
     def on_proven(self) -> None:
-        """One has proved that it is the pool's, whether or not it is wanted."""
+        """Note that an agent proved to be of the pool, whether or not it is wanted."""
 
     def on_refused(self, why: str) -> None:
-        """Somebody was turned away."""
+        """Take the line to log for a connection that was turned away."""
 
 
 class PreparedPool(NamedTuple):
@@ -222,7 +222,7 @@ class Program:
         return explain(error, doing, pool=pool, namespace=self.namespace, server=self._api.server)
 
     def _owner(self, pod: Body | None) -> Body | None:
-        """What the pool names as its owner, to go with it; owners are of the same namespace."""
+        """Return the owner of the pool, in the same namespace, with which it is deleted."""
         if pod is None or pod["metadata"]["namespace"] != self.namespace:
             return None
         metadata = pod["metadata"]

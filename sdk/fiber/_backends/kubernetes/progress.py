@@ -1,4 +1,4 @@
-"""What is waited for, in one line on stderr, for as long as that lasts."""
+"""Line on stderr that tells what is waited for, while that lasts."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Progress:
             self._timer = self._loop.call_later(first, self._say)
 
     def stop(self) -> None:
-        """It is over: a terminal's line goes."""
+        """End the waiting: remove the line from a terminal."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -1,4 +1,4 @@
-"""What goes wrong with one FiberPool, told to whoever uses it: each thing once while it lasts."""
+"""Reports of troubles with a FiberPool, each once while it lasts."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Reporter:
             self._loop.call_soon(self._on_warning, message)
 
     def trouble(self, doing: str, error: ApiError) -> None:
-        """It may pass.  ``doing``: what cannot be done, in words that the pool follows."""
+        """Report an error that may pass.  ``doing``: the action, before the name of the pool."""
         # One that fails in general fails in all that is done; of rights there are several.
         kind = type(error).__name__
         what = kind if isinstance(error, Transient) else f"{kind}: {doing}"
@@ -85,7 +85,7 @@ class Reporter:
         self.warn(_EXPIRED, str(self.error("LeaseExpired", what)))
 
     def refused(self, doing: str, error: ApiError) -> None:
-        """It will not pass."""
+        """Report an error that will not pass."""
         self.fail(self._explained(doing, error))
 
     def fault(self, error: Exception) -> None:
@@ -95,7 +95,7 @@ class Reporter:
         self.fail(failure)
 
     def fail(self, error: FiberPoolError) -> None:
-        """Nothing comes of the pool any more."""
+        """Report that the pool has failed."""
         if not self._muted and self._failing.acquire(blocking=False):
             self._loop.call_soon(self._on_error, error)
             self._on_failure()  # whatever that leads to is told later
@@ -112,7 +112,7 @@ class Reporter:
         return explain(error, doing, pool=name, namespace=namespace, server=self._server)
 
     def say_what_stays(self, why: str, remedy: str) -> None:
-        """On stderr: the loop may have ended.  ``remedy`` is the command that removes it."""
+        """Say on stderr what stays behind.  ``remedy`` is the command that removes it."""
         with contextlib.suppress(Exception):  # stderr may be closed
             sys.stderr.write(
                 f"fiber: {self._pool} stays behind: {why}. The operator notices that this program "

@@ -1,4 +1,4 @@
-"""What is wanted of a pool, on its way into the pool."""
+"""Wishes for a pool's size, on their way into the pool."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Scaling:
         self._changed = False
         self._replicas = 0
         self._release: dict[str, None] = {}
-        """In the order in which they came: no more than MAX_RELEASE of them go at a time."""
+        """Pods to release, in order.  At most MAX_RELEASE of them go at a time."""
         self._gone: set[str] = set()
         """Pods that were there.  A name is never used again."""
         self._due = 0.0

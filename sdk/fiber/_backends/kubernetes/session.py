@@ -32,7 +32,7 @@ _KUBECONFIG = "~/.kube/config"
 
 
 class Request(NamedTuple):
-    """What is asked of the API server."""
+    """Request to the API server."""
 
     method: str
     path: str
@@ -42,7 +42,7 @@ class Request(NamedTuple):
 
 
 class Session:
-    """One API server and one login, renewed when it has expired.  Any thread may use it."""
+    """Session with an API server.  Its login is renewed when it expires.  Any thread may use it."""
 
     def __init__(self, login: Login) -> None:
         self.login = login
@@ -96,7 +96,7 @@ class Session:
 
 @contextlib.contextmanager
 def network_errors() -> Iterator[None]:
-    """What goes wrong on the way to the API server is Unreachable."""
+    """Turn errors on the way to the API server into Unreachable."""
     from kubernetes.client.exceptions import ApiException
     from urllib3.exceptions import HTTPError
 
@@ -120,7 +120,7 @@ def _login_errors() -> Iterator[None]:
 
 
 class Login(NamedTuple):
-    """Where an API server is and who asks it, read anew for each client."""
+    """Address of an API server and account, read anew for each client."""
 
     kubeconfig: str | None
     """None: the account of the pod that this is."""
@@ -133,7 +133,7 @@ class Login(NamedTuple):
 
     @classmethod
     def find(cls, context: str | None) -> Login:
-        """What there is to go by."""
+        """Find a kubeconfig, or the account of this pod."""
         package = _package()
         file = os.environ.get("KUBECONFIG")
         if not file and context is None and "KUBERNETES_SERVICE_HOST" in os.environ:
@@ -179,7 +179,7 @@ class Login(NamedTuple):
 
 @contextlib.contextmanager
 def _temporary_folder() -> Iterator[str | None]:
-    """Where the package puts what a kubeconfig has of certificates and keys, for OpenSSL to read.
+    """Give the package a folder for certificates and keys of a kubeconfig, which OpenSSL reads.
 
     It is gone once they are read: the package itself would delete those files when the interpreter
     exits, and never if it is killed.  None where nothing can be written, as in a pod whose files

@@ -1,4 +1,4 @@
-"""What tells the FiberPools of one program apart: the shape of their pods."""
+"""Shape of pods, by which the FiberPools of a program differ."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Shape:
     image: str | None = None
     """None: that of the program's own pod, or of this version's worker."""
     resources: Resources = field(default_factory=Resources)
-    """What one process needs."""
+    """Resources that one process needs."""
     template: str = field(default="{}", repr=False)
     """The configured pod template, as JSON with sorted keys."""
     processes_per_pod: int = 1
@@ -137,7 +137,7 @@ def _check_container(container: object, what: str) -> None:
 
 
 def program_name(path: str | None) -> str:
-    """What to call the program with this ``__main__.__file__``, for people who look at its pools.
+    """Return a name for the program with this ``__main__.__file__``, to show with its pools.
 
     None is one that has no file, such as an interactive session.
     """

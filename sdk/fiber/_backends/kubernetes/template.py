@@ -1,4 +1,4 @@
-"""What the program asks for: the pod template of a shape, and the FiberPool around it.
+"""Pod template of a shape, and the FiberPool around it.
 
 A worker is to find what its program has.  In a pod that is the program's own container: its image,
 environment, volumes, account and so on, without what belongs to that one pod.  Elsewhere it is an
@@ -25,7 +25,7 @@ from fiber_api import names
 Document = dict[str, Any]
 
 WORKER_IMAGE = f"fiber-worker:{fiber.__version__}"
-"""What workers run where nothing else is said: as charts and manifests name it."""
+"""Image of workers by default, as charts and manifests name it."""
 
 _SHM = "/dev/shm"
 _SHM_VOLUME = "fiber-shm"
@@ -157,7 +157,7 @@ _OF_THE_CONTAINER = (
 )
 
 _ACCOUNT = "/var/run/secrets/kubernetes.io/serviceaccount"
-"""Where a pod has its token, which is its own: workers need nothing of the API."""
+"""Folder of a pod's token, which workers do not get: they need nothing of the API."""
 
 
 def _like(pod: Mapping[str, Any], container: str) -> Document:
@@ -194,7 +194,7 @@ _SECRET = re.compile(
 
 
 def _is_secret(variable: Mapping[str, Any]) -> bool:
-    """Whether the value stands in the manifest itself and the name is that of a secret."""
+    """Tell whether the manifest has the value itself, under the name of a secret."""
     return bool(variable.get("value")) and _SECRET.search(variable["name"]) is not None
 
 
@@ -244,7 +244,7 @@ _TERMINATION_LOG = re.compile(r"/pods/[^/ ]+/containers/([^/ ]+)/\S+ /dev/termin
 
 
 def own_container(pod: Mapping[str, Any], mountinfo: str) -> str:
-    """Which container of its pod this program runs in; ``mountinfo`` is /proc/self/mountinfo.
+    """Return the container of its pod that this program runs in, by ``/proc/self/mountinfo``.
 
     The kubelet keeps the file that it mounts in each container in a folder of that name.  Where
     that cannot be seen it is the one that kubectl takes if told of none.

@@ -1,4 +1,4 @@
-"""Those that wait for a pod: told what for while they do, and not kept for ever."""
+"""Children that wait for a pod: what they wait for is shown, and the wait has a limit."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Waiting:
         on_begin: Callable[[], None],
     ) -> None:
         self.pool = PoolName("", "")
-        """What they wait for, once that has a name."""
+        """Pool that they wait for, once it has a name."""
         self.way = Way("")
-        """How its agents come, once it has a name."""
+        """Way of its agents to this program, once it has a name."""
         self.status: Mapping[str, Any] = {}
-        """The pool's, as it is now."""
+        """Present status of the pool."""
         self.attached = False
-        """Whether the pool is there, and this program its master."""
+        """True if the pool is there, with this program as its master."""
         self._output = output
         self._api = api
         self._agents = agents
@@ -69,7 +69,7 @@ class Waiting:
         self._progress = Progress(agents.loop, output, self._describe)
 
     def stop(self) -> None:
-        """Nobody waits any more."""
+        """End the waiting."""
         self._progress.stop()
         self._wait_no_more()
         self._cancel_judgement()
@@ -95,7 +95,7 @@ class Waiting:
         self._judge_reachability()
 
     def refuse(self, error: Exception) -> None:
-        """Nobody is to wait any longer."""
+        """Refuse all that wait with ``error``."""
         self._progress.stop()  # first: whoever is refused may write where its line stands
         if self._has_processes:
             # Whoever started it has gone on.  Pools raise it to their callers.
@@ -131,7 +131,7 @@ class Waiting:
 
     @property
     def _has_processes(self) -> bool:
-        """Whether others than workers of pools wait: nobody else does what they are to do."""
+        """True if other children than workers wait.  No other process can do their work."""
         return not all(child.is_worker for child in self._placement.waiting)
 
     def _look_at_limit(self, most: int) -> None:

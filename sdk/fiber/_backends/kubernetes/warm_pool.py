@@ -51,14 +51,14 @@ def read_pool_key(
 
 
 class WarmPool:
-    """One pool, from before this program is its master to after."""
+    """Pool of another owner, from before this program is its master until after that."""
 
     def __init__(self, api: Api, namespace: str, name: str, master: Master) -> None:
         self._api = api
         self._master = master
         self._attached: AttachedPool | None = None
         self._replicas = 0
-        """What the pool had before, and has again after."""
+        """Replicas of the pool before, which it gets again."""
         self.name = name
         self.namespace = namespace
         self.doing = "attach to"
@@ -66,7 +66,7 @@ class WarmPool:
 
     @property
     def remedy(self) -> str:
-        """What detaches the program when ``detach`` does not."""
+        """Command that detaches the program if ``detach`` cannot."""
         patch = json.dumps({"spec": {"master": None, "replicas": self._replicas}})
         where = f"fiberpool {self.name} -n {self.namespace}"
         return f"kubectl patch {where} --type=merge -p '{patch}'"
