@@ -1,4 +1,4 @@
-"""What the API server's answers mean.
+"""Errors of the API server.
 
 What can go wrong is one of these, so that a caller says what it does about it::
 
@@ -38,12 +38,12 @@ class ApiError(Exception):
 
     @property
     def writes(self) -> bool:
-        """Whether something was to be changed, which admission webhooks are asked about."""
+        """True if the call changes something, and so passes admission webhooks."""
         return not self.call.startswith(("get ", "list "))
 
 
 class Gone(ApiError):
-    """There is no such object."""
+    """The object does not exist."""
 
 
 class Conflict(ApiError):
@@ -59,7 +59,7 @@ class Invalid(ApiError):
 
 
 class Unavailable(ApiError):
-    """It is not known whether the call was carried out."""
+    """The call had no answer, and may have been carried out."""
 
 
 class TooMany(Unavailable):
@@ -71,7 +71,7 @@ class TooMany(Unavailable):
 
 
 def complaint(error: ApiError) -> str:
-    """What went wrong, and what to do where that is known."""
+    """Return what went wrong, and what to do if that is known."""
     if isinstance(error, Refused):
         return f"{error}. Give the operator's account this right: the chart's roles have it"
     return str(error)

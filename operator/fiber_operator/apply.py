@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class State:
-    """What is remembered of one pool between reconciles, by uid.  Losing it costs only calls."""
+    """Memory of one pool between reconciles, by uid.  Losing it costs only calls."""
 
     uid: str
     dependents: Dependents | None = None
@@ -64,11 +64,11 @@ class State:
     warnings: dict[str, str] = field(default_factory=dict)
     pace: Pace = field(default_factory=Pace)
     generation: int = -1
-    """Of the pool at the last reconcile that did not fail, the one under way included."""
+    """Generation of the pool at the last reconcile that did not fail, or the present one."""
 
     @property
     def address(self) -> str | None:
-        """Where agents dial, once that is known."""
+        """Address that agents dial, once it is known."""
         return self.dependents.address if self.dependents else None
 
     def refused(
@@ -81,7 +81,7 @@ class State:
         self.refusal = Refusal(template_hash, error.status, error.message, now, count, dry_run)
 
     def not_created(self, error: ApiError) -> None:
-        """It is not known whether a pod of this template is made."""
+        """Note a failed creation, after which it is not known whether the template is good."""
         # Of a quota that is counted at the same time, which is nobody's trouble, comes a Conflict.
         self.creation = (
             None if isinstance(error, Conflict) else error_conditions.with_creation(error)
@@ -90,7 +90,7 @@ class State:
 
 @dataclass
 class Work:
-    """One pass over a pool: what it is, and once that is planned what there is to do."""
+    """Pass over a pool: its state, and once it is planned the work to do."""
 
     key: Key
     document: Body
@@ -215,7 +215,7 @@ class Applier:
         return Result() if as_planned else Result(requeue_after=0.0)
 
     async def _delete(self, work: Work) -> tuple[int, bool]:
-        """How many of the pods were seen to, and whether each was as the plan had it.
+        """Delete pods; return how many were handled, and whether each was as the plan had it.
 
         This stops after a while, so that the status is not out of date for long.
         """
@@ -253,7 +253,7 @@ class Applier:
         return done, as_planned
 
     async def _has_changed(self, work: Work) -> bool:
-        """Whether the pool is not the one any more that this was planned for."""
+        """Tell whether the pool has changed since the plan was made."""
         try:
             document = await self._cluster.read(POOLS, *work.key)
         except Gone:
@@ -275,7 +275,7 @@ class Applier:
 
 
 def _version(document: Body) -> tuple[object, ...]:
-    """What changes with everything that a plan is made from, and not with the status."""
+    """Return a version that changes with all inputs of a plan, and not with the status."""
     metadata = mapping(document, "metadata")
     return tuple(metadata.get(key) for key in ("uid", "generation", "deletionTimestamp"))
 

@@ -1,4 +1,4 @@
-"""Which release serves a namespace: of several that watch it, one acts there.
+"""Claims of namespaces: of several releases that watch a namespace, one acts there.
 
 Each namespace that is served has a Lease of one name, whatever the releases are called and whatever
 else they watch.  A release holds it, not a process: which process acts for a release is decided by
@@ -21,11 +21,11 @@ from fiber_operator.leader_election import LeaderElector, NotLeader
 from fiber_operator.logs import about
 
 NAME = names.CRD_NAME
-"""Of the Lease.  No release's own is called so, nor one that the SDK makes, which has no dot."""
+"""Name of the Lease.  No release's own Lease has it, nor one of the SDK, which has no dot."""
 SECONDS = 900
-"""How long other releases wait for one that went away without a word."""
+"""Seconds that other releases wait for one that ended without a word."""
 LINGER = 60
-"""How long they wait for one that stopped: less, but longer than an upgrade takes."""
+"""Seconds that they wait for one that stopped: less, but longer than an upgrade takes."""
 AT_ONCE = 4
 """Leases that are asked for at the same time."""
 SHOWN = 3
@@ -39,7 +39,7 @@ class _Claim:
     elector: LeaderElector
     due: float
     held: bool = False
-    """As it was told."""
+    """Last state that was reported."""
     complaint: str = ""
     """Why the namespace is not served by this operator, as it was told."""
 
@@ -73,16 +73,16 @@ class Claims:
         self._wake = asyncio.Event()
 
     def begin(self) -> None:
-        """This process acts for its release from now on."""
+        """Begin to act for the release."""
         for namespace in self._namespaces:
             self.holds(namespace)
 
     def end(self) -> None:
-        """It does no more; another one does, perhaps."""
+        """Stop acting for the release.  Another process may begin."""
         self._claims.clear()
 
     def holds(self, namespace: str) -> bool:
-        """Whether this operator may act in the namespace.  If that is not known it is found out."""
+        """Tell whether this operator may act in the namespace; find it out if it is not known."""
         claim = self._claims.get(namespace)
         if claim is None:
             self._claims[namespace] = _Claim(namespace, self._elector(namespace), self._now())
@@ -98,12 +98,12 @@ class Claims:
         return claim.elector.require()
 
     def refused(self, namespace: str) -> bool:
-        """Whether it is known that this operator may not act there now."""
+        """Tell whether it is known that this operator may not act there now."""
         claim = self._claims.get(namespace)
         return claim is not None and bool(claim.complaint)
 
     def wrong(self) -> list[str]:
-        """Which namespaces are not served as they should be, and why; a sentence each.
+        """Return a sentence for each namespace that is not served as it should be.
 
         Where all namespaces are watched it is right that some are served by others.
         """

@@ -97,7 +97,7 @@ async def _document(response: RESTResponse, what: str) -> Body:
 
 
 class Cluster:
-    """One API server.
+    """Client of one API server.
 
     ``permit`` is called with the namespace before each call that changes something.  It returns how
     many seconds the call may take, and raises where this process may not.  ``connections`` bounds
@@ -311,7 +311,7 @@ _WRITES = {"create", "update", "patch", "delete"}
 
 
 async def load_configuration() -> Configuration:
-    """Where the API server is and how to log in: KUBECONFIG, else the pod's own account."""
+    """Load the address of the API server and the login: from KUBECONFIG, else the pod's account."""
     configuration = Configuration()
     file = os.environ.get("KUBECONFIG")
     if not file and "KUBERNETES_SERVICE_HOST" in os.environ:

@@ -1,4 +1,4 @@
-"""One reconcile of one pool: read, plan, act.
+"""Reconcile of one pool: read, plan, act.
 
 While pods are being created this is done again and again beside it, so that neither waits for the
 other.  Nothing that an event said is used: the pool and its pods are read anew, from the API
@@ -71,7 +71,7 @@ class Controller:
         self._states: dict[Key, State] = {}
 
     def is_news(self, key: Key, uid: str, generation: int) -> bool:
-        """Whether a reconcile would see another spec than the last one; our own status is none."""
+        """Tell whether a reconcile would see another spec than the last one did."""
         state = self._states.get(key)
         return state is None or state.uid != uid or state.generation != generation
 
@@ -100,7 +100,7 @@ class Controller:
         return result
 
     async def _reconcile(self, key: Key) -> Result:
-        """One pass, and others while pods are created beside them."""
+        """Make one pass, and more passes while pods are being created."""
         found = await self._read(key)
         if found is None:
             return Result(forget=True)
@@ -253,7 +253,7 @@ def _master_lease(pool: FiberPool) -> MasterLease | None:
 
 
 def _together(result: Result, made: Result, waited: float) -> Result:
-    """What follows from a pass, and then from the creation that it ``waited`` for."""
+    """Combine the results of a pass and of the creation that it ``waited`` for."""
     after = made.requeue_after
     if after is None and result.requeue_after is not None:
         after = max(0.0, result.requeue_after - waited)

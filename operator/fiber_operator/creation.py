@@ -30,16 +30,16 @@ Draw = Callable[[], str]
 
 
 def draw_suffix() -> str:
-    """What makes a pod's name unique."""
+    """Return a suffix that makes a pod's name unique."""
     return secrets.token_hex(names.POD_SUFFIX_LENGTH // 2)
 
 
 @dataclass
 class Pace:
-    """How it went with a pool so far, for the next batch."""
+    """Pace of creation of a pool so far, for its next batch."""
 
     batch: int = 1
-    """How many may be created at once."""
+    """Number of pods that may be created at once."""
     unsure: list[str] = field(default_factory=list)
     """Names of pods of which it is not known whether they were created.  They are used first: one
     that exists after all is refused as a duplicate, so none is created twice."""
@@ -47,7 +47,7 @@ class Pace:
 
 @dataclass(frozen=True)
 class Order:
-    """Which pods to create."""
+    """Order of pods to create."""
 
     template_hash: str
     body: Callable[[str], Body]
@@ -55,18 +55,18 @@ class Order:
     container: str
     """The one that it is judged by."""
     limit: int
-    """How many may be created at once."""
+    """Number of pods that may be created at once."""
 
 
 @dataclass
 class Created:
-    """What came of it."""
+    """Outcome of an order."""
 
     names: list[str] = field(default_factory=list)
     refusal: ApiError | None = None
     """403 or 422: the first one."""
     failure: ApiError | None = None
-    """What else went wrong: the first one."""
+    """First of the other errors."""
     wait: float = 0.0
     """Seconds that the API server asked to wait."""
 
@@ -128,7 +128,7 @@ class Creation:
         return bool(done)
 
     def take(self) -> Created:
-        """What came of it since this was asked last."""
+        """Take the outcome since the last call."""
         done, self._done = self._done, Created()
         return done
 

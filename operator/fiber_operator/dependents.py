@@ -42,30 +42,30 @@ LOOK_AGAIN = 50.0
 
 @dataclass(frozen=True)
 class Dependents:
-    """What was found or made."""
+    """Dependents that were found or made."""
 
     address: str | None
     """``host:port`` of the Service."""
     obstacles: tuple[Obstacle, ...]
     master: Master | None
-    """Where the EndpointSlice leads."""
+    """Master that the EndpointSlice leads to."""
     looked: float
     credentials: bool
     """The Secret is the pool's own and whole, or it is not the operator's."""
     credentials_made: float = 0.0
-    """When the Secret was, as the cluster says; 0.0 where that is not known."""
+    """Time at which the Secret was made, as the cluster says; 0.0 if that is not known."""
     budget: int | None = None
-    """What the PodDisruptionBudget says; None: there is none, 0: not known."""
+    """Value of the PodDisruptionBudget; None: there is none, 0: not known."""
     failure: ApiError | None = None
     """A call that nobody knows the outcome of: to be raised once it is told."""
 
 
 @dataclass(frozen=True)
 class _Found:
-    """What came of one step."""
+    """Outcome of one step."""
 
     told: str | None = None
-    """Of the Service its address, of the Secret when it was made."""
+    """Address of the Service, or creation time of the Secret."""
     obstacle: Obstacle | None = None
     failure: ApiError | None = None
 
@@ -87,7 +87,7 @@ class DependentsReconciler:
         self._now = now
 
     async def ensure(self, pool: FiberPool, known: Dependents | None) -> Dependents:
-        """What there is now; ``known`` is what this returned for the pool last time.
+        """Make what is missing; ``known`` is the result of the last call for the pool.
 
         What fails is an obstacle and not raised, but for a Conflict: then the next look finds out
         what there is.
@@ -267,7 +267,7 @@ class DependentsReconciler:
 
 
 def _concerns_budget(pool: FiberPool, known: Dependents | None) -> bool:
-    """Whether the pool has a PodDisruptionBudget, should have one, or may have one."""
+    """Tell whether the pool has a PodDisruptionBudget, should have one, or may have one."""
     if pool.spec.min_available is not None:
         return True
     # A pool of which nothing is told yet has none.
@@ -275,7 +275,7 @@ def _concerns_budget(pool: FiberPool, known: Dependents | None) -> bool:
 
 
 async def _all(*steps: Awaitable[_Found]) -> list[_Found]:
-    """What each step came to, once all have ended; what one raised is raised then."""
+    """Await all steps; return their outcomes, or raise the error of one once all have ended."""
     found = []
     for result in await asyncio.gather(*steps, return_exceptions=True):
         if isinstance(result, BaseException):

@@ -49,7 +49,7 @@ class _Posted:
 
 
 _Place = tuple[str, str, str]
-"""What an event is counted by: the pool's uid, its reason and its message."""
+"""Key by which events are counted: the pool's uid, the reason and the message."""
 
 
 @dataclass
@@ -78,7 +78,7 @@ class EventRecorder:
         self._identity = identity
         self._bell = asyncio.Event()
         self._namespaces: dict[str, _Namespace] = {}
-        """In the order of their turns."""
+        """Namespaces in the order of their turns."""
 
     def tell(self, key: Key, uid: str, event: Event) -> None:
         """Log ``event`` and have it posted on the pool when its turn comes."""

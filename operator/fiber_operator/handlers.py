@@ -47,7 +47,7 @@ Renewed = Callable[[str, str, str, int | None], None]
 many agents its master has."""
 
 Configure = Callable[[], Awaitable[Configuration]]
-"""Where the API server is and how to log in; asked again when a login has expired."""
+"""Function that returns address and login.  It is called again when a login has expired."""
 
 _IDENTITY: Any = "fiber-operator"
 """kopf would ask the system for the user's name, which a container's user need not have."""

@@ -1,4 +1,4 @@
-"""When the operator is well: what /healthz and /readyz answer.
+"""Health of the operator, for /healthz and /readyz.
 
 Not alive means that a restart may help: something in this process is stuck.  Not ready means that
 pools are not served as they should be, whoever is to blame; a restart would change nothing.

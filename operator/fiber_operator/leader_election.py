@@ -24,20 +24,20 @@ from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Conflict, Go
 from fiber_operator.logs import about
 
 HELD_SHARE = 2 / 3
-"""Of the duration, how long a renewal lets the holder act."""
+"""Share of the duration for which a renewal lets the holder act."""
 WRITTEN_SHARE = 9 / 10
-"""When its last write has ended; the rest is for clocks that do not run alike."""
+"""Share of the duration after which its last write has ended.  The rest is for differing clocks."""
 RENEW_SHARE = 1 / 3
 RETRY_SHARE = 1 / 8
 LONGEST_RETRY = 60.0
 TRIES = 2
-"""To give up a Lease."""
+"""Number of attempts to give up a Lease."""
 
 log = logging.getLogger(__name__)
 
 
 class NotLeader(Exception):
-    """This operator does not hold a Lease (any more) without which it may not change anything."""
+    """This operator does not hold the Lease that it needs to change anything."""
 
 
 class LeaderElector:
@@ -64,7 +64,7 @@ class LeaderElector:
         self._clock = clock or asyncio.get_running_loop().time
         self._wall_clock = wall_clock
         self._asked = float("-inf")
-        """When it asked for what it holds."""
+        """Time at which it asked for the Lease that it holds."""
         self._failures = 0
         self._told = False
         self._lease: Body | None = None
@@ -74,11 +74,11 @@ class LeaderElector:
         self.why = "the Lease was not read yet"
         """Why this operator does not act; empty while it does."""
         self.holder = ""
-        """Who else holds the Lease, as far as is known."""
+        """Other holder of the Lease, as far as is known."""
 
     @property
     def is_leader(self) -> bool:
-        """Whether this operator may act now."""
+        """True while this operator may act."""
         return self._clock() < self._until
 
     @property

@@ -1,4 +1,4 @@
-"""Whether the masters of the pools are alive, judged by their Leases.
+"""Monitor of the masters of pools, which judges by their Leases whether they live.
 
 A master is alive while its Lease changes.  One watch hears of all of them, by the label that they
 carry (``handlers.py``); a Lease is read only when its master is new and twice before the master is
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 
 class MasterLease(NamedTuple):
-    """What is watched: one master of a pool.  Another epoch is another master."""
+    """Master of a pool that is watched.  Another epoch is another master."""
 
     name: str
     epoch: int
@@ -50,11 +50,11 @@ class MasterLease(NamedTuple):
 class _Watched:
     lease: MasterLease
     changed: float
-    """When the Lease was first seen to be as it is."""
+    """Time at which the Lease was first seen in its present state."""
     due: float
-    """When it is to be read."""
+    """Time at which to read the Lease."""
     version: str | None = None
-    """Its resourceVersion; empty: there is no such Lease, None: nobody has looked."""
+    """Its resourceVersion; empty: there is no such Lease, None: it was not read yet."""
     doubted: bool = False
     """A read has found it unchanged for the whole duration."""
     verdict: LeaseVerdict = field(default_factory=LeaseVerdict)
@@ -72,7 +72,7 @@ class LeaseMonitor:
         self._on_change = on_change
         self._watched: dict[Key, _Watched] = {}
         self._pools: dict[tuple[str, str], set[Key]] = {}
-        """By the namespace and the name of the Lease."""
+        """Pools by the namespace and the name of the Lease."""
         self._wake = asyncio.Event()
 
     def follow(self, key: Key, lease: MasterLease | None) -> LeaseVerdict:
@@ -145,7 +145,7 @@ class LeaseMonitor:
             self._find_unchanged(key, watched)
 
     def _see(self, key: Key, watched: _Watched, version: str, connected: int | None) -> bool:
-        """Whether the Lease is not as it was.
+        """Note the state of a Lease; return whether it has changed.
 
         To find it is no sign of life, for it may be that of a master that died long ago.
         """

@@ -34,7 +34,7 @@ def about(
 
 
 class JsonLines(logging.Formatter):
-    """One JSON object a line, whatever the message holds."""
+    """Formatter of records as JSON objects, one a line."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The line of ``record``, without its end."""

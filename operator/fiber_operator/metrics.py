@@ -1,4 +1,4 @@
-"""What Prometheus can ask for."""
+"""Metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 @dataclass(frozen=True)
 class PoolSample:
-    """What is shown of one pool, as of its last reconcile."""
+    """Numbers of one pool, as of its last reconcile."""
 
     desired: int = 0
     pods: Mapping[str, int] = field(default_factory=dict)
-    """By state: pending, starting, ready, notready, terminating, ended."""
+    """Pods by state: pending, starting, ready, notready, terminating, ended."""
     problems: Mapping[str, int] = field(default_factory=dict)
-    """By reason."""
+    """Problems by reason."""
     failed: int = 0
     disrupted: int = 0
 

@@ -1,4 +1,4 @@
-"""What Kubernetes' events say of a pod that does not start and whose status does not say why."""
+"""Kubernetes' events about a pod that does not start and whose status does not say why."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NO_NEWS = frozenset(
 
 
 class _Said(NamedTuple):
-    """One event; the greatest is the newest."""
+    """Event; the greatest is the newest."""
 
     second: int
     """Kubernetes tells most times no better than that."""
@@ -68,7 +68,7 @@ def _said(event: Body) -> _Said | None:
 
 
 def _version(event: Body) -> int:
-    """Which of two events of one second was written later."""
+    """Return a number that is greater for the later of two events of one second."""
     try:
         return int(text(mapping(event, "metadata").get("resourceVersion")))
     except ValueError:
@@ -76,7 +76,7 @@ def _version(event: Body) -> int:
 
 
 def _last_time(event: Body) -> float:
-    """When it happened last: a repeated event is the same object with another time."""
+    """Return when an event happened last: a repeated one is the same object with another time."""
     stamps = (
         mapping(event, "series").get("lastObservedTime"),
         event.get("lastTimestamp"),

@@ -52,13 +52,13 @@ log = logging.getLogger(__name__)
 
 
 class Part(Protocol):
-    """What runs until it is cancelled."""
+    """Part of the operator that runs until it is cancelled."""
 
     async def run(self) -> None: ...
 
 
 class Program:
-    """One operator.  ``watches`` makes what calls ``notice``."""
+    """Operator of one process.  ``watches`` makes the watches, which call ``notice``."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class Program:
         self._watched_before = False
         self.metrics = Metrics()
         self.port = 0
-        """Where /healthz is served, once it is."""
+        """Port of /healthz, once it is served."""
 
     async def run(self, stop: asyncio.Event) -> None:
         """Operate until ``stop``; then end what is under way and give up the Lease."""

@@ -10,7 +10,7 @@ from aiohttp import web
 from fiber_operator.metrics import CONTENT_TYPE, Metrics
 
 Check = Callable[[], list[str]]
-"""What is wrong, a sentence each; nothing: all is well."""
+"""Function that returns a sentence for each trouble; none: all is well."""
 
 
 @contextlib.asynccontextmanager

@@ -1,4 +1,4 @@
-"""What can be set from outside: environment variables that begin with FIBER_OPERATOR_.
+"""Settings from environment variables that begin with FIBER_OPERATOR_.
 
 A name that is not known is an error, since a setting that is misspelt and therefore ignored is
 found out too late.
@@ -32,7 +32,7 @@ class SettingsError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How this operator runs.  Seconds are seconds."""
+    """Settings of this operator.  Times are in seconds."""
 
     namespaces: tuple[str, ...] = ()
     """FIBER_OPERATOR_NAMESPACES: serve only these, separated by commas; empty: all of them."""
@@ -70,7 +70,7 @@ class Settings:
 
     @property
     def requests(self) -> dict[str, str]:
-        """What a worker requests of resources that nothing else speaks of."""
+        """Default requests of a worker, for resources that its template does not mention."""
         asked = {"cpu": self.cpu_request, "memory": self.memory_request}
         return {kind: amount for kind, amount in asked.items() if amount}
 

@@ -42,7 +42,7 @@ class Failed(Exception):
 
 
 class Smoke:
-    """One test; ``say`` is told what happens, in lines."""
+    """Smoke test.  ``say`` is called with lines about its progress."""
 
     def __init__(
         self,
@@ -156,22 +156,22 @@ class Smoke:
 
 
 def is_ready(pool: Pool) -> bool:
-    """Whether the operator says so of the spec that the pool has now."""
+    """Tell whether the operator reports Ready for the present spec of the pool."""
     return _is_true(pool, ConditionType.READY)
 
 
 def is_degraded(pool: Pool) -> bool:
-    """Whether something is wrong, though it may pass."""
+    """Tell whether a problem is reported, which may pass."""
     return _is_true(pool, ConditionType.DEGRADED)
 
 
 def hopeless(pool: Pool) -> bool:
-    """Whether there is a problem that waiting cannot help."""
+    """Tell whether there is a problem that waiting cannot help."""
     return any(problem.get("terminal") for problem in _problems(pool))
 
 
 def state(pool: Pool) -> str:
-    """How far the pool is, in a few words."""
+    """Return the progress of the pool in a few words."""
     status = pool.get("status")
     if not status:
         return UNSEEN
@@ -180,7 +180,7 @@ def state(pool: Pool) -> str:
 
 
 def problems(pool: Pool) -> str:
-    """What is wrong and what to do, in the operator's words."""
+    """Return the problems and what to do, in the operator's words."""
     return " ".join(str(problem.get("message")) for problem in _problems(pool))
 
 

@@ -20,7 +20,7 @@ class Turns:
     def __init__(self, places: int) -> None:
         self._free = places
         self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
-        """By namespace, the one whose turn comes next first."""
+        """Waiters by namespace, in the order of their turns."""
 
     @contextlib.asynccontextmanager
     async def take(self, namespace: str) -> AsyncIterator[None]:

@@ -1,4 +1,4 @@
-"""Whether the watches work: what the API server answers to whoever watches.
+"""State of the watches, by the answers of the API server.
 
 kopf tries again for ever and tells nobody; an operator without the right to watch would seem well
 and see nothing.  So its requests are looked at as they are answered.
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class Watches:
-    """What is known of them.  ``namespaces`` are those that are watched; empty: all."""
+    """State of the watches.  ``namespaces`` are those that are watched; empty: all."""
 
     def __init__(self, namespaces: Sequence[str]) -> None:
         self._needed = [

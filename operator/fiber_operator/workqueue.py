@@ -58,7 +58,7 @@ log = logging.getLogger(__name__)
 
 _Heap = list[tuple[float, int, "Key"]]
 _Heaps = dict[str, _Heap]
-"""By namespace."""
+"""Heaps by namespace."""
 
 
 class Key(NamedTuple):
@@ -70,7 +70,7 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True)
 class Result:
-    """What came out of one reconcile of a pool."""
+    """Result of one reconcile of a pool."""
 
     requeue_after: float | None = None
     """Reconcile again after this many seconds though nothing happens."""
@@ -81,30 +81,30 @@ class Result:
     failed: bool = False
     """Reconcile again soon, and later each time."""
     forget: bool = False
-    """There is no such pool."""
+    """True if the pool does not exist."""
 
 
 @dataclass
 class _Entry:
     due: float | None = None
-    """When it is due; None: it does not wait."""
+    """Time at which it is due; None: it does not wait."""
     blocked: float = -1e9
     """No reconcile before this time, unless events cease."""
     rested: float = -1e9
-    """When events of pods bring a reconcile, at the latest."""
+    """Time at which events of pods bring a reconcile, at the latest."""
     lull: bool = False
-    """Whether they bring one before that if they cease."""
+    """True if they bring one earlier once they cease."""
     limit: float | None = None
     """While it waits for that: when its reconcile comes though they do not cease."""
     owed: float = 0.0
-    """What its last rest was shortened by."""
+    """Seconds by which its last rest was shortened."""
     failures: int = 0
     running: float | None = None
     """Since when."""
     rush: bool = False
-    """Whether what was added while it ran is urgent."""
+    """True if it was added urgently while it ran."""
     order: int = -1
-    """Of its place in the heap; places of other orders are void."""
+    """Order of its valid place in the heap.  Places with other orders are void."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Queue:
         self._well: _Heaps = {}
         self._failing: _Heaps = {}
         self._last_begun: dict[str, int] = {}
-        """By namespace: the order of its last reconcile."""
+        """Order of the last reconcile of each namespace."""
         self._orders = itertools.count()
         self._tasks: dict[asyncio.Task[None], tuple[float, str]] = {}
         """Reconciles under way, the oldest first: since when, and the namespace."""
@@ -233,7 +233,7 @@ class Queue:
         return None
 
     def _firsts(self) -> Iterator[tuple[float, _Heaps, str]]:
-        """When the first pool of each namespace that may begin is due, and where it is."""
+        """Yield when the first pool of each namespace that may begin is due, and its place."""
         under_way = Counter(namespace for _, namespace in self._tasks.values())
         everywhere, alone = self._open(self._concurrency), self._open(2 * self._concurrency)
         for heaps in alone:
@@ -254,7 +254,7 @@ class Queue:
         return [self._well, self._failing]
 
     def _next(self) -> tuple[_Heaps, str] | None:
-        """Where the pool is that is to be next."""
+        """Return the place of the next pool."""
         now = self._now()
         under_way = Counter(namespace for _, namespace in self._tasks.values())
         turns = []

@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 LEFT = {
-    "operator/fiber_operator": 213,
+    "operator/fiber_operator": 9,
     "sdk/fiber": 9,
     "sdk/fiber/_agent": 0,
     "sdk/fiber/_backends": 8,

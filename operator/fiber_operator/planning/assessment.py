@@ -1,4 +1,4 @@
-"""What is so: the pool, its pods and what the operator knows of both, judged once for one plan."""
+"""Assessment of a pool, its pods and what the operator knows of both, made once for a plan."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Assessment:
 
     @property
     def floor(self) -> int:
-        """How many minReplicas keeps of those that the master does not want."""
+        """Number of pods that minReplicas keeps and the master does not want."""
         spec, forgotten = self.spec, self.idleness.forgotten
         return spec.min_replicas if spec.replicas < spec.min_replicas and not forgotten else 0
 
@@ -139,7 +139,7 @@ class Assessment:
         )
 
     def _is_orphaned(self) -> bool:
-        """Its master is lost and what follows from that has not happened yet."""
+        """Tell whether the master is lost, and the pool does not show that yet."""
         attachment = self.attachment
         if self.spec.on_lost == "Retain":
             return False

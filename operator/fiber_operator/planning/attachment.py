@@ -24,9 +24,9 @@ class Attachment:
     lost_since: float | None = None
     """Set while ``alive`` is False."""
     due: float | None = None
-    """When the grace of a lost master ends, if it has not ended."""
+    """Time at which the grace of a lost master ends, if it has not ended."""
     missing: bool = False
-    """There is no Lease of that name, and it is too soon to call the master lost."""
+    """True if there is no Lease of that name, and it is too soon to call the master lost."""
     connected: int | None = None
     """Agents that are linked to it; None: nobody can tell."""
     gone: bool = False
@@ -34,12 +34,12 @@ class Attachment:
 
     @property
     def grace_is_over(self) -> bool:
-        """It is lost for good, unless the operator comes to know better."""
+        """Tell whether the grace of a lost master is over."""
         return self.alive is False and self.due is None
 
 
 def judge(pool: FiberPool, lease: plans.LeaseVerdict, now: float) -> Attachment:
-    """What the spec, the Lease and the status together say.
+    """Judge the master by the spec, the Lease and the status together.
 
     After a restart the operator does not know for a while; it goes by the status meanwhile, if
     that is of this master, and neither deletes for a lost master nor creates for one.
@@ -78,16 +78,16 @@ class Idleness:
     since: float | None = None
     """None: it asks for some, there is none, or nobody minds."""
     due: float | None = None
-    """When it has been forgotten, if it has not yet."""
+    """Time at which the master counts as forgotten, if it does not yet."""
 
     @property
     def forgotten(self) -> bool:
-        """It has asked for nothing for so long that it does not hold minReplicas any more."""
+        """True if the master was idle for so long that it no longer holds minReplicas."""
         return self.since is not None and self.due is None
 
 
 def idleness(pool: FiberPool, attachment: Attachment, now: float) -> Idleness:
-    """What the spec and the status say of the master's wishes.
+    """Judge how long the master has asked for nothing, by the spec and the status.
 
     One that is lost is not idle: ``onLost`` says what follows.
     """
@@ -110,14 +110,14 @@ def _lost_since(pool: FiberPool, before: Condition | None, now: float) -> float:
 
 
 def _connected_before(pool: FiberPool) -> int | None:
-    """What was known of this very master before this operator began to look."""
+    """Return the connected agents of this master that the status has from an earlier operator."""
     master, status = pool.spec.master, pool.status
     same = master is not None and status.master_epoch == master.epoch
     return status.connected_replicas if same else None
 
 
 def _condition(pool: FiberPool) -> Condition | None:
-    """What the status says of this very master, whatever else of the spec has changed."""
+    """Return the condition about this master in the status, also if the spec has changed."""
     if pool.spec.master is None or pool.status.master_epoch != pool.spec.master.epoch:
         return None
     conditions = pool.status.conditions

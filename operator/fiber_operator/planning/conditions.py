@@ -19,13 +19,13 @@ Truth = Literal["True", "False", "Unknown"]
 
 @dataclass(frozen=True)
 class Counts:
-    """How many pods are in which state."""
+    """Numbers of pods by state."""
 
     desired: int
     live: int
     ready: int
     joining: int
-    """They run, and their agents have not reached a master yet."""
+    """Pods that run, and whose agents have not reached a master yet."""
     pending: int
     """Live and never Ready."""
     terminating: int
@@ -48,13 +48,13 @@ class Counts:
 
 @dataclass(frozen=True)
 class Outlook:
-    """What there is, and what is about to happen."""
+    """State of the pool, and what is about to happen."""
 
     counts: Counts
     problems: tuple[Problem, ...]
     attachment: Attachment
     judged: bool = True
-    """Whether the API server has said what it thinks of the template, as far as that matters."""
+    """True if the API server has judged the template, as far as that matters."""
     create: int = 0
     delete: int = 0
     """Live pods that go now."""
@@ -65,7 +65,7 @@ class Outlook:
     replacing: int = 0
     """Live pods of an older template that are to be replaced, now or when they are idle."""
     lease_unreadable: bool = False
-    """There is no right to read the master's Lease."""
+    """True if there is no right to read the master's Lease."""
 
     @property
     def worst(self) -> Problem | None:
@@ -79,14 +79,14 @@ class Outlook:
 
 @dataclass(frozen=True)
 class Finding:
-    """One condition less its history."""
+    """Condition without its history."""
 
     type: ConditionType
     status: Truth
     reason: str
     message: str = ""
     since: float | None = None
-    """Where it is known otherwise than from the condition's history."""
+    """Time since when, if that is known otherwise than from the condition's history."""
 
 
 def conditions(pool: FiberPool, outlook: Outlook, now: float) -> tuple[Condition, ...]:

@@ -1,4 +1,4 @@
-"""How an agent gets its own key, and no task the pool's.
+"""Init container by which an agent gets its own key, and no task the pool's.
 
 A first init container mounts the pool's Secret, derives the agent's key from it and from the pod's
 name and uid, and writes it to a volume in memory.  The agent reads the file and removes it.
@@ -95,7 +95,7 @@ def _mounts_of_the_interpreter(
 
 
 def runs_the_agent(worker: Mapping[str, Any]) -> bool:
-    """Whether the same command line ends in an agent: that of the image does, too."""
+    """Tell whether the worker container runs the agent, by its command or its image."""
     words = [worker.get("command"), worker.get("args")]
     return not any(words) or _AGENT in str(words)
 

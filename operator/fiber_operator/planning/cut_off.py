@@ -19,7 +19,7 @@ from fiber_operator.planning.pods import PodView
 from fiber_operator.planning.situation import Situation
 
 OUTDATED = "cut-off"
-"""In place of a template's hash."""
+"""Mark in place of a template's hash."""
 
 SKEW = 5.0
 """Seconds that the clocks of two API servers may differ by, which date the Secret and the pods."""
@@ -34,7 +34,7 @@ class CutOff:
 
 
 def find(pool: FiberPool, live: Sequence[PodView], memory: Memory) -> CutOff:
-    """Which of the pods are."""
+    """Find the pods that are cut off."""
     address = None if _names_its_own_address(pool) else memory.address
     return CutOff(
         [pod for pod in live if address and pod.address not in ("", address)],
@@ -55,7 +55,7 @@ def outdated(pods: Sequence[PodView], cut_off: CutOff, *, attached: bool) -> lis
 
 
 def problems(situation: Situation) -> Iterator[Problem]:
-    """What there is to say of them; those that go now are left out."""
+    """Yield the problems of pods that are cut off, but for those that go now."""
     found = find(situation.pool, situation.live, situation.memory)
     if pods := found.by_address:
         pod = situation.example(Reason.ADDRESS_CHANGED, pods)

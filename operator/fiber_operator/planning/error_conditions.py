@@ -1,4 +1,4 @@
-"""What it means for a pool that a call about it failed: what, why, what to do.
+"""Obstacles for a pool that follow from failed calls: what, why, what to do.
 
 Whatever cannot be asked or done is told in the pool's status; silence would look like success.
 """
@@ -43,7 +43,7 @@ def with_object(error: ApiError, what: str) -> Obstacle:
 
 
 def with_creation(error: ApiError) -> Obstacle:
-    """It is not known whether a pod was created, or would be."""
+    """Return the obstacle after a failed creation of a pod."""
     message = (
         f"The API server does not make workers{quoted(error.message)}. Those that run go on. "
         f"{_WEBHOOKS.format(what='pods')}"
@@ -52,7 +52,7 @@ def with_creation(error: ApiError) -> Obstacle:
 
 
 def with_deletion(error: ApiError) -> Obstacle:
-    """What is to go could not be deleted."""
+    """Return the obstacle after a failed deletion."""
     if isinstance(error, Refused | Invalid):
         return _forbidden(error, "to remove what is not wanted any more")
     message = (
@@ -63,7 +63,7 @@ def with_deletion(error: ApiError) -> Obstacle:
 
 
 def with_list(error: ApiError) -> Obstacle:
-    """Nobody knows which pods there are."""
+    """Return the obstacle after a failed list of pods."""
     blind = "Until they are known none is made or deleted, and the numbers are those of before."
     if isinstance(error, Refused | Invalid):
         return _forbidden(error, "to see the pool's workers", blind)
@@ -72,7 +72,7 @@ def with_list(error: ApiError) -> Obstacle:
 
 
 def with_lease(pool: FiberPool, words: str) -> str:
-    """Nobody can tell whether the master is alive."""
+    """Return the words for a Lease that cannot be read."""
     lease = pool.spec.master.lease_name if pool.spec.master else None
     return (
         f"The operator may not get leases, so that nobody sees whether the master renews the Lease "

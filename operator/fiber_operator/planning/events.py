@@ -24,7 +24,7 @@ class Change:
 
 
 def events(change: Change, *, told: bool) -> Iterator[Event]:
-    """What is done first; then, if the new status is ``told``, what is new in it."""
+    """Yield events for actions; then, if the new status is ``told``, for the news in it."""
     yield from _actions(change)
     if told:
         yield from _disruptions(change)

@@ -13,7 +13,7 @@ from fiber_operator.planning.situation import Situation
 
 
 def failed_pods(situation: Situation) -> Iterator[Problem]:
-    """What is wrong as long as failures are not forgotten."""
+    """Yield the problems of failed pods, until the failures are forgotten."""
     failures = situation.account.failures
     if not failures.waves:
         return
@@ -80,7 +80,7 @@ def _last_failure(situation: Situation) -> Problem:
 
 
 def failure_reason(pod: PodView) -> Reason:
-    """Which problem a failed worker is."""
+    """Return the reason of the problem for a failed worker."""
     if pod.state is not State.ENDED:
         return Reason.STARTUP_TIMEOUT
     if pod.reason == "OOMKilled":
@@ -94,6 +94,6 @@ _NO_PROGRAM = ("executable file not found", "no such file or directory", "exec f
 
 
 def _hopeless(pod: PodView) -> bool:
-    """Whether the image has no such program: no second attempt will find it."""
+    """Tell whether the image lacks the program, so that no later attempt can succeed."""
     start_failed = failure_reason(pod) == Reason.RUN_CONTAINER_ERROR
     return start_failed and any(words in pod.message for words in _NO_PROGRAM)

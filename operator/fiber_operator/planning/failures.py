@@ -39,7 +39,7 @@ AT_ONCE = "CompletedAtOnce"
 """Why a worker failed that ended with exit code 0 and had not worked."""
 
 _JITTER = 0.1
-"""How much longer than its due a wait may be, so that pools which fail together come apart."""
+"""Share by which a wait may be longer, so that pools that fail together are spread out."""
 
 
 def delay(policy: FailurePolicy, waves: int, seed: str) -> float:
@@ -51,19 +51,19 @@ def delay(policy: FailurePolicy, waves: int, seed: str) -> float:
 
 
 def given_up(failures: Failures, policy: FailurePolicy) -> bool:
-    """Whether nothing more is created until the user changes something."""
+    """Tell whether no pod is created until the user changes something."""
     return failures.consecutive > policy.backoff_limit
 
 
 def held_back_until(failures: Failures, now: float) -> float | None:
-    """When those that wait are replaced; None if none does."""
+    """Return when waiting replacements are created; None if none waits."""
     due = failures.next_create_time
     return due if failures.waiting and due is not None and due > now else None
 
 
 @dataclass(frozen=True)
 class Account:
-    """What one look at the pods added."""
+    """Account of failures after one look at the pods."""
 
     failures: Failures
     proven: str | None
@@ -74,7 +74,7 @@ class Account:
     held_back: int = 0
     """Places of workers that failed, which are not to be taken yet."""
     recovers: float | None = None
-    """When the waves are over, if nothing happens until then."""
+    """Time at which the waves are over, if nothing happens until then."""
 
 
 def account(
@@ -131,7 +131,7 @@ def account(
 
 
 def _with(failures: Failures, **fields: Any) -> Failures:
-    """With other fields; sums stay what a status may hold."""
+    """Return failures with other fields.  Sums stay within what a status may hold."""
     held = {key: min(x, MAX_COUNT) if isinstance(x, int) else x for key, x in fields.items()}
     return failures.model_copy(update=held)
 
@@ -167,7 +167,7 @@ def _failed(pod: PodView) -> bool:
 
 
 def in_itself(pod: PodView) -> bool:
-    """Of one that counts as failed: whether it did not just end after a while, with exit code 0."""
+    """Tell of a failed pod whether it failed in itself: False if it exited with 0 after a while."""
     return pod.trouble is not Trouble.COMPLETED
 
 
@@ -176,7 +176,7 @@ def _disrupted(pod: PodView) -> bool:
 
 
 def _has_lived(pod: PodView, now: float) -> bool:
-    """Whether it is Ready for long enough, or was as far as anybody can tell."""
+    """Tell whether a pod was Ready for long enough, as far as is known."""
     if pod.state is State.READY:
         return now - pod.since >= RECOVERY
     return pod.state is State.ENDED and pod.was_ready and pod.ran >= RECOVERY
@@ -215,7 +215,7 @@ def _reason(pod: PodView) -> str:
 def _recovers(
     found: Failures, pods: Sequence[PodView], desired: int, policy: FailurePolicy, seed: str
 ) -> float | None:
-    """When workers have lived, if nothing happens until then.
+    """Return when workers will have lived long enough, if nothing happens until then.
 
     That is when one that became Ready since the last wave began has stayed so for a minute, or all
     that are wanted have: where fewer are wanted than there were, no new one need ever come.

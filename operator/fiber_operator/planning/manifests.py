@@ -102,7 +102,7 @@ def secret(pool: FiberPool, data: Mapping[str, str]) -> dict[str, Any]:
 
 
 def is_ours(pool: FiberPool, existing: Mapping[str, Any]) -> bool:
-    """Whether an object that already has the name was made for this very pool."""
+    """Tell whether an object that already has the name was made for this pool."""
     owners = items(mapping(existing, "metadata").get("ownerReferences"))
     return any(o.get("uid") == pool.metadata.uid and o.get("controller") is True for o in owners)
 
@@ -136,7 +136,7 @@ def slice_patch(pool: FiberPool, existing: Mapping[str, Any]) -> dict[str, Any] 
 
 
 def slice_must_be_replaced(pool: FiberPool, existing: Mapping[str, Any]) -> bool:
-    """Whether the master moved between IPv4 and IPv6: delete the slice and create it anew."""
+    """Tell whether the master moved between IPv4 and IPv6: make the slice anew then."""
     master = pool.spec.master
     return master is not None and existing.get("addressType") != _family(master)
 
@@ -176,7 +176,7 @@ def _ports(master: Master | None) -> list[dict[str, Any]]:
 
 
 def _leads_to(document: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
-    """Where a slice leads, less what the API server may have added."""
+    """Return addresses and ports of a slice, without what the API server may have added."""
     addresses = [
         (endpoint.get("addresses"), mapping(endpoint, "conditions").get("ready"))
         for endpoint in items(document.get("endpoints"))

@@ -1,4 +1,4 @@
-"""What goes into ``reconcile.plan`` beside the pool and its pods, and what comes out of it.
+"""Inputs of ``reconcile.plan`` beside the pool and its pods, and its result.
 
 Values only, all frozen: the controller fills in a ``Memory`` from what it saw of the cluster and
 does what a ``Plan`` says.  The times are unix seconds.
@@ -13,13 +13,13 @@ from typing import Any
 from fiber_api.names import Reason
 
 QUOTA_IS_FULL = "exceeded quota"
-"""What the API server says where a quota allows no more."""
+"""Words of the API server where a quota allows no more."""
 _QUOTA_WANTS_REQUESTS = "must specify "
-"""What it says where a quota counts what a container does not request."""
+"""Words of the API server where a quota counts what a container does not request."""
 _NAMESPACE_ENDS = "because it is being terminated"
-"""What it says where nothing new may be made because the namespace is deleted."""
+"""Words of the API server in a namespace that is being deleted."""
 _NO_ACCOUNT_YET = "error looking up service account"
-"""What it says for a moment in a new namespace, whose accounts are made after it."""
+"""Words of the API server for a moment in a new namespace, whose accounts come after it."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class Refusal:
     """The API server's own words."""
     at: float
     count: int = 1
-    """How often in a row, this one included: the next attempt waits longer each time."""
+    """Number of refusals in a row, with this one.  The next attempt waits longer each time."""
     dry_run: bool = False
-    """Whether it was the dry run that was refused, which judges the template and nothing else."""
+    """True if the dry run was refused, which judges only the template."""
 
     @property
     def reason(self) -> Reason:
-        """Which problem it is."""
+        """Reason of the problem."""
         if self.status != 403 and not self.may_pass:
             return Reason.INVALID_TEMPLATE
         if QUOTA_IS_FULL in self.message:
@@ -55,7 +55,7 @@ class Refusal:
 
     @property
     def may_pass(self) -> bool:
-        """Whether it is not the template that is to blame, which was good in the dry run.
+        """True if the template is not to blame, since it was good in the dry run.
 
         400 is how admission webhooks refuse what they find wrong at the moment.
         """
@@ -63,18 +63,18 @@ class Refusal:
 
     @property
     def lacks_account(self) -> bool:
-        """Whether the ServiceAccount of the template is not there, or not there yet."""
+        """True if the ServiceAccount of the template is not there, or not there yet."""
         return _NO_ACCOUNT_YET in self.message
 
     @property
     def namespace_ends(self) -> bool:
-        """Whether all of the namespace is about to go."""
+        """True if the namespace is being deleted."""
         return _NAMESPACE_ENDS in self.message
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """What stands in the way of the operator, as an object of the pool that could not be had.
+    """Obstacle for the operator, such as an object of the pool that it could not make.
 
     ``reason`` is ``Reason.NAME_TAKEN``, ``INVALID_CREDENTIALS``, ``FORBIDDEN`` or
     ``API_UNAVAILABLE``, which is no error until it lasts; ``message`` says what, why and what to do
@@ -84,12 +84,12 @@ class Obstacle:
     reason: Reason
     message: str
     terminal: bool = False
-    """Whether waiting cannot help."""
+    """True if waiting cannot help."""
 
 
 @dataclass(frozen=True)
 class LeaseVerdict:
-    """What the operator's own monotonic clock says of the master's Lease.
+    """Verdict on the master's Lease, by the operator's own monotonic clock.
 
     ``lease_monitor.py`` makes one for each pool whose ``spec.master.leaseName`` is set, anew for
     each epoch.  After a restart of the operator ``alive`` is None until the Lease is seen to change
@@ -99,7 +99,7 @@ class LeaseVerdict:
 
     alive: bool | None = None
     missing: bool = False
-    """There is no Lease of that name."""
+    """True if there is no Lease of that name."""
     connected: int | None = None
     """Agents that were linked to the master at its last renewal, if the Lease says so."""
     unreadable: str = ""
@@ -108,7 +108,7 @@ class LeaseVerdict:
 
 @dataclass(frozen=True)
 class Memory:
-    """What the operator knows of a pool beside its resource and its pods.
+    """Knowledge of the operator about a pool, beside its resource and its pods.
 
     A fresh ``Memory()`` after a restart of the operator is always right, only less informed.
     """
@@ -116,11 +116,11 @@ class Memory:
     address: str | None = None
     """``host:port`` of the pool's Service.  Nothing is created while it is None."""
     credentials: bool | None = None
-    """Whether the pool's Secret was seen to be the pool's own and whole; None: not looked at."""
+    """True if the pool's Secret is its own and whole; None: it was not looked at."""
     credentials_made: float = 0.0
-    """When the pool's Secret was made, as the cluster says."""
+    """Time at which the pool's Secret was made, as the cluster says."""
     obstacles: tuple[Obstacle, ...] = ()
-    """Nothing is created while there is any."""
+    """Obstacles.  While there is one, nothing is created."""
     led: bool = True
     """The EndpointSlice leads where ``spec.master`` says."""
     creation: Obstacle | None = None
@@ -138,7 +138,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class Deletion:
-    """One pod to delete, with preconditions that make it a no-op where the plan is out of date.
+    """Pod to delete, with preconditions that make it a no-op if the plan is out of date.
 
     404 means that it is done.  409 means that the pod changed since: plan again.
     """
@@ -166,7 +166,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to do now, in this order:
+    """Plan of the work to do now, in this order:
 
     0. if ``delete_pool``, delete the FiberPool, with its uid and the resourceVersion that the plan
        was made from as preconditions, and do nothing else: a master that comes back in this very

@@ -1,4 +1,4 @@
-"""What one pod is, in the few words that the planner needs.
+"""Views of pods, with the few facts that the planner needs.
 
 A pod comes as the JSON of the API, where any field may be missing or nonsense; a ``PodView`` is
 always whole.
@@ -23,15 +23,15 @@ LONGEST_MESSAGE = 1000
 
 
 class State(StrEnum):
-    """Where a pod is in its life.  ``TERMINATING`` and ``ENDED`` pods are not live."""
+    """State of a pod.  ``TERMINATING`` and ``ENDED`` pods are not live."""
 
     PENDING = "Pending"
-    """Its worker container does not run yet."""
+    """Worker container that does not run yet."""
     STARTING = "Starting"
     """The container runs; the pod was never seen Ready."""
     READY = "Ready"
     NOT_READY = "NotReady"
-    """It was Ready and is not now: its node is silent, or a probe fails."""
+    """Was Ready and is not now: the node is silent, or a probe fails."""
     TERMINATING = "Terminating"
     """Somebody asked to delete it."""
     ENDED = "Ended"
@@ -39,7 +39,7 @@ class State(StrEnum):
 
 
 class Trouble(StrEnum):
-    """What is wrong with a pod, by what follows from it."""
+    """Trouble of a pod, by its consequence."""
 
     DISRUPTED = "Disrupted"
     """The cluster ended it: replaced at once, no failure."""
@@ -56,7 +56,7 @@ class Trouble(StrEnum):
 
 @dataclass(frozen=True)
 class PodView:
-    """One pod.  Times are unix seconds as the cluster wrote them; 0.0 where it wrote none."""
+    """View of a pod.  Times are unix seconds as the cluster wrote them; 0.0 where it wrote none."""
 
     name: str
     uid: str
@@ -67,9 +67,9 @@ class PodView:
     template_hash: str
     state: State
     since: float
-    """When it came into this state, as far as the cluster says."""
+    """Time at which it came into this state, as far as the cluster says."""
     was_ready: bool = False
-    """Whether the pod is or was Ready, as far as its conditions tell."""
+    """True if the pod is or was Ready, as far as its conditions tell."""
     joining: bool = False
     """It runs, and its agent has not reached a master yet.  Nothing is planned by that: it counts
     as ``READY`` in all but what is shown."""
@@ -82,23 +82,23 @@ class PodView:
     ran: float = 0.0
     """Seconds that the worker container ran, once it has ended."""
     scheduled: bool = False
-    """It has a node."""
+    """True if the pod has a node."""
     lingers: bool = False
     """The worker has ended but other containers of the pod have not."""
     deletion_cost: int = 0
     address: str = ""
-    """Where the agent dials; empty where that is not said in so many words."""
+    """Address that the agent dials; empty if the pod does not state it."""
     init_container: str = ""
     """The init container that failed, so that the worker never ran; empty if none did."""
 
     @property
     def live(self) -> bool:
-        """Whether it counts as a replica."""
+        """True if the pod counts as a replica."""
         return self.state not in (State.TERMINATING, State.ENDED)
 
 
 def observe(pod: Mapping[str, Any], container: str) -> PodView:
-    """What ``pod`` is, judged by its container of that name.  Never raises."""
+    """Return the view of ``pod``, judged by its container of that name.  Never raises."""
     return _Observation(pod, container).view()
 
 
@@ -139,7 +139,7 @@ _LOST_CONTAINERS = frozenset({"ContainerStatusUnknown", "Unknown"})
 
 
 class _Observation:
-    """One look at one pod."""
+    """Observation of one pod."""
 
     def __init__(self, pod: Mapping[str, Any], container: str) -> None:
         self._meta = mapping(pod, "metadata")
@@ -242,7 +242,7 @@ class _Observation:
         return self._created
 
     def _ending(self) -> Mapping[str, Any]:
-        """How the worker ended or, if it never ran, the init container that was to blame."""
+        """Return how the worker ended or, if it never ran, how the init container did."""
         if self._end:
             return self._end
         return _end(self._failed_init().get("state"))
@@ -363,7 +363,7 @@ class _Observation:
 
 
 def _end(state: object) -> Mapping[str, Any]:
-    """How a container ended; empty if it has not, or if nothing says with which exit code."""
+    """Return how a container ended; empty if it has not, or if its exit code is not known."""
     end = mapping(state, "terminated")
     return end if _exit_code(end) is not None else {}
 

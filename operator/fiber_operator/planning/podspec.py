@@ -76,7 +76,7 @@ NO_REQUESTS: Mapping[str, str] = {}
 def pod(
     pool: FiberPool, name: str, address: str, requests: Mapping[str, str] = NO_REQUESTS
 ) -> dict[str, Any]:
-    """One worker pod.  ``address`` is ``host:port`` of the pool's Service.
+    """Return a worker pod.  ``address`` is ``host:port`` of the pool's Service.
 
     ``requests`` says what a worker requests of a resource that the template says nothing of.
     """

@@ -1,4 +1,4 @@
-"""What is wrong with a pool, worst first, as a person reads it and the SDK raises it."""
+"""Problems of a pool, worst first, as users read them and the SDK raises them."""
 
 from __future__ import annotations
 

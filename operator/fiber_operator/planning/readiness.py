@@ -27,7 +27,7 @@ for _ in range(200):
     time.sleep(0.1)
 sys.exit("no master has answered the agent yet; the log of the pod may say why")
 """
-"""One process that sleeps is cheaper than one process a second, and told at once."""
+"""Command of the probe.  A sleeping process is cheaper than a process each second, and faster."""
 
 _PROBE: Mapping[str, Any] = {
     # Without the site module an interpreter needs a hundredth of a second.

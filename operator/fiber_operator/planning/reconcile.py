@@ -52,7 +52,7 @@ _ENDED: Mapping[Trouble | None, Reason] = {
 
 
 def plan(pool: FiberPool, pods: Sequence[PodView], memory: Memory, now: float) -> Plan:
-    """What to do so that the cluster gets nearer to what ``pool`` says.
+    """Plan the work that brings the cluster nearer to ``pool``.
 
     ``pods`` are all pods with the label of the pool's uid, from a fresh list; those that another
     controller owns are ignored.  Pure and total: the same arguments give an equal plan, and
@@ -85,7 +85,7 @@ def plan_blind(document: Mapping[str, Any], obstacle: Obstacle, now: float) -> P
 
 
 class _Planner:
-    """One plan, of what is so."""
+    """Planner of one plan."""
 
     def __init__(self, facts: Assessment) -> None:
         self._facts = facts
@@ -195,7 +195,7 @@ class _Planner:
         return min(self._account.held_back, missing)
 
     def _creations(self, held_back: int) -> tuple[int, float | None]:
-        """How many now, and when more may follow if that is not all."""
+        """Return how many pods to create now, and when more may follow."""
         missing = self._facts.desired - len(self._remaining) - held_back
         if missing <= 0 or not self._facts.may_create or not self._facts.accepted:
             return 0, None

@@ -13,7 +13,7 @@ _LENGTH = 16
 
 
 def template_hash(pool: FiberPool) -> str:
-    """Of what the user says of a worker: the template, and how many processes are in each.
+    """Return a hash of the worker: of the template, and of the number of processes in each.
 
     Nothing that the operator adds is in it, so that a new operator replaces no pod, and nothing
     that the SDK writes.
@@ -22,7 +22,7 @@ def template_hash(pool: FiberPool) -> str:
 
 
 def spec_hash(pool: FiberPool) -> str:
-    """Of everything that a person, or a new master, changes to get a failed pool going again.
+    """Return a hash of all that a user or a new master changes to revive a failed pool.
 
     ``replicas`` and ``release`` are not in it: the SDK writes them all the time.
     """

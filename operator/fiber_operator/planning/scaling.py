@@ -1,4 +1,4 @@
-"""Which pods go, and how many come.
+"""Choice of pods to delete, and number of pods to create.
 
 Who may be taken depends on who could be working.  While a master is attached, only it knows which
 of its workers are idle: under ``ReleasedOnly`` the operator takes what the master has released and
@@ -54,7 +54,7 @@ def outdated_to_replace(
 
 
 def _idle(pods: Sequence[PodView]) -> list[PodView]:
-    """Those that no master can have given work to."""
+    """Return the pods that no master can have given work to."""
     return [pod for pod in pods if pod.state is State.PENDING]
 
 
@@ -104,18 +104,18 @@ def released_to_delete(
 
 @dataclass(frozen=True)
 class Trial:
-    """How many more pods of a template may be there now."""
+    """Number of pods of a template that may be added now."""
 
     room: int | None = None
     """None: as many as are wanted."""
     again: float | None = None
-    """When there will be more room, if nothing happens until then."""
+    """Time at which there will be more room, if nothing happens until then."""
 
 
 def trial(
     current: Sequence[PodView], *, proven: bool, failing: bool, held_back: int, now: float
 ) -> Trial:
-    """Whether a template, of which ``current`` are the live pods, is still being tried out.
+    """Judge whether a template with these ``current`` live pods is still being tried out.
 
     It is until one of its pods is Ready.  A pod that cannot start, or ``failing`` ones before
     these, leave it at the canaries that there are, the places of failed ones that are ``held_back``

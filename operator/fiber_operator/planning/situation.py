@@ -1,4 +1,4 @@
-"""What problems are found in, and how one is put together."""
+"""Situation in which problems are found, and their construction."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Situation:
         return found.model_copy(update={"since": float(math.floor(self.now))})
 
     def severity(self, reason: str, *, again: bool = False) -> Severity:
-        """Of what may pass by itself: a warning at first, an error if it is seen ``again``."""
+        """Return the severity of a passing problem: at first a warning, an error ``again``."""
         before = self.previous(reason)
         lasted = before and before.since and self.now - before.since >= SECOND_LOOK
         was_error = before is not None and before.severity == "Error"

@@ -25,7 +25,7 @@ _REASONS = {
 
 
 def pods_that_do_not_start(situation: Situation) -> Iterator[Problem]:
-    """One problem for each reason that keeps pods from starting."""
+    """Yield a problem for each reason that keeps pods from starting."""
     waiting = [pod for pod in situation.live if not pod.was_ready]
     stuck: dict[Reason, list[PodView]] = {}
     for pod in waiting:

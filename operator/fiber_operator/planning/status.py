@@ -68,7 +68,7 @@ def _connected(outlook: Outlook) -> int | None:
 
 
 def patch(pool: FiberPool, status: FiberPoolStatus) -> dict[str, Any] | None:
-    """What to write, whole, with None for what is to go; None if the pool says so already.
+    """Return the patch of the status, with None for fields to remove; None if nothing changes.
 
     What could not be read in the old status is not known to be right and is written over.
     """

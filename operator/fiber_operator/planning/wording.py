@@ -1,4 +1,4 @@
-"""What problems say: what happened, in the cluster's own words; why; what to do."""
+"""Messages of problems: what happened, in the cluster's own words; why; what to do."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _said(pod: PodView) -> str:
 
 
 def wants_root(pod: PodView) -> bool:
-    """Whether it cannot start because it would be root."""
+    """Tell whether the pod cannot start because it would be root."""
     return "runAsNonRoot" in pod.message or "non-root" in pod.message
 
 
@@ -140,7 +140,7 @@ LAST_LINES = " Its last lines:\n"
 
 
 def failure(pool: FiberPool, failures: Failures, reason: Reason, pod: PodView) -> str:
-    """How a worker failed, when the next one comes, and its last lines."""
+    """Return how a worker failed, when the next one comes, and its last lines."""
     wait = _wait(failures)
     own = pod.message and not _ended_by_node(pod) and reason != Reason.RUN_CONTAINER_ERROR
     lines = f"{LAST_LINES}{pod.message}" if own else ""
@@ -222,7 +222,7 @@ def _without_identity(reason: Reason, pod: PodView) -> str:
 
 
 def _ended_by_node(pod: PodView) -> bool:
-    """Whether the message is the node's, not the worker's."""
+    """Tell whether the message is the node's, not the worker's."""
     return pod.exit_code is None or pod.reason == "Evicted"
 
 
@@ -249,7 +249,7 @@ def _memory_limit(pool: FiberPool) -> str:
 
 
 def limit_exceeded(pool: FiberPool, failures: Failures, last: str) -> str:
-    """Nothing more is created."""
+    """Return the message of a pool that creates no more pods."""
     limit = pool.spec.failure_policy.backoff_limit
     return (
         f"{failures.consecutive} waves of failures in a row, while fewer than half of the workers "
@@ -292,7 +292,7 @@ _MISSPELT = (
 _LIMIT_RANGE = re.compile(
     r"must be less than or equal to \S+ limit|usage per \w+ is |limit to request ratio per "
 )
-"""How the API server says that requests and limits do not fit each other, or a LimitRange."""
+"""Words of the API server if requests and limits do not fit each other, or a LimitRange."""
 
 _OUT_OF_RANGE = (
     "A limit that spec.template does not set comes from a LimitRange of the namespace: kubectl get "
