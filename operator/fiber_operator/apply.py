@@ -100,8 +100,8 @@ class Work:
     """None if the spec cannot be read."""
     plan: Plan = field(default_factory=Plan)
     rested: float = 0.0
-    """When the pool has rested from the list of its pods, by the loop's clock.  It is not listed
-    before, so pods may be changed until then."""
+    """Time of the loop's clock until which the pool rests from the list of its pods.  Pods may be
+    changed until then."""
 
 
 class Applier:

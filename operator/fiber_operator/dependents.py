@@ -1,4 +1,4 @@
-"""What a pool has beside its pods: the Service, its EndpointSlice, the Secret, and a
+"""Dependents of a pool beside its pods: the Service, its EndpointSlice, the Secret, and a
 PodDisruptionBudget where the pool asks for one.
 
 They are looked at when the operator meets a pool, again every ``LOOK_AGAIN`` seconds, and for as

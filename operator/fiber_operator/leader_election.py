@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 
 class NotLeader(Exception):
-    """This operator does not hold the Lease that it needs to change anything."""
+    """The Lease that this operator needs to change anything is not its own."""
 
 
 class LeaderElector:

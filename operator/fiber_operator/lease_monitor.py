@@ -26,8 +26,8 @@ from fiber_operator.turns import in_turn
 from fiber_operator.workqueue import Key
 
 CONFIRMED_AFTER = 1 / 3
-"""Of the duration: how long a Lease that was read and had not changed may take to, before its
-master is lost.  The SDK renews as often, so that one that could not for a while has its turn."""
+"""Share of the duration in which an unchanged Lease must change before its master is lost.  The SDK
+renews as often, so a master that could not renew for a while gets its turn."""
 MISSING_AFTER = 5.0
 """Seconds after which a Lease that is not there is missed: a program makes it after its pool."""
 RECHECK = 60.0
@@ -54,7 +54,7 @@ class _Watched:
     due: float
     """Time at which to read the Lease."""
     version: str | None = None
-    """Its resourceVersion; empty: there is no such Lease, None: it was not read yet."""
+    """Version of the Lease; empty: there is no such Lease, None: it was not read yet."""
     doubted: bool = False
     """A read has found it unchanged for the whole duration."""
     verdict: LeaseVerdict = field(default_factory=LeaseVerdict)

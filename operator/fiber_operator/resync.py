@@ -40,8 +40,7 @@ class Resync:
         self.failures: dict[str, str] = {}
         """Namespace (empty: all) -> why its pools cannot be listed."""
         self.tried: float | None = None
-        """When the pools were last tried to be listed, and when that last succeeded everywhere:
-        the event loop's time."""
+        """Time of the event loop at which the pools were last tried to be listed."""
         self.succeeded: float | None = None
 
     @property

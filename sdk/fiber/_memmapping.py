@@ -89,7 +89,7 @@ class MemmappedArguments:
 
 
 class _Reduced:
-    """Is what it was made of once it is unpickled."""
+    """Stand-in that unpickles to the object that its arguments describe."""
 
     def __init__(self, *reduction: Any) -> None:
         self._reduction = reduction

@@ -171,7 +171,7 @@ LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """What can be configured; each key's type and default is in the signature.
+    """Configuration of a program.  The signature has the type and default of each key.
 
     Keys marked * are read when the first process, pool, pipe, queue, event or semaphore is
     made, and cannot change after that; the others hold for what is made next.
@@ -511,7 +511,7 @@ AGENT_VARIABLES = frozenset(
         "FIBER_AGENT_UID",
     }
 )
-"""What an agent is told, by a backend or in a pod: known by name, so that a typo is found."""
+"""Variables for agents, which a backend or a pod sets.  Their names are known to find typos."""
 
 
 def _variable(key: str) -> str:

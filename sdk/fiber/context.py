@@ -409,7 +409,7 @@ class BaseContext:
 
     @property
     def reducer(self) -> ModuleType:
-        """How objects become bytes."""
+        """Module that pickles objects."""
         from fiber import reduction
 
         return reduction

@@ -251,7 +251,7 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> MapResult[_T]:
-        """As ``map``, but return at once with a result to wait for.  ``iterable`` is read first.
+        """Call as ``map`` does, but return a result once ``iterable`` is read.
 
         Its items are pickled later: change none of them, as an array in place, before the result is
         there.
@@ -304,7 +304,7 @@ class Pool:
         timeout: float | None = None,
         buffersize: int | None = None,
     ) -> IMapIterator[_T]:
-        """As ``imap``, in the order in which the results come."""
+        """Call as ``imap`` does, and yield results in the order in which they come."""
         iterator: IMapIterator[_T] = IMapUnorderedIterator(self)
         return self._imap(iterator, func, iterable, chunksize, timeout, buffersize)
 

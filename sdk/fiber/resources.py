@@ -15,7 +15,7 @@ __all__ = ["Resources", "largest", "merged", "meta", "resources_of", "wished", "
 
 _ATTRIBUTE = "__fiber_meta__"
 _RUN_BY_A_MANAGER = "_run_server"
-"""What a manager's class has in multiprocessing: the function that is run in its process."""
+"""Name of the function of a multiprocessing manager's class that runs in its process."""
 _F = TypeVar("_F", bound=Callable[..., Any])
 _N = TypeVar("_N", int, float)
 _V = TypeVar("_V", int, str)

@@ -33,14 +33,14 @@ _ErrorCallback = Callable[[BaseException], object]
 
 
 class Keeper(Protocol):
-    """What an iterator needs of its pool, which it keeps while there is something to wait for."""
+    """Part of a pool that an iterator needs.  It keeps the pool while results are to come."""
 
     def _check_may_wait(self) -> None:
-        """RuntimeError where a result would wait for whoever waits for it."""
+        """Raise RuntimeError on a thread that must not wait for a result."""
 
 
 class Owner(Keeper, Protocol):
-    """What a result needs of it."""
+    """Part of a pool that a result needs."""
 
     def _calls_back_here(self) -> bool:
         """Return whether the caller is a callback, on the thread of all callbacks."""

@@ -1,5 +1,5 @@
-"""Whether a master uses the pool: what may be taken from it, what becomes of it without one, and
-how long one that asks for nothing holds it.
+"""Attachment of a master to the pool: whether it uses the pool, what follows if it is lost, and how
+long a master that asks for nothing holds the pool.
 """
 
 from __future__ import annotations

@@ -71,8 +71,8 @@ class PodView:
     was_ready: bool = False
     """True if the pod is or was Ready, as far as its conditions tell."""
     joining: bool = False
-    """It runs, and its agent has not reached a master yet.  Nothing is planned by that: it counts
-    as ``READY`` in all but what is shown."""
+    """True if the pod runs and its agent has not reached a master yet.  This is only shown: plans
+    count such a pod as ``READY``."""
     trouble: Trouble | None = None
     reason: str = ""
     """The cluster's own word for the trouble: ``ErrImagePull``, ``OOMKilled``, ``Evicted``."""

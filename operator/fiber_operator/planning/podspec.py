@@ -19,8 +19,8 @@ from fiber_operator.planning.documents import items, mapping, text
 from fiber_operator.planning.revisions import template_hash
 
 NODE_LOST_SECONDS = 60
-"""How long a pod stays bound to a node that is silent.  Kubernetes' own default is five minutes; a
-worker's tasks are given to others after seconds, and the pool should not lack it for longer."""
+"""Seconds for which a pod stays bound to a silent node.  Kubernetes' default is five minutes.  A
+worker's tasks go to others after seconds, and the pool should not lack the worker for longer."""
 
 _NODE_LOST = ("node.kubernetes.io/not-ready", "node.kubernetes.io/unreachable")
 _EVICTION = "NoExecute"

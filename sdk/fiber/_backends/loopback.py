@@ -58,9 +58,7 @@ class LoopbackBackend:
     same_host = False
     same_pids = True
     elsewhere: str | None = None
-    """For tests: a directory that agents are started in as if this machine were another one, which
-    has not the program's files.
-    """
+    """Directory that agents are started in, for tests of a machine without the program's files."""
 
     def __init__(self, loop: Loop, hub: Hub, config: Config) -> None:
         self._loop = loop

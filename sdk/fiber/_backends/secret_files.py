@@ -149,8 +149,8 @@ _CONTENTS = {
     "a key of Anthropic": (rb"sk-ant-[a-z]+[0-9]{2}-[\w-]{80}",),
     "a key of OpenAI": (rb"sk-[\w-]{20,}T3BlbkFJ[\w-]{20}",),
 }
-"""What such contents show: each of the expressions is found in them.  One that begins with fixed
-letters is found fastest, so what must not precede them comes after.
+"""Expressions that are found in contents of each kind.  One that begins with fixed letters is found
+fastest, so what must not precede them comes after.
 """
 
 _CODE = (".py", ".pyi", ".pyx", ".so")

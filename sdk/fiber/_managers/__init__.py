@@ -1,4 +1,4 @@
-"""How a manager's proxies and its server meet: over Fiber's channels, on one host or between two.
+"""Connections between a manager's proxies and its server, over Fiber's channels.
 
 Proxies and managers are multiprocessing's own.  How they connect they look up in a table there,
 by the name of a serializer; this adds one more.  Whoever unpickles an address imports this.

@@ -42,7 +42,7 @@ class AsyncProxyResult:
         self._outcome: tuple[str, Any] | None = None
 
     def get(self, timeout: float | None = None) -> Any:
-        """What the method returned, each time the same; raises what it raised.
+        """Return the result of the method, each time the same object, or raise its error.
 
         TimeoutError if it has not ended within ``timeout`` seconds; the call goes on.
         ConnectionClosed if the manager is gone.
@@ -59,11 +59,11 @@ class AsyncProxyResult:
         self._pipeline.wait(self, timeout)
 
     def ready(self) -> bool:
-        """Whether the call has ended."""
+        """Tell whether the call has ended."""
         return self._pipeline.wait(self, 0)
 
     def successful(self) -> bool:
-        """Whether it has returned without an error; ValueError if it has not ended."""
+        """Tell whether the call ended without an error; ValueError if it has not ended."""
         if not self.ready():
             raise ValueError(f"{self!r} not ready")
         assert self._outcome is not None
@@ -164,7 +164,7 @@ class Pipeline:
             self._session.let_go(str(value[1].id))
 
     def _settle(self, number: int, kind: str, value: Any) -> bool:
-        """Whether anybody wants to know."""
+        """Settle a call; return whether its result is still wanted."""
         reference = self._pending.pop(number, None)
         result = None if reference is None else reference()
         if result is None:
@@ -188,7 +188,7 @@ class Pipeline:
 
 
 class _Ended(Exception):
-    """There will be no more answers."""
+    """No more answers come."""
 
 
 class AsyncBaseProxy(mp_managers.BaseProxy):

@@ -55,7 +55,7 @@ class Line:
         self._draining = False
         self.busy = False
         self.came = False
-        """Whether the server has answered the last request."""
+        """True if the server has answered the last request."""
 
     def ask(self, request: tuple[Any, ...]) -> None:
         """Send a request."""
@@ -75,12 +75,12 @@ class Line:
             self.came = False
 
     def take_back(self) -> None:
-        """Nobody waits for the last answer any more."""
+        """Take back the last request: its answer is not wanted."""
         self._draining = True
         self.ask((None, TAKE_BACK, (), {}))
 
     def is_free(self) -> bool:
-        """Whether a call may begin."""
+        """Tell whether a call may begin."""
         while self._draining and self._channel.poll(0):
             try:
                 number, *_ = self._channel.recv_object()
@@ -97,7 +97,7 @@ class Line:
 
 
 class Session:
-    """This process, to the server of one manager."""
+    """Session of this process with the server of one manager."""
 
     def __init__(self, address: ManagerAddress) -> None:
         self.address = address
@@ -146,25 +146,25 @@ class Session:
         return line
 
     def replace(self, line: Line) -> None:
-        """Nobody waits for what it brings; what this thread has acquired stays its own."""
+        """Replace a line whose answer is not wanted.  This thread keeps what it has acquired."""
         with contextlib.suppress(ConnectionClosed):
             self._new_line()
         self.give_up(line)
 
     def give_up(self, line: Line) -> None:
-        """Nobody waits for what it brings."""
+        """Close a line whose answer is not wanted."""
         line.close()
         lines: list[Line] = getattr(self._of_thread, "lines", [])
         if line in lines:
             lines.remove(line)
 
     def got_reference(self) -> None:
-        """One more reference to an object of the manager is ours."""
+        """Count a new reference to an object of the manager."""
         self._references += 1
         _held[self.address] = self
 
     def let_go(self, ident: str) -> None:
-        """One less; from anywhere, a finalizer too."""
+        """Drop a reference.  From anywhere, also from a finalizer."""
         self.say("decref", ident)
         self._references -= 1
         if self._references <= 0:
@@ -186,7 +186,7 @@ class Session:
                 return
 
     def close(self) -> None:
-        """This process goes in good order, and leaves locks as they are."""
+        """End the session in good order.  Locks stay as they are."""
         _held.pop(self.address, None)
         _sessions.pop(self.address, None)
         self.say("bye")
@@ -255,7 +255,7 @@ def _hand_over(carrier: Channel, *about: str) -> LocalChannel:
 
 
 class Request:
-    """What multiprocessing's proxies and managers take for a connection to the server."""
+    """Connection to the server, as multiprocessing's proxies and managers see it."""
 
     def __init__(self, address: ManagerAddress) -> None:
         self._address = address
@@ -292,7 +292,7 @@ class Request:
         self._under_way.append((line, method, ident))
 
     def recv(self) -> tuple[str, Any]:
-        """How the call that began last ended."""
+        """Return how the last call ended."""
         if not self._under_way:
             return "#RETURN", None  # letting go has no answer
         line, method, ident = self._under_way.pop()
@@ -334,7 +334,7 @@ class Request:
             raise
 
     def close(self) -> None:
-        """Nothing: lines are the thread's."""
+        """Do nothing: the thread keeps its lines."""
 
 
 _sessions: weakref.WeakValueDictionary[ManagerAddress, Session] = weakref.WeakValueDictionary()
@@ -343,7 +343,7 @@ _held: dict[ManagerAddress, Session] = {}
 
 
 def session(address: ManagerAddress) -> Session:
-    """This process's session with the server at ``address``."""
+    """Return this process's session with the server at ``address``."""
     found = _sessions.get(address)
     if found is None:
         made = Session(address)
@@ -391,12 +391,12 @@ def new_owner() -> str:
 
 
 def introduction() -> str:
-    """This process, in words."""
+    """Return a description of this process."""
     return f"process {current_process().name!r} (pid {os.getpid()} on host {host()!r})"
 
 
 def thread_name() -> str:
-    """This thread, for whoever looks at the server's."""
+    """Return the name of this thread, for the threads of the server."""
     name = current_process().name
     return name if current_thread() is main_thread() else f"{name}|{current_thread().name}"
 
@@ -417,7 +417,7 @@ def _close_all() -> None:
 
 
 def _forget() -> None:
-    """In a forked process: they are its parent's."""
+    """Forget the sessions in a forked process: they belong to its parent."""
     for one in list(_sessions.values()):
         one.end()
     _sessions.clear()

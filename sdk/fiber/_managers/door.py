@@ -1,4 +1,4 @@
-"""Where processes that want to talk to a manager's server knock, and how they find it."""
+"""Inbox of a manager's server for new clients, and its address."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _UNTIL_FILES_CLOSE = 0.05
 
 
 class ManagerAddress(NamedTuple):
-    """What ``manager.address`` is where none was chosen: any process of the program may use it.
+    """Value of ``manager.address`` where none was chosen.  Any process of the program may use it.
 
     Whoever has it may use every object of the manager, so it is not shown.
     """
@@ -43,7 +43,7 @@ class ManagerAddress(NamedTuple):
 
 
 class Door:
-    """A manager's Listener: a channel of which the hub lets in whoever has the address."""
+    """Listener of a manager: a channel that every process with the address may reach."""
 
     def __init__(self, address: object = None, backlog: int = 0) -> None:
         self._inbox, outbox = LocalChannel.pair()
@@ -56,12 +56,12 @@ class Door:
         )
 
     def accept(self) -> tuple[str, str, Channel]:
-        """Who comes next, and the end of a channel to it, after the word for that."""
+        """Return the next client: a word, its name, and the end of a channel to it."""
         invitation: tuple[str, str, Channel] = received(self._inbox)
         return invitation
 
     def close(self) -> None:
-        """Nobody can come in any more."""
+        """Admit no more clients."""
         self._grants.release()
         self._inbox.close()
 

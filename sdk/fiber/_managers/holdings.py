@@ -1,4 +1,4 @@
-"""What the clients of a manager's server hold, so that it is let go when they die.
+"""Holdings of the clients of a manager's server, which are released when clients die.
 
 Differs from multiprocessing, where a client that is killed keeps its locks, its references and its
 place in a barrier for ever.  A process that ends in good order keeps its locks here too: another
@@ -22,7 +22,7 @@ _ANYBODYS = (_LOCK, threading.Semaphore)
 """Any thread may release them."""
 _LOCKS = (*_ANYBODYS, RLock)
 CONTENDED = (*_LOCKS, threading.Condition, threading.Barrier, Queue)
-"""What has something for which several clients may wait."""
+"""Types of objects for which several clients may wait."""
 
 Got: TypeAlias = tuple[Any, str, tuple[str, Any]]
 """An object, the method that was called, and the answer."""
@@ -33,7 +33,7 @@ class Client:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        """In words."""
+        """Description of the client."""
         self.left_in_order = False
         self.gone = False
         self.references: Counter[str] = Counter()
@@ -42,7 +42,7 @@ class Client:
         """At which its threads wait."""
         self.threads: list[ClientThread] = []
         self.owners: dict[str, Owner] = {}
-        """Its own threads."""
+        """Threads of the client."""
 
 
 class Owner:
@@ -56,15 +56,15 @@ class Owner:
         self.ident = next(_idents)
         self.owned: set[RLock] = set()
         self.threads = 0
-        """Those here that act for it."""
+        """Number of threads of the server that act for it."""
 
 
 _idents = itertools.count(-1, -1)
-"""Which no thread has."""
+"""Numbers that no thread has."""
 
 
 class Holdings:
-    """Who has acquired which lock or semaphore how often."""
+    """Table of the locks and semaphores that each client has acquired, and how often."""
 
     def __init__(self) -> None:
         self._mutex = threading.Lock()
@@ -107,7 +107,7 @@ class Holdings:
             return True
 
     def end(self, client: Client) -> None:
-        """It is gone; if not in good order, release what it had."""
+        """Note the end of a client.  If it was not in good order, release its locks."""
         with self._mutex:
             client.gone = True
             mine = [(lock, holders.pop(client, 0)) for lock, holders in self._held.values()]
@@ -128,12 +128,12 @@ class Holdings:
         self._warnings[lock] = text
 
     def warning(self, lock: Any) -> str | None:
-        """What whoever has just acquired it should know."""
+        """Return a warning for the client that has just acquired a lock; None if there is none."""
         return self._warnings.pop(lock, None) if self._warnings else None
 
 
 class ClientThread:
-    """What one thread of the server has on behalf of one thread of a client, of a given name."""
+    """Thread of the server that acts for one thread of a client."""
 
     def __init__(self, holdings: Holdings, client: Client, name: str) -> None:
         self._holdings = holdings
@@ -146,7 +146,7 @@ class ClientThread:
         self._owned = self._owner.owned
         act_as(self._ident)
         self.got: Got | None = None
-        """What the last call brought, if others wait for such."""
+        """Result of the last call, if other clients wait for such a thing."""
         self.kept: Any = None
         """The last result that has proxies in it: until the client has references of its own to
         what they stand for, which it has when it asks for the next."""
@@ -210,7 +210,7 @@ class ClientThread:
                 obj.not_empty.notify()
 
     def abandon(self) -> None:
-        """Nobody else could release what this thread has acquired."""
+        """Give up the locks of this thread, which no other could release."""
         for lock in [lock for lock in self._owned if lock.owned_by(self._ident)]:
             self._holdings.warn(lock, abandoned(lock, f"a thread of {self._client.name}"))
             lock.revoke(self._ident)
@@ -228,7 +228,7 @@ class ClientThread:
 
 
 def abandoned(lock: Any, holder: str) -> str:
-    """What is said of a lock that ``holder`` had."""
+    """Return the message about a lock that ``holder`` had."""
     return (
         f"{holder} ended while it held this {type(lock).__name__.lower()} of a manager, "
         "which was released: what it protects may be half changed"

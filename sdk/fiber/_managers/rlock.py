@@ -12,7 +12,7 @@ _acting = threading.local()
 
 
 def act_as(owner: int) -> None:
-    """What this thread acquires from here on is that owner's, as it is of all that act as that."""
+    """Act as ``owner`` from now on: locks that this thread acquires belong to that owner."""
     _acting.owner = owner
 
 
@@ -22,17 +22,17 @@ def _me() -> int:
 
 
 class RLock:
-    """As ``threading.RLock``."""
+    """Reentrant lock with the methods of ``threading.RLock``."""
 
     def __init__(self) -> None:
         self._block = threading.Lock()
         self._mutex = threading.Lock()
-        """Of what follows; never held by who waits."""
+        """Lock for the fields below.  A waiter never holds it."""
         self._owner: int | None = None
         self._count = 0
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
-        """As in ``threading``."""
+        """Acquire the lock as in ``threading``."""
         me = _me()
         with self._mutex:
             if self._owner == me:
@@ -45,7 +45,7 @@ class RLock:
         return True
 
     def release(self) -> None:
-        """As in ``threading``."""
+        """Release the lock as in ``threading``."""
         with self._mutex:
             if self._owner != _me():
                 raise RuntimeError("cannot release un-acquired lock")
@@ -66,7 +66,7 @@ class RLock:
             return True
 
     def owned_by(self, owner: int) -> bool:
-        """Whether that thread has it."""
+        """Tell whether ``owner`` holds the lock."""
         return self._owner == owner
 
     def __enter__(self) -> bool:
@@ -99,7 +99,7 @@ class RLock:
         _acting.restored = count
 
     def undo_restore(self) -> None:
-        """What this thread's last ``wait`` of a condition acquired is not to be had."""
+        """Release what this thread's last ``wait`` of a condition acquired."""
         with self._mutex:
             if self._owner != _me():
                 return  # its client is gone, and it was revoked

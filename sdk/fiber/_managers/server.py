@@ -29,10 +29,10 @@ from fiber.errors import ConnectionClosed
 _mp: Any = mp_managers  # typeshed has part of it
 
 _PROXY = b"RebuildProxy"
-"""In the pickle of whatever has a proxy in it."""
+"""Bytes that a pickle has if there is a proxy in it."""
 
 _Answer = tuple[str, Any]
-"""Of what kind it is, in multiprocessing's words, and what it is."""
+"""Kind of an answer, in multiprocessing's words, and its value."""
 
 
 class Server(_mp.Server):  # type: ignore[misc]

@@ -39,7 +39,7 @@ def inherit(method: str | None, modules: list[str]) -> None:
 
 
 def zygote_method(method: str | None) -> str:
-    """What the zygote is asked to do for a start method, None being the one in force."""
+    """Return the action of the zygote for a start method; None is the one in force."""
     return "spawn" if (method or settle()) == "spawn" else "fork"
 
 

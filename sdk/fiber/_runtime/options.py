@@ -1,4 +1,4 @@
-"""What a person may pass as the options of a pool: checked once, and named when it is wrong."""
+"""Options of a pool, which are checked once.  An error names the wrong one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fiber._engine.charges import Limits
 from fiber.resources import Resources
 
 LARGEST_CHUNK = 2**32 - 1
-"""What a message can say; more than anybody has."""
+"""Largest number of tasks in a chunk that a message can express."""
 
 
 NO_WISHES = Resources()
@@ -24,10 +24,10 @@ IDLE_TIMEOUT = 60.0
 
 
 class PoolOptions(NamedTuple):
-    """What a pool promises its workers and callers; ``fiber.pool.Pool`` says what each means."""
+    """Options of a pool.  ``fiber.pool.Pool`` documents each."""
 
     new_process: Callable[..., BaseProcess]
-    """Makes the Process object for a WorkerHandle."""
+    """Function that makes the Process object for a WorkerHandle."""
     initializer: Callable[..., object] | None = None
     initargs: tuple[Any, ...] = ()
     minimum: int = 1
@@ -35,15 +35,15 @@ class PoolOptions(NamedTuple):
     max_tasks: int | None = None
     """Tasks, or chunks of them, after which a worker is replaced."""
     limits: Limits = Limits()
-    """How often a task runs again whose worker is lost."""
+    """Limits of how often a task runs again whose worker is lost."""
     retryable: tuple[type[BaseException], ...] = ()
     idle_timeout: float = IDLE_TIMEOUT
     resources: Resources = NO_WISHES
-    """What workers wish of their hosts, besides what the first task's function does."""
+    """Wishes of workers for their hosts, beside those of the first task's function."""
     calls_back_at_end: bool = False
-    """Whether callbacks run for calls that termination fails; not in multiprocessing."""
+    """True if callbacks run for calls that termination fails, unlike in multiprocessing."""
     refusal: Callable[[], Exception] = partial(ValueError, "Pool not running")
-    """Makes the error of what is asked of it once it is closed."""
+    """Function that makes the error for calls of a closed pool."""
 
 
 def whole(name: str, value: Any) -> int:

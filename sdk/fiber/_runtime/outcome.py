@@ -1,4 +1,4 @@
-"""What became of a task, as the executor hands it on.
+"""Outcome of a task, as the executor hands it on.
 
 The loop's thread never runs the user's code, and unpickling may: so what is not plain stays pickled
 until whoever wants it asks, in a thread of theirs.
@@ -35,11 +35,11 @@ class Pickled:
 
     @property
     def failed(self) -> bool:
-        """Whether it is an error."""
+        """True if the outcome is an error."""
         return self.kind != work.VALUE
 
     def decode(self) -> Any:
-        """The value, or the Failure."""
+        """Return the value, or the Failure."""
         try:
             value = pickle.loads(self.data, buffers=self.buffers)
         except Exception as error:
@@ -48,7 +48,7 @@ class Pickled:
 
 
 def is_failure(outcome: Any) -> bool:
-    """Whether a task failed; a value that does not unpickle is not known to."""
+    """Tell whether a task failed.  A value that does not unpickle does not count."""
     kind = type(outcome)
     return kind is Failure or (kind is Pickled and outcome.failed)
 

@@ -1,4 +1,4 @@
-"""What multiprocessing's Process asks of whatever runs it: the ``Popen`` protocol."""
+"""``Popen`` protocol of multiprocessing's Process, for all backends."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Popen:
         self._child: ChildHandle | None = None
         self._may_wait = runtime().backend.elastic
         self.same_pids = runtime().backend.same_pids
-        """Whether its pid says something on this host, in this PID namespace."""
+        """True if its pid is valid on this host, in this PID namespace."""
         self._answered = Latch()
-        """Whoever starts it need not wait any more."""
+        """Set when ``start`` need not wait longer."""
         self._born = Latch()
         self._exited = Latch()
         self._loop = loop = runtime().loop
@@ -69,14 +69,14 @@ class Popen:
     # What the agent says, on the loop's thread
 
     def begin(self, child: ChildHandle) -> None:
-        """It is started."""
+        """Note that the child is being started."""
         self._child = child
         child.start()
         if child.waiting and self._may_wait:
             self._answered.set()
 
     def started(self, pid: int) -> None:
-        """It has a pid."""
+        """Note the pid of the process."""
         _logs.debug("process %s has pid %d", self._name, pid)
         self._pid = pid
         self._born.set()
@@ -90,10 +90,10 @@ class Popen:
         """Only pool workers are given work."""
 
     def draining(self) -> None:
-        """Its host is about to go.  The process is told by a signal, if it is prepared for one."""
+        """Do nothing: a process on a host that is about to go gets a signal, if it handles one."""
 
     def exited(self, report: ExitReport) -> None:
-        """It is gone."""
+        """Note that the process has ended."""
         _logs.debug("process %s ended: %s", self._name, report.describe())
         self.report = report
         at_exit = self._at_exit
@@ -109,7 +109,7 @@ class Popen:
         self._child = None
 
     def broken(self, error: FiberError) -> None:
-        """Nobody will say how it ends: then it ends now."""
+        """Count the process as ended, since its end could not be reported."""
         if self.returncode is None:
             # What the loop failed for, descriptors that were closed, may be in the way of both.
             with contextlib.suppress(OSError):
@@ -126,7 +126,7 @@ class Popen:
 
     @property
     def pid(self) -> int | None:
-        """Its pid.  Waits for one for ``start_timeout`` seconds; None if it never had one."""
+        """Pid of the process.  Waits up to ``start_timeout`` seconds; None if it never had one."""
         if self._pid is None and not self._loop.on_thread():
             self._born.wait(runtime().config.start_timeout)
         return self._pid

@@ -51,7 +51,7 @@ class Receiver:
         self._advance = advance
         self._on_ready = on_ready
         self._last_words: dict[WorkerHandle, Words] = {}
-        """Of workers that callers use, whose agents heard them first since they died."""
+        """Last packets of leased workers that died, received by the agent and not by the caller."""
         self._taken_back: dict[WorkerHandle, list[int]] = {}
         """From workers that callers use: calls of theirs, which are no batches yet."""
 
@@ -113,7 +113,7 @@ class Receiver:
             self.recalled(handle, self._taken_back.pop(handle))
 
     def forget(self, handle: WorkerHandle) -> None:
-        """What was heard of it meanwhile is of no use."""
+        """Forget the last packets of a worker."""
         self._last_words.pop(handle, None)
         self._taken_back.pop(handle, None)
 
@@ -149,7 +149,7 @@ class Receiver:
         self._advance()
 
     def _unpickle_fault(self, batch: Batch, error: Pickled) -> None:
-        """On the background thread: whatever a worker found with a function is the user's."""
+        """Unpickle the error of a function on the background thread, as it runs the user's code."""
         try:
             fault = error.decode().error
         except BaseException as raised:  # what its unpickling raises may be anything

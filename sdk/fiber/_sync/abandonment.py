@@ -1,4 +1,4 @@
-"""What who acquires a lock is told when the one before died with it."""
+"""Result of acquiring a lock whose last holder died."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which process is meant, in one word that shared memory can hold, and whether it still lives.
+"""Identity of a process in one word of shared memory, by which others see whether it lives.
 
 A pid alone would not do: the kernel gives it to another process.  Beside it is the time at which
 the process started, as the kernel counts it.
@@ -33,7 +33,7 @@ def pid(who: int) -> int:
 
 
 def is_alive(who: int) -> bool:
-    """Whether that process still runs; one that has ended and that nobody reaped does not."""
+    """Tell whether that process still runs.  One that has ended and was not reaped does not."""
     return _start_time(who & _PID) == who >> 31
 
 

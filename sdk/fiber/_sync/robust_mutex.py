@@ -25,7 +25,7 @@ _Result = TypeVar("_Result")
 
 
 class RobustMutex:
-    """One at an address; ``create`` makes it, once, for all processes."""
+    """Robust mutex at an address; ``create`` makes it, once, for all processes."""
 
     __slots__ = ("_address",)
 
@@ -42,7 +42,7 @@ class RobustMutex:
         _check(_libc.pthread_mutex_init(self._address, attributes))
 
     def run(self, action: Callable[[], _Result]) -> _Result:
-        """What ``action`` returns, called while nobody else is within one."""
+        """Call ``action`` under the mutex; return its result."""
         outcomes: list[int] = []
         try:
             # The outcome is noted in the step that brings it: no signal strikes in between.

@@ -79,7 +79,7 @@ _MAXIMUM = 19
 _DEAD = range(20, 31)  # whose token was given back, in words
 _SLOTS = range(32, SIZE // 8, 8)
 _NO_SLOT = 31
-"""In place of one, when there are no more: nobody reads it."""
+"""Mark in place of a slot, when there are no more."""
 
 # Of a slot
 _WHO = 1  # the process, or 0: it is nobody's
@@ -109,7 +109,7 @@ class Block(Protocol):
 
     @property
     def address(self) -> int:
-        """Where it is in this process."""
+        """Address of the semaphore in this process."""
 
 
 class SharedSemaphore:
@@ -159,7 +159,7 @@ class SharedSemaphore:
         return new
 
     def _begin(self) -> None:
-        """In a new process, which may be a fork: what its parent has is not its own."""
+        """Begin in a new process, which may be a fork and does not have its parent's tokens."""
         self._me = identity.me()
         self._idle: list[int] = []
         self._held: list[int] = []
@@ -231,11 +231,11 @@ class SharedSemaphore:
         return True
 
     def is_untracked(self) -> bool:
-        """Whether nothing is given back for who dies."""
+        """True if the tokens of dead processes are not given back."""
         return bool(self._words[_IS_UNTRACKED])
 
     def listen(self, listens: bool) -> None:
-        """Whether the hub is to be rung for."""
+        """Set whether a release rings the hub."""
         self._bytes[_LISTENS] = listens
 
     def try_acquire(self) -> bool | Abandoned:
@@ -273,7 +273,7 @@ class SharedSemaphore:
             raise
 
     def _try_acquire(self, wait: tuple[bool] | tuple[bool, float], taken: list[int]) -> bool:
-        """One try; ``taken`` gets the slot if it succeeds, and keeps it if it is interrupted."""
+        """Try once.  ``taken`` gets the slot on success, and keeps it after an interrupt."""
         try:
             slot = self._idle.pop()
         except IndexError:
@@ -310,13 +310,13 @@ class SharedSemaphore:
             self._ring()
 
     def _leave(self, slot: int) -> None:
-        """What was done last was interrupted: a revival will see whether a token is lost."""
+        """Leave a slot after an interrupt.  A revival will see whether a token is lost."""
         if self._is_recursive and self._is_mine():
             self._sem._after_fork()  # it is not: the count is zero
         self._words[slot] = _LEFT
 
     def _told(self) -> bool | Abandoned:
-        """What who has acquired it is told: the first one after a death, of that."""
+        """Return the result for an acquirer: the first one after a death is told of it."""
         if not self._bytes[_ABANDONED]:
             return True
         self._bytes[_ABANDONED] = 0
@@ -363,7 +363,7 @@ class SharedSemaphore:
         self._warn(self._mutex.run(self._revive))
 
     def is_suspicious(self) -> bool:
-        """Whether somebody who is gone has a token, or may have."""
+        """Tell whether a dead process has a token, or may have one."""
         words = self._words
         if words[_IS_UNTRACKED] or self._get_value():
             return False
@@ -447,7 +447,7 @@ class SharedSemaphore:
         return f"{name} (pid {identity.pid(self._words[slot + _WHO])})"
 
     def _claim(self) -> int:
-        """One more slot for this process.  With the mutex."""
+        """Claim another slot for this process.  Called with the mutex."""
         for _ in range(0 if self._words[_IS_UNTRACKED] else 2):
             # One iterator for all: whoever interrupts this search looks at other slots.
             for slot in self._candidates:

@@ -1,5 +1,5 @@
-"""Who waits at a condition: a table in shared memory, which only the condition's lock's holder
-changes.
+"""Wait list of a condition: a table in shared memory.  Only the holder of the condition's lock
+changes it.
 
 ::
 
@@ -44,7 +44,7 @@ class Raisable(Protocol):
 
 
 class WaitList:
-    """One table, as this process sees it."""
+    """Wait list on the side of this process."""
 
     __slots__ = ("__weakref__", "_ring", "_words", "block")
 
@@ -75,11 +75,11 @@ class WaitList:
                 return
 
     def is_notified(self, place: int) -> bool:
-        """Whether whoever waits there is to go on."""
+        """Tell whether the waiter at ``place`` was notified."""
         return self._words[place] == _NOTIFIED
 
     def leave(self, place: int) -> bool:
-        """Whether it was notified; it is free then."""
+        """Free a place; return whether it was notified."""
         notified = self.is_notified(place)
         self._words[place + _WHO] = 0
         return notified
@@ -89,7 +89,7 @@ class WaitList:
         self._words[place + _WHO] = 0
 
     def lose(self, place: int) -> None:
-        """Whoever waits there, elsewhere, has died."""
+        """Note that the waiter at ``place``, on another host, has died."""
         self._words[place] = _LOST
 
     def notify(self, n: int) -> None:
@@ -107,11 +107,11 @@ class WaitList:
             self._ring()
 
     def waiters(self) -> int:
-        """How many wait."""
+        """Return the number of waiters."""
         return sum(self._words[place] in (_WAITS, _WAITS_AFAR) for place in self._used())
 
     def bury(self) -> int:
-        """How many died while they waited, since this was asked last."""
+        """Return how many waiters died since the last call."""
         dead = [place for place in self._used() if self._is_dead(place)]
         for place in dead:
             self._words[place + _WHO] = 0
@@ -127,7 +127,7 @@ class WaitList:
         self.set(1, total)
 
     def held(self) -> int:
-        """How many things all owners of places have."""
+        """Return the number of things that all owners of places have."""
         return sum(self._words[place + _HELD] for place in self._used())
 
     def reclaim(self, counter: Raisable) -> int:
@@ -142,7 +142,7 @@ class WaitList:
         return total
 
     def get(self, number: int) -> int:
-        """One of the user's two words."""
+        """Return one of the user's two words."""
         return self._words[_USERS + number]
 
     def set(self, number: int, value: int) -> None:

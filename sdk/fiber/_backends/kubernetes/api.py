@@ -63,8 +63,10 @@ class Api:
 
     @classmethod
     def connect(cls, context: str | None = None) -> Api:
-        """By the kubeconfig's ``context`` or its current one; in a pod without KUBECONFIG as the
-        pod's account.  Calls nobody yet.  ConfigError if there is nothing to go by.
+        """Connect by the kubeconfig's ``context`` or its current one.
+
+        A pod without KUBECONFIG uses its account.  This makes no call.  ConfigError if there is
+        neither.
         """
         return cls(Session(Login.find(context)))
 

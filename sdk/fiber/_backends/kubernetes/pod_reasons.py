@@ -88,7 +88,8 @@ def _disruption(pod: Mapping[str, Any]) -> str | None:
 
 
 _LOST_CONTAINERS = ("ContainerStatusUnknown", "Unknown")
-"""For a container that a node lost sight of, as when it restarted, it makes up an exit code."""
+"""Reasons of containers that a node lost sight of, for example in a restart.  Their exit code is
+made up."""
 
 
 def _deletion(pod: Mapping[str, Any]) -> str | None:

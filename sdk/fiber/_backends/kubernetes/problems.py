@@ -156,7 +156,7 @@ _LONGEST_CAUSE = 120
 
 
 def summary(status: Status, now: float) -> str:
-    """How many pods there are and what keeps the others: ``12 of 50 pods ready, 30 pending:
+    """Return the number of pods and what keeps the others: ``12 of 50 pods ready, 30 pending:
     0/3 nodes are available: insufficient cpu (for 14 s)``.  ``now`` is in unix seconds.
     """
     if "observedGeneration" not in status:
@@ -185,8 +185,8 @@ def _cause(problem: Mapping[str, Any], now: float) -> str:
 
 
 _OF_THE_MASTER = frozenset({Reason.LEASE_NOT_FOUND, Reason.MASTER_LOST})
-"""What others are told of this program, which lives.  It makes and renews the Lease itself: between
-two of its steps, or after it was stopped, the operator may have seen none."""
+"""Reasons that do not concern this program, which lives.  It makes and renews the Lease itself: the
+operator may have looked between two of its steps, or while it was stopped."""
 
 
 def _problems(status: Status) -> Iterator[Mapping[str, Any]]:

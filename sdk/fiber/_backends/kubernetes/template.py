@@ -142,8 +142,8 @@ _OF_THE_POD = (
     "tolerations",
     "topologySpreadConstraints",
 )
-"""What a worker's pod has of the program's.  Not its name and labels, by which others select it;
-not its other containers; not what it asks for, since the program is no worker."""
+"""Fields of the program's pod that a worker's pod gets.  Not its name and labels, by which others
+select it; not its other containers; not its requests, since the program is no worker."""
 
 _OF_THE_CONTAINER = (
     "env",
@@ -213,8 +213,8 @@ def _is_the_pods(mount: Mapping[str, Any]) -> bool:
 
 
 def _is_default(toleration: Mapping[str, Any]) -> bool:
-    """Whether the API server gave it to the pod.  The operator gives workers shorter ones, which
-    it leaves out where the template has its own.
+    """Tell whether the API server added the toleration.  The operator gives workers shorter ones,
+    unless the template has such a toleration.
     """
     key = str(toleration.get("key"))
     return toleration.get("tolerationSeconds") == 300 and key.startswith("node.kubernetes.io/")
