@@ -331,3 +331,5 @@ class Reason(StrEnum):
     REPLACED = "Replaced"
     RECOVERED = "Recovered"
     MASTER_CHANGED = "MasterChanged"
+    SERVED_TWICE = "ServedTwice"
+    """Another program writes the pool's status: probably a second operator."""

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from fiber_api import names
 from fiber_api.names import Reason
@@ -46,6 +47,12 @@ DELETIONS = 50
 _NO_VERDICTS = ("does not support dry run", QUOTA_IS_FULL)
 """Refusals of a dry run that say nothing about the template: a webhook's fault, a full quota."""
 
+RIVAL = (
+    "another program wrote this pool's status, probably the operator of another release. Two "
+    "operators each create and delete the pool's pods. Uninstall one of the two, or let them watch "
+    "different namespaces"
+)
+
 log = logging.getLogger(__name__)
 
 
@@ -63,6 +70,8 @@ class State:
     """Why the last one came to nothing."""
     warnings: dict[str, str] = field(default_factory=dict)
     pace: Pace = field(default_factory=Pace)
+    written: Mapping[str, Any] | None = None
+    """Status that the API server returned for the last write; None if that is not known."""
     generation: int = -1
     """Generation of the pool at the last reconcile that did not fail, or the present one."""
 
@@ -183,12 +192,22 @@ class Applier:
         # The uid keeps it from a new pool of the same name.  What is written is true whatever has
         # been changed since the pool was read: it names the generation that it is of.
         patch = {"metadata": {"uid": work.state.uid}, "status": dict(work.plan.status)}
+        work.state.written = None
         try:
-            await self._cluster.patch(POOLS, *work.key, patch, "status")
+            answer = await self._cluster.patch(POOLS, *work.key, patch, "status")
+            work.state.written = mapping(answer, "status")
         except (Refused, Invalid) as error:
             event = Event("Warning", Reason.FORBIDDEN, error_conditions.with_status(error))
             self._tell(work, [event])
             raise
+
+    def warn_of_rival(self, work: Work) -> None:
+        """Warn if another program has changed the status since this operator wrote it."""
+        written = work.state.written
+        if written is not None and written != mapping(work.document, "status"):
+            work.state.written = None
+            log.warning("%s", RIVAL, extra=about(*work.key, reason=Reason.SERVED_TWICE))
+            self._tell(work, [Event("Warning", Reason.SERVED_TWICE, RIVAL)])
 
     async def _delete_pool(self, work: Work) -> None:
         version = text(mapping(work.document, "metadata").get("resourceVersion"))

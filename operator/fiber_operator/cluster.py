@@ -53,7 +53,7 @@ __all__ = [
 T = TypeVar("T")
 Observer = Callable[[str, str, str, float], None]
 """Told of each call: verb, resource, HTTP status or what went wrong, seconds."""
-Permit = Callable[[str], float]
+Permit = Callable[[], float]
 
 PAGE = 500
 """Objects of a page, where a list is read in pages."""
@@ -99,8 +99,8 @@ async def _document(response: RESTResponse, what: str) -> Body:
 class Cluster:
     """Client of one API server.
 
-    ``permit`` is called with the namespace before each call that changes something.  It returns how
-    many seconds the call may take, and raises where this process may not.  ``connections`` bounds
+    ``permit`` is called before each call that changes something.  It returns how many seconds the
+    call may take, and raises if this process may change nothing now.  ``connections`` bounds
     the calls under way; namespaces take turns for them.
     """
 
@@ -109,7 +109,7 @@ class Cluster:
         configuration: Configuration,
         *,
         connections: int,
-        permit: Permit = lambda namespace: WRITE_TIMEOUT,
+        permit: Permit = lambda: WRITE_TIMEOUT,
         observe: Observer = lambda verb, resource, code, seconds: None,
     ) -> None:
         configuration.connection_pool_maxsize = connections
@@ -126,9 +126,9 @@ class Cluster:
         """Close the connections."""
         await self._client.close()
 
-    def check_permit(self, namespace: str) -> None:
-        """Raise what ``permit`` does where this process may change nothing now."""
-        self._permit(namespace)
+    def check_permit(self) -> None:
+        """Raise the error of ``permit`` if this process may change nothing now."""
+        self._permit()
 
     async def read(self, resource: Resource, namespace: str, name: str) -> Body:
         """The object as it is now, not as a cache had it."""
@@ -255,7 +255,7 @@ class Cluster:
         async with self._turns.take(namespace or ""):
             seconds = READ_TIMEOUT
             if verb in _WRITES:
-                seconds = min(WRITE_TIMEOUT, self._permit(namespace or ""))
+                seconds = min(WRITE_TIMEOUT, self._permit())
             started = time.perf_counter()
             code = "cancelled"
             try:

@@ -121,8 +121,10 @@ class Controller:
         clock = asyncio.get_running_loop().time
         state, end = found[1] if found else None, clock() + LONGEST
         while found is not None and found[1] is state:
-            self._cluster.check_permit(key.namespace)
-            result = await self._pass(Work(key, *found, creation))
+            self._cluster.check_permit()
+            work = Work(key, *found, creation)
+            self._applier.warn_of_rival(work)
+            result = await self._pass(work)
             began, last = clock(), clock() > end
             if last:
                 creation.stop()

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from fiber_operator.claims import Claims
 from fiber_operator.leader_election import LeaderElector
 from fiber_operator.resync import Resync
 from fiber_operator.watches import Watches
@@ -29,7 +28,6 @@ class Health:
     """Both checks.  Each returns what is wrong, a sentence each."""
 
     elector: LeaderElector
-    claims: Claims
     queue: Queue
     resync: Resync
     watches: Watches
@@ -60,7 +58,6 @@ class Health:
         wrong = list(self.resync.failures.values())
         if not self.elector.is_leader:
             wrong.append(f"this operator does not act: {self.elector.why}")
-        wrong += self.claims.wrong()
         if self.resync.succeeded is None:
             wrong.append("the pools were not listed yet")
         elif now - self.resync.succeeded > MISSED_RESYNCS * self.resync.seconds:

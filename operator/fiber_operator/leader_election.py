@@ -1,4 +1,4 @@
-"""Leader election by a Lease: of several that ask for it, at most one acts.
+"""Leader election by a Lease: of several processes of one release, at most one acts.
 
 Whether somebody else's Lease has run out is judged by this process's monotonic clock, from when it
 last saw the Lease change; clocks of different machines are never compared.  The holder counts its
@@ -7,8 +7,6 @@ as long as it may last, so that none is under way when others may begin::
 
     asked                      nothing begins any more    the last write ends    others may begin
       |------ 2/3 of the duration ------|-----------------------|-------- 1/10 --------|
-
-Program has one for its processes, and claims.py one for each namespace.
 """
 
 from __future__ import annotations
@@ -29,9 +27,6 @@ WRITTEN_SHARE = 9 / 10
 """Share of the duration after which its last write has ended.  The rest is for differing clocks."""
 RENEW_SHARE = 1 / 3
 RETRY_SHARE = 1 / 8
-LONGEST_RETRY = 60.0
-TRIES = 2
-"""Number of attempts to give up a Lease."""
 
 log = logging.getLogger(__name__)
 
@@ -73,8 +68,6 @@ class LeaderElector:
         self._resigned = False
         self.why = "the Lease was not read yet"
         """Why this operator does not act; empty while it does."""
-        self.holder = ""
-        """Other holder of the Lease, as far as is known."""
 
     @property
     def is_leader(self) -> bool:
@@ -114,23 +107,6 @@ class LeaderElector:
         except ApiError as error:
             log.warning("the Lease could not be released: %s", error)
 
-    async def linger(self, seconds: int) -> None:
-        """Let another operator begin in so many seconds; one of our identity goes on at once.
-
-        After ``resign``, if the Lease was held until then.
-        """
-        for _ in range(TRIES):
-            try:
-                await self._write(self._lease, holder=self._identity, seconds=seconds)
-            except Unavailable as error:
-                log.info("the Lease in namespace %s is left as it is: %s", self._namespace, error)
-            except ApiError as error:
-                # Not read anew: if another process of this identity wrote it, it counts on it.
-                log.info("the Lease in namespace %s is another's now: %s", self._namespace, error)
-                break
-            else:
-                break
-
     async def step(self) -> float:
         """Ask for the Lease, or renew it; returns the seconds until the next step is due."""
         started = self._clock()
@@ -157,7 +133,6 @@ class LeaderElector:
             self._lease = await self._write(
                 self._lease, holder=self._identity, seconds=int(self._seconds)
             )
-            self.holder = ""
             if not self._resigned:
                 self._asked, self.why = started, ""
 
@@ -167,7 +142,7 @@ class LeaderElector:
         elif self._failures:
             pause = min(RETRY_SHARE * self._seconds, 2.0 ** min(self._failures - 1, 10))
         else:
-            pause = min(RETRY_SHARE * self._seconds, LONGEST_RETRY)
+            pause = RETRY_SHARE * self._seconds
         if self.is_leader:
             # Not beyond the moment at which it lapses, so that it is told of in time.
             pause = min(pause, max(self._until - self._clock(), 0.0) + 0.001)
@@ -184,7 +159,6 @@ class LeaderElector:
         holder = spec.get("holderIdentity") or ""
         if holder in ("", self._identity):
             return True
-        self.holder = str(holder)
         now, seen = self._clock(), (holder, spec.get("renewTime"), spec.get("leaseTransitions"))
         if seen != self._seen:
             self._seen, self._seen_at = seen, now

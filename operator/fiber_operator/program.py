@@ -6,7 +6,6 @@
     resync  ────►  ▲          │  ▲            ▲
     leases  ────────┘         ▼  │            │ permit
                             planning        elector (Lease of the release: this process acts)
-                                            claims (Lease of a namespace: this release serves it)
 """
 
 from __future__ import annotations
@@ -19,13 +18,9 @@ from collections.abc import Callable
 from typing import Protocol
 
 from fiber_api import names
-from fiber_operator.claims import Claims
 from fiber_operator.cluster import (
-    POOLS,
     WRITE_TIMEOUT,
-    ApiError,
     Cluster,
-    Gone,
     Permit,
     load_configuration,
 )
@@ -45,8 +40,6 @@ from fiber_operator.workqueue import Key, Queue, Result
 
 DRAIN = 5.0
 """Seconds that a call under way may take to end when the operator is to stop."""
-HAND_OVER = 10.0
-"""Seconds that giving up the namespaces may take then."""
 
 log = logging.getLogger(__name__)
 
@@ -84,10 +77,9 @@ class Program:
         settings = self._settings
         async with contextlib.AsyncExitStack() as stack:
             self._build(
-                await self._open(stack, settings.connections, permit=self._require),
+                await self._open(stack, settings.connections, permit=self._permit),
                 # Their own, so that no queue of other calls keeps a Lease from being renewed.
                 await self._open(stack, 2),
-                await self._open(stack, 4),
             )
             self.port = await stack.enter_async_context(
                 serving(
@@ -107,7 +99,7 @@ class Program:
         self,
         stack: contextlib.AsyncExitStack,
         connections: int,
-        permit: Permit = lambda namespace: WRITE_TIMEOUT,
+        permit: Permit = lambda: WRITE_TIMEOUT,
     ) -> Cluster:
         cluster = Cluster(
             await self._configure(),
@@ -118,9 +110,8 @@ class Program:
         stack.push_async_callback(cluster.close)
         return cluster
 
-    def _build(self, cluster: Cluster, lease_cluster: Cluster, claim_cluster: Cluster) -> None:
+    def _build(self, cluster: Cluster, lease_cluster: Cluster) -> None:
         settings, clock = self._settings, asyncio.get_running_loop().time
-        self._cluster = cluster
         self.elector = LeaderElector(
             lease_cluster,
             namespace=settings.namespace,
@@ -131,14 +122,6 @@ class Program:
             wall_clock=self._now,
         )
         self.queue = Queue(self._reconcile, concurrency=settings.concurrency)
-        self.claims = Claims(
-            claim_cluster,
-            release=f"{settings.namespace}/{settings.lease}",
-            namespaces=settings.namespaces,
-            used=lambda: {key.namespace for key in self.queue.known()},
-            on_change=self._claim_changed,
-            wall_clock=self._now,
-        )
         self.lease_monitor = LeaseMonitor(cluster, lambda key: self.queue.add(key, urgent=True))
         self.recorder = EventRecorder(cluster, self._now, settings.identity)
         self.controller = Controller(
@@ -158,9 +141,7 @@ class Program:
             on_success=lambda: self.metrics.resynced(self._now()),
         )
         self.watches = Watches(settings.namespaces)
-        self.health = Health(
-            self.elector, self.claims, self.queue, self.resync, self.watches, clock
-        )
+        self.health = Health(self.elector, self.queue, self.resync, self.watches, clock)
         self.metrics.watch_queue(self.queue.statistics, lambda: self.elector.is_leader)
 
     async def _operate(self, stop: asyncio.Event) -> None:
@@ -175,7 +156,6 @@ class Program:
         )
         parts: list[Part] = [
             self.elector,
-            self.claims,
             self.lease_monitor,
             self.queue,
             self.resync,
@@ -186,11 +166,8 @@ class Program:
         stopped = asyncio.ensure_future(stop.wait())
         try:
             await asyncio.wait([*tasks, stopped], return_when=asyncio.FIRST_COMPLETED)
-            acting = self.elector.is_leader
             self.elector.resign()
             await self.queue.drain(DRAIN)
-            if acting:
-                await self._release_claims()
             # Before the watches are waited for: another operator may begin.
             tasks[0].cancel()
             await asyncio.wait([tasks[0]])
@@ -220,28 +197,10 @@ class Program:
     async def _reconcile(self, key: Key) -> Result:
         if not self.elector.is_leader:
             return Result()
-        if self.claims.holds(key.namespace):
-            return await self.controller.reconcile(key)
-        return Result(forget=self.claims.refused(key.namespace) and await self._is_gone(key))
+        return await self.controller.reconcile(key)
 
-    async def _is_gone(self, key: Key) -> bool:
-        try:
-            await self._cluster.read(POOLS, *key)
-        except Gone:
-            return True
-        except ApiError:
-            pass  # the next reconcile finds it out
-        return False
-
-    def _require(self, namespace: str) -> float:
-        return min(self.elector.require(), self.claims.require(namespace))
-
-    async def _release_claims(self) -> None:
-        try:
-            async with asyncio.timeout(HAND_OVER):
-                await self.claims.release()
-        except TimeoutError:
-            log.warning("not every namespace was given up in time: other releases wait longer")
+    def _permit(self) -> float:
+        return self.elector.require()
 
     def _watching(self, running: bool) -> None:
         if running and self._watched_before:
@@ -251,19 +210,8 @@ class Program:
 
     def _lease_changed(self, held: bool) -> None:
         self.controller.forget()
-        if not held:
-            self.claims.end()
-        else:
-            self.claims.begin()
+        if held:
             # What happened while another operator acted was not looked at.
             self.resync.poke()
             for key in self.queue.known():
                 self.queue.add(key)
-
-    def _claim_changed(self, namespace: str, held: bool) -> None:
-        if not held:
-            # Another operator may act there meanwhile.
-            self.controller.forget()
-        for key in self.queue.known():
-            if key.namespace == namespace:
-                self.queue.add(key, urgent=held)

@@ -17,7 +17,6 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Call
 from fakes.store import KINDS
 from fakes.world import NAMESPACE, World, a_world, configuration
-from fiber_operator import claims as claiming
 from fiber_operator import handlers
 from fiber_operator.cluster import Configuration
 from fiber_operator.event_recorder import PAUSE
@@ -48,7 +47,6 @@ def calls() -> list[Call]:
                 gets_stuck,
                 meets_masters,
                 is_orphaned,
-                renews_its_claim,
             ):
                 await happens(world)
             stop.set()
@@ -124,17 +122,8 @@ async def is_orphaned(world: World) -> None:
     await world.until(lambda: not world.store.list("fiberpools"), within=600)
 
 
-async def renews_its_claim(world: World) -> None:
-    world.make_pool()
-    before = counted(world, "update", "leases", claiming.NAME)
-    await world.until(lambda: counted(world, "update", "leases", claiming.NAME) > before, 900)
-
-
-def counted(world: World, verb: str, plural: str, name: str = "") -> int:
-    return sum(
-        call.verb == verb and call.plural == plural and name in ("", call.name)
-        for call in world.api.calls
-    )
+def counted(world: World, verb: str, plural: str) -> int:
+    return sum(call.verb == verb and call.plural == plural for call in world.api.calls)
 
 
 def rights(calls: Iterable[Call], where: Callable[[Call], bool]) -> set[Right]:
@@ -161,12 +150,3 @@ def test_what_it_may_do_to_its_lease_is_what_it_does(helm: Helm, calls: list[Cal
     (names,) = (rule["resourceNames"] for rule in role["rules"] if "resourceNames" in rule)
     renewed = {call.name for call in calls if call.namespace == OWN and call.verb == "update"}
     assert {name.replace("fiber-fiber-operator", "fiber-operator") for name in names} == renewed
-
-
-def test_of_the_leases_in_a_namespace_it_renews_one(helm: Helm, calls: list[Call]) -> None:
-    role = named(helm.render(), "ClusterRole", f"{OWN}:fiber-fiber-operator")
-    named_ones = [rule for rule in role["rules"] if "resourceNames" in rule]
-    (rule,) = named_ones
-    assert (rule["resources"], rule["verbs"]) == (["leases"], ["update"])
-    renewed = {call.name for call in calls if call.namespace != OWN and call.verb == "update"}
-    assert renewed == set(rule["resourceNames"])

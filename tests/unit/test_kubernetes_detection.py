@@ -24,7 +24,7 @@ class Account:
     def __init__(self, answer: dict[str, Any] | Exception) -> None:
         self._answer = answer
         self.served = True
-        self.claim: dict[str, Any] | None = None
+        self.refusal: Exception | None = None
         self.pools: list[dict[str, Any]] = []
         self.asked: list[dict[str, Any]] = []
         self.closed = False
@@ -46,13 +46,13 @@ class Account:
         assert timeout <= 5.0
         if path == "/apis/fiber.dev/v1alpha1" and self.served:
             return {}
-        if path.endswith("/leases/fiberpools.fiber.dev") and self.claim is not None:
-            return {"spec": self.claim}
         raise NotFound("404 page not found", status=404)
 
     def list(self, path: str, selector: dict[str, str], *, timeout: float) -> dict[str, Any]:
         assert timeout <= 5.0
-        assert path == "/apis/fiber.dev/v1alpha1/namespaces/lab/fiberpools"
+        assert path.endswith("/fiberpools")
+        if self.refusal is not None:
+            raise self.refusal
         return {"items": self.pools}
 
     def close(self) -> None:
@@ -125,30 +125,40 @@ def test_without_fiber_pools_processes_run_here_with_a_warning(
     assert "the cluster knows no FiberPools" in caplog.text
 
 
-RELEASE = {"holderIdentity": "fiber-system/fiber-operator", "leaseDurationSeconds": 900}
-FRESH, OLD = "9000-01-01T00:00:00Z", "2020-01-01T00:00:00Z"
+SEEN, NEW, OLD = {"observedGeneration": 1}, "9000-01-01T00:00:00Z", "2020-01-01T00:00:00Z"
+
+
+def pool(created: str, status: dict[str, Any] | None = None) -> dict[str, Any]:
+    return {"metadata": {"creationTimestamp": created}, **({"status": status} if status else {})}
 
 
 @pytest.mark.parametrize(
-    ("claim", "pools", "taken"),
+    ("pools", "taken"),
     [
-        (None, 0, True),  # a namespace that has had no pool yet
-        ({**RELEASE, "renewTime": FRESH}, 1, True),
-        ({**RELEASE, "renewTime": OLD}, 1, False),
-        ({**RELEASE, "renewTime": OLD, "holderIdentity": ""}, 1, True),  # it was given back
-        ({**RELEASE, "renewTime": OLD}, 0, True),  # operators give up a namespace without pools
+        ([], True),
+        ([pool(OLD, SEEN)], True),
+        ([pool(OLD), pool(OLD, SEEN)], True),
+        ([pool(NEW)], True),
+        ([pool(OLD), pool(NEW)], True),
+        ([{"metadata": {}}], True),
+        ([pool(OLD)], False),
+        ([pool(OLD), pool(OLD, {"phase": "Pending"})], False),
     ],
-    ids=["absent", "fresh", "old", "free", "unused"],
+    ids=["none", "seen", "one-seen", "new", "one-new", "no-time", "waits", "both-wait"],
 )
-def test_an_operator_that_is_gone_makes_no_pods(
-    claim: dict[str, Any] | None,
-    pools: int,
+def test_pools_that_wait_in_vain_show_that_no_operator_serves_them(
+    pools: list[dict[str, Any]],
     taken: bool,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     account = in_a_pod(monkeypatch, ALLOWED)
-    account.claim = claim
-    account.pools = [{}] * pools
+    account.pools = pools
     assert _is_on_cluster(Config()) == taken
-    assert ("is gone" in caplog.text) != taken
+    assert ("no operator serves" in caplog.text) != taken
+
+
+def test_pools_that_may_not_be_listed_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    account = in_a_pod(monkeypatch, ALLOWED)
+    account.refusal = Forbidden("no", status=403)
+    assert _is_on_cluster(Config())

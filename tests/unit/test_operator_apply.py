@@ -40,7 +40,7 @@ async def a_cluster(permit: Permit) -> AsyncIterator[tuple[KubernetesApi, Cluste
 Test = Callable[[KubernetesApi, Cluster], Coroutine[Any, Any, None]]
 
 
-def played(test: Test, permit: Permit = lambda namespace: 10.0) -> Callable[[], None]:
+def played(test: Test, permit: Permit = lambda: 10.0) -> Callable[[], None]:
     async def main() -> None:
         async with a_cluster(permit) as (api, door):
             await test(api, door)
@@ -219,7 +219,7 @@ async def test_a_creation_that_is_cancelled_is_unsure_of_what_is_under_way(
 
 
 def test_without_the_lease_nothing_is_created() -> None:
-    def refuse(namespace: str) -> float:
+    def refuse() -> float:
         raise NotLeader
 
     async def test(api: KubernetesApi, door: Cluster) -> None:
@@ -275,7 +275,7 @@ async def test_events_are_posted_in_order_and_nobody_waits(
 def test_events_without_the_lease_are_given_up() -> None:
     held = False
 
-    def require(namespace: str) -> float:
+    def require() -> float:
         if not held:
             raise NotLeader
         return 10.0

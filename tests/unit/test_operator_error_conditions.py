@@ -120,8 +120,6 @@ BY_READINESS = [
     ("watch", "pods"),
     ("list", "leases"),
     ("watch", "leases"),
-    ("create", "leases"),
-    ("update", "leases"),
 ]
 BY_LOG = [("get", "fiberpools")]
 EVENTS = [("create", "events"), ("list", "events"), ("patch", "events")]
@@ -199,8 +197,6 @@ def test_without_events_a_pool_works(right: Right) -> None:
 
 
 def test_without_the_right_to_list_pools_the_operator_is_not_ready() -> None:
-    """That to watch is of ``test_operator_watches``, that to leases of ``test_operator_claims``."""
-
     @played
     async def test(world: World) -> None:
         world.api.faults.append(denied(("list", "fiberpools")))

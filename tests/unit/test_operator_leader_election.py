@@ -342,7 +342,7 @@ async def test_no_write_is_under_way_when_another_begins(found: Operators) -> No
     async with way.serving():
         first = found.start("a", way)
         await until(lambda: first.is_leader)
-        door = Cluster(configuration(way), connections=4, permit=lambda _: first.require())
+        door = Cluster(configuration(way), connections=4, permit=first.require)
         second = found.start("b")
         way.faults += [
             Fault("update", "leases", late=600, times=10**6),
@@ -368,34 +368,3 @@ async def test_an_answer_that_is_lost_is_no_other_operator(found: Operators) -> 
         await asyncio.sleep(0.5)
         assert elector.is_leader
     assert found.told == [("a", True)]
-
-
-@played
-async def test_one_that_lingers_is_waited_for_and_goes_on_at_once(found: Operators) -> None:
-    first = found.start("a")
-    await until(lambda: first.is_leader)
-    second = found.start("b")
-    await asyncio.sleep(5)
-    first.resign()
-    await found.kill("a")
-    await first.linger(60)
-    again = found.start("a")
-    assert await until(lambda: again.is_leader) < 1
-    again.resign()
-    await found.kill("a")
-    found.api.faults.append(Fault("update", "leases", status=503))
-    await again.linger(60)
-    assert 60 <= await until(lambda: second.is_leader) < 65
-
-
-@played
-async def test_one_that_lingers_takes_nothing_from_the_next_process(found: Operators) -> None:
-    """Which counts on all of its time."""
-    first = found.start("a")
-    await until(lambda: first.is_leader)
-    first.resign()
-    await found.kill("a")
-    again = found.start("a")
-    await until(lambda: again.is_leader)
-    await first.linger(1)
-    assert found.lease()["leaseDurationSeconds"] == SECONDS

@@ -123,7 +123,6 @@ class Parts:
         self.watches.answered("watch leases", None)
         self.health = Health(
             SimpleNamespace(is_leader=True, why=""),  # type: ignore[arg-type]
-            SimpleNamespace(wrong=list),  # type: ignore[arg-type]
             SimpleNamespace(statistics=lambda: found),  # type: ignore[arg-type]
             self.resync,  # type: ignore[arg-type]
             self.watches,

@@ -34,16 +34,10 @@ pools:
   - apiGroups: [policy]
     resources: [poddisruptionbudgets]
     verbs: [create, delete, get, patch]
-  # Get, list, watch: the Leases that masters renew, which the operator only looks at. The name of what is created
-  # cannot be restricted.
+  # The Leases that masters renew. The operator only reads them.
   - apiGroups: [coordination.k8s.io]
     resources: [leases]
-    verbs: [create, get, list, watch]
-  # The Lease that keeps the operators of two releases from acting in one namespace.
-  - apiGroups: [coordination.k8s.io]
-    resources: [leases]
-    resourceNames: [fiberpools.fiber.dev]
-    verbs: [update]
+    verbs: [get, list, watch]
   # List: what the scheduler and the kubelet say of a pod that does not start.
   - apiGroups: [""]
     resources: [events]

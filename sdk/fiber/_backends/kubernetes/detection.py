@@ -8,7 +8,7 @@ import time
 
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.api_errors import ApiError, Body, NotFound
-from fiber._backends.kubernetes.resources import LEASES, POOLS
+from fiber._backends.kubernetes.resources import POOLS
 from fiber.errors import ConfigError
 from fiber_api import names
 from fiber_api.times import parse_time
@@ -17,12 +17,16 @@ _REVIEWS = "/apis/authorization.k8s.io/v1/selfsubjectaccessreviews"
 
 _TIMEOUT = 5.0
 """Seconds that a program may wait for an answer before it goes on without a cluster."""
+_PATIENCE = 60.0
+"""Seconds in which an operator reports on a new pool.  Clocks of two machines may differ."""
+_EXAMINED = 20
+"""Number of pools that are looked at."""
 
 
 def serves_pools(namespace: str | None) -> bool:
-    """Return whether this pod's account may make FiberPools that somebody serves.
+    """Return True if this pod's account may make FiberPools and an operator serves them.
 
-    A right without FiberPools, or without an operator, is told by one warning.
+    If the account has the right and FiberPools or an operator are missing, a warning says so.
     """
     try:
         with contextlib.closing(Api.connect()) as api:
@@ -39,9 +43,9 @@ def _serves(api: Api, namespace: str) -> bool:
         api.get(f"/apis/{names.API_VERSION}", timeout=_TIMEOUT)
     except NotFound:
         return _on_this_machine("the cluster knows no FiberPools. Install the operator's chart")
-    if _has_expired(_claim(api, namespace)) and _has_pools(api, namespace):
+    if _is_unserved(api, namespace):
         return _on_this_machine(
-            f"the operator that served the namespace {namespace!r} is gone. Start it again"
+            f"no operator serves the FiberPools of the namespace {namespace!r}. Start the operator"
         )
     return True
 
@@ -55,36 +59,29 @@ def _on_this_machine(why: str) -> bool:
     return False
 
 
-def _claim(api: Api, namespace: str) -> Body:
-    """Return the Lease of the operator in the namespace; empty where it cannot be read."""
-    try:
-        lease = api.get(LEASES.path(namespace, names.CRD_NAME), timeout=_TIMEOUT)
-    except ApiError:
-        return {}  # an operator claims a namespace when it sees the first pool there
-    return lease.get("spec") or {}
+def _is_unserved(api: Api, namespace: str) -> bool:
+    """Return True if the namespace's oldest FiberPools have waited in vain for an operator.
 
-
-def _has_expired(claim: Body) -> bool:
-    """Return whether the operator neither renewed its Lease nor gave it back."""
-    if not claim.get("holderIdentity"):
-        return False
-    try:
-        renewed = parse_time(str(claim.get("renewTime")))
-    except ValueError:
-        return False
-    return renewed + int(claim.get("leaseDurationSeconds") or 0) < time.time()
-
-
-def _has_pools(api: Api, namespace: str) -> bool:
-    """Return whether the namespace has FiberPools; False where they cannot be listed.
-
-    An operator gives up a namespace without pools, and leaves its Lease to expire.
+    An operator reports in a pool's status which generation of the spec it has seen.  A namespace
+    without pools, or one whose pools may not be listed, tells nothing.
     """
     try:
-        found = api.list(POOLS.path(namespace), {"limit": "1"}, timeout=_TIMEOUT)
+        found = api.list(POOLS.path(namespace), {"limit": str(_EXAMINED)}, timeout=_TIMEOUT)
     except ApiError:
         return False
-    return bool(found.get("items"))
+    waiting = [_has_waited(pool) for pool in found.get("items") or []]
+    return bool(waiting) and all(waiting)
+
+
+def _has_waited(pool: Body) -> bool:
+    """Return True if no operator has ever reported on the pool, though it had time to."""
+    if "observedGeneration" in (pool.get("status") or {}):
+        return False
+    try:
+        created = parse_time(str(pool["metadata"].get("creationTimestamp")))
+    except ValueError:
+        return False
+    return created + _PATIENCE < time.time()
 
 
 def _review(namespace: str) -> Body:
