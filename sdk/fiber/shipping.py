@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from multiprocessing import spawn
 
 from fiber._backends import program_files
-from fiber._backends.ignore_rules import BYTECODE, INCLUDING
 from fiber._backends.program_files import Entry, Why
-from fiber._backends.program_layout import LOOSE, Layout, find_layout
+from fiber._backends.program_layout import BYTECODE, INCLUDING, LOOSE, Layout, find_layout
 from fiber.errors import in_one_line
 
 __all__ = ["LeftOut", "Listing", "Sent", "listing"]

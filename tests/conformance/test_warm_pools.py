@@ -6,10 +6,9 @@ import pytest
 
 from conformance.runner import Target
 from conformance.warm_pools import warm_pools
-from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.api import POOLS, Api
 from fiber._backends.kubernetes.api_errors import NotFound
 from fiber._backends.kubernetes.attached_pool import Master
-from fiber._backends.kubernetes.resources import POOLS
 
 VARIABLES = Target("fiber", "spawn", frozenset({"core"}), 60).variables()
 

@@ -31,7 +31,7 @@ def square(number: int) -> int:
 def test_pods_are_ready_once_their_agents_are_linked(
     cluster: FakeCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fiber._backends.kubernetes.lease.RENEWALS", 300)
+    monkeypatch.setattr("fiber._backends.kubernetes.fiber_pool.RENEWALS", 300)
 
     def has(**counts: int) -> Callable[[], bool]:
         def reached() -> bool:

@@ -22,8 +22,8 @@ from fakes.cluster import FakeCluster, fake_cluster
 from faults.program import Program
 from faults.proxy import Proxy
 from faults.runtime import running
-from fiber._backends.kubernetes.address import _local_address
 from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.program import _local_address
 from fiber._runtime import state
 from fiber.errors import FiberPoolError, MemberLost, WorkerDied
 from fiber_api import names
@@ -495,7 +495,7 @@ def test_pools_of_all_shapes_end_at_the_same_time(
 def test_while_the_api_server_does_not_answer_that_is_what_is_said(
     cluster: FakeCluster, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fiber._backends.kubernetes.progress._FIRST_WRITTEN", 0.1)
+    monkeypatch.setattr("fiber._backends.kubernetes.waiting._FIRST_WRITTEN", 0.1)
     cluster.do(cluster.world.slow, "create", "fiberpools", 0.5)
     with running(backend="kubernetes"), fiber.Pool(1) as pool:
         assert pool.apply(square, (3,)) == 9
@@ -506,8 +506,8 @@ def test_while_the_api_server_does_not_answer_that_is_what_is_said(
 def test_pods_that_cannot_reach_the_program_are_an_error(
     cluster: FakeCluster, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fiber._backends.kubernetes.reachability.DOUBTED_AFTER", 0.2)
-    monkeypatch.setattr("fiber._backends.kubernetes.reachability.GIVEN_UP_AFTER", 0.5)
+    monkeypatch.setattr("fiber._backends.kubernetes.waiting.DOUBTED_AFTER", 0.2)
+    monkeypatch.setattr("fiber._backends.kubernetes.waiting.GIVEN_UP_AFTER", 0.5)
     cluster.nodes.cut_off = True
     with running(backend="kubernetes"):
         for _ in range(2):  # the second waits for the same pods

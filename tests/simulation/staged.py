@@ -21,7 +21,7 @@ from unittest import mock
 from fiber._agent import service
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._backends import remote
-from fiber._backends.remote_channel import RemoteTaskChannel
+from fiber._backends.remote import RemoteTaskChannel
 from fiber._runtime import executor, launcher, receiver
 from fiber._wire.packet import Message
 from simulation.agents import Agent, Child

@@ -15,10 +15,8 @@ import yaml
 from fakes.kubernetes_api import Call
 from fakes.served import Served, served
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.attached_pool import Master
+from fiber._backends.kubernetes.attached_pool import Master, OwnPool, WarmPool
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
-from fiber._backends.kubernetes.own_pool import OwnPool
-from fiber._backends.kubernetes.warm_pool import WarmPool
 from fiber._transport.credentials import make_credentials
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from fiber._agent import program_folder
-from fiber._backends.program_archive import pack
 from fiber._backends.program_files import Entry, select
 from fiber._backends.program_layout import Layout, Places
+from fiber._backends.shipping import pack
 from fiber._wire.blob import Blob
 
 NOWHERE = program_folder.ProgramPaths((), (), "", None)

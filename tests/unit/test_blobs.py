@@ -16,7 +16,7 @@ import fiber
 from fiber import reduction
 from fiber._agent import blob_store
 from fiber._agent.blob_store import BlobLacking, BlobStore
-from fiber._backends.blob_sender import BlobSender
+from fiber._backends.remote import BlobSender
 from fiber._runtime import state
 from fiber._runtime.shared_arguments import SharedArguments
 from fiber._wire import messages

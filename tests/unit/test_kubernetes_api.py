@@ -19,8 +19,7 @@ from kubernetes.config import incluster_config
 from fakes.certificates import RUN_VALIDITY, Certificates, make_certificates
 from fakes.kubernetes_api import Fault
 from fakes.served import Served, served
-from fiber._backends.kubernetes import session
-from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.api import LEASES, NODES, PODS, POOLS, Api
 from fiber._backends.kubernetes.api_errors import (
     ApiError,
     Conflict,
@@ -36,7 +35,6 @@ from fiber._backends.kubernetes.api_errors import (
     error_of,
     explain,
 )
-from fiber._backends.kubernetes.resources import LEASES, NODES, PODS, POOLS
 from fiber.errors import ConfigError
 from patience import PATIENCE
 from unit.kubernetes_rig import NAMESPACE, kubeconfig
@@ -122,7 +120,7 @@ def test_without_a_package_it_says_how_to_install_it(
 
 def test_the_package_is_imported_by_whoever_connects_alone() -> None:
     program = (
-        "import sys, fiber._backends.kubernetes.fiber_pool, fiber._backends.kubernetes.address;"
+        "import sys, fiber._backends.kubernetes.fiber_pool, fiber._backends.kubernetes.program;"
         "print([name for name in ('kubernetes', 'urllib3') if name in sys.modules])"
     )
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -223,7 +221,7 @@ def account(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[S
         monkeypatch.delenv("KUBECONFIG", raising=False)
         monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "localhost")
         monkeypatch.setenv("KUBERNETES_SERVICE_PORT", str(server.api.port))
-        monkeypatch.setattr(session, "_ACCOUNT", str(tmp_path))
+        monkeypatch.setattr("fiber._backends.kubernetes.api._ACCOUNT", str(tmp_path))
         files = {"SERVICE_TOKEN_FILENAME": "token", "SERVICE_CERT_FILENAME": "ca.crt"}
         for constant, file in files.items():
             monkeypatch.setattr(incluster_config, constant, str(tmp_path / file))

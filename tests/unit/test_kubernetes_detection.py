@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes import detection
+from fiber._backends.kubernetes import backend
 from fiber._backends.kubernetes.api_errors import Forbidden, NotFound, Unreachable
 from fiber._runtime.state import _is_on_cluster
 from fiber.config import Config
@@ -62,7 +62,7 @@ class Account:
 def in_a_pod(monkeypatch: pytest.MonkeyPatch, answer: dict[str, Any] | Exception) -> Account:
     account = Account(answer)
     monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "10.96.0.1")
-    monkeypatch.setattr(detection, "Api", account)
+    monkeypatch.setattr(backend, "Api", account)
     return account
 
 

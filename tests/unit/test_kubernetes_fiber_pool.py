@@ -16,7 +16,7 @@ import pytest
 
 from fakes.kubernetes_api import Call, Fault
 from fakes.store import Failure
-from fiber._backends.kubernetes import fiber_pool, informer, lease, scaling
+from fiber._backends.kubernetes import fiber_pool, informer
 from fiber._backends.kubernetes.api_errors import Forbidden
 from fiber_api import identity, names
 from patience import PATIENCE
@@ -197,7 +197,7 @@ def test_only_the_newest_demand_is_written(rig: Rig, told: Told) -> None:
 def test_a_demand_is_written_until_it_holds(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scaling, "_TIMEOUT", 0.0)
+    monkeypatch.setattr(fiber_pool, "_TIMEOUT", 0.0)
     rig.server.api.faults.append(Fault("patch", names.PLURAL, status=503, times=3))
     rig.own(told).demand(4)
     replicas_become(rig, told, 4)
@@ -209,7 +209,7 @@ def test_a_demand_is_written_until_it_holds(
 def test_names_to_release_are_written_until_their_pods_are_gone(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scaling, "PATCH_INTERVAL", 0.01)
+    monkeypatch.setattr(fiber_pool, "PATCH_INTERVAL", 0.01)
     client = rig.own(told)
     client.demand(2)
     replicas_become(rig, told, 2)
@@ -272,7 +272,7 @@ def test_who_begins_to_wait_is_told_what_others_were_told_before(
         tries.put(None)
         raise Forbidden("no right", status=403)
 
-    monkeypatch.setattr(scaling, "_PAUSE_MAX", 0.01)
+    monkeypatch.setattr(fiber_pool, "_PAUSE_MAX", 0.01)
     monkeypatch.setattr(rig.api, "apply", refuse)
     client = rig.own(told)
     client.demand(1)
@@ -420,16 +420,16 @@ def test_an_operator_of_which_nothing_could_be_heard(
 def test_an_own_pool_keeps_its_connections_when_its_lease_expires(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
-    monkeypatch.setattr(lease, "_RETRY", 0.01)
+    monkeypatch.setattr(fiber_pool, "_TIMEOUT", 0.0)
+    monkeypatch.setattr(fiber_pool, "_RETRY", 0.01)
     tried: queue.SimpleQueue[None] = queue.SimpleQueue()
-    expired = lease.LeaseRenewer._notice_expiry
+    expired = fiber_pool.LeaseRenewer._notice_expiry
 
-    def notice(renewer: lease.LeaseRenewer) -> None:
+    def notice(renewer: fiber_pool.LeaseRenewer) -> None:
         expired(renewer)
         tried.put(None)
 
-    monkeypatch.setattr(lease.LeaseRenewer, "_notice_expiry", notice)
+    monkeypatch.setattr(fiber_pool.LeaseRenewer, "_notice_expiry", notice)
     fault = Fault("patch", "leases", status=503, times=float("inf"))
     rig.server.do(rig.server.api.faults.append, fault)
     rig.own(told, master=replace(MASTER, lease_duration=0))
@@ -443,7 +443,7 @@ def test_an_own_pool_keeps_its_connections_when_its_lease_expires(
 def test_an_operator_that_ends_later_is_waited_for(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scaling, "PATCH_INTERVAL", 0.01)
+    monkeypatch.setattr(fiber_pool, "PATCH_INTERVAL", 0.01)
     client = rig.own(told)
     client.demand(1)
     told.wait(lambda: any("observedGeneration" in status for status in told.statuses))

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from fakes.kubernetes_api import Fault
-from fiber._backends.kubernetes import lease
+from fiber._backends.kubernetes import fiber_pool
 from fiber._backends.kubernetes.api_errors import ApiError
 from fiber._backends.kubernetes.attached_pool import AttachedPool
-from fiber._backends.kubernetes.lease import LeaseRenewer
+from fiber._backends.kubernetes.fiber_pool import LeaseRenewer
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from patience import PATIENCE
@@ -162,7 +162,7 @@ def test_a_pool_that_is_being_deleted_is_lost(case: Case) -> None:
 
 
 def test_what_failed_does_not_count_as_renewed(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
+    monkeypatch.setattr(fiber_pool, "_TIMEOUT", 0.0)
     case.rig.server.api.faults.append(Fault("patch", "leases", status=503))
     case.now += 20
     with pytest.raises(Exception, match="this is a test"):
@@ -176,7 +176,7 @@ def test_what_failed_does_not_count_as_renewed(case: Case, monkeypatch: pytest.M
 def test_it_expires_once_in_each_duration_without_a_renewal(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
+    monkeypatch.setattr(fiber_pool, "_TIMEOUT", 0.0)
     fault = Fault("patch", "leases", status=503, times=float("inf"))
     case.rig.server.api.faults.append(fault)
     for seconds in (29, 1, 10, 20):
@@ -238,7 +238,7 @@ def test_a_busy_api_server_is_asked_later_and_in_time(case: Case) -> None:
 def test_a_login_or_right_that_stays_away_ends_the_thread(
     rig: Rig, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lease, "_RETRY", 0.01)
+    monkeypatch.setattr(fiber_pool, "_RETRY", 0.01)
     case = Case(rig, duration=0)
     rig.server.api.faults.append(Fault("patch", "leases", status=status, times=9))
     case.renewer.start()

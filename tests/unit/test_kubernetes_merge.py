@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fiber._backends.kubernetes.merge import merge_template
+from fiber._backends.kubernetes.template import merge_template
 
 OURS: dict[str, Any] = {
     "spec": {

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes.pod_reasons import PodEnd, node_of, pod_end
+from fiber._backends.kubernetes.problems import PodEnd, node_of, pod_end
 
 
 def pod(

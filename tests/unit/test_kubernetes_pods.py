@@ -12,10 +12,10 @@ import pytest
 
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._backends.agent_set import AgentSet
-from fiber._backends.kubernetes import program, progress
+from fiber._backends.kubernetes import program, waiting
 from fiber._backends.kubernetes.pods import Pods
 from fiber._backends.kubernetes.program import PreparedPool
-from fiber._backends.kubernetes.shape import Shape
+from fiber._backends.kubernetes.template import Shape
 from fiber._backends.remote import RemoteChild
 from fiber._transport.handshake import Identity
 from fiber._transport.loop import Loop
@@ -209,7 +209,7 @@ def test_an_agent_whose_pod_is_about_to_go_is_not_let_in(site: Site) -> None:
 def test_the_live_line_goes_before_anybody_is_refused(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress, "_is_terminal", lambda: True)
+    monkeypatch.setattr(waiting, "_is_terminal", lambda: True)
     waits = threading.Event()
     pods = site.pods(lambda cancel: waits.set() or until_the_end(cancel))
     _, owner = site.start()
@@ -341,8 +341,8 @@ def test_a_process_that_waits_for_one_more_pod_is_told_what_for(
     worker: bool, told: list[str], site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pool works with what it has; nothing else can do what a process is to do."""
-    monkeypatch.setattr(progress, "_is_terminal", lambda: False)
-    monkeypatch.setattr(progress, "_FIRST_WRITTEN", 0.0)
+    monkeypatch.setattr(waiting, "_is_terminal", lambda: False)
+    monkeypatch.setattr(waiting, "_FIRST_WRITTEN", 0.0)
     pods = site.pods(until_the_end)
     full = {"reason": "QuotaExceeded", "severity": "Error", "message": "it is full"}
     status = {"observedGeneration": 1, "desiredReplicas": 2, "readyReplicas": 1}

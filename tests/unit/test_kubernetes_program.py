@@ -13,10 +13,9 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes import program
-from fiber._backends.kubernetes.claims import Claims, without_claims
-from fiber._backends.kubernetes.own_pool import OwnPool
-from fiber._backends.kubernetes.program import Program
-from fiber._backends.kubernetes.shape import Shape
+from fiber._backends.kubernetes.attached_pool import OwnPool
+from fiber._backends.kubernetes.program import Claims, Program, without_claims
+from fiber._backends.kubernetes.template import Shape
 from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import ConfigError

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes import progress
-from fiber._backends.kubernetes.progress import Progress
+from fiber._backends.kubernetes import waiting
+from fiber._backends.kubernetes.waiting import Progress
 from memory_link import SimulatedLoop
 
 
@@ -46,14 +46,14 @@ def wait(loop: SimulatedLoop, said: Said) -> Progress:
 
 
 def stderr_is(monkeypatch: pytest.MonkeyPatch, stderr: object) -> None:
-    monkeypatch.setattr(progress, "sys", SimpleNamespace(stderr=stderr))
+    monkeypatch.setattr(waiting, "sys", SimpleNamespace(stderr=stderr))
 
 
 @pytest.fixture
 def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     stderr_is(monkeypatch, SimpleNamespace(isatty=lambda: True, fileno=lambda: 2))
     size = os.terminal_size((28, 24))
-    monkeypatch.setattr(progress.os, "get_terminal_size", lambda descriptor: size)
+    monkeypatch.setattr(waiting.os, "get_terminal_size", lambda descriptor: size)
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ class TestOnATerminal:
         def refuse(descriptor: int) -> os.terminal_size:
             raise OSError("not a terminal after all")
 
-        monkeypatch.setattr(progress.os, "get_terminal_size", refuse)
+        monkeypatch.setattr(waiting.os, "get_terminal_size", refuse)
         wait.start()
         loop.run_for(1)
         assert said.shown == [(1.0, "[fiber] 0 of 8 pods ready at 1")]

@@ -10,13 +10,13 @@ import pytest
 from fiber._agent.interface import ChildSpec, ExitReport
 from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.problems import PoolName, Way
-from fiber._backends.kubernetes.reachability import (
+from fiber._backends.kubernetes.waiting import (
     DOUBTED_AFTER,
     GIVEN_UP_AFTER,
     Reachability,
     Verdict,
+    Waiting,
 )
-from fiber._backends.kubernetes.waiting import Waiting
 from fiber._engine.placement import Placement
 from memory_link import SimulatedLoop
 

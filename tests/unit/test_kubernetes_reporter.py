@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes.api_errors import Forbidden, ServerError, Unreachable
-from fiber._backends.kubernetes.problems import PoolName
-from fiber._backends.kubernetes.reporter import Reporter
+from fiber._backends.kubernetes.problems import PoolName, Reporter
 from fiber.errors import FiberPoolError
 
 

@@ -17,7 +17,7 @@ from fiber._backends.kubernetes.api_errors import (
     Unauthorized,
     Unreachable,
 )
-from fiber._backends.kubernetes.scaling import PATCH_INTERVAL, REFUSED, Scaling
+from fiber._backends.kubernetes.fiber_pool import PATCH_INTERVAL, REFUSED, Scaling
 from fiber.errors import FiberPoolError
 from fiber_api import names
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes.shape import Shape, pool_name, program_name, read_template
+from fiber._backends.kubernetes.template import Shape, pool_name, program_name, read_template
 from fiber.config import Config
 from fiber.errors import ConfigError
 from fiber.resources import Resources

@@ -11,9 +11,9 @@ import pytest
 
 import fiber
 from cluster import images, places
-from fiber._backends.kubernetes.shape import Shape
 from fiber._backends.kubernetes.template import (
     WORKER_IMAGE,
+    Shape,
     fiber_pool_body,
     own_container,
     pod_template,

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from fakes.kubernetes_api import Fault
-from fiber._backends.kubernetes import lease
-from fiber._backends.kubernetes.warm_pool import read_pool_key
+from fiber._backends.kubernetes import fiber_pool
+from fiber._backends.kubernetes.attached_pool import read_pool_key
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
@@ -223,8 +223,8 @@ def test_being_replaced_is_an_error_and_the_successor_is_left_alone(rig: Rig, to
 def test_a_master_whose_lease_expires_breaks_its_agents_connections(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lease, "_TIMEOUT", 0.0)
-    monkeypatch.setattr(lease, "_RETRY", 0.01)
+    monkeypatch.setattr(fiber_pool, "_TIMEOUT", 0.0)
+    monkeypatch.setattr(fiber_pool, "_RETRY", 0.01)
     rig.warm(told, AT_ONCE)
     has_master(rig, told, 1)
     fault = Fault("patch", "leases", status=503, times=float("inf"))

@@ -24,7 +24,7 @@ import census
 import fiber
 from fiber import config
 from fiber._agent.interface import ChildSpec
-from fiber._backends import agent_process, loopback
+from fiber._backends import loopback
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine import start_failures
@@ -186,10 +186,10 @@ def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() ->
 def test_agents_that_die_before_they_join_are_an_error_until_one_joins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    dies, works = [sys.executable, "-c", "raise SystemExit(3)"], agent_process.interpreter_arguments
+    dies, works = [sys.executable, "-c", "raise SystemExit(3)"], loopback.interpreter_arguments
     broken = True
     monkeypatch.setattr(
-        agent_process, "interpreter_arguments", lambda *them: dies if broken else works(*them)
+        loopback, "interpreter_arguments", lambda *them: dies if broken else works(*them)
     )
     with running():
         for _ in range(2):
@@ -231,7 +231,7 @@ def gate_second_agent(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
         assert next(numbers) != 1 or goes_on.wait(PATIENCE)
         return popen(*args, **options)
 
-    monkeypatch.setattr(agent_process.subprocess, "Popen", start_one)
+    monkeypatch.setattr(loopback.subprocess, "Popen", start_one)
     return goes_on
 
 
@@ -282,7 +282,7 @@ def test_an_agent_that_cannot_be_replaced_at_once_is_replaced_later_and_that_is_
     with running() as backend:
         child = start()
         reluctant = Reluctant(2, errno.EAGAIN)
-        monkeypatch.setattr(agent_process.subprocess, "Popen", reluctant)
+        monkeypatch.setattr(loopback.subprocess, "Popen", reluctant)
         os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL, "its end is reported whatever comes after"
@@ -305,7 +305,7 @@ def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.Monke
             assert goes_on.wait(PATIENCE)
             return popen(*args, **options)
 
-        monkeypatch.setattr(agent_process.subprocess, "Popen", slow)
+        monkeypatch.setattr(loopback.subprocess, "Popen", slow)
         os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
         assert census.wait_until(lambda: backend._slots[0].name != "loopback-0", PATIENCE)
         turned = threading.Event()
@@ -340,7 +340,7 @@ def test_an_agent_that_cannot_be_watched_is_ended_before_the_next_attempt(
 def test_an_agent_that_can_never_be_started_is_an_error_with_the_cause(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(agent_process.subprocess, "Popen", Reluctant(999, errno.ENOEXEC))
+    monkeypatch.setattr(loopback.subprocess, "Popen", Reluctant(999, errno.ENOEXEC))
     with running(), pytest.raises(StartError, match="none joined") as caught:
         start()
     assert "its process cannot be started: [Errno 8]" in str(caught.value)
@@ -353,7 +353,7 @@ def test_while_another_agent_is_there_no_place_is_given_up(
     monkeypatch.setattr(start_failures, "SAID_AFTER", 0.0)
     with running(agents=2) as backend:
         assert census.wait_until(lambda: len(backend.agents.agents) == 2, PATIENCE)
-        monkeypatch.setattr(agent_process.subprocess, "Popen", Reluctant(4, errno.ENOEXEC))
+        monkeypatch.setattr(loopback.subprocess, "Popen", Reluctant(4, errno.ENOEXEC))
         os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
         assert census.wait_until(lambda: backend._failures.count >= TRIES, PATIENCE)
         child = start()  # on the other one
@@ -390,14 +390,14 @@ def test_it_leaves_no_file(tmp_path: Any) -> None:
 def test_agents_that_do_not_answer_share_one_deadline_at_the_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    clock, waits, wait = [0.0], [], agent_process.AgentProcess.wait
+    clock, waits, wait = [0.0], [], loopback.AgentProcess.wait
 
-    def stuck(process: agent_process.AgentProcess, timeout: float) -> None:
+    def stuck(process: loopback.AgentProcess, timeout: float) -> None:
         waits.append(timeout)
         clock[0] += timeout
         wait(process, PATIENCE)
 
-    monkeypatch.setattr(agent_process.AgentProcess, "wait", stuck)
+    monkeypatch.setattr(loopback.AgentProcess, "wait", stuck)
     monkeypatch.setattr(loopback, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     with running(agents=3):
         pass

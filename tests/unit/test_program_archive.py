@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fiber._backends import program_archive, program_files, shipping
+from fiber._backends import program_files, shipping
 from fiber._backends.program_files import Why
 from fiber.errors import ProgramTooLarge
 from unit.shipping_site import files, layout, packed, tree, unpacked, write
@@ -138,7 +138,7 @@ def test_what_cannot_be_read_is_left_out(
         return opening(path, *args)
 
     opening = os.open
-    monkeypatch.setattr(program_archive.os, "open", refusing)
+    monkeypatch.setattr(shipping.os, "open", refusing)
     archive = packed(folder)
     monkeypatch.undo()
     assert tree(unpacked(archive, tmp_path / "there")) == {
@@ -307,8 +307,8 @@ def test_a_file_that_changes_while_it_is_read_is_read_again_and_else_named(
             os.utime(folder / "main.py", ns=(0, time.time_ns() + len(left)))
         return status
 
-    monkeypatch.setattr(program_archive.os, "fstat", changing)
-    packed = program_archive.pack(layout(folder), found)
+    monkeypatch.setattr(shipping.os, "fstat", changing)
+    packed = shipping.pack(layout(folder), found)
     monkeypatch.undo()
     there = unpacked(packed.archive, tmp_path / "there")
     assert (there / "es/main.py").read_text() == text
@@ -318,7 +318,7 @@ def test_a_file_that_changes_while_it_is_read_is_read_again_and_else_named(
 def test_a_file_that_is_gone_when_it_is_read_is_left_out(folder: Path, tmp_path: Path) -> None:
     found = files(folder)
     (folder / "main.py").unlink()
-    archive = program_archive.pack(layout(folder), found).archive
+    archive = shipping.pack(layout(folder), found).archive
     assert "es/main.py" not in tree(unpacked(archive, tmp_path / "there"))
 
 
@@ -349,7 +349,7 @@ def test_what_grows_beyond_the_bound_meanwhile_is_the_same_error(
     found = files(folder)
     write(folder, main_py=bytes(2 << 20))
     with pytest.raises(ProgramTooLarge, match="files that are growing"):
-        program_archive.pack(layout(folder), found)
+        shipping.pack(layout(folder), found)
 
 
 def test_too_many_files_are_not_even_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

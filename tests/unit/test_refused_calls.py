@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import pytest
 
 import fiber
-from fiber._backends import agent_process
+from fiber._backends import loopback
 from fiber._runtime import state
 from fiber._transport.loop import Loop
 from fiber.errors import FiberError, StartError
@@ -160,7 +160,7 @@ def test_a_terminated_pool() -> None:
 
 def test_a_broken_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     waits = [sys.executable, "-c", "import signal; signal.pause()"]
-    monkeypatch.setattr(agent_process, "interpreter_arguments", lambda *_: waits)
+    monkeypatch.setattr(loopback, "interpreter_arguments", lambda *_: waits)
     queue: Any = fiber.Queue()
     with running() as backend:
         error = StartError("the agents", "none joined")

@@ -326,7 +326,7 @@ def test_files_that_are_being_written_are_named_once(site: Site) -> None:
     program = """
 import os
 import elsewhere, fiber
-from fiber._backends import program_archive
+from fiber._backends import shipping
 
 def growing(descriptor):
     if os.readlink(f"/proc/self/fd/{descriptor}").endswith("results.csv"):
@@ -370,7 +370,7 @@ if __name__ == "__main__":
 def test_what_keeps_files_from_being_unpacked_is_said(site: Site) -> None:
     program = """
 import elsewhere, fiber
-from fiber._backends import program_archive, shipping
+from fiber._backends import shipping, shipping
 shipping.pack = lambda *_: program_archive.Packed(b"no archive", [])
 if __name__ == "__main__":
     elsewhere.begin()

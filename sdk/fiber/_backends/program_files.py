@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from fiber._backends import secret_files
-from fiber._backends.ignore_rules import IgnoreRules
-from fiber._backends.program_layout import Layout
+from fiber._backends.program_layout import IgnoreRules, Layout
 from fiber.errors import ProgramTooLarge
 
 LIMIT = 100 << 20

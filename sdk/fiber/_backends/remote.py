@@ -1,25 +1,30 @@
-"""Agents behind links and their children, as the master sees them."""
+"""Agents behind links and their children, as the master sees them.
+
+``RemoteAgent`` is an agent that has connected. ``RemoteChild`` is a child on its host, and
+``RemoteTaskChannel`` the child's task channel. ``BlobSender`` sends the blobs that the agent's
+children need.
+"""
 
 from __future__ import annotations
 
 import itertools
 import pickle
 import signal
+import threading
+import weakref
 from collections import deque
-from collections.abc import Callable, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache, partial
 from typing import Protocol
 
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
-from fiber._backends.blob_sender import BlobSender
 from fiber._backends.output import Output
-from fiber._backends.remote_channel import RemoteTaskChannel
 from fiber._hub.hub import Hub
 from fiber._transport.link import EventLoop, Link
 from fiber._transport.stream import Frame
 from fiber._wire import messages, packet
 from fiber._wire.blob import Blob
-from fiber._wire.packet import BytesLike
+from fiber._wire.packet import BytesLike, Message
 
 _SHUTDOWN_GRACE = 0.5
 
@@ -388,3 +393,151 @@ class RemoteChild:
         if self._agent is not None:
             report = self._agent.explain(report)
         self.observer.exited(report)
+
+
+class Send(Protocol):
+    """Sends a message to the agent; ``on_left`` is called once the last of it is on its way."""
+
+    def __call__(
+        self, message: messages.Message, on_left: Callable[[], None] | None = None
+    ) -> None: ...
+
+
+class BlobSender:
+    """Sends each blob once, and has the agent forget it when nobody here has it any more.
+
+    So an agent keeps no more than this program does, and nobody counts: a blob lives as long as a
+    pool, a child or the program itself refers to it.  On the loop's thread.
+    """
+
+    def __init__(self, loop: EventLoop, send: Send) -> None:
+        self._loop = loop
+        self._send = send
+        self._sent: dict[bytes, weakref.ref[Blob]] = {}
+        self._leaving: dict[bytes, int] = {}
+        """Number of times that each blob was sent and has not left."""
+        self._waiting: list[tuple[list[bytes], Callable[[], None]]] = []
+        """The blobs that a caller needs, and what follows when they have left."""
+
+    def send_missing(self, blobs: Iterable[Blob], then: Callable[[], None]) -> None:
+        """Send the blobs that the agent does not have, and call ``then`` when all have left.
+
+        What is sent next finds them there, though large messages pass one another.
+        """
+        needed = []
+        for blob in blobs:
+            digest = blob.digest
+            needed.append(digest)
+            if digest not in self._sent:
+                self._leaving[digest] = self._leaving.get(digest, 0) + 1
+                self._send(blob.message, partial(self._left, digest))
+            # The newest of several with the same content counts.
+            self._sent[digest] = weakref.ref(blob, self._forgetter(digest))
+        self._waiting.append((needed, then))
+        self._go_on()
+
+    def lost(self, digest: bytes) -> None:
+        """The agent could not keep it."""
+        self._sent.pop(digest, None)
+
+    def _left(self, digest: bytes) -> None:
+        self._leaving[digest] -= 1
+        if not self._leaving[digest]:
+            del self._leaving[digest]
+            self._go_on()
+
+    def _go_on(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        for needed, then in waiting:
+            if self._leaving.keys().isdisjoint(needed):
+                then()
+            else:
+                self._waiting.append((needed, then))
+
+    def _forgetter(self, digest: bytes) -> Callable[[object], None]:
+        # A finalizer runs anywhere, and may only put something into the loop's queue.
+        return lambda _: self._loop.call_soon(self._forget, digest)
+
+    def _forget(self, digest: bytes) -> None:
+        reference = self._sent.get(digest)
+        if reference is not None and reference() is None:  # otherwise it was made and sent again
+            del self._sent[digest]
+            self._send(messages.Forget(digest))
+
+
+class RemoteTaskChannel:
+    """A ``DirectChannel``.  What it sends and receives passes the loop, and nothing above it.
+
+    ``deliver`` is the child handle's own.  Each wait has a lock of its own, which the loop
+    releases: an interruption at any line leaves at most a lock that nobody waits for.
+    """
+
+    def __init__(self, loop: EventLoop, deliver: Callable[..., bool]) -> None:
+        self._loop = loop
+        self._deliver = deliver
+        self._messages: deque[Message] = deque()
+        self._waiting: deque[threading.Lock] = deque()
+        self._under_way = 0
+        """The last packet that was sent and that the link does not have yet."""
+        self._ended = False
+
+    # Whoever borrowed it
+
+    def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a packet; BrokenPipeError if the worker is gone."""
+        if self._ended:
+            raise BrokenPipeError("the worker is gone")
+        self._under_way = seq
+        self._loop.call_soon(self._send, seq, payload, buffers)
+
+    def receive(self, timeout: float) -> Message | None:
+        """The next packet, None after ``timeout`` seconds.
+
+        At the end EOFError, or BrokenPipeError if what was sent last never left.
+        """
+        if not self._messages and not self._ended:
+            self._wait(timeout)
+        try:
+            return self._messages.popleft()
+        except IndexError:
+            if not self._ended:
+                return None
+        if self._under_way:
+            raise BrokenPipeError("the worker was gone before this was sent")
+        raise EOFError
+
+    def close(self) -> None:
+        """Let go of it."""
+
+    def _wait(self, timeout: float) -> None:
+        lock = threading.Lock()
+        lock.acquire()
+        self._waiting.append(lock)
+        # The loop notes what there is first and looks who waits then.
+        if not self._messages and not self._ended:
+            lock.acquire(timeout=timeout)
+
+    # The loop's thread
+
+    def put(self, message: Message) -> None:
+        """The worker sent it."""
+        self._messages.append(message)
+        self._wake()
+
+    def end(self) -> None:
+        """The worker is gone."""
+        self._ended = True
+        self._wake()
+
+    def drain(self) -> Iterator[Message]:
+        """Yield the messages that were not received."""
+        while self._messages:
+            yield self._messages.popleft()
+
+    def _send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview]) -> None:
+        if self._deliver(seq, payload, buffers):
+            self._under_way = 0
+
+    def _wake(self) -> None:
+        while self._waiting:
+            self._waiting.popleft().release()

@@ -28,7 +28,7 @@ from fiber.errors import StartError
 from fiber.resources import resources_of
 
 if TYPE_CHECKING:
-    from fiber._backends.base import Backend
+    from fiber._backends.local import Backend
     from fiber._backends.shipping import Program, Shipping
     from fiber._runtime.shared_arguments import SharedArguments
 
@@ -215,7 +215,7 @@ def _is_on_cluster(settings: config.Config) -> bool:
     """Tell whether a program that chose no backend runs in a pod that may make others."""
     if settings.backend != "auto" or "KUBERNETES_SERVICE_HOST" not in os.environ:
         return False
-    from fiber._backends.kubernetes.detection import serves_pools
+    from fiber._backends.kubernetes.backend import serves_pools
 
     return serves_pools(settings.namespace)
 

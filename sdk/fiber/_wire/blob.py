@@ -12,7 +12,7 @@ from fiber._wire.messages import BytesLike
 class Blob:
     """Bytes, named by their content.
 
-    An agent has them for as long as the master has the object (``fiber._backends.blob_sender``).
+    An agent has them for as long as the master has the object (``fiber._backends.remote``).
     """
 
     __slots__ = ("__weakref__", "_data", "_file", "digest")

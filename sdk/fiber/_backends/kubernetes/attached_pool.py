@@ -1,20 +1,37 @@
-"""A FiberPool whose master is this program."""
+"""FiberPool whose master is this program.
+
+``OwnPool`` is made for the program and deleted when it ends. ``WarmPool`` belongs to another owner,
+and the program is its master for a while.
+"""
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import datetime
+import json
+import threading
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from fiber import _logs
-from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import Body, Forbidden, NotFound
-from fiber._backends.kubernetes.resources import LEASES, POOLS
+from fiber._backends.kubernetes.api import LEASES, POOLS, SECRETS, TIMEOUT, Api
+from fiber._backends.kubernetes.api_errors import (
+    ApiError,
+    Body,
+    Conflict,
+    Forbidden,
+    NotFound,
+    Transient,
+)
 from fiber._exceptions import fresh
+from fiber._transport.credentials import MasterCredentials
 from fiber.errors import FiberPoolError
-from fiber_api import names
+from fiber_api import identity, names
+from fiber_api.identity import InvalidKey
+from fiber_api.names import ConditionType
 
 LOST = ("Deleted", "Replaced")
 """Reasons of a FiberPoolError by which the pool is this program's no more."""
@@ -229,3 +246,283 @@ def identity_in(pool: Body) -> str | None:
 def _micro_time() -> str:
     now = datetime.datetime.now(datetime.UTC)
     return now.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def secret_body(
+    name: str, credentials: MasterCredentials, owner: Body, labels: dict[str, str]
+) -> Body:
+    """The Secret that the init containers of pods mount.
+
+    It names the master's certificate: who reads the key can pose as an agent, never as the master.
+    """
+    texts = {names.KEY_POOL: credentials.pool_key, names.KEY_MASTER: credentials.fingerprint}
+    return {
+        "apiVersion": SECRETS.api_version,
+        "kind": SECRETS.kind,
+        "metadata": {
+            "name": name,
+            "labels": {**labels, names.LABEL_MANAGED_BY: names.SDK_MANAGER},
+            "ownerReferences": [owner],
+        },
+        "type": "Opaque",
+        "data": {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()},
+    }
+
+
+def pool_key_of(secret: Body) -> str:
+    """Return the key in a Secret that the operator made; InvalidKey if it cannot serve."""
+    return identity.key_in(secret.get("data") or {})
+
+
+_EPOCH = 1
+"""Epoch of a program's own pool, which never has another master."""
+
+
+class OwnPool:
+    """Pool of this program alone, from before it is made until it is deleted.
+
+    Its name must never have been used before.
+    """
+
+    def __init__(
+        self,
+        api: Api,
+        namespace: str,
+        body: Body,
+        credentials: MasterCredentials,
+        master: Master,
+        owner: Body | None,
+    ) -> None:
+        self._api = api
+        self._body = body
+        self._credentials = credentials
+        self._master = master
+        self._owner = owner
+        self._attached: AttachedPool | None = None
+        self._may_exist = False
+        self.name = str(body["metadata"]["name"])
+        self.namespace = namespace
+        self.doing = "make"
+        self.displaced = ""
+        self.remedy = f"kubectl delete fiberpool {self.name} -n {namespace}"
+        """Command that removes the pool if ``detach`` cannot."""
+
+    def attach(self, cancel: threading.Event) -> AttachedPool:
+        """Make it, without pods; then its Secret and its Lease, which go when it goes.
+
+        It has its master from the first moment: whoever dies between two of these calls leaves a
+        pool whose master's Lease is absent or gets old, and that the operator deletes.
+        """
+        self._attached = AttachedPool(self._api, self._create(cancel), self._master, _EPOCH)
+        self._make_secret(self._attached, cancel)
+        try:
+            self._attached.make_lease(cancel=cancel)
+        except Conflict as error:
+            if not (error.repeated and self._attached.has_lease(cancel=cancel)):
+                raise
+            # It was made by an attempt whose answer was lost.
+        return self._attached
+
+    def detach(self, timeout: float) -> None:
+        """Delete it, if it may be there."""
+        if self._attached is None and not self._may_exist:
+            return
+        uid = None if self._attached is None else self._attached.uid
+        try:
+            self._api.delete(POOLS.path(self.namespace, self.name), uid=uid, timeout=timeout)
+        except (NotFound, Conflict):
+            pass  # it is gone, or even its name is another's
+
+    def _make_secret(self, pool: AttachedPool, cancel: threading.Event) -> None:
+        name = names.secret_name(self.name)
+        secret = secret_body(name, self._credentials, pool.owner, pool.labels)
+        try:
+            self._api.create(SECRETS.path(self.namespace), secret, cancel=cancel)
+        except Conflict as error:
+            if not error.repeated:
+                raise  # somebody else was faster
+            try:
+                found = self._api.get(SECRETS.path(self.namespace, name), cancel=cancel)
+            except Forbidden:
+                return  # fiber-user reads no Secret. With another's keys no agent could join
+            if found.get("data") != secret["data"]:
+                raise
+            # It was made by an attempt whose answer was lost.
+
+    def _create(self, cancel: threading.Event) -> Body:
+        metadata = dict(self._body["metadata"])
+        if self._owner is not None:
+            metadata["ownerReferences"] = [self._owner]
+        spec = {
+            **self._body["spec"],
+            "replicas": 0,
+            "master": self._master.spec(self.name, _EPOCH),
+            "onLost": "Delete",
+            "credentialsSecretName": names.secret_name(self.name),
+        }
+        body = {**self._body, "metadata": metadata, "spec": spec}
+        try:
+            return self._api.create(POOLS.path(self.namespace), body, strict=True, cancel=cancel)
+        except Conflict as error:
+            if not error.repeated:
+                raise
+            found = self._api.get(POOLS.path(self.namespace, self.name), cancel=cancel)
+            if identity_in(found) != self._master.identity:
+                raise
+            return found  # made by an attempt whose answer was lost
+        except Transient:
+            self._may_exist = True
+            raise
+
+
+_PAUSE = 0.05
+"""Seconds until the next attempt after somebody else has written to the pool."""
+
+
+def read_pool_key(
+    api: Api, namespace: str, pool: str, spec: Body, cancel: threading.Event | None = None
+) -> str:
+    """Read the key of the pool with this ``spec`` from its Secret.  Blocks; ``ApiError``,
+    FiberPoolError.
+    """
+    name = spec.get("credentialsSecretName") or names.secret_name(pool)
+    what = f"the Secret {name!r} of the FiberPool {pool!r} in namespace {namespace!r}"
+    try:
+        secret = api.get(SECRETS.path(namespace, name), cancel=cancel)
+        return pool_key_of(secret)
+    except InvalidKey as error:
+        raise FiberPoolError(
+            f"{what} cannot serve: {error}. If the operator made it, delete it: it makes a new "
+            "one; then delete the pool's pods, which hold the old one",
+            pool=pool,
+            namespace=namespace,
+            reason=names.Reason.INVALID_CREDENTIALS,
+        ) from None
+    except Forbidden as error:
+        raise FiberPoolError(
+            f"cannot read {what}, whose credentials its master needs: {error.message}. The role "
+            f"fiber-user reads no Secret; give this one: `kubectl create role NAME -n {namespace} "
+            f"--verb=get --resource=secrets --resource-name={name}`, and bind it",
+            pool=pool,
+            namespace=namespace,
+            reason=names.Reason.FORBIDDEN,
+        ) from None
+
+
+class WarmPool:
+    """Pool of another owner, from before this program is its master until after that."""
+
+    def __init__(self, api: Api, namespace: str, name: str, master: Master) -> None:
+        self._api = api
+        self._master = master
+        self._attached: AttachedPool | None = None
+        self._replicas = 0
+        """Replicas of the pool before, which it gets again."""
+        self.name = name
+        self.namespace = namespace
+        self.doing = "attach to"
+        self.displaced = ""
+
+    @property
+    def remedy(self) -> str:
+        """Command that detaches the program if ``detach`` cannot."""
+        patch = json.dumps({"spec": {"master": None, "replicas": self._replicas}})
+        where = f"fiberpool {self.name} -n {self.namespace}"
+        return f"kubectl patch {where} --type=merge -p '{patch}'"
+
+    def attach(self, cancel: threading.Event) -> AttachedPool:
+        """Be its master from now on; FiberPoolError if it has one."""
+        deadline = time.monotonic() + TIMEOUT
+        while not self._try_to_attach(cancel):
+            # Its status was written meanwhile, or another program was faster.
+            if time.monotonic() > deadline or cancel.wait(_PAUSE):
+                raise Conflict("it changes faster than it can be attached to", status=409)
+        assert self._attached is not None
+        try:
+            self._attached.make_lease(cancel=cancel)
+        except Conflict:
+            self._attached.take_lease(cancel=cancel)  # the master before left it
+        return self._attached
+
+    def detach(self, timeout: float) -> None:
+        """Leave it as it was, if this program still is its master."""
+        attached = self._attached
+        if attached is None:
+            return
+        deadline = time.monotonic() + timeout
+        while not self._try_to_detach(attached, left := max(deadline - time.monotonic(), 0.0)):
+            if not left:
+                raise Conflict("it changes faster than it can be detached from", status=409)
+            time.sleep(min(_PAUSE, left))
+
+    def _try_to_detach(self, attached: AttachedPool, timeout: float) -> bool:
+        try:
+            found = self._api.get(attached.path, timeout=timeout)
+        except NotFound:
+            return True
+        if attached.loss(found) is not None:
+            return True
+        try:
+            # While it is ours: afterwards it may be the next master's.
+            attached.free_lease(timeout=timeout)
+            version = found["metadata"]["resourceVersion"]
+            attached.apply(self._replicas, master=False, resource_version=version, timeout=timeout)
+        except Conflict:
+            return False
+        return True
+
+    def _try_to_attach(self, cancel: threading.Event) -> bool:
+        found = self._api.get(POOLS.path(self.namespace, self.name), cancel=cancel)
+        there = found["spec"].get("master") or {}
+        epoch = int(there.get("epoch") or 0)
+        if there and identity_in(found) == self._master.identity:
+            self._attached = self._as_master(found, epoch)
+            return True  # by an attempt whose answer was lost
+        if there:
+            self._check_lost(found, there)
+        self.displaced = str(there.get("identity") or there.get("host") or "")
+        seen = int((found.get("status") or {}).get("masterEpoch") or 0)
+        attached = self._as_master(found, 1 + max(epoch, seen))
+        self._replicas = 0 if there else int(found["spec"].get("replicas") or 0)
+        version = found["metadata"]["resourceVersion"]
+        # Whatever becomes of the call, `detach` looks whether the pool is ours.
+        self._attached = attached
+        try:
+            attached.apply(self._replicas, resource_version=version, cancel=cancel)
+        except Conflict:
+            return False
+        return True
+
+    def _as_master(self, found: Body, epoch: int) -> AttachedPool:
+        return AttachedPool(self._api, found, self._master, epoch, kept_by_others=True)
+
+    def _check_lost(self, found: Body, there: Body) -> None:
+        """Raise unless the operator says that the master that is there is gone."""
+        status = found.get("status") or {}
+        known = {entry["type"]: entry["status"] for entry in status.get("conditions") or ()}
+        # A status of before may be about the master before.
+        current = status.get("observedGeneration", 0) >= found["metadata"]["generation"]
+        if current and known.get(ConditionType.MASTER_ALIVE) == "False":
+            return
+        lease = self._lease_of(there)
+        since = f" since {lease['acquireTime']}" if lease.get("acquireTime") else ""
+        sign = f", last heard of at {lease['renewTime']}" if lease.get("renewTime") else ""
+        raise FiberPoolError(
+            f"the FiberPool {self.name!r} in namespace {self.namespace!r} is in use: its master is "
+            f"{there.get('identity') or there.get('host')}{since}{sign}. Wait until that program "
+            "ends, or end it; one that was killed counts as gone "
+            f"{there.get('leaseDurationSeconds', 30)} s after its last sign of life",
+            pool=self.name,
+            namespace=self.namespace,
+            reason="InUse",
+        )
+
+    def _lease_of(self, master: Body) -> Body:
+        name = master.get("leaseName")
+        if not name:
+            return {}
+        try:
+            spec = self._api.get(LEASES.path(self.namespace, name), timeout=0.0).get("spec")
+        except ApiError:
+            return {}  # it only makes the message better
+        return spec or {}

@@ -1,23 +1,33 @@
-"""The life of one FiberPool, as the program that is its master sees it."""
+"""Life of one FiberPool, as the program that is its master sees it.
+
+``FiberPoolClient`` runs the thread of the pool. ``LeaseRenewer`` renews the master's Lease, which
+shows the operator that the program lives. ``Scaling`` writes the program's demand for workers to
+the pool.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Protocol
 
-from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden
+from fiber._backends.kubernetes.api import PODS, POOLS, Api
+from fiber._backends.kubernetes.api_errors import (
+    ApiError,
+    Body,
+    Conflict,
+    Forbidden,
+    NotFound,
+    Transient,
+    Unauthorized,
+)
 from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber._backends.kubernetes.informer import Informer
-from fiber._backends.kubernetes.lease import LeaseRenewer
-from fiber._backends.kubernetes.problems import PoolName
-from fiber._backends.kubernetes.reporter import Reporter
-from fiber._backends.kubernetes.resources import PODS, POOLS
-from fiber._backends.kubernetes.scaling import Scaling
+from fiber._backends.kubernetes.problems import PoolName, Reporter
 from fiber._exceptions import fresh
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
@@ -279,3 +289,248 @@ class FiberPoolClient:
     def _give_up(self) -> None:
         self._over.set()
         self._wake.set()
+
+
+RENEWALS = 3
+"""Within one duration."""
+
+_TIMEOUT = 1.0
+"""Seconds in which a connection that breaks is made again."""
+
+_RETRY = 2.0
+"""Seconds after one that failed."""
+
+
+class LeaseRenewer:
+    """Renews the Lease of one pool, every third of its duration.
+
+    It does little, over a connection that stays open, so that an interpreter that is busy or held
+    by native code delays it as little as can be.  Where that, or a stopped process, took longer
+    than the duration the operator may have given the pool away: it looks before it goes on.
+    """
+
+    def __init__(
+        self,
+        pool: AttachedPool,
+        *,
+        on_lost: Callable[[FiberPoolError], None],
+        on_trouble: Callable[[ApiError], None],
+        on_expired: Callable[[float], None],
+        on_refused: Callable[[ApiError], None],
+        on_fault: Callable[[Exception], None],
+        now: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
+    ) -> None:
+        """The Lease is fresh.  Told on the thread: ``on_trouble`` what keeps it from being renewed,
+        each time; ``on_expired``, once in each duration that passes without a renewal, the seconds
+        since the last one.  And once, which ends the thread: ``on_lost`` that the pool is this
+        program's no more, ``on_refused`` that a login or a right has been missing for a whole
+        duration, ``on_fault`` of a fault of ours.  ``now`` counts seconds, a machine's sleep among
+        them.
+        """
+        self._pool = pool
+        self._on_lost = on_lost
+        self._on_trouble = on_trouble
+        self._on_expired = on_expired
+        self._on_refused = on_refused
+        self._on_fault = on_fault
+        self._now = now
+        self._renewed = now()
+        self._expires = self._renewed + pool.master.lease_duration
+        """Time at which the Lease runs out, as far as this program knows."""
+        self._refused: float | None = None
+        """Time of the first refusal.  A starting API server refuses everything for a while."""
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fiber-lease", daemon=True)
+
+    def start(self) -> None:
+        """Begin, on a thread of its own."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Renew no more; returns at once."""
+        self._stopped.set()
+
+    def join(self, timeout: float) -> None:
+        """Wait for the thread's end after ``stop``."""
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
+
+    def explain(self, error: FiberPoolError) -> FiberPoolError:
+        """``error``, which says that the pool is this program's no more, and why that may be."""
+        late = self._late()
+        if late <= self._pool.master.lease_duration:
+            return error
+        return FiberPoolError(
+            f"{error}. This program did not renew its Lease for {late:.0f} s, and counts as gone "
+            f"after {self._pool.master.lease_duration} s: it was stopped, native code held its "
+            "interpreter, or the API server could not be reached",
+            pool=error.pool,
+            namespace=error.namespace,
+            reason=error.reason,
+        )
+
+    def renew(self) -> None:
+        """Once; FiberPoolError if the pool is this program's no more."""
+        now = self._now()
+        if self._late() > self._pool.master.lease_duration:
+            self._pool.check()
+        try:
+            self._pool.renew_lease(timeout=_TIMEOUT)
+        except NotFound:
+            self._make()
+        self._renewed = now
+        self._expires = now + self._pool.master.lease_duration
+
+    def _run(self) -> None:
+        pause = self._pool.master.lease_duration / RENEWALS
+        try:
+            while not self._stopped.wait(pause):
+                pause = self._attempt()
+        except FiberPoolError as error:
+            self._on_lost(self.explain(error))
+        except ApiError as error:
+            self._on_refused(error)
+        except Exception as error:
+            self._on_fault(error)
+
+    def _attempt(self) -> float:
+        """Seconds until the next one."""
+        pause = self._pool.master.lease_duration / RENEWALS
+        try:
+            self.renew()
+        except ApiError as error:
+            if self._stays_refused(error):
+                raise
+            self._on_trouble(error)
+            self._notice_expiry()
+            asked = error.retry_after if isinstance(error, Transient) else 0.0
+            return max(_RETRY, min(asked, pause))  # who lives must be heard in time all the same
+        self._refused = None
+        return pause
+
+    def _notice_expiry(self) -> None:
+        now = self._now()
+        if now >= self._expires:
+            self._expires = now + self._pool.master.lease_duration
+            self._on_expired(now - self._renewed)
+
+    def _stays_refused(self, error: ApiError) -> bool:
+        if not isinstance(error, Forbidden | Unauthorized):
+            self._refused = None
+            return False
+        now = self._now()
+        self._refused = now if self._refused is None else self._refused
+        return now - self._refused > self._pool.master.lease_duration
+
+    def _late(self) -> float:
+        return self._now() - self._renewed
+
+    def _make(self) -> None:
+        """Somebody deleted it, or all of the pool."""
+        self._pool.check()
+        try:
+            self._pool.make_lease(timeout=_TIMEOUT)
+        except Conflict:
+            pass  # it is there again
+
+
+PATCH_INTERVAL = 1.0
+"""Seconds from one change to the next, so that a demand that moves is not a flood of patches."""
+
+REFUSED = 30.0
+"""Seconds that a login or a right may be missing that was there before."""
+
+
+_PAUSE_MIN, _PAUSE_MAX = 0.2, 5.0
+"""Seconds after an attempt that failed, growing."""
+
+
+class Scaling:
+    """The newest demand, written at once, then once a second at most, and again until it holds.
+
+    ``want`` and ``gone`` are for any thread, ``step`` for one.
+    """
+
+    def __init__(
+        self,
+        on_trouble: Callable[[ApiError], None],
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``on_trouble`` is told what keeps a demand from being written, each time."""
+        self._on_trouble = on_trouble
+        self._now = now
+        self._lock = threading.Lock()
+        self._changed = False
+        self._replicas = 0
+        self._release: dict[str, None] = {}
+        """Pods to release, in order.  At most MAX_RELEASE of them go at a time."""
+        self._gone: set[str] = set()
+        """Pods that were there.  A name is never used again."""
+        self._due = 0.0
+        self._pause = _PAUSE_MIN
+        self._refused: float | None = None
+        """Since when."""
+
+    def want(self, replicas: int, release: Iterable[str]) -> None:
+        """From now on; names to release are added to those of before."""
+        with self._lock:
+            self._replicas = replicas
+            self._release.update((name, None) for name in release if name not in self._gone)
+            self._changed = True
+
+    def gone(self, name: str) -> bool:
+        """The pod is there no more; whether there is a name now that can take its place."""
+        with self._lock:
+            self._gone.add(name)
+            if name not in self._release:
+                return False
+            waiting = len(self._release) > names.MAX_RELEASE
+            del self._release[name]
+            self._changed = self._changed or waiting
+            return waiting
+
+    def step(self, pool: AttachedPool) -> float:
+        """Write what is due; seconds until the next step is.
+
+        ``ApiError`` and FiberPoolError where that will never succeed.
+        """
+        now = self._now()
+        if now < self._due:
+            return self._due - now
+        with self._lock:
+            if not self._changed:
+                return math.inf
+            self._changed = False
+            replicas = self._replicas
+            release = list(itertools.islice(self._release, names.MAX_RELEASE))
+        try:
+            self._write(pool, replicas, release)
+            self._due, self._pause, self._refused = now + PATCH_INTERVAL, _PAUSE_MIN, None
+        except (Conflict, Forbidden, Unauthorized, Transient) as error:
+            if not self._put_off(error):
+                raise
+        return self._due - now
+
+    def _write(self, pool: AttachedPool, replicas: int, release: list[str]) -> None:
+        try:
+            pool.apply(replicas, release, timeout=_TIMEOUT)
+        except (Forbidden, Unauthorized, Transient):
+            raise
+        except ApiError:
+            pool.check()  # another's by now, or deleted: that says more
+            raise
+
+    def _put_off(self, error: ApiError) -> bool:
+        """Try again later; return False if the server has refused for too long."""
+        now = self._now()
+        if isinstance(error, Forbidden | Unauthorized):
+            self._refused = now if self._refused is None else self._refused
+            if now - self._refused >= REFUSED:
+                return False
+        with self._lock:
+            self._changed = True
+        asked = error.retry_after if isinstance(error, Transient) else 0.0
+        self._due = now + max(self._pause, asked)
+        self._pause = min(2 * self._pause, _PAUSE_MAX)
+        self._on_trouble(error)
+        return True

@@ -11,11 +11,9 @@ from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import LOST
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
-from fiber._backends.kubernetes.pod_reasons import node_of, pod_end
-from fiber._backends.kubernetes.preparation import Preparation
-from fiber._backends.kubernetes.problems import PoolName, Way
+from fiber._backends.kubernetes.problems import PoolName, Way, node_of, pod_end
 from fiber._backends.kubernetes.program import ListenerObserver, PreparedPool
-from fiber._backends.kubernetes.waiting import Waiting
+from fiber._backends.kubernetes.waiting import Preparation, Waiting
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.demand import Demand

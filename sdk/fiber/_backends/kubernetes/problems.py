@@ -1,12 +1,31 @@
-"""Meaning of a FiberPool's status for the program that waits for its workers."""
+"""Problems of FiberPools and ends of pods, told to the program in sentences.
+
+* Functions over a FiberPool's status: which problems are new, whether they are terminal, a summary.
+* ``pod_end``: why a pod ended, from its document.
+* ``Reporter``: warns of a problem once while it lasts.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Iterator, Mapping
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from fiber._backends.kubernetes.api_errors import (
+    ApiError,
+    ServerError,
+    TooManyRequests,
+    Transient,
+    Unreachable,
+    explain,
+)
+from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
+from fiber_api import names
 from fiber_api.names import ConditionType, Reason
 from fiber_api.times import parse_time
 
@@ -199,3 +218,230 @@ def _problems(status: Status) -> Iterator[Mapping[str, Any]]:
 def _is_true(status: Status, kind: ConditionType) -> bool:
     conditions = status.get("conditions") or ()
     return any(c.get("type") == kind and c.get("status") == "True" for c in conditions)
+
+
+class PodEnd(NamedTuple):
+    """The end of a pod, as an ``ExitReport`` and a ``WorkerDied`` tell it."""
+
+    reason: str
+    """Reason in one word, a colon, and details: ``OOMKilled: its memory limit is 512Mi``."""
+    node: str
+    """Empty if it never had one."""
+    exitcode: int | None = None
+    """Exit code as in multiprocessing; None if no program ended, or it is not known how."""
+    disrupted: bool = False
+    """True if the cluster ended the pod, and not its programs."""
+
+
+def pod_end(pod: Mapping[str, Any], container: str = names.WORKER_CONTAINER) -> PodEnd | None:
+    """Return how ``pod`` ended or is about to; None if it is well, as far as Kubernetes knows.
+
+    What ended it comes before what became of its programs for that.
+    """
+    status = pod.get("status") or {}
+    worker = _ended(status, container)
+    own = _out_of_memory(pod, worker, container)
+    disruption = None if own else _disruption(pod) or _deletion(pod) or _lost_container(worker)
+    reason = own or disruption or _own_end(status, worker)
+    if reason is None:
+        return None
+    return PodEnd(reason, node_of(pod), _exitcode(worker), disruption is not None)
+
+
+def node_of(pod: Mapping[str, Any]) -> str:
+    """The name of its node; empty while it has none."""
+    return str((pod.get("spec") or {}).get("nodeName") or "")
+
+
+def _ended(status: Mapping[str, Any], container: str) -> Mapping[str, Any]:
+    """The end of the container of that name; empty while it goes on."""
+    for found in status.get("containerStatuses") or ():
+        if found.get("name") == container:
+            return (found.get("state") or {}).get("terminated") or {}
+    return {}
+
+
+def _out_of_memory(pod: Mapping[str, Any], worker: Mapping[str, Any], container: str) -> str | None:
+    if worker.get("reason") != "OOMKilled":
+        return None
+    limit = None
+    for found in (pod.get("spec") or {}).get("containers") or ():
+        if found.get("name") == container:
+            limit = ((found.get("resources") or {}).get("limits") or {}).get("memory")
+    # Without a limit of its own it was the node that had no more.
+    return f"OOMKilled: its memory limit is {limit}" if limit else "OOMKilled: it has no limit"
+
+
+_DISRUPTIONS = {
+    "DeletionByPodGC": "NodeLost",
+    "DeletionByTaintManager": "NodeLost",
+    "EvictionByEvictionAPI": "Evicted",
+    "PreemptionByScheduler": "Preempted",
+    # In the status itself, by the kubelet.
+    "Evicted": "Evicted",
+    "NodeLost": "NodeLost",
+    "NodeShutdown": "NodeLost",
+    "Preempting": "Preempted",
+    "Shutdown": "NodeLost",
+    "Terminated": "NodeLost",
+}
+"""Kubernetes' words for why it ended a pod, and what people call it."""
+
+
+def _disruption(pod: Mapping[str, Any]) -> str | None:
+    status = pod.get("status") or {}
+    conditions = status.get("conditions") or ()
+    for told in (status, *(c for c in conditions if c.get("type") == "DisruptionTarget")):
+        word = _DISRUPTIONS.get(str(told.get("reason")))
+        if word and told.get("status") != "False":
+            return _sentence(word, str(told.get("message") or ""))
+    return None
+
+
+_LOST_CONTAINERS = ("ContainerStatusUnknown", "Unknown")
+"""Reasons of containers that a node lost sight of, for example in a restart.  Their exit code is
+made up."""
+
+
+def _deletion(pod: Mapping[str, Any]) -> str | None:
+    if not (pod.get("metadata") or {}).get("deletionTimestamp"):
+        return None
+    return "Deleted: somebody deleted the pod"
+
+
+def _lost_container(worker: Mapping[str, Any]) -> str | None:
+    lost = worker.get("reason") in _LOST_CONTAINERS
+    return "NodeLost: its node lost sight of it" if lost else None
+
+
+def _own_end(status: Mapping[str, Any], worker: Mapping[str, Any]) -> str | None:
+    reason, message = str(status.get("reason") or ""), str(status.get("message") or "")
+    exitcode = _exitcode(worker)
+    if exitcode is not None:
+        word = reason or str(worker.get("reason") or "Error")
+        return _sentence(word, f"its agent {_ending(exitcode)}")
+    if reason or status.get("phase") in ("Failed", "Succeeded"):
+        return _sentence(reason or str(status["phase"]), message)
+    return None
+
+
+def _sentence(word: str, rest: str) -> str:
+    rest = rest.strip().rstrip(".")
+    return f"{word}: {rest}" if rest else word
+
+
+def _exitcode(worker: Mapping[str, Any]) -> int | None:
+    code = worker.get("exitCode")
+    if not isinstance(code, int) or worker.get("reason") in _LOST_CONTAINERS:
+        return None
+    return 128 - code if code > 128 else code  # runtimes add 128 to a signal
+
+
+def _ending(exitcode: int) -> str:
+    if exitcode >= 0:
+        return f"ended with exit status {exitcode}"
+    try:
+        return f"was killed by {signal.Signals(-exitcode).name}"
+    except ValueError:
+        return f"was killed by signal {-exitcode}"
+
+
+_EXPIRED = "Lease expired"
+
+
+class Reporter:
+    """Any thread may call; ``on_warning`` and ``on_error`` are told on the loop's.
+
+    There is one error at most.  ``on_failure`` is called after it, on the thread that found it.
+    """
+
+    def __init__(
+        self,
+        loop: Loop,
+        pool: PoolName,
+        server: str,
+        *,
+        on_warning: Callable[[str], None],
+        on_error: Callable[[FiberPoolError], None],
+        on_failure: Callable[[], None],
+    ) -> None:
+        self._loop = loop
+        self._pool = pool
+        self._server = server
+        self._on_warning = on_warning
+        self._on_error = on_error
+        self._on_failure = on_failure
+        self._failing = threading.Lock()
+        """Taken by whoever tells of the error, and never given back."""
+        self._warned: set[str] = set()
+        self._muted = False
+
+    def mute(self) -> None:
+        """The pool is given back: nobody wants to know any more."""
+        self._muted = True
+
+    def answered(self) -> None:
+        """The API server is well: if it fails again that is news."""
+        kinds = {kind.__name__ for kind in (Unreachable, ServerError, TooManyRequests)}
+        self._warned -= {*kinds, _EXPIRED}
+
+    def warn_anew(self) -> None:
+        """Somebody begins to wait, and is to be told what was told before, if it is still so."""
+        self._warned.clear()
+
+    def warn(self, what: str, message: str) -> None:
+        """``what`` names that of which one warning is enough until it has passed."""
+        if not self._muted and what not in self._warned:
+            self._warned.add(what)
+            self._loop.call_soon(self._on_warning, message)
+
+    def trouble(self, doing: str, error: ApiError) -> None:
+        """Report an error that may pass.  ``doing``: the action, before the name of the pool."""
+        # One that fails in general fails in all that is done; of rights there are several.
+        kind = type(error).__name__
+        what = kind if isinstance(error, Transient) else f"{kind}: {doing}"
+        self.warn(what, str(self._explained(doing, error)))
+
+    def expired(self, seconds: float) -> None:
+        """Tell that the Lease has not been renewed for its duration."""
+        what = (
+            f"may get another master: this program has not renewed its Lease for {seconds:.0f} s. "
+            "Its agents dial anew: they come back with their work, or go to the next master. See "
+            "that this program can reach the API server"
+        )
+        self.warn(_EXPIRED, str(self.error("LeaseExpired", what)))
+
+    def refused(self, doing: str, error: ApiError) -> None:
+        """Report an error that will not pass."""
+        self.fail(self._explained(doing, error))
+
+    def fault(self, error: Exception) -> None:
+        """A fault of ours must not leave anybody waiting."""
+        failure = self.error("Internal", f"is given up after an unexpected {error!r}")
+        failure.__cause__ = error
+        self.fail(failure)
+
+    def fail(self, error: FiberPoolError) -> None:
+        """Report that the pool has failed."""
+        if not self._muted and self._failing.acquire(blocking=False):
+            self._loop.call_soon(self._on_error, error)
+            self._on_failure()  # whatever that leads to is told later
+
+    def error(self, reason: str, what: str) -> FiberPoolError:
+        """``what``: what is the matter, in words that follow the pool."""
+        name, namespace = self._pool
+        message = f"{self._pool} {what}"
+        return FiberPoolError(message, pool=name, namespace=namespace, reason=reason)
+
+    def _explained(self, doing: str, error: ApiError) -> FiberPoolError:
+        name, namespace = self._pool
+        doing = f"{doing} the FiberPool {name!r}"
+        return explain(error, doing, pool=name, namespace=namespace, server=self._server)
+
+    def say_what_stays(self, why: str, remedy: str) -> None:
+        """Say on stderr what stays behind.  ``remedy`` is the command that removes it."""
+        with contextlib.suppress(Exception):  # stderr may be closed
+            sys.stderr.write(
+                f"fiber: {self._pool} stays behind: {why}. The operator notices that this program "
+                f"is gone; to be quicker: {remedy}\n"
+            )

@@ -1,32 +1,37 @@
-"""Program on a cluster: its identity, its address for pods, and the start of its FiberPools."""
+"""Program on a cluster: its identity, its address for pods, and the start of its FiberPools.
+
+The address is found without connecting to another machine. A PersistentVolumeClaim that only one
+node can mount is left out of the workers' pods, because it would keep workers on other nodes from
+starting.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import copy
+import ipaddress
 import itertools
 import os
 import secrets
 import socket
 import sys
 import threading
-from typing import NamedTuple, Protocol
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, NamedTuple, Protocol
 
-from fiber._backends.kubernetes.address import reachable_address, resolved
-from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body, NotFound, explain
-from fiber._backends.kubernetes.attached_pool import Master
-from fiber._backends.kubernetes.claims import Claims, look_up, without_claims
+from fiber._backends.kubernetes.api import CLAIMS, NODES, PODS, POOLS, Api
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden, NotFound, explain
+from fiber._backends.kubernetes.attached_pool import Master, OwnPool, WarmPool, read_pool_key
 from fiber._backends.kubernetes.fiber_pool import Attachment
-from fiber._backends.kubernetes.own_pool import OwnPool
-from fiber._backends.kubernetes.resources import PODS, POOLS
-from fiber._backends.kubernetes.shape import Shape, pool_name, program_name
 from fiber._backends.kubernetes.template import (
+    Shape,
     fiber_pool_body,
     own_container,
     pod_template,
+    pool_name,
+    program_name,
     secrets_left_out,
 )
-from fiber._backends.kubernetes.warm_pool import WarmPool, read_pool_key
 from fiber._transport.acceptor import Acceptor
 from fiber._transport.credentials import MasterCredentials, make_certificate, make_credentials
 from fiber._transport.handshake import Identity
@@ -254,3 +259,169 @@ def _mountinfo() -> str:
             return file.read()
     except OSError:
         return ""
+
+
+_NODES = 10
+"""Nodes that are looked at: the way to one is mostly the way to all."""
+
+_ELSEWHERE = ("192.0.2.1", "2001:db8::1")
+"""Addresses that are nobody's (RFC 5737, RFC 3849): the way to them is the default route."""
+
+
+def reachable_address(api: Api, listen_host: str | None, *, pool: str, namespace: str) -> str:
+    """The IP address that pods reach this program at.
+
+    ``listen_host``, if it names one.  Else the local address on the way to the cluster's nodes, to
+    its API server, or out of this machine: of these the first that is no loopback.  In a pod that
+    is the pod's.  FiberPoolError if all are.
+    """
+    if listen_host is not None and not _is_unspecified(listen_host):
+        return resolved("listen_host", listen_host)
+    for target in _targets(api):
+        found = _local_address(target)
+        if found is not None and _is_reachable(found):
+            return found
+    raise FiberPoolError(
+        f"pods cannot reach this program: the only address of this machine on the way to the "
+        f"cluster at {api.server} is a loopback. Set listen_host (fiber.init(listen_host=) or "
+        "FIBER_LISTEN_HOST) to an address of this machine that pods can reach, run the program in "
+        "a pod, or set advertised_host too where pods reach this machine at another address",
+        pool=pool,
+        namespace=namespace,
+        reason="NoAddress",
+    )
+
+
+def _targets(api: Api) -> Iterator[str]:
+    if not api.in_cluster:
+        yield from _node_addresses(api)
+    yield api.server
+    yield from _ELSEWHERE
+
+
+def _node_addresses(api: Api) -> Iterator[str]:
+    try:
+        nodes = api.list(NODES.path(), {"limit": str(_NODES)}, timeout=0.0)["items"]
+    except ApiError:
+        return  # few may list them; whoever else cannot be reached is told by the next call
+    for node in nodes:
+        for address in node.get("status", {}).get("addresses", ()):
+            if address.get("type") == "InternalIP":
+                yield address["address"]
+
+
+def _local_address(target: str) -> str | None:
+    """Return the address that this machine would send from.  Nothing is sent."""
+    try:
+        family, kind, _, _, where = socket.getaddrinfo(target, 9, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.connect(where)
+            return str(probe.getsockname()[0])
+    except OSError:
+        return None  # no such name, or no way there
+
+
+def resolved(key: str, host: str) -> str:
+    """Return the IP address of ``host``, the value of the configuration's ``key``, for pods."""
+    try:
+        found = str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+    except OSError as error:
+        raise _useless(key, host, f"has no address ({error})") from error
+    if not _is_reachable(found):
+        raise _useless(key, host, f"is {found}, which is another machine in each pod")
+    return found
+
+
+def _useless(key: str, host: str, why: str) -> ConfigError:
+    return ConfigError(
+        f"pods cannot reach this program: {key} {host!r} {why}. Set it to an address of this "
+        "machine that pods can reach, or leave it out. Behind NAT or port forwarding, set "
+        "advertised_host to the address that pods dial"
+    )
+
+
+def _is_unspecified(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_unspecified
+    except ValueError:
+        return False
+
+
+def _is_reachable(host: str) -> bool:
+    address = ipaddress.ip_address(host.partition("%")[0])
+    return not (address.is_loopback or address.is_link_local or address.is_unspecified)
+
+
+_ONE_NODE = {"ReadWriteOnce", "ReadWriteOncePod"}
+
+
+class Claims(NamedTuple):
+    """The claims that need a word."""
+
+    one_node: tuple[str, ...] = ()
+    """Names of those that one node alone may mount."""
+    unread: Mapping[str, str] = {}
+    """Why a claim cannot be read, by its name."""
+
+    def warnings(self, template: Mapping[str, Any]) -> list[str]:
+        """Lines about the claims, for a program whose workers have this pod template."""
+        mounted = set(_claims_by_volume(template["spec"]).values())
+        left_out = [claim for claim in self.one_node if claim not in mounted]
+        lines = [
+            f"workers mount the PersistentVolumeClaim {claim} as this program does, though it "
+            f"cannot be read ({why}): if one node alone may mount it, workers on other nodes do "
+            "not start. Give this program's account the right to get persistentvolumeclaims, "
+            "which the role fiber-user has"
+            for claim, why in self.unread.items()
+        ]
+        if left_out:
+            lines.append(
+                f"workers do not get the PersistentVolumeClaims {', '.join(left_out)}: their "
+                "access mode lets one node alone mount them, and workers run on others, too. Use a "
+                "claim with ReadWriteMany or ReadOnlyMany, or bring the volumes and volumeMounts "
+                "with fiber.init(template=), where a nodeSelector can keep workers on that node"
+            )
+        return lines
+
+
+def look_up(
+    api: Api, namespace: str, pod: Mapping[str, Any], container: str, cancel: threading.Event
+) -> Claims:
+    """Ask what the claims allow that the container mounts, for workers in ``namespace``."""
+    found = next(c for c in pod["spec"]["containers"] if c["name"] == container)
+    uses = (*(found.get("volumeMounts") or ()), *(found.get("volumeDevices") or ()))
+    used = {use["name"] for use in uses}
+    volumes = _claims_by_volume(pod["spec"])
+    one_node, unread = [], {}
+    for claim in sorted({claim for volume, claim in volumes.items() if volume in used}):
+        try:
+            spec = api.get(CLAIMS.path(namespace, claim), cancel=cancel)["spec"]
+        except (Forbidden, NotFound) as error:
+            unread[claim] = error.message
+        else:
+            modes = set(spec.get("accessModes") or ())
+            if modes and modes <= _ONE_NODE:
+                one_node.append(claim)
+    return Claims(tuple(one_node), unread)
+
+
+def without_claims(pod: Mapping[str, Any], claims: Collection[str]) -> Body:
+    """Return the pod without the volumes of these claims, and without their mounts."""
+    changed = copy.deepcopy(dict(pod))
+    spec = changed["spec"]
+    gone = {volume for volume, claim in _claims_by_volume(spec).items() if claim in claims}
+    documents = [(spec, "volumes")]
+    for container in spec["containers"]:
+        documents += [(container, "volumeMounts"), (container, "volumeDevices")]
+    for document, field in documents:
+        if document.get(field):
+            document[field] = [item for item in document[field] if item["name"] not in gone]
+    return changed
+
+
+def _claims_by_volume(spec: Mapping[str, Any]) -> dict[str, str]:
+    return {
+        volume["name"]: volume["persistentVolumeClaim"]["claimName"]
+        for volume in spec.get("volumes") or ()
+        if volume.get("persistentVolumeClaim")
+    }

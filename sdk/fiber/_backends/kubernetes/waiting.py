@@ -1,8 +1,18 @@
-"""Children that wait for a pod: what they wait for is shown, and the wait has a limit."""
+"""Children that wait for a pod.
+
+* ``Preparation`` makes the FiberPool on a thread, because that waits for the API server.
+* ``Waiting`` holds the children until an agent arrives or the time for that is over.
+* ``Progress`` shows on stderr what the children wait for.
+* ``Reachability`` tells when running pods send no agent.  It is pure: ``now`` is an argument.
+"""
 
 from __future__ import annotations
 
+import enum
 import math
+import os
+import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -19,15 +29,10 @@ from fiber._backends.kubernetes.problems import (
     summary,
     unreachable,
 )
-from fiber._backends.kubernetes.progress import Progress
-from fiber._backends.kubernetes.reachability import (
-    DOUBTED_AFTER,
-    GIVEN_UP_AFTER,
-    Reachability,
-    Verdict,
-)
+from fiber._backends.kubernetes.program import PreparedPool
 from fiber._backends.output import Output
-from fiber._transport.link import Timer
+from fiber._transport.link import EventLoop, Timer
+from fiber._transport.loop import Loop
 from fiber.errors import FiberError
 
 
@@ -211,3 +216,167 @@ class Waiting:
         if trouble is None:
             return f"the API server {self._api.server} has not answered yet"
         return f"the API server {self._api.server} is asked again and again: {trouble}"
+
+
+_FIRST_SHOWN, _SHOWN_AGAIN = 1.0, 1.0
+"""Seconds on a terminal, where each line takes the place of the one before."""
+
+_FIRST_WRITTEN, _WRITTEN_AGAIN = 5.0, 60.0
+"""Seconds elsewhere, where lines stay."""
+
+_COLUMNS = 80
+
+
+class Progress:
+    """Says what ``describe()`` does, again and again while a wait lasts.
+
+    On the loop's thread.
+    """
+
+    def __init__(self, loop: EventLoop, output: Output, describe: Callable[[], str]) -> None:
+        self._loop = loop
+        self._output = output
+        self._describe = describe
+        self._timer: Timer | None = None
+        self._shows = False
+
+    def start(self) -> None:
+        """The wait begins, or goes on."""
+        if self._timer is None:
+            self._shows = _is_terminal()
+            first = _FIRST_SHOWN if self._shows else _FIRST_WRITTEN
+            self._timer = self._loop.call_later(first, self._say)
+
+    def stop(self) -> None:
+        """End the waiting: remove the line from a terminal."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+            if self._shows:
+                self._output.show("")
+
+    def _say(self) -> None:
+        text = self._describe()
+        if self._shows:
+            # A line that wraps cannot be taken away.
+            self._output.show(f"[fiber] {text}"[: _columns() - 1])
+        else:
+            self._output.write("fiber", text)
+        again = _SHOWN_AGAIN if self._shows else _WRITTEN_AGAIN
+        self._timer = self._loop.call_later(again, self._say)
+
+
+def _is_terminal() -> bool:
+    try:
+        return sys.stderr.isatty()
+    except (AttributeError, ValueError):  # there is none, or it is closed
+        return False
+
+
+def _columns() -> int:
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).columns or _COLUMNS
+    except (AttributeError, OSError, ValueError):  # some terminals do not say
+        return _COLUMNS
+
+
+DOUBTED_AFTER = 8.0
+"""Seconds from the first running pod until the missing agent is reported.  An agent needs a second
+or two to start and to dial."""
+
+GIVEN_UP_AFTER = 60.0
+"""Seconds from that report to the error."""
+
+_LATE = 2.0
+"""Seconds by which a judgement may be late.  A longer delay means that this program was stopped or
+held up, and that agents had to wait for it."""
+
+
+class Verdict(enum.Enum):
+    """Conclusion from running pods that send no agent."""
+
+    OPEN = enum.auto()
+    DOUBTFUL = enum.auto()
+    UNREACHABLE = enum.auto()
+
+
+class Reachability:
+    """Record of the running pods of one pool, and of the first sign of an agent."""
+
+    def __init__(self) -> None:
+        self.due = math.inf
+        """Time of the next judgement that can differ from the last."""
+        self._proven = False
+        self._running = 0
+        self._since = math.inf
+        self._newest = math.inf
+
+    def prove(self) -> None:
+        """Note that an agent has dialled: the address works."""
+        self._proven = True
+        self.due = math.inf
+
+    def judge(self, running: int, now: float) -> Verdict:
+        """Return the conclusion, with ``running`` pods there now."""
+        late, self.due = now > self.due + _LATE, math.inf
+        if not running or self._proven:
+            self._running = 0
+            return Verdict.OPEN
+        if not self._running or late:
+            self._since = now
+        if running > self._running or late:
+            self._newest = now  # as much time for this pod's agent as for the first
+        self._running = running
+        doubted_at = self._since + DOUBTED_AFTER
+        given_up_at = max(doubted_at + GIVEN_UP_AFTER, self._newest + DOUBTED_AFTER)
+        if now >= given_up_at:
+            return Verdict.UNREACHABLE
+        self.due = given_up_at if now >= doubted_at else doubted_at
+        return Verdict.OPEN if now < doubted_at else Verdict.DOUBTFUL
+
+
+class Preparation:
+    """Calls ``prepare`` once, and on the loop's thread ``on_prepared`` with what it returns or
+    ``on_failed`` with what it raises.
+    """
+
+    def __init__(
+        self,
+        loop: Loop,
+        prepare: Callable[[], PreparedPool],
+        *,
+        on_prepared: Callable[[PreparedPool], None],
+        on_failed: Callable[[FiberError], None],
+    ) -> None:
+        self._loop = loop
+        self._prepare = prepare
+        self._on_prepared = on_prepared
+        self._on_failed = on_failed
+        self._thread = threading.Thread(target=self._run, name="fiber-prepare", daemon=True)
+
+    def start(self) -> None:
+        """Begin.  On the loop's thread."""
+        try:
+            self._thread.start()
+        except RuntimeError as error:  # the system has no room for it
+            self._on_failed(_unexpected(error))
+
+    def join(self, timeout: float) -> None:
+        """Wait until it is over."""
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        try:
+            prepared = self._prepare()
+        except FiberError as error:
+            self._loop.call_soon(self._on_failed, error)
+        except Exception as error:  # a fault of ours must not leave anybody waiting
+            self._loop.call_soon(self._on_failed, _unexpected(error))
+        else:
+            self._loop.call_soon(self._on_prepared, prepared)
+
+
+def _unexpected(error: Exception) -> FiberError:
+    failure = FiberError(f"no pods can be asked for, after an unexpected {error!r}")
+    failure.__cause__ = error
+    return failure
