@@ -1,6 +1,6 @@
 """What an attacker on the path can do: hold up and break off, and nothing else.
 
-``docs/decisions/0015-the-way-in-is-ours.md`` says why.
+``docs/decisions/0006-one-port-accepts-agents-by-tls.md`` says why.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Acceptor:
     then says which.  Connections are taken once there is a pool.
 
     All pools show the same ``certificate``.  An agent does not name its pool: the key of its proof
-    tells the pool (decision 39).  A stranger has no pool, and is reported to the first one.
+    tells the pool (decision 6).  A stranger has no pool, and is reported to the first one.
     """
 
     def __init__(self, address: str, certificate: Certificate) -> None:

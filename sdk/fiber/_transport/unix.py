@@ -84,7 +84,7 @@ def grow(sock: socket.socket) -> None:
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _usual_room())  # the kernel doubles it
 
 
-# How a receiver looks for an answer before it sleeps (decision 16)
+# How a receiver looks for an answer before it sleeps (decision 4)
 
 _LOOK = 200e-6
 """Seconds that it looks: more than it takes to wake a processor on which the other end sleeps."""
