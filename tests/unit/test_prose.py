@@ -1,6 +1,6 @@
-"""Docstrings begin with a verb (functions) or a noun, as CONTRIBUTING.md asks.
+"""Prose as CONTRIBUTING.md asks: docstrings begin with a verb or a noun, records are short.
 
-A reader must guess the noun of one that begins with a pronoun or a question word.
+A reader must guess the noun of a docstring that begins with a pronoun or a question word.
 """
 
 from __future__ import annotations
@@ -18,6 +18,19 @@ BADLY = re.compile(
     "(As|By|For|Has|Here|How|In|Is|It|Its|Nobody|Nothing|Of|On|One|Such|That|There|These|They|This"
     r"|Those|To|What|Whatever|When|Where|Whether|Which|Who|Whoever|With|Without)\b"
 )
+
+RECORDS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
+
+
+@pytest.mark.parametrize("record", RECORDS, ids=lambda record: str(record.name))
+def test_decision_records_have_four_parts_and_are_short(record: Path) -> None:
+    text = record.read_text(encoding="utf-8")
+    parts = re.findall(r"^\*\*(\w+)\.\*\* ", text, re.MULTILINE)
+    assert parts == ["Context", "Decision", "Price", "Evidence"]
+    assert len(text.split()) <= 250
+    title = text.splitlines()[0].removeprefix(f"# {int(record.name[:4])}. ")
+    index = (record.parent / "README.md").read_text(encoding="utf-8")
+    assert f"| [{title}]({record.name}) |" in index
 
 
 @pytest.mark.parametrize("folder", ["operator", "sdk"])
