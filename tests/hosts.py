@@ -10,8 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from fiber._hub import client, handles
-from fiber._hub.hub import Hub
-from fiber._hub.hub_link import HubLink
+from fiber._hub.hub import Hub, HubLink
 from fiber._runtime.state import runtime
 from fiber._transport.loop import Loop
 from fiber._wire import messages

@@ -13,8 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fiber._transport.handshake import Identity
-from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive
-from fiber._transport.resumable_link import ResumableLink
+from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, ResumableLink
 from fiber._transport.stream import Datagram
 
 

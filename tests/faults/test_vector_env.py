@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 import fiber
 from faults.program import Program, alive, wait_for
 from fiber.vector import VectorEnv, worker_process
-from fiber.vector.failures import ATTEMPTS
+from fiber.vector.worker import ATTEMPTS
 from patience import PATIENCE
 from vector_envs import Faulty, Telling
 

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from fiber._transport.link import Keepalive
-from fiber._transport.resumable_link import ResumableLink
+from fiber._transport.link import Keepalive, ResumableLink
 from fiber._transport.stream import Frame
 from memory_link import Cable, SimulatedLoop
 

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from fiber._hub.coherence import Twin
-from fiber._hub.replicas import MemoryLink
+from fiber._hub.replicas import MemoryLink, Twin
 from simulation.memory_hosts import World
 
 SEEDS = 2000

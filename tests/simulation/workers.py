@@ -12,7 +12,7 @@ import signal
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from fiber._agent.watchdog import SPLIT_EAGER_AFTER
+from fiber._agent.worker import SPLIT_EAGER_AFTER
 from fiber._engine.chunks import LIMIT
 from simulation.schedule import Act, Crash, Lie, Repeat, Slow, StillBirth, Task
 

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from faults.program import wait_for
-from fiber._transport import acceptor, admission, refusals, tls
-from fiber._transport.admission import Admission
+from fiber._transport import acceptor, tls
+from fiber._transport.acceptor import Admission
 from fiber._transport.handshake import Hello, Identity
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
@@ -156,12 +156,12 @@ def test_a_crowd_from_one_address_is_bounded_and_keeps_nobody_out(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(acceptor, "_MOST", 8)
-    monkeypatch.setattr(admission, "_FAIR_CHANCE", 60.0)
+    monkeypatch.setattr(acceptor, "_FAIR_CHANCE", 60.0)
     listener, master = site.listener()
     crowd = [Visitor(site, listener.address) for _ in range(20)]
     ended = [visitor for visitor in crowd[4:] if visitor.rest() == b""]
     assert len(ended) == 16, "no more than half of the bound is for one address"
-    monkeypatch.setattr(admission, "_FAIR_CHANCE", 0.0)
+    monkeypatch.setattr(acceptor, "_FAIR_CHANCE", 0.0)
     _, agent = site.dialer(listener.address)
     agent.link.send(b"in")  # one of them had to make room
     master.wait(lambda: master.frames)
@@ -292,7 +292,7 @@ def test_an_agent_that_nobody_wants_hears_why_and_is_told_once(site: Site) -> No
 def test_an_agent_without_a_pod_is_told_of_whatever_strangers_do(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(refusals, "_MOST", 1)
+    monkeypatch.setattr(acceptor, "_REMEMBERED", 1)
     listener, master = site.listener()
     listener._knows = lambda identity: None
     told = listener._acceptor._refusals
@@ -308,15 +308,15 @@ def test_an_agent_without_a_pod_is_told_of_whatever_strangers_do(
 def test_a_crowd_is_told_of_once_from_wherever_it_comes(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(admission, "_FAIR_CHANCE", 60.0)
+    monkeypatch.setattr(acceptor, "_FAIR_CHANCE", 60.0)
     listener, master = site.listener()
-    acceptor, full = listener._acceptor, Admission(1, 1)
-    full.enter("somebody", "192.0.2.1", acceptor.loop.now())
-    acceptor._admission = full
+    accepting, full = listener._acceptor, Admission(1, 1)
+    full.enter("somebody", "192.0.2.1", accepting.loop.now())
+    accepting._admission = full
     ends = []
     for number in range(3):
         ours, theirs = socket.socketpair()
-        acceptor.loop.call_soon(acceptor._admit, theirs, f"10.0.0.{number}", f"10.0.0.{number}:1")
+        accepting.loop.call_soon(accepting._admit, theirs, f"10.0.0.{number}", f"10.0.0.{number}:1")
         ends.append(ours)
     for ours in ends:
         assert ours.recv(1) == b""
@@ -326,7 +326,7 @@ def test_a_crowd_is_told_of_once_from_wherever_it_comes(
 
 
 def test_complaints_are_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refusals, "_MOST", 3)
+    monkeypatch.setattr(acceptor, "_REMEMBERED", 3)
     listener, master = site.listener()
     site.on_loop(lambda: None)
     for number in range(10):

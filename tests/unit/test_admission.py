@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fiber._transport.admission import Admission, Verdict
+from fiber._transport.acceptor import Admission, Verdict
 
 IN, OUT = Verdict(True), Verdict(False)
 

@@ -9,7 +9,7 @@ import pytest
 
 _MESSAGES = """
 import resource, sys
-from fiber._agent.allocator import keep_memory
+from fiber._agent.main import keep_memory
 
 def send():
     messages = [b"x" * (1 << 19) for _ in range(int(sys.argv[1]))]

@@ -14,8 +14,8 @@ import pytest
 import census
 import fiber
 from fiber import reduction
-from fiber._agent import blob_store
-from fiber._agent.blob_store import BlobLacking, BlobStore
+from fiber._agent import service
+from fiber._agent.service import BlobLacking, BlobStore
 from fiber._backends.remote import BlobSender
 from fiber._runtime import state
 from fiber._runtime.shared_arguments import SharedArguments
@@ -149,7 +149,7 @@ def test_a_store_without_room_says_so_once_and_keeps_the_next(
         raise OSError(28, "No space left on device")
 
     store, message = BlobStore(str(tmp_path)), messages.Blob(Blob(b"x").digest, b"x")
-    monkeypatch.setattr(blob_store.Blob, "in_file", full)
+    monkeypatch.setattr(service.Blob, "in_file", full)
     store.put(message)
     with pytest.raises(BlobLacking, match="No space left on device") as caught:
         store.get(message.digest)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import census
-from fiber._agent.capture import LAST_LINES, Capture
+from fiber._agent.service import LAST_LINES, Capture
 from fiber._transport.loop import Loop
 from patience import PATIENCE
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fiber._hub.coherence import PATCH, Twin
+from fiber._hub.replicas import PATCH, Twin
 
 SIZE = 10_000
 

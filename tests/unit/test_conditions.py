@@ -14,7 +14,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import synchronize
-from fiber._hub import hosted_wait_list
+from fiber._hub import hosted
 from fiber._hub.client import HubStream
 from fiber._hub.protocol import Op
 from hosts import Far, Hosts, background
@@ -191,7 +191,7 @@ def test_who_died_elsewhere_while_it_waited_is_passed_over(hosts: Hosts) -> None
 def test_one_elsewhere_wakes_though_the_doorbell_was_never_rung(
     hosts: Hosts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hosted_wait_list, "_LOOK", 0.01)
+    monkeypatch.setattr(hosted, "_LOOK", 0.01)
     condition, woken = fiber.Condition(), []
     thread = waiter(Far(hosts)(condition), woken, "far")
     condition._waiters._ring = lambda: None  # the notifier dies just before

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from fiber._transport.connecting import connect
 from fiber._transport.credentials import make_credentials
+from fiber._transport.dialer import connect
 from unit.link_site import Site, black_hole, free_port, port_of
 
 PATIENCE = 3600.0

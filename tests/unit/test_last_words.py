@@ -13,7 +13,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber._agent import last_words, zygote
-from fiber._agent.progress import ProgressTable
+from fiber._agent.last_words import ProgressTable
 from patience import PATIENCE
 from unit.test_zygote import Master
 

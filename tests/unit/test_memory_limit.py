@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from fiber._agent.agent import Agent
-from fiber._agent.memory_limit import MemoryLimit
+from fiber._agent.agent import Agent, MemoryLimit
 
 
 @pytest.fixture

@@ -6,10 +6,9 @@ import random
 
 import pytest
 
+import fiber._transport.link
 import memory_link
-from fiber._transport import resumable_link
-from fiber._transport.link import Keepalive
-from fiber._transport.resumable_link import ResumableLink
+from fiber._transport.link import Keepalive, ResumableLink
 from fiber._transport.stream import Frame
 from memory_link import Cable, SimulatedLoop
 from unit.interrupting import is_interrupted
@@ -255,7 +254,7 @@ def test_what_is_sent_after_the_end_is_not_kept(loop: SimulatedLoop) -> None:
 def test_a_send_that_a_signal_interrupts_does_not_keep_later_ones_back(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     notes = Notes(cable.agent)
-    files = {resumable_link.__file__, memory_link.__file__}
+    files = {fiber._transport.link.__file__, memory_link.__file__}
     step = 0
     while is_interrupted(lambda: cable.master.send(b"lost or sent"), step, files):
         step += 1

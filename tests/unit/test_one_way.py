@@ -19,11 +19,10 @@ import fiber
 import fiber.connection
 from census import wait_until
 from fiber._hub import dealer, one_way
-from fiber._hub.backlog import AMBIGUOUS
 from fiber._hub.dealer import Dealer
 from fiber._hub.hosted import HostedReceiver
 from fiber._hub.local import LocalChannel
-from fiber._hub.one_way import Receiver, Sender
+from fiber._hub.one_way import AMBIGUOUS, Receiver, Sender
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
 from hosts import PATIENCE, Far, background

@@ -13,8 +13,7 @@ import pytest
 
 import census
 from fiber._transport.loop import Loop
-from fiber._transport.outbox import Outbox
-from fiber._transport.unix import socketpair
+from fiber._transport.unix import Outbox, socketpair
 from fiber._wire import packet
 from fiber.errors import TooManyOpenFiles
 from patience import PATIENCE

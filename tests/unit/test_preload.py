@@ -13,8 +13,8 @@ import pytest
 
 import census
 from fiber._agent import preload, zygote
+from fiber._agent.last_words import ProgressTable
 from fiber._agent.preload import Imports
-from fiber._agent.progress import ProgressTable
 from patience import PATIENCE
 from unit.test_zygote import Master, progress_table
 

@@ -17,7 +17,7 @@ from census import wait_until
 from fiber._hub import shared_semaphores
 from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.protocol import Op, Status
-from fiber._hub.remote_semaphore import RemoteSemaphore
+from fiber._hub.shared_semaphores import RemoteSemaphore
 from fiber.synchronize import Abandoned
 from hosts import Far, Hosts, Wire, background, objects_kept
 from patience import PATIENCE

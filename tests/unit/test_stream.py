@@ -13,15 +13,17 @@ from hypothesis import strategies as st
 from fiber._transport.stream import (
     ACK_DELAY,
     BUDGET,
+    FIRST,
     HEARTBEAT,
     LARGE,
+    LAST,
+    SIZE,
     WINDOW,
     WINDOW_BYTES,
     Datagram,
     Gap,
     ResumableStream,
 )
-from fiber._transport.turns import FIRST, LAST, SIZE
 from fiber._wire.messages import ProtocolError
 
 BUDGET_SMALL = 64

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from fiber._transport.stream import ResumableStream
-from fiber._transport.turns import SLOTS, Lane, Turns
+from fiber._transport.stream import SLOTS, Lane, ResumableStream, Turns
 from fiber._wire import assembly
 
 BUDGET = 64

@@ -19,7 +19,7 @@ import fiber
 from faults.program import alive, wait_for
 from fiber._runtime.state import runtime
 from fiber.vector import VectorEnv
-from fiber.vector.failures import ATTEMPTS
+from fiber.vector.worker import ATTEMPTS
 from vector_envs import Faulty, Sampling, Step
 
 Make = Callable[..., VectorEnv]

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 
 from fiber._agent import worker as worker_module
-from fiber._agent.watchdog import Watchdog
-from fiber._agent.worker import FUNCTIONS, Worker
+from fiber._agent.worker import FUNCTIONS, Watchdog, Worker
 from fiber._wire import packet, work
 from patience import PATIENCE
 from unit import pool_tasks as tasks

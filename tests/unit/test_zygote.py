@@ -22,9 +22,9 @@ import pytest
 import census
 from fiber import reduction
 from fiber._agent import child, zygote, zygote_process
+from fiber._agent.last_words import ProgressTable
 from fiber._agent.preload import Imports
-from fiber._agent.progress import ProgressTable
-from fiber._agent.signals import is_expected
+from fiber._agent.service import is_expected
 from fiber._transport.unix import socketpair
 from fiber._wire import packet
 from fiber.process import Process

@@ -6,6 +6,9 @@ separate process (``python -m fiber.agent``), whose observers send events over t
 The agent runs on the loop's thread.  Any thread may call ``Agent.child``, which registers nothing,
 and a child's ``recall`` and ``signal``, which only put a call into the loop's queue.  So the agent
 needs no lock, on which a finalizer or a signal handler could block.
+
+``MemoryLimit`` detects children that the kernel killed because the control group was out of memory.
+They look like any other child that got a SIGKILL, so the kernel's count of such deaths decides.
 """
 
 from __future__ import annotations
@@ -18,11 +21,9 @@ from typing import Any
 
 from fiber._agent import zygote
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
-from fiber._agent.local_child import LocalChild
-from fiber._agent.memory_limit import MemoryLimit
+from fiber._agent.last_words import ProgressTable
+from fiber._agent.local_child import LocalChild, ZygoteLink
 from fiber._agent.preload import Imports
-from fiber._agent.progress import ProgressTable
-from fiber._agent.zygote_link import ZygoteLink
 from fiber._hub import client as hub_client
 from fiber._hub.hub import Hub
 from fiber._hub.protocol import HubAddress
@@ -260,3 +261,67 @@ def describe(exitcode: int) -> str:
         return f"killed by {signal.Signals(-exitcode).name}"
     except ValueError:
         return f"killed by signal {-exitcode}"
+
+
+_ROOT = "/sys/fs/cgroup"
+_MEMBERSHIP = "/proc/self/cgroup"
+
+_UNITS = (("Gi", 1 << 30), ("Mi", 1 << 20), ("Ki", 1 << 10))
+
+
+class MemoryLimit:
+    """Memory limit of the control group that this process is in."""
+
+    def __init__(self, root: str = _ROOT, membership: str = _MEMBERSHIP) -> None:
+        self._events, self._maximum = _files(root, membership)
+        self._kills = self._count()
+
+    def was_exceeded(self) -> bool:
+        """Return whether the kernel has killed a process for memory since the last call."""
+        before, self._kills = self._kills, self._count()
+        return self._kills > before
+
+    def describe(self) -> str:
+        """Return a sentence with the limit as Kubernetes writes it."""
+        limit = _read(self._maximum).strip()
+        if limit.isdigit():
+            return f"its memory limit is {_quantity(int(limit))}"
+        return "no limit of its own"
+
+    def _count(self) -> int:
+        for line in _read(self._events).splitlines():
+            name, _, count = line.partition(" ")
+            if name == "oom_kill" and count.isdigit():
+                return int(count)
+        return 0
+
+
+def _files(root: str, membership: str) -> tuple[str, str]:
+    """Return the paths of the file that counts the deaths and the file with the limit."""
+    groups = {}
+    for line in _read(membership).splitlines():
+        _, controllers, group = line.split(":", 2)
+        groups[controllers] = group.rstrip("/")
+    found = []
+    # In a separate cgroup namespace the group is the root of the mount, under any name.
+    for group in (groups.get("", ""), ""):
+        found.append((f"{root}{group}/memory.events", f"{root}{group}/memory.max"))
+    for group in (groups.get("memory", ""), ""):
+        old = f"{root}/memory{group}"
+        found.append((f"{old}/memory.oom_control", f"{old}/memory.limit_in_bytes"))
+    return next((files for files in found if _read(files[0])), found[0])
+
+
+def _quantity(limit: int) -> str:
+    for unit, size in _UNITS:
+        if limit % size == 0:
+            return f"{limit // size}{unit}"
+    return f"{limit} bytes"
+
+
+def _read(path: str) -> str:
+    try:
+        with open(path, encoding="utf-8") as file:
+            return file.read()
+    except OSError:  # no such file, or no such group
+        return ""

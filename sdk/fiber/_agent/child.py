@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from fiber import _logs
 from fiber._agent import last_words, program_folder
-from fiber._agent.progress import ProgressTable
+from fiber._agent.last_words import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import client as hub_client
 from fiber._hub.protocol import HubAddress

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import signal
@@ -15,7 +16,6 @@ from typing import NoReturn
 from fiber import _logs, config
 from fiber._agent import leftovers, zygote_process
 from fiber._agent.agent import Agent
-from fiber._agent.allocator import keep_memory
 from fiber._agent.child import become_subreaper, go_on_without_parent
 from fiber._agent.service import AgentService
 from fiber._hub.directory import remove_directory
@@ -335,3 +335,26 @@ def main() -> int:
     except (FiberError, AuthenticationError) as error:
         print(f"fiber agent: {error}", file=sys.stderr)
         return 1
+
+
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # malloc.h
+
+_MAPPED = 2 << 20
+"""Bytes from which on malloc maps a piece separately: more than a datagram has."""
+
+_KEPT = 16 << 20
+"""Free bytes that malloc keeps.  Above that, it keeps half as many."""
+
+
+def keep_memory() -> None:
+    """Let malloc keep the memory of large messages.  Does nothing without glibc.
+
+    glibc gives large free pieces back to the kernel at once.  For the next message it gets them
+    again, page by page and zeroed: with messages of half a megabyte a page fault for each 4 KiB
+    that an agent sends.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _MAPPED)
+        mallopt(_M_TRIM_THRESHOLD, _KEPT)
+        mallopt(_M_TOP_PAD, _KEPT // 2)  # else a trim would free all of it

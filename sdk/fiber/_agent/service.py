@@ -1,9 +1,16 @@
-"""The agent's side of its link: obeys the master's messages and reports the children's events."""
+"""The agent's side of its link: obeys the master's messages and reports the children's events.
+
+It also reads the output of remote children by lines, and keeps the blobs that the master sent for
+children that the agent starts.
+"""
 
 from __future__ import annotations
 
+import fcntl
+import os
 import pickle
 import signal
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -11,11 +18,9 @@ from typing import Any
 
 from fiber import config
 from fiber._agent.agent import Agent
-from fiber._agent.blob_store import BlobLacking, BlobStore
-from fiber._agent.capture import Capture
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
+from fiber._agent.last_words import TELL
 from fiber._agent.local_child import LocalChild
-from fiber._agent.signals import is_expected
 from fiber._hub.hub import Hub
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
@@ -23,6 +28,7 @@ from fiber._transport.stream import Frame
 from fiber._transport.unix import naming_the_limit
 from fiber._wire import messages, packet
 from fiber._wire.assembly import pass_on, place_of
+from fiber._wire.blob import Blob
 from fiber._wire.descriptor import contents
 from fiber._wire.packet import BytesLike
 
@@ -306,3 +312,147 @@ class _Observed:
 
     def _output_left(self, size: int) -> None:
         self._output -= size
+
+
+LAST_LINES = 20
+"""Lines kept to explain a death."""
+
+_CHUNK = 1 << 16
+_LONGEST = 1 << 13
+"""Bytes after which a line without an end is passed on in pieces."""
+
+
+class Capture:
+    """Pipe for one child's stdout and stderr.  Runs on the loop's thread."""
+
+    def __init__(self, loop: Loop, write: Callable[[str], None], busy: Callable[[], bool]) -> None:
+        self._loop = loop
+        self._write = write
+        self._busy = busy
+        with naming_the_limit("capturing the output of a process"):
+            self._reader, self._writer = os.pipe2(os.O_CLOEXEC)
+        os.set_blocking(self._reader, False)
+        self._rest = b""
+        self._lines: deque[str] = deque(maxlen=LAST_LINES)
+        self._closed = False
+        loop.register(self._reader, self._readable)
+
+    @property
+    def stdio(self) -> tuple[int, int]:
+        """Descriptors for the child's stdout and stderr."""
+        return self._writer, self._writer
+
+    def started(self) -> None:
+        """Close the writing end: the child has its own now."""
+        if self._writer >= 0:
+            os.close(self._writer)
+            self._writer = -1
+
+    def finish(self) -> tuple[str, ...]:
+        """Read the rest of a dead child's output; return its last lines."""
+        if not self._closed:
+            self._closed = True
+            self._loop.unregister(self._reader)
+            # No more than the pipe's size: a process that the child started may write for ever.
+            left = fcntl.fcntl(self._reader, fcntl.F_GETPIPE_SZ)
+            while left > 0 and (size := self._read()):
+                left -= size
+            self._pass_on(b"\n" if self._rest else b"")
+            os.close(self._reader)
+            self.started()
+        return tuple(self._lines)
+
+    def _readable(self) -> None:
+        if self._busy():
+            # The link is behind: let the child wait for room in the pipe, as at a slow terminal.
+            self._loop.unregister(self._reader)
+            self._loop.call_later(0.05, self._resume)
+        else:
+            self._read()
+
+    def _resume(self) -> None:
+        if not self._closed:
+            self._loop.register(self._reader, self._readable)
+
+    def _read(self) -> int:
+        try:
+            data = os.read(self._reader, _CHUNK)
+        except BlockingIOError:
+            return 0
+        if data:
+            self._pass_on(data)
+        elif not self._closed:
+            # All writers have closed the pipe, though the child may still run.
+            self._loop.unregister(self._reader)
+        return len(data)
+
+    def _pass_on(self, data: bytes) -> None:
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        while len(self._rest) > _LONGEST:
+            lines.append(self._rest[:_LONGEST])
+            self._rest = self._rest[_LONGEST:]
+        if lines:
+            texts = [line.decode(errors="replace").removesuffix("\r") for line in lines]
+            self._lines.extend(texts)
+            self._write("\n".join(texts))
+
+
+class BlobLacking(Exception):
+    """Error: the agent does not have a blob.  The text says why."""
+
+    def __init__(self, digest: bytes, reason: str) -> None:
+        super().__init__(f"what its master sent ahead is not there: {reason}")
+        self.digest = digest
+
+
+class BlobStore:
+    """Blobs of one master, in files in ``directory``, until the master sends Forget.
+
+    Frames come in order.  A blob that is sent before a Start is here when the Start comes.  A child
+    that was started before a Forget still has the blob open.
+    """
+
+    def __init__(self, directory: str | None) -> None:
+        self._directory = directory
+        self._blobs: dict[bytes, Blob] = {}
+        self._refused: dict[bytes, str] = {}
+        """Blobs for which the system had no room, and the reasons."""
+
+    def put(self, message: messages.Blob) -> None:
+        """Keep a blob.  If the system refuses that, ``get`` raises the reason."""
+        try:
+            blob = Blob.in_file(message.digest, message.data, self._directory)
+        except OSError as error:
+            self._refused[message.digest] = str(error)
+            return
+        self._refused.pop(message.digest, None)
+        self._blobs[message.digest] = blob
+
+    def get(self, digest: bytes) -> Blob:
+        """Return a blob that was sent; raise BlobLacking if it is not here."""
+        blob = self._blobs.get(digest)
+        if blob is None:
+            raise BlobLacking(digest, self._refused.pop(digest, "it was forgotten"))
+        return blob
+
+    def forget(self, digest: bytes) -> None:
+        """Delete a blob, which no later Start names."""
+        self._blobs.pop(digest, None)
+        self._refused.pop(digest, None)
+
+
+def is_expected(pid: int, signum: int) -> bool:
+    """Return whether process ``pid`` handles, blocks or ignores ``signum``.
+
+    False if the signal would end the process, if the process cannot be inspected, and for a child
+    that still has its zygote's handlers, recognized by TELL, which zygotes ignore.
+    """
+    try:
+        with open(f"/proc/{pid}/status") as status:
+            lines = dict(line.split(":", 1) for line in status)
+        caught, blocked, ignored = (int(lines[name], 16) for name in ("SigCgt", "SigBlk", "SigIgn"))
+    except (OSError, KeyError, ValueError):
+        return False
+    if ignored >> (TELL - 1) & 1:
+        return False
+    return bool((caught | blocked | ignored) >> (signum - 1) & 1)

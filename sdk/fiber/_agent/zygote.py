@@ -42,8 +42,8 @@ from typing import Any, NoReturn
 from fiber._agent import child as child_module
 from fiber._agent import last_words, program_folder
 from fiber._agent.child import StartRequest
+from fiber._agent.last_words import ProgressTable
 from fiber._agent.preload import Imports, Unfit, preload
-from fiber._agent.progress import ProgressTable
 from fiber._wire import packet
 from fiber.errors import TooManyOpenFiles
 

@@ -30,9 +30,8 @@ from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._engine.start_failures import StartFailure, StartFailures
 from fiber._hub.hub import Hub
-from fiber._transport import address as addresses
 from fiber._transport.credentials import Credentials, make_credentials
-from fiber._transport.handshake import Identity
+from fiber._transport.handshake import Identity, join_address
 from fiber._transport.link import Keepalive, Link, Timer
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
@@ -98,7 +97,7 @@ class LoopbackBackend:
         self._credentials = make_credentials()
         self._listener = MasterListener(
             loop,
-            addresses.join(config.listen_host or _LOOPBACK, config.listen_port),
+            join_address(config.listen_host or _LOOPBACK, config.listen_port),
             self._credentials,
             on_agent=self._joined,
             objection=self._objection,

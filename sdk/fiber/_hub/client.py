@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from fiber._hub import protocol
-from fiber._hub.doorbell import Doorbell
 from fiber._hub.local import QuietSocket, without_timeout
-from fiber._hub.protocol import HEAD, ONE, SECRETS, HubAddress, Op, Status
+from fiber._hub.protocol import HEAD, ONE, SECRETS, Doorbell, HubAddress, Op, Status
 from fiber._hub.registry import Registry
 from fiber._transport.unix import naming_the_limit, wait_readable
 from fiber._wire import packet

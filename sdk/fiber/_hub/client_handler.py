@@ -10,11 +10,8 @@ from functools import partial
 from typing import Protocol
 
 from fiber._hub import protocol
-from fiber._hub.doorbell import Doorbell
 from fiber._hub.heap import Block
-from fiber._hub.hosted import HostedChannel, HostedCounter
-from fiber._hub.hosted_semaphore import HostedSemaphore
-from fiber._hub.hosted_wait_list import HostedWaitList
+from fiber._hub.hosted import HostedChannel, HostedCounter, HostedSemaphore, HostedWaitList
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,
@@ -23,6 +20,7 @@ from fiber._hub.protocol import (
     SECRET,
     SECRETS,
     TWO,
+    Doorbell,
     Extent,
     GrantFlags,
     ObjectKind,

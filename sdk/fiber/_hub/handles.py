@@ -23,11 +23,10 @@ from multiprocessing import context as mp_context
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from fiber._hub import client
-from fiber._hub.backlog import Backlog
 from fiber._hub.client import HubStream, Unreachable
 from fiber._hub.heap import Block, block_of
 from fiber._hub.local import LocalChannel, LocalCounter
-from fiber._hub.one_way import ENDS, OneWayEnd, Receiver, Sender
+from fiber._hub.one_way import ENDS, Backlog, OneWayEnd, Receiver, Sender
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,

@@ -1,19 +1,29 @@
-"""Objects of this host as its hub sees them: who waits for what, on the loop's thread.
+"""Objects of this host as its hub sees them, with the requests that wait for them, on the loop
+thread.
 
-A hub takes a message out of a channel, or lowers a counter, only for a request that waits for that,
-and answers at once.  A user who dies takes nothing that it had not asked for.
+A hub takes a message out of a channel, or lowers a counter, only for a request that waits for it,
+and answers at once.  A client that dies has taken only what it asked for.
+
+``HostedSemaphore`` has tokens for processes of other hosts.  The loop never waits: while a process
+of another host waits for a token, each release rings the hub's doorbell.  The first process that
+asked gets the token first. ``HostedWaitList`` is the wait list of a condition.
 """
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.one_way import LOOK_AGAIN, Receiver
-from fiber._hub.poller import EDGE, IN, OUT, Poller
-from fiber._hub.protocol import Status
+from fiber._hub.protocol import Doorbell, Status
+from fiber._hub.streams import EDGE, IN, OUT, Poller
+from fiber._sync.abandonment import Abandoned
+from fiber._sync.semaphore import COUNTING, SLICE, Block, SharedSemaphore, warn_of
+from fiber._sync.wait_list import WaitList
 from fiber._transport.loop import Loop
 from fiber._wire.packet import INLINE_LIMIT, Message
 
@@ -281,3 +291,135 @@ class HostedMemory:
 
     def close(self) -> None:
         """The registry lets go of it."""
+
+
+_RELEASE_AGAIN = 0.005
+"""Seconds until the next try while dead processes' tokens are given back."""
+
+
+class HostedSemaphore:
+    """Semaphore that the hub serves.  Runs on the loop's thread."""
+
+    def __init__(self, loop: Loop, doorbell: Doorbell, block: Block) -> None:
+        self._loop = loop
+        self._doorbell = doorbell
+        # A view of its own, and no recursive one: the tokens are not this process's.
+        self._semaphore = SharedSemaphore(block, COUNTING)
+        self._waiters: deque[tuple[Waiter, Callable[[bool], None]]] = deque()
+        self._is_listening = False
+        self._revival = threading.Thread()  # none yet
+
+    def acquire(self, waiter: Waiter, granted: Callable[[bool], None]) -> None:
+        """Answer once there is a token for it, having told ``granted`` whether it is to keep it."""
+        self._waiters.append((waiter, granted))
+        self._serve()
+        if self._waiters and not self._is_listening:
+            self._is_listening = True
+            self._doorbell.listen(self._serve)
+            self._semaphore.listen(True)
+            self._look()
+
+    def release(self) -> None:
+        """Give a token back; ValueError if there are as many as there can be."""
+        if self._semaphore.release(wait=False):
+            self._serve()
+        else:
+            self._loop.call_later(_RELEASE_AGAIN, self.release)
+
+    def abandon(self, holder: str) -> None:
+        """Give back a token of a process that has ended."""
+        self._semaphore.abandon(holder)
+        with contextlib.suppress(RuntimeWarning):  # as an error it would end the hub
+            warn_of(holder)
+        self.release()
+
+    def value(self) -> int:
+        """Return how often it can be acquired now."""
+        return self._semaphore._get_value()
+
+    def withdraw(self, waiter: Waiter) -> bool:
+        """Stop waiting; return False if ``waiter`` did not wait."""
+        for entry in self._waiters:
+            if entry[0] is waiter:
+                self._waiters.remove(entry)
+                return True
+        return False
+
+    def close(self) -> None:
+        """Stop serving it: no process of another host uses it."""
+        self._waiters.clear()
+        self._stop_listening()
+
+    def _serve(self) -> None:
+        while self._waiters and (result := self._semaphore.try_acquire()):
+            waiter, granted = self._waiters.popleft()
+            tracked = not self._semaphore.is_untracked()
+            granted(tracked)
+            holder = [memoryview(result.holder.encode())] if isinstance(result, Abandoned) else []
+            waiter.answer(Status.OK, tracked, holder)
+
+    def _look(self) -> None:
+        """Now and then: who would ring may die before it does, or while it has a token."""
+        self._serve()
+        if not self._waiters:
+            self._stop_listening()
+            return
+        if not self._revival.is_alive() and self._semaphore.is_suspicious():
+            self._revival = threading.Thread(target=self._semaphore.revive, name="fiber-revival")
+            self._revival.start()
+        self._loop.call_later(SLICE, self._look)
+
+    def _stop_listening(self) -> None:
+        if self._is_listening:
+            self._is_listening = False
+            self._semaphore.listen(False)
+            self._doorbell.forget(self._serve)
+
+
+_LOOK = 1.0
+"""Seconds until it looks for itself whether somebody was notified: who rings may die before."""
+
+
+class HostedWaitList:
+    """Wait list that the hub serves.  Runs on the loop's thread."""
+
+    def __init__(self, loop: Loop, doorbell: Doorbell, block: Block) -> None:
+        self._loop = loop
+        self._doorbell = doorbell
+        self.places = WaitList(block, self._serve)
+        self._sleepers: dict[Waiter, int] = {}
+        self._is_looking = False
+
+    def sleep(self, waiter: Waiter, place: int) -> None:
+        """Answer once that place is notified."""
+        if not self._sleepers:
+            self._doorbell.listen(self._serve)
+        self._sleepers[waiter] = place
+        self._serve()
+        if self._sleepers and not self._is_looking:
+            self._is_looking = True
+            self._loop.call_later(_LOOK, self._look)
+
+    def withdraw(self, waiter: Waiter) -> bool:
+        """Stop waiting; return False if ``waiter`` did not wait."""
+        return self._sleepers.pop(waiter, None) is not None
+
+    def close(self) -> None:
+        """Stop serving it: no process of another host uses it."""
+        self._sleepers.clear()
+        self._doorbell.forget(self._serve)
+
+    def _serve(self) -> None:
+        for waiter, place in list(self._sleepers.items()):
+            if self.places.is_notified(place):
+                del self._sleepers[waiter]
+                waiter.answer(Status.OK)
+        if not self._sleepers:
+            self._doorbell.forget(self._serve)
+
+    def _look(self) -> None:
+        self._is_looking = False
+        self._serve()
+        if self._sleepers:
+            self._is_looking = True
+            self._loop.call_later(_LOOK, self._look)

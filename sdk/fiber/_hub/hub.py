@@ -15,32 +15,37 @@ import socket
 import struct
 import tempfile
 import weakref
+from collections import deque
+from collections.abc import Callable
 from functools import partial
 from queue import Empty, SimpleQueue
 
 from fiber._exceptions import fresh
 from fiber._hub import protocol
-from fiber._hub.backlog import Backlog
 from fiber._hub.client import NoHub, Unreachable
 from fiber._hub.client_handler import ClientHandler
 from fiber._hub.directory import remove_directory
-from fiber._hub.doorbell import Doorbell
 from fiber._hub.heap import block_of
-from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory, HostedReceiver
-from fiber._hub.hosted_semaphore import HostedSemaphore
-from fiber._hub.hosted_wait_list import HostedWaitList
-from fiber._hub.hub_link import HubLink, Send
+from fiber._hub.hosted import (
+    HostedChannel,
+    HostedCounter,
+    HostedMemory,
+    HostedReceiver,
+    HostedSemaphore,
+    HostedWaitList,
+)
 from fiber._hub.local import LocalChannel, LocalCounter, QuietSocket, without_timeout
-from fiber._hub.one_way import ENDS, Receiver
-from fiber._hub.poller import Poller
-from fiber._hub.protocol import HubAddress, ObjectKind
+from fiber._hub.one_way import ENDS, Backlog, Receiver
+from fiber._hub.protocol import Doorbell, HubAddress, ObjectKind
 from fiber._hub.registry import Hosted, Registry, SharedObject
-from fiber._hub.replicas import Replicas
-from fiber._hub.streams import SocketStream, Stream
-from fiber._hub.tunnel import Router
+from fiber._hub.replicas import MemoryLink, Replicas
+from fiber._hub.streams import Poller, SocketStream, Stream
+from fiber._hub.tunnel import Frame as TunnelFrame
+from fiber._hub.tunnel import Router, Tunnels
 from fiber._transport.loop import DOZE, Loop
 from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire.descriptor import Descriptor, own
+from fiber._wire.messages import Memory, OfHubs
 from fiber.errors import TooManyOpenFiles
 
 _PEER = struct.Struct("iII")  # pid, uid, gid
@@ -268,3 +273,44 @@ def _problem(error: OSError) -> str:
         "FIBER_RUNTIME_DIRECTORY (runtime_directory) to a directory that can be written to and has "
         "a short path, and start the program again"
     )
+
+
+Send = Callable[[OfHubs], None]
+
+
+class HubLink:
+    """Side of a link between two hubs.  Runs on the loop's thread.
+
+    Whatever else is sent over the link has to be preceded by ``flush``.
+    """
+
+    memory: MemoryLink
+    tunnels: Tunnels
+
+    def __init__(self, call_soon: Callable[..., None], send: Send) -> None:
+        self._call_soon = call_soon
+        self._send = send
+        self._waiting: deque[TunnelFrame] = deque()
+
+    def on_frame(self, frame: OfHubs) -> None:
+        """A frame of the other side's hub."""
+        if isinstance(frame, Memory):
+            self.memory.on_frame(frame)
+        else:
+            self.tunnels.on_frame(frame)
+
+    def send(self, frame: TunnelFrame) -> None:
+        """Send a frame of a tunnel, after what has changed in shared memory."""
+        if not self.memory and not self._waiting:
+            self._send(frame)
+            return
+        # To look for changes takes time: once for all frames of a turn of the loop.
+        self._waiting.append(frame)
+        if len(self._waiting) == 1:
+            self._call_soon(self.flush)
+
+    def flush(self) -> None:
+        """Send what has changed in shared memory, and what waits for that."""
+        self.memory.flush()
+        while self._waiting:
+            self._send(self._waiting.popleft())

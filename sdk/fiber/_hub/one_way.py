@@ -1,13 +1,13 @@
 """Channels of one direction, which hold as many unread messages as a pipe does.
 
 The kernel counts about 800 bytes of a socket's buffer for every packet, so a socket holds fewer
-small messages than a pipe.  What it has no room for goes into a *backlog* in shared memory, until
-that is empty again.  Messages in the socket are older than those in the backlog::
+small messages than a pipe.  Messages that do not fit go into a *backlog* in shared memory, until
+the backlog is empty again.  Messages in the socket are older than those in the backlog::
 
     Sender ──┬─ the backlog is empty ──► socket ────────────────┬─► Receiver
              └─ the socket is full ────► backlog, wake-up ──────┘
 
-* As long as nothing overflows, neither end takes a lock or does a system call more.
+* As long as nothing overflows, neither end takes a lock or needs another system call.
 * While there is a backlog, its socket holds a *wake-up* packet behind all messages, so that its
   descriptor is readable and a receiver that sleeps wakes.  A receiver finds the packet at the head
   of the socket and takes from the backlog.  In the packet is a descriptor of the sending end:
@@ -15,8 +15,8 @@ that is empty again.  Messages in the socket are older than those in the backlog
 * A sender that has checked the backlog a moment too early may send behind the wake-up packet.  It
   notes that (``AMBIGUOUS``), and the next receiver moves the packet to the end.
 * A sender that finds the backlog full waits for a packet in the other direction.
-* A receiver that dies with the wake-up packet in its hands takes no message with it, but others
-  are not woken.  They look at the backlog each second, as the hub and the dealer of a queue do for
+* If a receiver dies while it has the wake-up packet, no message is lost, but other receivers are
+  not woken.  They look at the backlog each second, as the hub and the dealer of a queue do for
   their readers, and the next sender finds the socket empty and sends another wake-up packet.
 """
 
@@ -29,18 +29,128 @@ import socket
 import struct
 import termios
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
-from fiber._hub.backlog import AMBIGUOUS, HEAD, ROOM, TAIL, UNANNOUNCED, Backlog
+from fiber._hub import heap
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
+from fiber._sync.robust_mutex import RobustMutex
 from fiber._transport.unix import BorrowedSocket, wait_readable, wait_until
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.packet import BytesLike, Message
 from fiber.errors import ConnectionClosed
+
+HEAD, TAIL = 8, 9
+"""Words.  Where they differ, there are records."""
+
+_NEEDED = 10
+"""Word: free bytes that a sender waits for, or 0.  While it waits, no other sender puts."""
+
+AMBIGUOUS = 11
+"""Word: whether the socket has messages behind a wake-up packet."""
+
+UNANNOUNCED = 12
+"""Word: whether a wake-up packet is missing."""
+
+ROOM = 13
+"""Word: the usual size of the socket's buffer."""
+
+_HEADER = 128
+_SIZE = heap.LARGE - 8  # small blocks share a segment, and with it a descriptor
+_LENGTH = 4
+
+_Result = TypeVar("_Result")
+
+
+class Backlog:
+    """The ring, as this process sees it.  Changed only within ``run``."""
+
+    __slots__ = ("_capacity", "_data", "_mutex", "block", "words")
+
+    def __init__(self, block: heap.Block) -> None:
+        self.block = block
+        self.words = block.view[:_HEADER].cast("q")
+        self._data = block.view[_HEADER:]
+        self._capacity = len(self._data)
+        self._mutex = RobustMutex(block.address)
+
+    @classmethod
+    def create(cls) -> Backlog:
+        """Make an empty one."""
+        new = cls(heap.allocate(_SIZE))
+        new._mutex.create()
+        return new
+
+    def run(self, action: Callable[[], _Result]) -> _Result:
+        """Return what ``action`` returns, called while no other thread or process is in ``run``."""
+        return self._mutex.run(action)
+
+    def __bool__(self) -> bool:
+        words = self.words
+        return words[HEAD] != words[TAIL]
+
+    def holds_one(self) -> bool:
+        """Tell whether the next record is the last one."""
+        head = self.words[HEAD]
+        return head + _LENGTH + self._length(head) == self.words[TAIL]
+
+    def fits(self, size: int) -> bool:
+        """Tell whether a payload of ``size`` bytes fits in at all."""
+        return size + _LENGTH <= self._capacity
+
+    def put(self, payload: memoryview) -> bool:
+        """Append a record; False if there is no room, or an earlier sender waits for some."""
+        words, size = self.words, payload.nbytes
+        while True:
+            tail = words[TAIL]
+            end = tail + _LENGTH + size
+            if words[_NEEDED] or end - words[HEAD] > self._capacity:
+                return False
+            self._write(tail, memoryview(size.to_bytes(_LENGTH, "little")))
+            self._write(tail + _LENGTH, payload)
+            if words[TAIL] == tail:  # else a finalizer or a signal's handler has put meanwhile
+                words[TAIL] = end
+                return True
+
+    def take(self, say_room: Callable[[], None]) -> bytes:
+        """Remove the first record; first ``say_room`` if a sender waits and there will be room."""
+        words = self.words
+        while True:
+            head = words[HEAD]
+            start = head + _LENGTH
+            end = start + self._length(head)
+            payload = self._read(start, end)
+            needed = words[_NEEDED]
+            if needed and self._capacity - (words[TAIL] - end) >= needed:
+                say_room()  # first: after a death here a sender looks once in vain
+                words[_NEEDED] = 0
+            if words[HEAD] == head:
+                words[HEAD] = end
+                return payload
+
+    def need(self, size: int) -> None:
+        """Note that a sender waits for room: all of it where the payload does not fit in."""
+        wanted = max(size + _LENGTH, self._capacity // 2)
+        self.words[_NEEDED] = max(self.words[_NEEDED], min(wanted, self._capacity))
+
+    def _length(self, at: int) -> int:
+        return int.from_bytes(self._read(at, at + _LENGTH), "little")
+
+    def _write(self, at: int, data: memoryview) -> None:
+        at %= self._capacity
+        first = min(len(data), self._capacity - at)
+        self._data[at : at + first] = data[:first]
+        self._data[: len(data) - first] = data[first:]
+
+    def _read(self, at: int, end: int) -> bytes:
+        size = end - at
+        at %= self._capacity
+        data = self._data[at : at + size].tobytes()
+        return data if len(data) == size else data + self._data[: size - len(data)].tobytes()
+
 
 LOOK_AGAIN = 1.0
 """Seconds after which a receiver that sleeps looks at the backlog."""

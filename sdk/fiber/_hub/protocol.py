@@ -1,19 +1,22 @@
-"""Messages on a stream to a hub.
+"""Messages on a stream to a hub, and the doorbell of a hub.
 
-A message is one packet.  Requests and replies are a few numbers; what a user sends or receives lies
-beside them as the packet's buffers, payload first, and nothing here is ever unpickled.
+A message is one packet.  Requests and replies are a few numbers.  The payload that a user sends or
+receives is in the packet's buffers, payload first, and nothing here is ever unpickled.
 
-``HELLO`` comes first and is silent unless refused, as are ``CONNECT`` (go on to another host's
-hub; what follows is for that one, ``HELLO`` first) and ``ATTACH`` (what follows concerns one
-object).  So a client opens a stream and makes its first request without waiting.  At most one
-request of a stream is unanswered; another one withdraws it.
+``HELLO`` comes first and is silent unless refused, as are ``CONNECT`` (go on to another host's hub;
+what follows is for that one, ``HELLO`` first) and ``ATTACH`` (what follows concerns one object).
+So a client opens a stream and makes its first request without waiting.  At most one request of a
+stream is unanswered; another one withdraws it.
 
 Layout (little endian): request kind:u8, number:u32, and its own fields; reply the same.
+
+A process that changed shared memory rings the doorbell, and the hub looks at the memory.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
@@ -195,3 +198,28 @@ def gone(reason: str) -> bytes:
 def text(payload: memoryview) -> str:
     """Return the text after the numbers of CONNECT and GONE."""
     return str(payload[HEAD.size :], "utf-8", "replace")
+
+
+class Doorbell:
+    """Doorbell of one hub.  Runs on the loop's thread, but for ``ring``."""
+
+    def __init__(self, call_soon: Callable[..., None]) -> None:
+        self._call_soon = call_soon
+        self._listeners: set[Callable[[], None]] = set()
+
+    def listen(self, listener: Callable[[], None]) -> None:
+        """Call it whenever the bell is rung, and perhaps for nothing."""
+        self._listeners.add(listener)
+
+    def forget(self, listener: Callable[[], None]) -> None:
+        """Stop calling ``listener``."""
+        self._listeners.discard(listener)
+
+    def ring(self) -> None:
+        """Have all listeners look.  Any thread; waits for nothing."""
+        self._call_soon(self.rung)
+
+    def rung(self) -> None:
+        """Call all listeners."""
+        for listener in tuple(self._listeners):
+            listener()

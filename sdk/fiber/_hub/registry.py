@@ -18,9 +18,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
-from fiber._hub.hosted import HostedChannel, HostedCounter, HostedMemory
-from fiber._hub.hosted_semaphore import HostedSemaphore
-from fiber._hub.hosted_wait_list import HostedWaitList
+from fiber._hub.hosted import (
+    HostedChannel,
+    HostedCounter,
+    HostedMemory,
+    HostedSemaphore,
+    HostedWaitList,
+)
 from fiber._hub.protocol import NO_SECRET, SECRET_BYTES, WHOLE, Extent, ObjectKind
 from fiber._transport.unix import naming_the_limit
 from fiber._wire.descriptor import Descriptor, opened

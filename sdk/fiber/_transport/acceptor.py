@@ -1,9 +1,18 @@
-"""Takes connections, and lets pass agents that prove in time which pod of which pool they are.
+"""Accepts connections of agents that prove in time which pod of which pool they are.
 
 The acceptor has its own thread and loop.  A TLS handshake costs milliseconds of processor time.  A
 thousand agents, or strangers without end, must not hold up the program's loop: one thread serves
 them all.  Nothing on this thread blocks, OpenSSL runs without the interpreter's lock, and a slow
 peer delays only itself.
+
+``Admission`` limits pending connections, so that strangers neither use up the program's descriptors
+nor keep agents waiting.  One limit holds for all pending connections and one for those from one
+address.  At a limit, a newcomer replaces the oldest connection: from the same address, or else from
+the address with the most connections.  A connection is not replaced before it has had a fair
+chance.
+
+``Refusals`` chooses the refusals that are logged, so that strangers with many addresses or many
+faults do not fill the log and do not hide refusals of the program's own agents.
 """
 
 from __future__ import annotations
@@ -15,16 +24,13 @@ import resource
 import select
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
-from fiber._transport import address as addresses
 from fiber._transport import handshake, tls
-from fiber._transport.admission import Admission
 from fiber._transport.credentials import Certificate, MasterCredentials
-from fiber._transport.handshake import Hello, Identity, Refusal
+from fiber._transport.handshake import Hello, Identity, Refusal, join_address, parse_address
 from fiber._transport.loop import Loop
-from fiber._transport.refusals import Refusals
 from fiber._transport.sealing import Secrets
 from fiber._wire.messages import ProtocolError
 from fiber.errors import LinkError, TooManyOpenFiles
@@ -92,7 +98,7 @@ class Acceptor:
             self.loop.stop()
             raise
         host = address.rpartition(":")[0].strip("[]")
-        self.address = addresses.join(host, self._listener.getsockname()[1])
+        self.address = join_address(host, self._listener.getsockname()[1])
         self._pending: set[PendingConnection] = set()
         self.loop.start_thread("fiber-accept")
 
@@ -159,7 +165,7 @@ class Acceptor:
                     self._pause(error)
                     return
                 continue  # that connection broke before it was taken
-            self._admit(sock, host, addresses.join(host, port))
+            self._admit(sock, host, join_address(host, port))
 
     def _pause(self, error: OSError) -> None:
         self.report("", "whoever comes now", f"{error.strerror}; it is tried again all the time")
@@ -369,7 +375,7 @@ def _listen(address: str) -> socket.socket:
     for port in range(int(first), int(last)) if last else ():
         with contextlib.suppress(LinkError):
             return _listen_at(address, host.strip("[]"), port)
-    return _listen_at(address, *addresses.parse(f"{host}:{last or first}"))
+    return _listen_at(address, *parse_address(f"{host}:{last or first}"))
 
 
 def _listen_at(address: str, host: str, port: int) -> socket.socket:
@@ -400,3 +406,116 @@ def _listen_at(address: str, host: str, port: int) -> socket.socket:
         ) from error
     listener.setblocking(False)
     return listener
+
+
+_FAIR_CHANCE = 1.0
+"""Seconds for which a newcomer replaces no connection; a handshake takes some hundredths of one."""
+
+
+class Verdict(NamedTuple):
+    """Decision about a newcomer, and the connection that it replaces, if any."""
+
+    admitted: bool
+    leaves: Hashable | None = None
+
+
+class Admission:
+    """Table of pending connections by address and age.  Pure: the caller passes the time."""
+
+    def __init__(self, total: int, per_address: int) -> None:
+        self._total = total
+        self._per_address = per_address
+        self._waiting: dict[str, dict[Hashable, float]] = {}
+        self._addresses: dict[Hashable, str] = {}
+
+    def __len__(self) -> int:
+        return len(self._addresses)
+
+    def enter(self, newcomer: Hashable, address: str, now: float) -> Verdict:
+        """Decide whether ``newcomer`` is admitted."""
+        crowd = self._crowd(address)
+        leaves = None
+        if crowd:
+            leaves, since = next(iter(crowd.items()))
+            if now - since < _FAIR_CHANCE:
+                return Verdict(False)
+            self.leave(leaves)
+        self._waiting.setdefault(address, {})[newcomer] = now
+        self._addresses[newcomer] = address
+        return Verdict(True, leaves)
+
+    def leave(self, one: Hashable) -> None:
+        """Remove a connection that has proved itself, or has ended."""
+        address = self._addresses.pop(one, None)
+        if address is not None:
+            crowd = self._waiting[address]
+            del crowd[one]
+            if not crowd:
+                del self._waiting[address]
+
+    def _crowd(self, address: str) -> dict[Hashable, float] | None:
+        """Return the connections of which one must leave for a newcomer; None if there is room."""
+        own = self._waiting.get(address, {})
+        if len(own) >= self._per_address:
+            return own
+        if len(self) >= self._total:
+            return max(self._waiting.values(), key=lambda crowd: (len(crowd), -_oldest(crowd)))
+        return None
+
+
+def _oldest(crowd: dict[Hashable, float]) -> float:
+    return next(iter(crowd.values()))
+
+
+_REMEMBERED = 256
+"""Limit of remembered refusals: of strangers, and of the program's own agents."""
+
+_FORGET = 300.0
+"""Seconds until the same refusal is logged again, and between two summaries of strangers."""
+
+
+class Refusals:
+    """Refusals that were logged, and when.  Pure: the caller passes the time.
+
+    An own agent is one that has proved to have the pool's credentials.
+    """
+
+    def __init__(self) -> None:
+        self._strangers: dict[tuple[str, str], float] = {}
+        self._own: dict[tuple[str, str], float] = {}
+        self._untold = 0
+        self._next_summary = 0.0
+
+    def news(self, host: str, origin: str, reason: str, now: float, *, own: bool = False) -> str:
+        """Return the line to log for a refusal; empty if the same was logged lately.
+
+        ``own`` marks a refusal of an agent of the program: no number of strangers suppresses it.
+        """
+        told = self._own if own else self._strangers
+        _forget(told, now)
+        if (host, reason) in told:
+            return ""
+        if len(told) >= _REMEMBERED:
+            if not own:
+                return self._summary(origin, reason, now)
+            del told[next(iter(told))]
+        told[host, reason] = now
+        return f"{reason} ({origin})" if own else f"{origin} was turned away: {reason}"
+
+    def _summary(self, origin: str, reason: str, now: float) -> str:
+        self._untold += 1
+        if now < self._next_summary:
+            return ""
+        count, self._untold = self._untold, 0
+        self._next_summary = now + _FORGET
+        return (
+            f"strangers come from many addresses: {count} more turned away, the last was {origin} "
+            f"({reason}). The next line about them comes in {_FORGET / 60:.0f} minutes"
+        )
+
+
+def _forget(told: dict[tuple[str, str], float], now: float) -> None:
+    for refusal, when in list(told.items()):
+        if now - when < _FORGET:
+            return  # the others were told later
+        del told[refusal]

@@ -1,4 +1,4 @@
-"""Greetings on a connection, before it belongs to a link.
+"""Greetings on a connection before it belongs to a link, and addresses of masters (``host:port``).
 
     agent                                master
       │  Hello: identity, link,            │
@@ -22,7 +22,7 @@ from importlib import metadata
 from typing import Any, NamedTuple, TypeAlias
 
 from fiber._wire.messages import PROTOCOL, ProtocolError
-from fiber.errors import VersionMismatch
+from fiber.errors import ConfigError, VersionMismatch
 
 _HELLO, _WELCOME, _REFUSAL = 0x10, 0x11, 0x12
 
@@ -204,3 +204,21 @@ _READERS: dict[int, Callable[[Identity, Mapping[str, Any]], Greeting]] = {
     _WELCOME: _read_welcome,
     _REFUSAL: _read_refusal,
 }
+
+
+def parse_address(address: str) -> tuple[str, int]:
+    """Return host and port; ConfigError if there are none.  ``[::1]:80`` is an address too."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise ConfigError(f"{address!r} is no address: it must be host:port, as in 10.0.0.7:8642")
+    return host.strip("[]"), int(port)
+
+
+def parse_addresses(addresses: str) -> list[tuple[str, int]]:
+    """Parse addresses with commas between them, all of one master."""
+    return [parse_address(address) for address in addresses.split(",")]
+
+
+def join_address(host: str, port: int | str) -> str:
+    """Return ``host:port``, an IPv6 address in brackets; ``port`` may be a range."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -2,19 +2,33 @@
 
 A link carries frames both ways, each once and in order, also when the connection under it breaks
 and is replaced.  It ends when one side closes it, or after too long a silence, and stays ended.
-``resumable_link.ResumableLink`` is the one implementation; ``listener``, ``dialer`` and ``memory``
-make them.
+``ResumableLink`` is the implementation: a stream, the loop that drives it, and the present
+connection. Its ``send``, ``close`` and ``attach`` may be called from any thread; they only leave a
+note for the loop. Everything else runs on the loop thread.  The transport under the link
+(``listener``, ``dialer``, ``memory``) calls ``connected``, ``disconnected``, ``datagram`` and
+``refused``.  The link calls ``on_end`` when the transport must forget it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import enum
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
+from fiber import _logs
 from fiber._transport.handshake import Identity
-from fiber._transport.stream import HEARTBEAT, Datagram, Frame, Statistics
-from fiber._transport.turns import Lane
-from fiber._wire.messages import BytesLike
+from fiber._transport.stream import (
+    HEARTBEAT,
+    Datagram,
+    Frame,
+    Gap,
+    Lane,
+    ResumableStream,
+    Statistics,
+)
+from fiber._wire.messages import BytesLike, ProtocolError
 
 
 class Keepalive(NamedTuple):
@@ -124,3 +138,300 @@ class SelectorEventLoop(EventLoop, Protocol):
 
     def unregister(self, fd: int) -> None:
         """Stop watching ``fd``."""
+
+
+_BYE, _BYE_HEARD = b"\x20", b"\x21"
+
+_LAST_WORD = 0.2
+"""Seconds for a farewell, or the answer to it, to leave before this side hangs up."""
+
+
+_GRAIN = 0.001
+"""Seconds that a timer takes at least.  Rounding could make a shorter one fire early for ever."""
+
+
+class _State(enum.Enum):
+    OPEN = enum.auto()
+    CLOSING = enum.auto()
+    """Closed by this side.  Queued frames still leave."""
+    LEAVING = enum.auto()
+    """Waiting for the answer to the good-bye of this side."""
+    ENDED = enum.auto()
+
+
+class ResumableLink:
+    """Link over one wire after the other; a ``Link``."""
+
+    def __init__(
+        self,
+        loop: EventLoop,
+        peer: Identity,
+        keepalive: Keepalive,
+        on_end: Callable[[ResumableLink], None],
+        *,
+        dials: bool = False,
+    ) -> None:
+        """``dials``: True if this side makes new connections, and so may give one up."""
+        self.peer = peer
+        self._loop = loop
+        self._keepalive = keepalive
+        self._on_end = on_end
+        self._dials = dials
+        self._stream = ResumableStream(loop.now(), heartbeat=keepalive.heartbeat)
+        self._state = _State.OPEN
+        self._wire: Wire | None = None
+        self._suspect = False
+        self._observer: LinkObserver | None = None
+        self._inbox: deque[Frame] = deque()
+        self._lost: str | None = None
+        self._flush_due = False
+        self._timer: Timer | None = None
+        self._timer_due = 0.0
+        self._farewell = b""
+        self._then: list[Callable[[], None]] = []
+
+    @property
+    def arrived(self) -> int:
+        """Number of the peer's datagrams that have arrived, for the handshake."""
+        return self._stream.arrived
+
+    @property
+    def is_connected(self) -> bool:
+        """True while there is a connection."""
+        return self._wire is not None
+
+    @property
+    def heard(self) -> bool:
+        """True if the peer has ever sent anything."""
+        return self._stream.heard
+
+    def attach(self, observer: LinkObserver) -> None:
+        """Set the observer.  Frames that arrived before wait for it."""
+        self._observer = observer
+        self._loop.call_soon(self._hand_over)
+
+    def send(
+        self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
+    ) -> None:
+        """Send a frame as soon as there is room; dropped if the link has ended."""
+        self._loop.call_soon(self._send, frame, lane, on_left)
+
+    def close(
+        self,
+        reason: str = "",
+        *,
+        linger: float = 1.0,
+        then: Callable[[], None] | None = None,
+    ) -> None:
+        """End the link after what was sent, within ``linger`` seconds, and then call ``then``."""
+        self._observer = None
+        self._loop.call_soon(self._close, reason, linger, then)
+
+    def statistics(self) -> Statistics:
+        """Return what the link holds now, and what it has done so far."""
+        return self._stream.statistics()
+
+    def connected(self, wire: Wire, arrived: int) -> None:
+        """Go on over ``wire``, whose other end has ``arrived`` of our datagrams."""
+        if self._state is _State.ENDED:
+            wire.close()
+            return
+        if self._wire is not None:
+            self._unplug().close()
+        try:
+            self._stream.connected(arrived)
+        except ProtocolError as error:
+            # A peer that forgot what it had acknowledged is not the one that this link was with.
+            wire.close()
+            self._lose(str(error))
+            return
+        _logs.debug("link with %s: connected", self.peer.name)
+        self._wire = wire
+        self._flush()
+
+    def disconnect(self) -> None:
+        """Close the wire.  The peer has closed it, or dials again once it notices."""
+        if self._wire is not None:
+            self._unplug().close()
+
+    def disconnected(self, wire: Wire) -> None:
+        """Note that ``wire`` broke.  A wire that was replaced before does not matter."""
+        if wire is not self._wire:
+            return
+        _logs.debug("link with %s: the connection ended", self.peer.name)
+        self._unplug()
+        if self._state is _State.LEAVING:
+            self._end()
+
+    def datagram(self, wire: Wire, datagram: BytesLike) -> None:
+        """Take a datagram from ``wire`` without keeping it; ignore a wire that was replaced."""
+        if wire is not self._wire or self._state is _State.ENDED:
+            return
+        if datagram[:1] == _BYE:
+            wire.put(_BYE_HEARD)
+            self._lose(str(datagram[1:], "utf-8", "replace") or "it closed the link", hang_up=False)
+        elif datagram == _BYE_HEARD:
+            if self._state is _State.LEAVING:
+                self._end()
+        else:
+            self._take(wire, datagram)
+
+    def refused(self, reason: str) -> None:
+        """End the link, which the peer does not continue."""
+        self._lose(reason)
+
+    def _take(self, wire: Wire, datagram: BytesLike) -> None:
+        now = self._loop.now()
+        try:
+            frames = self._stream.received(datagram, now)
+        except Gap:
+            wire.break_off()
+            return
+        except ProtocolError as error:
+            # Past this point nothing that it says can be relied upon.
+            self._lose(f"it broke the protocol: {error}")
+            return
+        if self._state is _State.OPEN:
+            self._inbox += frames
+        self._heard()
+        self._hand_over()
+        if self._state is not _State.OPEN or self._stream.wants_to_speak(now):
+            self._flush_soon()
+        elif not self._flush_due:
+            self._set_timer(now)
+
+    def _heard(self) -> None:
+        if self._suspect:
+            self._suspect = False
+            if observer := self._observer:
+                observer.on_trusted()
+
+    def _hand_over(self) -> None:
+        """Give the observer the frames that wait for it.
+
+        If the observer fails on a frame, the link ends: the peer relies on every frame.
+        """
+        try:
+            while self._inbox and (observer := self._observer):
+                observer.on_frame(self._inbox.popleft())
+        except Exception as error:
+            self._inbox.clear()
+            self._lose(f"{type(error).__name__} on what it said: {error}")
+            raise
+        if self._lost is not None and (observer := self._observer):
+            self._observer = None
+            observer.on_lost(self._lost)
+
+    def _send(
+        self, frame: Sequence[BytesLike], lane: Lane, on_left: Callable[[], None] | None
+    ) -> None:
+        if self._state is not _State.ENDED:
+            told = None if on_left is None else partial(self._loop.call_soon, on_left)
+            self._stream.send(*frame, lane=lane, on_left=told)
+            self._flush_soon()
+
+    def _flush_soon(self) -> None:
+        """Flush once for all frames that are sent in this turn."""
+        if not self._flush_due:
+            self._flush_due = True
+            self._loop.call_soon(self._flush)
+
+    def _flush(self) -> None:
+        self._flush_due = False
+        if self._state is not _State.ENDED:
+            self._speak()
+
+    def _speak(self) -> None:
+        now = self._loop.now()
+        if self._wire is not None:
+            for datagram in self._stream.outgoing(now):
+                self._wire.put(datagram)
+            if self._state is _State.CLOSING and self._stream.idle:
+                self._state = _State.LEAVING
+                self._wire.put(self._farewell)
+        self._set_timer(now)
+
+    def _set_timer(self, now: float) -> None:
+        """Set the timer.  A timer that fires too early only looks again."""
+        due = self._stream.next_timer()
+        if self._timer is not None:
+            if self._timer_due <= due:
+                return
+            self._timer.cancel()
+        self._timer_due = due
+        self._timer = self._loop.call_later(max(_GRAIN, due - now), self._tick)
+
+    def _tick(self) -> None:
+        self._timer = None
+        silent = self._stream.tick(self._loop.now())
+        if silent >= self._keepalive.lost_after:
+            broken = "" if self._wire else "the connection broke, and "
+            self._lose(f"{broken}nothing was heard for {silent:.0f} s")
+            return
+        if silent >= self._keepalive.suspect_after and not self._suspect:
+            self._suspect = True
+            if self._wire is not None and self._dials:
+                self._wire.break_off()
+            if observer := self._observer:
+                observer.on_suspect()
+        self._speak()
+
+    def _unplug(self) -> Wire:
+        wire, self._wire = self._wire, None
+        assert wire is not None
+        self._stream.disconnected()
+        return wire
+
+    def _close(self, reason: str, linger: float, then: Callable[[], None] | None) -> None:
+        if then is not None:
+            self._then.append(then)
+        self._inbox.clear()
+        if self._state is _State.ENDED:
+            self._finished()
+        elif self._state is _State.OPEN:
+            self._state = _State.CLOSING
+            self._farewell = _BYE + reason.encode("utf-8", "replace")
+            self._loop.call_later(linger, self._give_up)
+            self._flush()
+
+    def _give_up(self) -> None:
+        """End the link after its linger, with or without the peer's answer."""
+        if self._state is _State.ENDED:
+            return
+        if self._state is _State.CLOSING and self._wire is not None:
+            self._wire.put(self._farewell)
+            self._state = _State.LEAVING
+            self._loop.call_later(_LAST_WORD, self._give_up)
+        else:
+            self._end()
+
+    def _lose(self, reason: str, *, hang_up: bool = True) -> None:
+        if self._state is _State.ENDED:
+            return
+        if self._state is _State.OPEN:
+            self._lost = reason
+        if hang_up:
+            self._end()
+        else:
+            self._stop()
+            self._loop.call_later(_LAST_WORD, self._end)
+        self._hand_over()
+
+    def _stop(self) -> None:
+        self._state = _State.ENDED
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _end(self) -> None:
+        self._stop()
+        if self._wire is not None:
+            self._unplug().close()
+        self._stream.end()
+        self._on_end(self)
+        self._finished()
+
+    def _finished(self) -> None:
+        finished, self._then = self._then, []
+        for then in finished:
+            then()

@@ -10,9 +10,14 @@ from fiber._transport import handshake
 from fiber._transport.acceptor import MASTER, Acceptor, PendingConnection, ServedPool
 from fiber._transport.credentials import MasterCredentials
 from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
-from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, Link, SelectorEventLoop
+from fiber._transport.link import (
+    DEFAULT_KEEPALIVE,
+    Keepalive,
+    Link,
+    ResumableLink,
+    SelectorEventLoop,
+)
 from fiber._transport.nng import Connection
-from fiber._transport.resumable_link import ResumableLink
 from fiber._transport.sealing import Secrets
 from fiber.errors import FiberError
 

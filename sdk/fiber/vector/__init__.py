@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 from fiber._installation import explained_if_missing
 
 if TYPE_CHECKING:
-    from fiber.vector.registration import make_vec as make_vec
-    from fiber.vector.registration import register as register
     from fiber.vector.vec_env import VecEnv as VecEnv
     from fiber.vector.vector_env import VectorEnv as VectorEnv
+    from fiber.vector.vector_env import make_vec as make_vec
+    from fiber.vector.vector_env import register as register
 
 _HOMES = {
     "VecEnv": "vec_env",
     "VectorEnv": "vector_env",
-    "make_vec": "registration",
-    "register": "registration",
+    "make_vec": "vector_env",
+    "register": "vector_env",
 }
 
 __all__ = ["VecEnv", "VectorEnv", "make_vec", "register"]

@@ -1,16 +1,305 @@
-"""Arrays of one step of many environments: actions, observations, rewards, endings."""
+"""Arrays of one step of many environments: actions, observations, rewards, endings.
+
+``Columns`` keep the values of many environments, of one space, each in its row.  A number, or an
+array of one shape, has its row in a NumPy array, which may be in memory that processes share.
+Values without a fixed size (text, graphs, sequences, unknown spaces) are kept as objects, which
+travel in messages. A Dict or Tuple is a tree of these.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TypeAlias
+import pickle
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
-from gymnasium import Space
+import numpy.typing as npt
+from gymnasium import Space, spaces
 
+from fiber import reduction
 from fiber._hub import client, handles, heap
 from fiber._hub.handles import BlockHandle
 from fiber._hub.protocol import ObjectKind
-from fiber.vector.columns import Allocate, Array, Carver, Rows, columns_of
+
+Array: TypeAlias = npt.NDArray[Any]
+Rows: TypeAlias = Sequence[int] | slice
+"""Rows of a column; a slice where they lie side by side."""
+
+Allocate: TypeAlias = Callable[[tuple[int, ...], Any], Array]
+"""Function that makes the array of a shape and type."""
+
+ALIGNMENT = 64
+"""Alignment of arrays in shared memory, in bytes: each begins in its own line of the cache."""
+
+
+class Columns(Protocol):
+    """Interface of all kinds of columns."""
+
+    def put(self, row: int, value: Any) -> None:
+        """Set one environment's value."""
+
+    def take_back(self, row: int) -> None:
+        """Restore the value before the last ``put``, for all parts that might not pickle."""
+
+    def get(self, row: int) -> Any:
+        """Return the value of one environment, which later steps do not change."""
+
+    def fits(self, batch: Any, count: int) -> bool:
+        """Tell whether ``fill`` takes this batch of ``count`` values without changing any."""
+
+    def fill(self, rows: Rows, batch: Any) -> None:
+        """Set the values of many environments from a batch of them."""
+
+    def batch(self, rows: Rows) -> Any:
+        """Return the values of ``rows`` as Gymnasium batches them.
+
+        They are views of the arrays where ``rows`` is a slice, else copies.
+        """
+
+    def pack(self, rows: Rows, *, shared: bool) -> Any:
+        """Return what must be sent so that another process has these values.
+
+        ``shared``: that process has the same arrays.  Then None is enough for arrays.
+        """
+
+    def unpack(self, rows: Rows, packed: Any) -> None:
+        """Set the values that another process has packed."""
+
+    def part(self, first: int, count: int) -> Columns:
+        """Return the columns of ``count`` environments from ``first`` on, in the same arrays."""
+
+
+class ArrayColumn:
+    """Numbers, or arrays of one shape."""
+
+    def __init__(self, array: Array) -> None:
+        self._array = array
+        self._shape = array.shape[1:]
+        # Views of single rows are made once: that takes as long as to write to one.
+        self._views = list(array) if self._shape else None
+
+    def put(self, row: int, value: Any) -> None:
+        if not hasattr(value, "shape"):
+            value = np.asarray(value)
+        if value.shape != self._shape:
+            raise ValueError(
+                f"an observation has the shape {value.shape}, where its space has {self._shape}"
+            )
+        if self._views is None:
+            self._array[row] = value
+        else:
+            self._views[row][...] = value
+
+    def take_back(self, row: int) -> None:
+        pass  # numbers are always pickled
+
+    def get(self, row: int) -> Any:
+        return self._array[row] if self._views is None else self._views[row].copy()
+
+    def fits(self, batch: Any, count: int) -> bool:
+        return (
+            isinstance(batch, np.ndarray)
+            and batch.dtype == self._array.dtype
+            and batch.shape == (count, *self._shape)
+        )
+
+    def fill(self, rows: Rows, batch: Array) -> None:
+        self._array[rows] = batch
+
+    def batch(self, rows: Rows) -> Array:
+        return self._array[rows]
+
+    def pack(self, rows: Rows, *, shared: bool) -> Array | None:
+        return None if shared else self._array[rows]
+
+    def unpack(self, rows: Rows, packed: Array | None) -> None:
+        if packed is not None:
+            self._array[rows] = packed
+
+    def part(self, first: int, count: int) -> ArrayColumn:
+        return ArrayColumn(self._array[first : first + count])
+
+
+class ObjectColumn:
+    """Values of any kind."""
+
+    def __init__(self, values: Array) -> None:
+        self._values = values
+        self._before = values.copy()
+
+    def put(self, row: int, value: Any) -> None:
+        if value is not self._values[row]:  # else it is shown once more
+            self._before[row] = self._values[row]
+            self._values[row] = value
+
+    def take_back(self, row: int) -> None:
+        self._values[row] = self._before[row]
+
+    def get(self, row: int) -> Any:
+        return self._values[row]
+
+    def fits(self, batch: Any, count: int) -> bool:
+        return False  # it would have to travel all the same
+
+    def fill(self, rows: Rows, batch: Iterable[Any]) -> None:
+        numbers = range(len(self._values))[rows] if isinstance(rows, slice) else rows
+        # One by one: NumPy would look into values that are sequences.
+        for row, value in zip(numbers, batch, strict=True):
+            self._values[row] = value
+
+    def batch(self, rows: Rows) -> tuple[Any, ...]:
+        return tuple(self._values[rows].tolist())
+
+    def pack(self, rows: Rows, *, shared: bool) -> tuple[Any, ...]:
+        return in_band(self.batch(rows))
+
+    def unpack(self, rows: Rows, packed: tuple[Any, ...]) -> None:
+        self.fill(rows, packed)
+
+    def part(self, first: int, count: int) -> ObjectColumn:
+        return ObjectColumn(self._values[first : first + count])
+
+
+class DictColumns:
+    """Dictionaries with the same keys."""
+
+    def __init__(self, columns: dict[str, Columns]) -> None:
+        self._columns = columns
+
+    def put(self, row: int, value: Any) -> None:
+        for key, column in self._columns.items():
+            column.put(row, value[key])
+
+    def take_back(self, row: int) -> None:
+        for column in self._columns.values():
+            column.take_back(row)
+
+    def get(self, row: int) -> dict[str, Any]:
+        return {key: column.get(row) for key, column in self._columns.items()}
+
+    def fits(self, batch: Any, count: int) -> bool:
+        return isinstance(batch, dict) and all(
+            key in batch and column.fits(batch[key], count) for key, column in self._columns.items()
+        )
+
+    def fill(self, rows: Rows, batch: Any) -> None:
+        for key, column in self._columns.items():
+            column.fill(rows, batch[key])
+
+    def batch(self, rows: Rows) -> dict[str, Any]:
+        return {key: column.batch(rows) for key, column in self._columns.items()}
+
+    def pack(self, rows: Rows, *, shared: bool) -> list[Any] | None:
+        return _packed([column.pack(rows, shared=shared) for column in self._columns.values()])
+
+    def unpack(self, rows: Rows, packed: list[Any] | None) -> None:
+        if packed is not None:
+            for column, part in zip(self._columns.values(), packed, strict=True):
+                column.unpack(rows, part)
+
+    def part(self, first: int, count: int) -> DictColumns:
+        return DictColumns({key: part.part(first, count) for key, part in self._columns.items()})
+
+
+class TupleColumns:
+    """Tuples of the same length."""
+
+    def __init__(self, columns: Sequence[Columns]) -> None:
+        self._columns = columns
+
+    def put(self, row: int, value: Any) -> None:
+        for column, part in zip(self._columns, value, strict=True):
+            column.put(row, part)
+
+    def take_back(self, row: int) -> None:
+        for column in self._columns:
+            column.take_back(row)
+
+    def get(self, row: int) -> tuple[Any, ...]:
+        return tuple(column.get(row) for column in self._columns)
+
+    def fits(self, batch: Any, count: int) -> bool:
+        return (
+            isinstance(batch, tuple)
+            and len(batch) == len(self._columns)
+            and all(
+                column.fits(part, count) for column, part in zip(self._columns, batch, strict=True)
+            )
+        )
+
+    def fill(self, rows: Rows, batch: Any) -> None:
+        for column, part in zip(self._columns, batch, strict=True):
+            column.fill(rows, part)
+
+    def batch(self, rows: Rows) -> tuple[Any, ...]:
+        return tuple(column.batch(rows) for column in self._columns)
+
+    def pack(self, rows: Rows, *, shared: bool) -> list[Any] | None:
+        return _packed([column.pack(rows, shared=shared) for column in self._columns])
+
+    def unpack(self, rows: Rows, packed: list[Any] | None) -> None:
+        if packed is not None:
+            for column, part in zip(self._columns, packed, strict=True):
+                column.unpack(rows, part)
+
+    def part(self, first: int, count: int) -> TupleColumns:
+        return TupleColumns([column.part(first, count) for column in self._columns])
+
+
+def columns_of(space: Space[Any], count: int, allocate: Allocate) -> Columns:
+    """Columns for ``count`` values of a space."""
+    if isinstance(space, spaces.Dict):
+        return DictColumns(
+            {key: columns_of(part, count, allocate) for key, part in space.spaces.items()}
+        )
+    if isinstance(space, spaces.Tuple):
+        return TupleColumns([columns_of(part, count, allocate) for part in space.spaces])
+    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        return ArrayColumn(allocate((count, *(space.shape or ())), space.dtype))
+    return ObjectColumn(np.empty(count, object))
+
+
+class Carver:
+    """Allocator of arrays in given memory.  Without memory it only adds up their sizes."""
+
+    def __init__(self, memory: memoryview | None = None) -> None:
+        self._memory = memory
+        self.size = 0
+
+    def __call__(self, shape: tuple[int, ...], dtype: Any) -> Array:
+        """Return the next array."""
+        length = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        begin, self.size = self.size, self.size + -(-length // ALIGNMENT) * ALIGNMENT
+        if self._memory is None:
+            # No memory either: all its elements are one.
+            return np.broadcast_to(np.zeros((), dtype), shape)
+        return np.ndarray(shape, dtype, self._memory[begin : begin + length])
+
+
+def _packed(parts: list[Any]) -> list[Any] | None:
+    return None if all(part is None for part in parts) else parts
+
+
+_Value = TypeVar("_Value")
+
+
+class _InBand:
+    def __init__(self, value: Any) -> None:
+        self._value = value
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return pickle.loads, (reduction.dumps(self._value, protocol=5),)
+
+
+def in_band(value: _Value) -> _Value:
+    """Return a stand-in for ``value`` in a message.  The receiver gets its own copy of the arrays.
+
+    Otherwise large arrays lie beside the pickle, and the learner reads them where the worker wrote
+    them (``Connection._recv_pickled``).  That is right for arrays that the learner copies at once,
+    and wrong for values that its user may keep.
+    """
+    return cast(_Value, _InBand(value))
+
 
 Packed: TypeAlias = tuple[Any, Array | None, Array | None, Array | None]
 """Results to send: observations, rewards, terminations, truncations."""

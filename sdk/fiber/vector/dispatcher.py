@@ -14,11 +14,9 @@ from fiber._exceptions import add_note, fresh
 from fiber._transport.loop import DOZE
 from fiber.errors import StartError
 from fiber.vector.arrays import Shape, SharedMemory, StepArrays
-from fiber.vector.failures import ATTEMPTS, Failure
 from fiber.vector.slot import Note
-from fiber.vector.worker import Answer, Begin, Hello, Results
-from fiber.vector.worker_process import Pending, WorkerProcess
-from fiber.vector.worker_set import Ended, Unreadable, WorkerSet
+from fiber.vector.worker import ATTEMPTS, Answer, Begin, Failure, Hello, Results
+from fiber.vector.worker_process import Ended, Pending, Unreadable, WorkerProcess, WorkerSet
 
 _STEP = Pending("step")
 

@@ -7,21 +7,25 @@ Else it may have several, so that finished environments do not wait for a slow o
 from __future__ import annotations
 
 import contextlib
+import pickle
+import signal
 import time
+import traceback
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from multiprocessing import TimeoutError as TookTooLong
+from types import FrameType
 from typing import Any, NamedTuple
 
 from gymnasium.vector import AutoresetMode
 
 from fiber import reduction
+from fiber._agent.travelling import encode_error
+from fiber._exceptions import add_note
 from fiber._hub import client
 from fiber.connection import Connection
-from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays
-from fiber.vector.failures import ATTEMPTS, Failure, summary
-from fiber.vector.in_band import in_band
+from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays, in_band
 from fiber.vector.slot import MakeEnv, Note, Slot
-from fiber.vector.time_limit import TimeLimit
 
 REPORT_AFTER, REPORT_AFTER_ELSEWHERE = 200e-6, 2e-3
 """Seconds that finished environments may wait for more, so that many quick steps make one message.
@@ -400,3 +404,58 @@ def _pickles(obj: object) -> bool:
     except Exception:
         return False
     return True
+
+
+ATTEMPTS = 3
+"""Number of times in a row that an environment is made anew without having done anything."""
+
+
+class Failure(NamedTuple):
+    """Error that one environment raised."""
+
+    row: int
+    doing: str
+    error: bytes
+    """The pickled exception."""
+
+    @classmethod
+    def of(cls, row: int, doing: str, error: BaseException) -> Failure:
+        """Return the failure of the environment in ``row``.  Called in its worker."""
+        return cls(row, doing, encode_error(error))
+
+    def exception(self, whose: str) -> Exception:
+        """Return the exception to raise, with a note that names the environment."""
+        error: Exception = pickle.loads(self.error)
+        add_note(error, f"{self.doing} of {whose}")
+        return error
+
+
+def summary(error: BaseException) -> str:
+    """Return the last line of the traceback of ``error``."""
+    return "".join(traceback.format_exception_only(error)).strip()
+
+
+class TimeLimit:
+    """Context that raises ``multiprocessing.TimeoutError`` in a block that takes too long.
+
+    It uses an alarm (SIGALRM).  So it works only in a main thread, and only while Python code runs
+    or a system call waits: it does not end native code that never returns.  The alarm is repeated,
+    since the block may have caught the error.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._inside = False
+        signal.signal(signal.SIGALRM, self._ring)
+
+    def __enter__(self) -> None:
+        self._inside = True
+        signal.setitimer(signal.ITIMER_REAL, self._seconds, self._seconds)
+
+    def __exit__(self, *_: object) -> None:
+        self._inside = False  # first: an alarm may strike yet
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+    def _ring(self, _signal: int, _frame: FrameType | None) -> None:
+        if self._inside:
+            raise TookTooLong(f"it took longer than {self._seconds:g} s (timeout)")
