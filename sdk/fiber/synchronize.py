@@ -343,19 +343,19 @@ class Barrier(threading.Barrier):
             if self._state == _FILLING and (lost or left <= RECHECK):
                 self._break()
                 raise threading.BrokenBarrierError(
-                    f"{lost} of the processes that took part have died"
+                    "a process that took part has died"
                     if lost
                     else f"the others did not come in {timeout} s"
                 )
         if self._state < 0:
             raise threading.BrokenBarrierError
 
-    def _bury(self) -> int:
-        """Stop counting members that died; return their number."""
+    def _bury(self) -> bool:
+        """Stop counting members that died; tell whether there were any."""
         died = self._cond._waiters.bury() + self._members.bury()
         if died:
             self._members.set(1, self._members.held())
-        return int(died)
+        return bool(died)
 
     # What threading's class keeps, in shared memory
 

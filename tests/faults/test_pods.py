@@ -192,7 +192,7 @@ def test_a_barrier_of_which_a_pod_is_deleted_is_broken(cluster: FakeCluster) -> 
         assert barrier.wait(PATIENCE) in (0, 1)
         (pod,) = pods_of(cluster)
         cluster.do(cluster.world.store.delete, "pods", "lab", pod)
-        with pytest.raises(threading.BrokenBarrierError, match="have died"):
+        with pytest.raises(threading.BrokenBarrierError, match="a process that took part has died"):
             barrier.wait(PATIENCE)
         process.join(PATIENCE)
 
