@@ -135,11 +135,6 @@ def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
             raise _blame_process(process, error) from error
         finally:
             fds.clear()
-    except RuntimeError as error:
-        fds.clear()
-        if _is_of_multiprocessing(error):
-            raise _blame_process(process, error) from error
-        raise
     except BaseException:
         fds.clear()  # now: the traceback, which holds them, may be kept for long
         raise
@@ -208,30 +203,19 @@ def _refusal(obj: Any) -> str | None:
         dumps(obj)
     except Exception as error:
         # The error itself would keep what our callers hold, in a cycle.
-        return _SHARED_BY_MULTIPROCESSING if _is_of_multiprocessing(error) else str(error)
+        return str(error)
     finally:
         pickling.take_back()
         pickling.done = True
     return None
 
 
-_SHARED_BY_MULTIPROCESSING = (
-    "it is a lock of multiprocessing, or holds one, and Fiber's processes cannot share that. Make "
-    "it with Fiber (fiber.Lock, fiber.Queue, fiber.Array), or name the module that makes it to "
-    "fiber.adopt()"
-)
-
-
-def _is_of_multiprocessing(error: Exception) -> bool:
-    """Return whether multiprocessing complains about start methods, which are not the reason."""
-    text = str(error)
-    return isinstance(error, RuntimeError) and ("SemLock" in text or "through inheritance" in text)
-
-
 def _way_to_culprit(obj: Any) -> str:
     """From ``obj`` to the innermost part that does not pickle, as Python spells it."""
     way = ""
     for _ in range(_DEPTH):  # what refers to itself has no innermost part
+        if type(obj).__module__.startswith("multiprocessing."):
+            break  # its parts say nothing to the user, and pickling a connection leaves descriptors
         for step, part in islice(_parts(obj), _BREADTH):
             if _refusal(part) is not None:
                 way, obj = way + step, part
@@ -261,9 +245,10 @@ class RemoteSpawning:
 
     def duplicate_for_child(self, fd: int) -> int:
         """Refuse."""
-        raise RuntimeError(
-            f"descriptor {fd} cannot go to a process on another host: "
-            "use Fiber's Pipe and Queue there instead of multiprocessing's or a socket"
+        raise pickle.PicklingError(
+            f"it is or holds descriptor {fd}, which cannot go to a process on another host. Use "
+            "fiber.Pipe, fiber.Queue or fiber.Array instead of multiprocessing's or a socket, or "
+            "name the module that makes it to fiber.adopt()"
         )
 
     def forget(self) -> None:
@@ -420,5 +405,23 @@ def _dump(
 ) -> bytes:
     buffer = io.BytesIO()
     options = {"buffer_callback": buffer_callback} if buffer_callback else {}
-    pickler(buffer, protocol or pickle.DEFAULT_PROTOCOL, **options).dump(obj)
+    try:
+        pickler(buffer, protocol or pickle.DEFAULT_PROTOCOL, **options).dump(obj)
+    except RuntimeError as error:
+        if _is_of_multiprocessing(error):
+            raise pickle.PicklingError(_SHARED_BY_MULTIPROCESSING) from error
+        raise
     return buffer.getvalue()
+
+
+_SHARED_BY_MULTIPROCESSING = (
+    "it is a lock, queue or array of multiprocessing, or holds one, and cannot be sent by Fiber. "
+    "Make it with Fiber (fiber.Lock, fiber.Queue, fiber.Array), or name the module that makes it "
+    "to fiber.adopt()"
+)
+
+
+def _is_of_multiprocessing(error: RuntimeError) -> bool:
+    """Return whether multiprocessing complains about start methods, which are not the reason."""
+    text = str(error)
+    return "SemLock" in text or "through inheritance" in text

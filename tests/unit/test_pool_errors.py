@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import pickle
 import threading
 from collections.abc import Callable, Iterator
@@ -161,6 +162,18 @@ def test_the_argument_that_does_not_pickle_is_named(pool: Pool) -> None:
         with pytest.raises(UnpicklableError, match=r"_thread\.lock") as caught:
             call()
         assert caught.value.what == what
+
+
+@pytest.mark.parametrize("make", ["Lock", "Queue"])
+def test_what_multiprocessing_made_is_refused_with_what_to_do(pool: Pool, make: str) -> None:
+    theirs = getattr(multiprocessing, make)()
+    for call in (
+        lambda: pool.apply(tasks.identity, (theirs,)),
+        lambda: pool.map(tasks.identity, [theirs]),
+        lambda: pool.broadcast(tasks.identity, theirs),
+    ):
+        with pytest.raises(UnpicklableError, match=r"of multiprocessing.*fiber\.adopt\(\)"):
+            call()
 
 
 def test_so_is_the_way_to_it(pool: Pool) -> None:

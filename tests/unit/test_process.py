@@ -124,15 +124,13 @@ def test_what_does_not_pickle_is_named(options: dict[str, Any], culprit: str) ->
         fiber.Process(name="odd", **options).start()
 
 
-@pytest.mark.parametrize(
-    ("make", "way"), [("Lock", "._semlock"), ("Queue", "._rlock._semlock")], ids=["lock", "queue"]
-)
-def test_what_multiprocessing_made_is_refused_with_what_to_do(make: str, way: str) -> None:
+@pytest.mark.parametrize("make", ["Lock", "Queue"])
+def test_what_multiprocessing_made_is_refused_with_what_to_do(make: str) -> None:
     """multiprocessing's own error is about start methods, which are not the reason."""
     theirs = getattr(multiprocessing.get_context("fork"), make)()
     with pytest.raises(UnpicklableError, match=r"fiber\.adopt\(\)") as caught:
-        fiber.Process(name="odd", target=print, args=(theirs,)).start()
-    assert f"argument 0 of process 'odd' cannot be pickled (at {way})" in str(caught.value)
+        fiber.Process(name="odd", target=print, args=({"it": theirs},)).start()
+    assert "argument 0 of process 'odd' cannot be pickled (at ['it'])" in str(caught.value)
 
 
 def test_an_error_of_the_objects_own_pickling_is_left_as_it_is() -> None:

@@ -161,8 +161,12 @@ def test_a_socket_goes_along_on_the_same_host_only() -> None:
     process = Process(target=print, args=(ours,))
     _, fds = reduction.dump_process(process, same_host=True)
     assert len(fds) == 1
-    with pytest.raises(RuntimeError, match="cannot go to a process on another host"):
+    before = open_files()
+    with pytest.raises(UnpicklableError, match="cannot go to a process on another host") as caught:
         reduction.dump_process(process, same_host=False)
+    assert caught.value.what == f"argument 0 of process {process.name!r}"
+    assert "fiber.adopt()" in caught.value.reason
+    assert open_files() == before
     ours.close()
     theirs.close()
 
@@ -195,6 +199,16 @@ def test_blame_names_what_refers_to_itself_too() -> None:
     error = reduction.blame({"it": loop}, TypeError("no"))
     assert isinstance(error, UnpicklableError)
     assert error.what == "it"
+
+
+def test_blame_leaves_no_descriptor_of_what_multiprocessing_made() -> None:
+    theirs = multiprocessing.Queue()
+    before = open_files()
+    error = reduction.blame({"it": [theirs]}, pickle.PicklingError("no"))
+    assert isinstance(error, UnpicklableError)
+    assert error.path == "[0]"
+    assert "of multiprocessing" in error.reason
+    assert open_files() == before
 
 
 def test_blame_is_for_refusals_only() -> None:
