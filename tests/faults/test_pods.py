@@ -515,7 +515,7 @@ def test_pods_that_cannot_reach_the_program_are_an_error(
                 pool.map(square, range(3))
             assert caught.value.reason == "Unreachable"
             assert "has reached this program at " in str(caught.value)
-    assert capfd.readouterr().err.count("Waiting for 60 s more") == 1
+    assert capfd.readouterr().err.count("Waiting for 0.5 s more") == 1
 
 
 FORKS = """

@@ -370,8 +370,8 @@ if __name__ == "__main__":
 def test_what_keeps_files_from_being_unpacked_is_said(site: Site) -> None:
     program = """
 import elsewhere, fiber
-from fiber._backends import shipping, shipping
-shipping.pack = lambda *_: program_archive.Packed(b"no archive", [])
+from fiber._backends import shipping
+shipping.pack = lambda *_: shipping.Packed(b"no archive", [])
 if __name__ == "__main__":
     elsewhere.begin()
     try:
