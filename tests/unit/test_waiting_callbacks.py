@@ -29,14 +29,16 @@ class WaitsWhenPickled:
     """Waits for another call when it is pickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return int, (_ask(),)
+        return str, (_ask(),)
 
 
-_asked: list[fiber.Executor] = []
+_asked: list[tuple[fiber.Executor, Path]] = []
+"""The executor, and the file without which the call does not end: the caller does wait for it."""
 
 
-def _ask() -> int:
-    return _asked[0].submit(tasks.square, 3).result(PATIENCE)
+def _ask() -> object:
+    executor, gate = _asked[0]
+    return executor.submit(return_later, gate, 3).result(PATIENCE)
 
 
 def return_later(gate: Path, value: object) -> object:
@@ -112,11 +114,13 @@ def test_a_callback_may_wait_for_other_futures(
 
 
 def test_what_is_pickled_or_unpickled_cannot_wait_for_the_same_executor(
-    executor: fiber.Executor,
+    executor: fiber.Executor, tmp_path: Path
 ) -> None:
-    _asked[:] = [executor]
+    gate = tmp_path / "gate"
+    _asked[:] = [(executor, gate)]
     with pytest.raises(MaybeEncodingError, match="cannot wait for another result"):
         executor.submit(make_waits).result(PATIENCE)
     with pytest.raises(RuntimeError, match="cannot wait for the same pool"):
         list(executor.map(tasks.identity, [WaitsWhenPickled()]))
+    gate.touch()
     _asked.clear()
