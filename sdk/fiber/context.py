@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, overload
 
 from fiber import config, cpu
 from fiber import process as _process
-from fiber._runtime import early, methods
+from fiber._runtime import start_methods
 from fiber.process import ForkProcess, ForkServerProcess, Process, SpawnProcess
 
 if TYPE_CHECKING:
@@ -312,7 +312,7 @@ class BaseContext:
         pool: str | None = None,
     ) -> Pool:
         """A pool of workers; ``fiber.pool.Pool`` says what the options mean."""
-        early.start_zygote()
+        start_methods.start_zygote()
         from fiber.pool import Pool
 
         return Pool(
@@ -381,7 +381,7 @@ class BaseContext:
 
     def get_all_start_methods(self) -> list[str]:
         """The start methods, the default first."""
-        return list(methods.START_METHODS)
+        return list(start_methods.START_METHODS)
 
     def set_executable(self, executable: str | bytes | os.PathLike[str]) -> None:
         """The interpreter for processes started with ``spawn`` on this host."""
@@ -391,7 +391,7 @@ class BaseContext:
         """Modules that the zygote imports before it forks; takes effect before the first start."""
         if not all(isinstance(name, str) for name in module_names):
             raise TypeError("module_names must be a list of strings")
-        methods.preload[:] = module_names
+        start_methods.preload[:] = module_names
 
     def freeze_support(self) -> None:
         """Do nothing: frozen executables exist on Windows only."""
@@ -446,20 +446,20 @@ class DefaultContext(BaseContext):
     """The context behind ``fiber`` itself: its start method can be set, once."""
 
     def _in_force(self) -> BaseContext:
-        return _contexts[methods.chosen or methods.START_METHODS[0]]
+        return _contexts[start_methods.chosen or start_methods.START_METHODS[0]]
 
     def _start_method(self, allow_none: bool) -> str | None:
-        return methods.chosen if allow_none else methods.settle()
+        return start_methods.chosen if allow_none else start_methods.settle()
 
     def set_start_method(self, method: str | None, force: bool = False) -> None:
         """Set the start method; RuntimeError if it is set already and not ``force``."""
-        if methods.chosen is not None and not force:
+        if start_methods.chosen is not None and not force:
             raise RuntimeError("context has already been set")
         if method is not None:
             self.get_context(method)
         elif not force:
             raise ValueError("cannot find context for None")
-        methods.choose(method)
+        start_methods.choose(method)
 
 
 _contexts: dict[str, BaseContext] = {

@@ -7,9 +7,10 @@ futures and errors are concurrent.futures'.  What is more is spelled by keywords
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     ALL_COMPLETED,
     FIRST_COMPLETED,
@@ -23,6 +24,7 @@ from concurrent.futures import (
     as_completed,
     wait,
 )
+from concurrent.futures._base import CANCELLED, CANCELLED_AND_NOTIFIED, FINISHED, RUNNING
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing import TimeoutError as WaitedTooLong
@@ -31,15 +33,15 @@ from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
-from fiber import cpu
-from fiber._exceptions import fresh
-from fiber._runtime import methods, options
-from fiber._runtime.call_future import CallFuture, WorkerDied, translated
-from fiber._runtime.calls import CallQueue
-from fiber._runtime.executor import Executor as Engine
-from fiber._runtime.executor_group import ExecutorGroup, refusal
+from fiber import cpu, errors
+from fiber._exceptions import fresh, report_uncaught
+from fiber._runtime import options, start_methods
+from fiber._runtime.answers import Pickled, TaskFailure
+from fiber._runtime.background import BackgroundThread
+from fiber._runtime.executor import PoolExecutor
+from fiber._runtime.executor_group import ExecutorGroup, broken, refusal
+from fiber._runtime.jobs import CallQueue
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.outcome import Failure
 from fiber._runtime.state import runtime
 from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
@@ -67,6 +69,13 @@ __all__ = [
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
+
+
+class WorkerDied(errors.WorkerDied, BrokenProcessPool):
+    """``fiber.WorkerDied``, and what concurrent.futures raises then.
+
+    It concerns this task alone: the executor goes on with another worker.
+    """
 
 
 class Executor(concurrent.futures.Executor):
@@ -106,7 +115,7 @@ class Executor(concurrent.futures.Executor):
         if initializer is not None and not callable(initializer):
             raise TypeError("initializer must be a callable")
         self._max_workers = options.positive("max_workers", max_workers) or cpu.cpu_count()
-        like = process_type(methods.settle()) if mp_context is None else _process(mp_context)
+        like = process_type(start_methods.settle()) if mp_context is None else _process(mp_context)
         limits = options.limits(retries, disruptions)
         self._group = ExecutorGroup(
             PoolOptions(
@@ -130,7 +139,7 @@ class Executor(concurrent.futures.Executor):
         self._disruptions = disruptions
         self._limits = limits
         self._timeout: float | None = None
-        self._queues: dict[Engine, CallQueue] = {}
+        self._queues: dict[PoolExecutor, CallQueue] = {}
 
     def options(
         self,
@@ -246,7 +255,7 @@ class Executor(concurrent.futures.Executor):
     def __reduce__(self) -> str:
         raise NotImplementedError("executors cannot be passed between processes or pickled")
 
-    def _queue(self, engine: Engine) -> CallQueue:
+    def _queue(self, engine: PoolExecutor) -> CallQueue:
         queue = CallQueue(limits=self._limits, timeout=self._timeout, cancellable=True)
         return self._queues.setdefault(engine, queue)  # another thread may be here as well
 
@@ -265,7 +274,167 @@ ProcessPoolExecutor = Executor
 """Name of the executor for programs that were written for concurrent.futures."""
 
 
-def _close_queues(queues: dict[Engine, CallQueue]) -> None:
+class CallFuture(Future[_T]):
+    """The future of one call, as an executor sees it: ``work_items.Cancellable``.
+
+    What runs the user's code, unpicklers and callbacks, does not run on the loop's thread.
+    """
+
+    def __init__(self, executor: PoolExecutor, queue: CallQueue) -> None:
+        super().__init__()
+        self._executor = executor
+        self._threads = executor.threads
+        self._queue = queue
+        self._undecided = bytearray(1)  # which the collector has no work with
+        """Token of a decision.  The side that takes it out runs the call, or cancels it."""
+        self._claimed: bool | None = None
+
+    def __await__(self) -> Generator[Any, None, _T]:
+        """Await the result.  A task that is cancelled meanwhile cancels the call."""
+        import asyncio  # who awaits has it already, and it takes long to import
+
+        return asyncio.wrap_future(self).__await__()
+
+    def cancel(self) -> bool:
+        """Cancel as in concurrent.futures.  ``wait`` and ``as_completed`` notice it in a moment."""
+        if not (self._decide() or self.cancelled()):
+            return False
+        super().cancel()
+        self._executor.calls.drop_cancelled(self._queue)
+        return True
+
+    def cancelled(self) -> bool:
+        """Tell whether the call was cancelled.  It takes no lock, as the loop asks too."""
+        return self._claimed is False or self._state in (CANCELLED, CANCELLED_AND_NOTIFIED)
+
+    def result(self, timeout: float | None = None) -> _T:
+        """Return the result as in concurrent.futures.  Each call raises a new exception."""
+        error = self._error(timeout)
+        if error is not None:
+            raise fresh(error)
+        result: Any = self._result
+        return result  # type: ignore[no-any-return]
+
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        """Return the exception as in concurrent.futures.  Each call returns a new one."""
+        error = self._error(timeout)
+        return error and fresh(error)
+
+    def _error(self, timeout: float | None) -> BaseException | None:
+        """Wait, and return the stored exception."""
+        if self._state != FINISHED:
+            if (timeout is None or timeout > 0) and not self.done():
+                self._threads.check_may_wait()
+            return super().exception(timeout)
+        return self._exception
+
+    def _decide(self) -> bool:
+        try:
+            self._undecided.pop()
+        except IndexError:
+            return False
+        return True
+
+    # What the executor says, on the loop's thread
+
+    def claim(self) -> bool:
+        """Claim the call for a worker; return False if it was cancelled."""
+        if self._claimed is None:
+            self._claimed = self._decide()
+            if self._claimed:
+                self._state = RUNNING
+            else:
+                self._locked(self._end_cancelled)
+        return self._claimed
+
+    def _end_cancelled(self) -> None:
+        super().cancel()  # whoever did may have been interrupted
+        self.set_running_or_notify_cancel()
+
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
+        """Take the outcome."""
+        outcome = outcomes[0]
+        if type(outcome) is Pickled:
+            self._submit(self._threads.unpickling, partial(self._unpickle, outcome))
+        else:
+            self._settle(outcome)
+        return False
+
+    def set_done(self) -> None:
+        """Do nothing: a call is done with its outcome."""
+
+    def has_room(self) -> bool:
+        """Return True: one outcome always has room."""
+        return True
+
+    def lift_bound(self) -> None:
+        """Do nothing: there is no bound."""
+
+    def set_exception(self, exception: BaseException | None) -> None:
+        """Set an exception as the outcome, or in place of one."""
+        if self.claim() and exception is not None:
+            error = translated(exception, self._executor)
+            self._locked(partial(super().set_exception, error))
+
+    def _settle(self, outcome: Any) -> None:
+        if type(outcome) is TaskFailure:
+            self.set_exception(outcome.error)
+        else:
+            self._locked(partial(self.set_result, outcome))
+
+    def _unpickle(self, outcome: Pickled) -> None:
+        try:
+            value = outcome.decode()
+        except BaseException as error:  # whatever the user's unpickler raises
+            value = TaskFailure(error)
+        self._settle(value)
+
+    def _locked(self, action: Callable[[], object]) -> None:
+        """Do what takes the lock that the program's threads take, too.
+
+        The loop does not wait for it: one who was interrupted between taking it and the ``with``
+        block has it for as long as it likes.
+        """
+        if not self._executor.on_loop():
+            action()
+        elif self._condition.acquire(blocking=False):
+            try:
+                action()
+            finally:
+                self._condition.release()
+        else:
+            self._submit(self._threads.unpickling, action)
+
+    def _invoke_callbacks(self) -> None:
+        call = super()._invoke_callbacks  # type: ignore[misc]
+        here = self._executor.on_loop() or self._threads.unpickling.runs_here()
+        if self._done_callbacks and here:  # type: ignore[attr-defined]
+            self._submit(self._threads.callbacks, call)
+        else:
+            call()
+
+    def _submit(self, thread: BackgroundThread, action: Callable[[], object]) -> None:
+        with contextlib.suppress(RuntimeError):  # the system has no room for its thread
+            if thread.submit(action):
+                return
+        try:
+            action()  # else the outcome, or its callbacks, would be lost
+        except BaseException:  # of a callback that exits: the loop has to go on
+            report_uncaught()
+
+
+def translated(error: BaseException, executor: PoolExecutor) -> BaseException:
+    """An error of the executor's as concurrent.futures' users know it."""
+    if error is executor.error:
+        return broken(error)
+    if type(error) is errors.WorkerDied:
+        died = errors._rebuild(WorkerDied, error.args)
+        vars(died).update(vars(error))
+        return died
+    return error
+
+
+def _close_queues(queues: dict[PoolExecutor, CallQueue]) -> None:
     for engine, queue in queues.items():
         engine.calls.close(queue)
 
@@ -285,7 +454,7 @@ def _iterable(given: Any) -> Iterable[Any]:
 
 
 def _taken(
-    results: IMapIterator[Any], engine: Engine, item: WorkItem | None, deadline: float | None
+    results: IMapIterator[Any], engine: PoolExecutor, item: WorkItem | None, deadline: float | None
 ) -> Iterator[Any]:
     """The results of a map, up to the first error."""
     try:
@@ -297,7 +466,7 @@ def _taken(
             engine.cancel(item)
 
 
-def _next(results: IMapIterator[Any], engine: Engine, deadline: float | None) -> list[Any]:
+def _next(results: IMapIterator[Any], engine: PoolExecutor, deadline: float | None) -> list[Any]:
     """The next result of a map; none at its end."""
     left = None if deadline is None else deadline - time.monotonic()
     try:
@@ -306,6 +475,6 @@ def _next(results: IMapIterator[Any], engine: Engine, deadline: float | None) ->
         return []
     except WaitedTooLong:
         raise TimeoutError("the next result of the map was not there in time") from None
-    if type(outcome) is Failure:
+    if type(outcome) is TaskFailure:
         raise fresh(translated(outcome.error, engine))
     return [outcome]

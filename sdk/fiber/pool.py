@@ -26,12 +26,12 @@ from typing import Any, Self, TypeVar
 from fiber import _logs
 from fiber._engine.chunks import default_chunksize
 from fiber._exceptions import report_uncaught
-from fiber._runtime import methods, options
-from fiber._runtime.executor import Executor
+from fiber._runtime import options, start_methods
+from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import runtime
 from fiber._runtime.work_items import WorkItem
-from fiber._runtime.worker_view import WorkerInfo
+from fiber._runtime.workers import WorkerInfo
 from fiber._wire import work
 from fiber.errors import FiberError, TimeoutError
 from fiber.process import PoolProcess, process_type
@@ -113,8 +113,8 @@ class Pool:
         self._maxtasksperchild = options.max_tasks(maxtasksperchild)
         self._task_timeout = options.seconds("task_timeout", task_timeout)
         self._owner = os.getpid()
-        like = process_type(methods.settle()) if context is None else context.Process
-        self._executor = Executor(
+        like = process_type(start_methods.settle()) if context is None else context.Process
+        self._executor = PoolExecutor(
             PoolOptions(
                 new_process=partial(PoolProcess, like=like),
                 initializer=initializer,
@@ -498,7 +498,7 @@ class Pool:
             _warn(f"unclosed running multiprocessing pool {self!r}", ResourceWarning, source=self)
 
 
-def _end(executor: Executor) -> None:
+def _end(executor: PoolExecutor) -> None:
     executor.terminate(_terminated())
     if not (executor.on_loop() or executor.threads.pickling.runs_here()):
         executor.ended.wait()
@@ -511,7 +511,7 @@ def _terminated() -> FiberError:
     )
 
 
-def _abandon(executor: Executor) -> None:
+def _abandon(executor: PoolExecutor) -> None:
     """The program ends, or has forgotten the pool."""
     if util.is_exiting():
         _end(executor)

@@ -21,7 +21,7 @@ from multiprocessing.process import (
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fiber._runtime.worker_handle import WorkerHandle
+    from fiber._runtime.workers import WorkerHandle
 
 __all__ = [
     "BaseProcess",
@@ -51,11 +51,11 @@ class Process(BaseProcess):
     _start_method: str | None = None
 
     def _Popen(self) -> Any:
-        from fiber._runtime.early import start_zygote
+        from fiber._runtime.start_methods import start_zygote
 
         start_zygote()
-        from fiber._runtime.methods import zygote_method
         from fiber._runtime.popen import Popen
+        from fiber._runtime.start_methods import zygote_method
 
         return Popen(self, zygote_method(self._start_method), self._on_exit())
 
@@ -65,7 +65,7 @@ class Process(BaseProcess):
 
     def start(self) -> None:
         """Start it; returns when it has a pid, or waits for a pod that is yet to be made."""
-        from fiber._runtime.methods import check_main
+        from fiber._runtime.start_methods import check_main
 
         self._check_closed()  # type: ignore[attr-defined]
         assert self.pid is None, "cannot start a process twice"
@@ -135,7 +135,7 @@ class PoolProcess(Process):
         return self.__dict__ | {"_handle": None}
 
     def _Popen(self) -> WorkerHandle:
-        from fiber._runtime.methods import zygote_method
+        from fiber._runtime.start_methods import zygote_method
 
         assert self._handle is not None
         self._handle.launch(self, zygote_method(self._start_method))

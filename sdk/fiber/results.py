@@ -17,11 +17,10 @@ from multiprocessing import TimeoutError
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 from fiber._exceptions import fresh
-from fiber._runtime.executor import Executor
-from fiber._runtime.input_stream import InputStream
+from fiber._runtime.answers import Pickled, TaskFailure, decode, is_failure
+from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.latch import Latch, Waiters, acquire
-from fiber._runtime.outcome import Failure, Pickled, decode, is_failure
-from fiber._runtime.work_items import WorkItem
+from fiber._runtime.work_items import InputStream, WorkItem
 
 __all__ = ["ApplyResult", "AsyncResult", "IMapIterator", "IMapUnorderedIterator", "MapResult"]
 
@@ -39,7 +38,7 @@ class Keeper(Protocol):
         """Raise RuntimeError on a thread that must not wait for a result."""
 
 
-class Owner(Keeper, Protocol):
+class ResultPool(Keeper, Protocol):
     """Part of a pool that a result needs."""
 
     def _calls_back_here(self) -> bool:
@@ -54,12 +53,12 @@ class ApplyResult(Generic[_T]):
 
     def __init__(
         self,
-        pool: Owner,
+        pool: ResultPool,
         callback: Callable[[_T], object] | None = None,
         error_callback: _ErrorCallback | None = None,
     ) -> None:
         # Keeps the pool while there is something to wait for, as in multiprocessing.
-        self._pool: Owner | None = pool
+        self._pool: ResultPool | None = pool
         self._callback = callback
         self._error_callback = error_callback
         self._outcome: Any = None
@@ -80,7 +79,7 @@ class ApplyResult(Generic[_T]):
         """Tell whether the call completed without raising; ValueError if it has not completed."""
         if not self.ready():
             raise ValueError(f"{self!r} not ready")
-        return type(self._settled()) is not Failure
+        return type(self._settled()) is not TaskFailure
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the result is there or ``timeout`` seconds are over."""
@@ -95,7 +94,7 @@ class ApplyResult(Generic[_T]):
         if not self.ready():
             raise _too_late(timeout)
         outcome = self._settled()
-        if type(outcome) is Failure:
+        if type(outcome) is TaskFailure:
             raise fresh(outcome.error)
         value: _T = outcome
         return value
@@ -127,14 +126,14 @@ class ApplyResult(Generic[_T]):
 
     def set_exception(self, error: BaseException) -> None:
         """Fail the call with ``error``."""
-        self._outcome = Failure(error)
+        self._outcome = TaskFailure(error)
         self._mixed = False
         self.set_done()
 
     def _run_callback(self) -> None:
         try:
             self._settle()
-            failed = type(self._outcome) is Failure
+            failed = type(self._outcome) is TaskFailure
             callback = self._error_callback if failed else self._callback
             if callback is not None:
                 callback(fresh(self._outcome.error) if failed else self._outcome)
@@ -194,7 +193,7 @@ class MapResult(ApplyResult[list[_T]]):
 
     def __init__(
         self,
-        pool: Owner,
+        pool: ResultPool,
         callback: Callable[[list[_T]], object] | None = None,
         error_callback: _ErrorCallback | None = None,
     ) -> None:
@@ -225,12 +224,12 @@ class MapResult(ApplyResult[list[_T]]):
         self._mixed = False
 
 
-def _unpickle(outcomes: list[Any]) -> Failure | None:
+def _unpickle(outcomes: list[Any]) -> TaskFailure | None:
     """Unpickle in place what is pickled, up to the first failure, which stays pickled there."""
     for at, outcome in enumerate(outcomes):
         if type(outcome) is Pickled:
             value = outcome.decode()
-            if type(value) is Failure:
+            if type(value) is TaskFailure:
                 return value
             outcomes[at] = value
     return None
@@ -241,7 +240,7 @@ HELD = 64 << 20
 them.  Then no more tasks are begun until half of the results are read."""
 
 
-class _Buffer:
+class _ResultBuffer:
     """Results on their way to an iterator: what the executor fills and the iterator empties."""
 
     def __init__(self, pool: Keeper) -> None:
@@ -344,7 +343,7 @@ class _Buffer:
 
     def set_exception(self, error: BaseException) -> None:
         """End the results with ``error``."""
-        self.items.append(Failure(error))
+        self.items.append(TaskFailure(error))
         self.set_done()
 
     def wait(self, timeout: float | None) -> Any:
@@ -368,7 +367,7 @@ class _Buffer:
                 raise _too_late(timeout)
 
 
-class _OrderedBuffer(_Buffer):
+class _OrderedResultBuffer(_ResultBuffer):
     def __init__(self, pool: Keeper) -> None:
         super().__init__(pool)
         self._early: dict[int, tuple[list[Any], int]] = {}
@@ -387,7 +386,7 @@ class _OrderedBuffer(_Buffer):
 class IMapIterator(Iterator[_T]):
     """Iterator over the results of ``imap``, in order."""
 
-    _buffer_type: type[_Buffer] = _OrderedBuffer
+    _buffer_type: type[_ResultBuffer] = _OrderedResultBuffer
     _cancel: Callable[[], None] | None = None
 
     def __init__(self, pool: Keeper) -> None:
@@ -399,7 +398,7 @@ class IMapIterator(Iterator[_T]):
     def next(self, timeout: float | None = None) -> _T:
         """The next result; TimeoutError if it takes longer than ``timeout`` seconds."""
         outcome = self._take(timeout)
-        if type(outcome) is Failure:
+        if type(outcome) is TaskFailure:
             raise fresh(outcome.error)
         value: _T = outcome
         return value
@@ -417,7 +416,11 @@ class IMapIterator(Iterator[_T]):
         return outcome.decode() if type(outcome) is Pickled else outcome
 
     def _begin(
-        self, executor: Executor, item: WorkItem, iterable: Iterable[Any], buffersize: int | None
+        self,
+        executor: PoolExecutor,
+        item: WorkItem,
+        iterable: Iterable[Any],
+        buffersize: int | None,
     ) -> None:
         """Have ``item``, whose future the buffer is, map ``iterable``."""
         buffer = self._buffer
@@ -437,7 +440,7 @@ class IMapIterator(Iterator[_T]):
             raise
 
     def __del__(self) -> None:
-        buffer: _Buffer | None = getattr(self, "_buffer", None)
+        buffer: _ResultBuffer | None = getattr(self, "_buffer", None)
         if buffer is None or buffer.finished:  # None: ``__init__`` was interrupted
             return
         if self._cancel is None:
@@ -450,4 +453,4 @@ class IMapIterator(Iterator[_T]):
 class IMapUnorderedIterator(IMapIterator[_T]):
     """Iterator over the results of ``imap_unordered``, as they come."""
 
-    _buffer_type = _Buffer
+    _buffer_type = _ResultBuffer

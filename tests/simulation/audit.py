@@ -7,7 +7,9 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._engine.chunks import LIMIT
-from fiber._engine.ledger import PATIENCE, Batch, Job, Ledger, Loss, Receipt, Worker
+from fiber._engine.ledger import Ledger
+from fiber._engine.load import PATIENCE
+from fiber._engine.tasks import Batch, Job, Loss, Receipt, WorkerEntry
 from simulation.oracle import Account, Violation, require
 from simulation.workers import Ref
 
@@ -32,7 +34,7 @@ class Names(Protocol):
     def ref(self, job: Job, index: int, item: Any) -> Ref:
         """Which task ``item``, the ``index``-th of ``job``, is."""
 
-    def child(self, worker: Worker) -> Child:
+    def child(self, worker: WorkerEntry) -> Child:
         """Which process it is."""
 
 
@@ -48,13 +50,13 @@ class Audit:
         self._world = world
         self._ledger = ledger
         self._names = names
-        self._watched: dict[Worker, float] = {}
+        self._watched: dict[WorkerEntry, float] = {}
         self._patience: dict[Job, int] = {}
-        self._asked: set[Worker] = set()
-        self._left: dict[Worker, int] = {}
+        self._asked: set[WorkerEntry] = set()
+        self._left: dict[WorkerEntry, int] = {}
         """Units that each may do, less those that it has done."""
         self._jobs: set[Job] = set()
-        self._lent: set[Worker] = set()
+        self._leased: set[WorkerEntry] = set()
         watched = {
             "open": self._open,
             "add": self._add,
@@ -66,7 +68,7 @@ class Audit:
             "recall": self._recall,
             "put_back": self._put_back,
             "lose": self._lose,
-            "lend": self._lend,
+            "lease": self._lease,
             "return_idle": self._return_idle,
             "return_busy": self._return_busy,
         }
@@ -80,8 +82,8 @@ class Audit:
         self._jobs.add(job)
         return job
 
-    def _add(self, key: Any, now: float, left: int | None = None) -> Worker:
-        worker: Worker = self._real.add(key, now, left)
+    def _add(self, key: Any, now: float, left: int | None = None) -> WorkerEntry:
+        worker: WorkerEntry = self._real.add(key, now, left)
         if left is not None:
             self._left[worker] = left
         return worker
@@ -109,7 +111,7 @@ class Audit:
             require(back or batch.pin, "a task is begun though nobody reads results")
             require(worker in self._ledger.workers, "a worker that is gone is given a batch")
             require(not worker.leaving, "a worker that leaves is given a batch")
-            require(not worker.lent, "a worker that is lent is given a batch")
+            require(not worker.leased, "a worker that is leased is given a batch")
             require(not worker.key.leaving, "a worker that was told to stop is given a batch")
             require(worker.queue[-1] is batch, "a batch is not the last one of its worker")
             pinned_to = pins.get((batch.job, batch.start))
@@ -119,7 +121,7 @@ class Audit:
                 self._check_turns(batch.job, worker)
         return batch
 
-    def _check_turns(self, job: Job, given: Worker) -> None:
+    def _check_turns(self, job: Job, given: WorkerEntry) -> None:
         """``job`` is given a worker: others that wait must get their turns."""
         workers = self._ledger.workers
         # Another one with a single batch is kept free for whoever needs an idle worker.
@@ -146,7 +148,7 @@ class Audit:
         ref = self._names.ref(job, index, item)
         require(ref == (account.number, index), f"{ref} is taken for task {index}")
 
-    def _receive(self, worker: Worker, seq: int, *args: Any, **options: Any) -> Receipt | None:
+    def _receive(self, worker: WorkerEntry, seq: int, *args: Any, **options: Any) -> Receipt | None:
         batch = self._ledger.batches.get(seq)
         receipt: Receipt | None = self._real.receive(worker, seq, *args, **options)
         if batch is not None and seq not in self._ledger.batches and batch.worker in self._left:
@@ -164,7 +166,7 @@ class Audit:
             self._world.oracle.tried_again(ref)
         return again
 
-    def _cancel(self, job: Job) -> list[Worker]:
+    def _cancel(self, job: Job) -> list[WorkerEntry]:
         missing = job.fed - job.done
         unfinished = len(self._ledger.unfinished(job))
         require(unfinished == missing, f"{unfinished} tasks are unfinished, not {missing}")
@@ -173,12 +175,12 @@ class Audit:
             for worker in self._ledger.workers
             if any(batch.job is job for batch in list(worker.queue)[1:])
         }
-        told: list[Worker] = self._real.cancel(job)
+        told: list[WorkerEntry] = self._real.cancel(job)
         self._jobs.discard(job)
         require(set(told) == holders, "unread batches of a cancelled job are not recalled")
         return told
 
-    def _leave(self, worker: Worker) -> bool:
+    def _leave(self, worker: WorkerEntry) -> bool:
         busy = bool(worker.queue or worker.pinned)
         leaving = worker.leaving
         left: bool = self._real.leave(worker)
@@ -188,18 +190,18 @@ class Audit:
         require(worker.leaving is (left or leaving), "a refusal to leave changes the worker")
         return left
 
-    def _recall(self, now: float) -> list[Worker]:
-        asked: list[Worker] = self._real.recall(now)
+    def _recall(self, now: float) -> list[WorkerEntry]:
+        asked: list[WorkerEntry] = self._real.recall(now)
         self._asked.update(asked)
         return asked
 
-    def _put_back(self, worker: Worker, seqs: Iterable[int], now: float) -> None:
+    def _put_back(self, worker: WorkerEntry, seqs: Iterable[int], now: float) -> None:
         self._asked.discard(worker)
         self._real.put_back(worker, seqs, now)
 
     def _lose(
         self,
-        worker: Worker,
+        worker: WorkerEntry,
         unread: Iterable[int],
         running: tuple[int, int] | None,
         disrupted: bool = False,
@@ -232,29 +234,29 @@ class Audit:
                 self._world.note("%s is given up", ref)
         return losses
 
-    def _lend(self, worker: Worker) -> bool:
+    def _lease(self, worker: WorkerEntry) -> bool:
         idle = worker in self._ledger.idle()
-        lent: bool = self._real.lend(worker)
-        require(idle or not lent, "a worker is lent that is not idle")
-        if lent:
-            self._lent.add(worker)
-        return lent
+        leased: bool = self._real.lease(worker)
+        require(idle or not leased, "a worker is leased that is not idle")
+        if leased:
+            self._leased.add(worker)
+        return leased
 
-    def _return_idle(self, worker: Worker, now: float) -> None:
+    def _return_idle(self, worker: WorkerEntry, now: float) -> None:
         self._check_return(worker)
         self._real.return_idle(worker, now)
 
     def _return_busy(
-        self, worker: Worker, seq: int, job: Job | None, item: Any, now: float
+        self, worker: WorkerEntry, seq: int, job: Job | None, item: Any, now: float
     ) -> None:
         self._check_return(worker)
         require(seq not in self._ledger.batches, "two batches have the same number")
         self._real.return_busy(worker, seq, job, item, now)
 
-    def _check_return(self, worker: Worker) -> None:
-        require(worker in self._lent, "a worker is returned that was not lent")
+    def _check_return(self, worker: WorkerEntry) -> None:
+        require(worker in self._leased, "a worker is returned that was not leased")
         require(worker in self._ledger.workers, "a worker is returned that is gone")
-        self._lent.discard(worker)
+        self._leased.discard(worker)
 
     def _check_charge(
         self, child: Child, seq: int, offset: int, ref: Ref, charged: bool, disrupted: bool
@@ -314,8 +316,8 @@ class Audit:
             held += len(worker.queue)
             child = self._names.child(worker)
             # Whoever uses it finds that out.
-            require(worker.lent or not child.gone, f"{child.name} is gone, but not lost")
-            require(not (worker.lent and worker.queue), f"{child.name} is lent and has a batch")
+            require(worker.leased or not child.gone, f"{child.name} is gone, but not lost")
+            require(not (worker.leased and worker.queue), f"{child.name} is leased and has a batch")
             require(len(worker.queue) <= 2, f"{child.name} has too many batches")
             for batch in worker.queue:
                 require(self._ledger.batches.get(batch.seq) is batch, "an unknown batch is held")

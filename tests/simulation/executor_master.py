@@ -10,13 +10,11 @@ from multiprocessing import process as mp_process
 from typing import Any
 
 from fiber._backends.remote import RemoteChild
-from fiber._engine import ledger as engine
-from fiber._runtime.executor import Executor
-from fiber._runtime.functions import Function
-from fiber._runtime.input_stream import InputStream
+from fiber._engine import tasks as engine
+from fiber._runtime.answers import Pickled
+from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.outcome import Pickled
-from fiber._runtime.work_items import Call, WorkItem
+from fiber._runtime.work_items import Call, Function, InputStream, WorkItem
 from fiber._wire import work
 from fiber.errors import StartError
 from fiber.process import ForkProcess, PoolProcess
@@ -63,7 +61,7 @@ class Names:
         future: Any = item.future
         return Ref(future.account.number, future.call)
 
-    def child(self, worker: engine.Worker) -> Child:
+    def child(self, worker: engine.WorkerEntry) -> Child:
         """Which process it is."""
         handle = worker.key.child
         if isinstance(handle, RemoteChild):
@@ -76,13 +74,14 @@ class Names:
 class ExecutorMaster:
     """Plays the pool's user, each job on a thread of its own."""
 
-    def __init__(self, world: World, make: type[Executor] = Executor) -> None:
+    def __init__(self, world: World, make: type[PoolExecutor] = PoolExecutor) -> None:
         self.world = world
         self._stage = Stage(world)
         self._stage.enter()
         self._rng = random.Random(f"{world.schedule.seed} user")
         thread: Any = self._stage.thread
-        self._executor = make(_options(world.schedule), self._stage, thread=thread)
+        runtime: Any = self._stage
+        self._executor = make(_options(world.schedule), runtime, thread=thread)
         self._ledger = self._executor._ledger
         self.language = Wire(world.schedule.seed)
         self._audit = Audit(world, self._ledger, Names())

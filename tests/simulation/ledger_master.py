@@ -9,9 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 from fiber._agent.interface import ExitReport
-from fiber._engine import ledger as engine
-from fiber._engine.chunks import Pace
-from fiber._engine.ledger import Ledger, WrongAnswer
+from fiber._engine import tasks as engine
+from fiber._engine.chunks import TaskPace
+from fiber._engine.ledger import Ledger
+from fiber._engine.tasks import WrongAnswer
 from simulation.agents import Child
 from simulation.audit import Audit
 from simulation.oracle import Account, Violation, limits_of, require
@@ -49,7 +50,7 @@ class Member:
 
     def __init__(self, master: LedgerMaster) -> None:
         self.child: Child
-        self.worker: engine.Worker | None = None
+        self.worker: engine.WorkerEntry | None = None
         self.leaving = False
         self.convicted = False
         self._master = master
@@ -91,7 +92,7 @@ class Names:
         ref: Ref = item
         return ref
 
-    def child(self, worker: engine.Worker) -> Child:
+    def child(self, worker: engine.WorkerEntry) -> Child:
         """Which process it is."""
         child: Child = worker.key.child
         return child
@@ -109,13 +110,13 @@ class LedgerMaster:
         self._audit = Audit(world, ledger, Names())
         self._rng = random.Random(f"{world.schedule.seed} master")
         self._members: dict[Child, Member] = {}
-        self._gone: dict[Child, engine.Worker] = {}
+        self._gone: dict[Child, engine.WorkerEntry] = {}
         self._terminated = False
-        self._pace = Pace()
+        self._pace = TaskPace()
         self._recall_at: float | None = None
-        self._idle_since: dict[engine.Worker, float] = {}
-        self._direct: dict[engine.Worker, int] = {}
-        """What lent workers were sent by those who use them."""
+        self._idle_since: dict[engine.WorkerEntry, float] = {}
+        self._direct: dict[engine.WorkerEntry, int] = {}
+        """What leased workers were sent by those who use them."""
         self._adopted: list[engine.Job] = []
 
     def begin(self) -> None:
@@ -146,7 +147,7 @@ class LedgerMaster:
         job = self.ledger.open(
             account, pace=pace, limits=limits_of(plan), unit=plan.unit, alone=plan.alone
         )
-        self._pace = Pace(job.pace)
+        self._pace = TaskPace(job.pace)
         self.jobs[account.number] = job
         if plan.cancelled_at is not None:
             self._later(max(0.0, plan.cancelled_at - self._now), self._cancel, account)
@@ -218,7 +219,7 @@ class LedgerMaster:
                 member.child.signal(signal.SIGKILL)
         self._settle()
 
-    def _hear(self, worker: engine.Worker, said: Any) -> None:
+    def _hear(self, worker: engine.WorkerEntry, said: Any) -> None:
         if isinstance(said, Unreadable):
             if self.ledger.held(worker, said.seq) is not None:
                 self._split(said.seq)
@@ -236,13 +237,13 @@ class LedgerMaster:
             require(self.ledger.held(worker, said.seq) is None, "a lost worker has a batch")
         self._settle()
 
-    def _receive(self, worker: engine.Worker, said: Results) -> engine.Receipt | None:
+    def _receive(self, worker: engine.WorkerEntry, said: Results) -> engine.Receipt | None:
         seq, offset, tasks, seconds, kept = said
         return self.ledger.receive(
             worker, seq, offset, len(tasks), self._now, seconds=seconds, kept=kept
         )
 
-    def _take(self, worker: engine.Worker, said: Results) -> None:
+    def _take(self, worker: engine.WorkerEntry, said: Results) -> None:
         receipt = self._receive(worker, said)
         if receipt is None:
             return
@@ -286,7 +287,7 @@ class LedgerMaster:
             self._lose(member.worker, report)
         self._settle()
 
-    def _lose(self, worker: engine.Worker, report: ExitReport) -> None:
+    def _lose(self, worker: engine.WorkerEntry, report: ExitReport) -> None:
         losses = self.ledger.lose(worker, report.unread, report.running, report.disrupted)
         self._direct.pop(worker, None)
         losses = [loss for loss in losses if loss.item != NO_OP]
@@ -308,7 +309,7 @@ class LedgerMaster:
     def drain(self) -> None:
         """Ask some worker to leave."""
         able = sorted(self._members.values(), key=lambda member: member.child.name)
-        able = [it for it in able if it.worker and not it.worker.lent and not it.leaving]
+        able = [it for it in able if it.worker and not it.worker.leased and not it.leaving]
         if able:
             self._leave(self._rng.choice(able))
         self._settle()
@@ -328,7 +329,7 @@ class LedgerMaster:
             worker.key.child.recall()
         self._let_go()
         if self._rng.random() < 0.05:
-            self._lend()
+            self._lease()
         self._scale()
         self._set_timer()
         self._audit.check()
@@ -346,18 +347,18 @@ class LedgerMaster:
             if account is not None and account.plan.timeout is not None:
                 self._later(account.plan.timeout, self._expire, batch)
 
-    def _lend(self) -> None:
+    def _lease(self) -> None:
         """Leave an idle worker to somebody who may call it directly, for a while."""
         idle = self.ledger.idle()
-        if not idle or not self.ledger.lend(worker := self._rng.choice(idle)):
+        if not idle or not self.ledger.lease(worker := self._rng.choice(idle)):
             return
-        self.world.note("%s is lent", worker.key.child.name)
+        self.world.note("%s is leased", worker.key.child.name)
         if self._rng.random() < 0.7:
             seq = self._direct[worker] = self.ledger.next_seq()
             worker.key.child.deliver(seq, Work(seq, [NO_OP], 1, 1, apart=True))
         self._later(self._rng.choice((1e-5, 1e-3, 0.1)), self._return, worker)
 
-    def _return(self, worker: engine.Worker) -> None:
+    def _return(self, worker: engine.WorkerEntry) -> None:
         """Whoever used it leaves it, and perhaps the answer that is still to come."""
         if worker not in self.ledger.workers:
             return
@@ -404,7 +405,7 @@ class LedgerMaster:
         self._members[member.child] = member
         self.ledger.starting += 1
 
-    def _dismiss(self, worker: engine.Worker, since: float) -> None:
+    def _dismiss(self, worker: engine.WorkerEntry, since: float) -> None:
         """It had nothing to do for a while."""
         member: Member = worker.key
         staying = sum(not member.leaving for member in self._members.values())

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
-from fiber._engine.charges import Limits
+from fiber._engine.tasks import Limits
 from simulation.schedule import Act, Job, Schedule
 from simulation.workers import NO_OP, Ref, Worker
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from fiber._runtime.outcome import Failure, Pickled
+from fiber._runtime.answers import Pickled, TaskFailure
 from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from fiber.errors import StartError, TimeoutError, UnpicklableError, WorkerDied
@@ -50,7 +50,7 @@ class Outcomes:
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Outcomes of tasks from ``start`` on; sometimes nobody reads them for a while."""
-        if not mixed and any(type(outcome) in (Failure, Pickled) for outcome in outcomes):
+        if not mixed and any(type(outcome) in (TaskFailure, Pickled) for outcome in outcomes):
             raise Violation(f"job {self.account.number} has results that are not plain")
         for index, outcome in enumerate(outcomes, start if self.call is None else self.call):
             self._put(Ref(self.account.number, index), outcome)
@@ -68,7 +68,7 @@ class Outcomes:
         self._master.waits_for_all(self.account)
 
     def _put(self, ref: Ref, outcome: Any) -> None:
-        error = outcome.error if type(outcome) is Failure else None
+        error = outcome.error if type(outcome) is TaskFailure else None
         if isinstance(error, BrokenInput):
             job = self.item.job if self.item is not None else None
             if job is None or ref.task != job.fed:
@@ -130,7 +130,7 @@ class Outcomes:
     def _reject(self, ref: Ref, error: BaseException) -> None:
         """A call does not pickle."""
         if ref.task < self.account.fed:  # else one before it came too late, and so did this one
-            self._put(ref, Failure(error))
+            self._put(ref, TaskFailure(error))
         if self._master.ended_call(self.account):
             self._oracle.finished(self.account.number)
 

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from fiber._engine.chunks import Pace
-from fiber._engine.ledger import Loss
+from fiber._engine.chunks import TaskPace
 from fiber._engine.scheduler import Decisions
 from fiber._engine.start_failures import (
     KILLED_PATIENCE,
@@ -18,11 +17,11 @@ from fiber._engine.start_failures import (
     TRIES,
     StartFailure,
 )
-from fiber._engine.worker_set import Member
-from fiber._runtime.executor import Executor
-from fiber._runtime.host import TICK
-from fiber._runtime.input_stream import AHEAD, InputStream
-from fiber._runtime.work_items import WorkItem
+from fiber._engine.tasks import Loss
+from fiber._engine.worker_set import PoolMember
+from fiber._runtime.executor import PoolExecutor
+from fiber._runtime.jobs import TICK
+from fiber._runtime.work_items import AHEAD, InputStream, WorkItem
 from simulation.oracle import require
 from simulation.world import MOMENTS
 
@@ -51,7 +50,7 @@ class PoolAudit:
     """Checks what one executor does; ``check_ledger`` checks its ledger."""
 
     def __init__(
-        self, world: World, stage: Stage, executor: Executor, check_ledger: Callable[[], None]
+        self, world: World, stage: Stage, executor: PoolExecutor, check_ledger: Callable[[], None]
     ) -> None:
         self._world = world
         self._stage = stage
@@ -89,7 +88,7 @@ class PoolAudit:
         decisions: Decisions = self._real.decide(now)
         return decisions
 
-    def _ready(self, member: Member, now: float) -> None:
+    def _ready(self, member: PoolMember, now: float) -> None:
         before = member.worker
         self._real.ready(member, now)
         if member.worker is not before:
@@ -99,7 +98,7 @@ class PoolAudit:
             self._told = self.starved = False
 
     def _gone(
-        self, member: Member, now: float, *, failure: StartFailure | None = None, **rest: Any
+        self, member: PoolMember, now: float, *, failure: StartFailure | None = None, **rest: Any
     ) -> list[Loss]:
         require(member in self._workers.members, "an unknown worker is gone")
         counts = member.worker is None and not member.leaving and failure is not None
@@ -160,17 +159,19 @@ class PoolAudit:
         require(workers.size <= workers.maximum, f"the pool has {workers.size} workers")
         ready = {member.worker for member in workers.members if member.worker is not None}
         require(ready == self._ledger.workers, "the ledger knows other workers")
-        lent = sum(worker.lent for worker in self._ledger.workers)
-        require(lent == self._scheduler.lent, f"{lent} workers are lent")
+        leased = sum(worker.leased for worker in self._ledger.workers)
+        require(leased == self._scheduler.ledger.leased, f"{leased} workers are leased")
         unused = bool(self._executor._leases._idle)
         needed = any(job.has_next for job in self._ledger.jobs) or bool(self._ledger._pins)
-        otherwise = "a task waits for a worker that is lent and not in use"
-        self._lasts("lent", unused and needed, lambda: PROMPTLY, otherwise)
+        otherwise = "a task waits for a worker that is leased and not in use"
+        self._lasts("leased", unused and needed, lambda: PROMPTLY, otherwise)
 
     def _check_messages(self) -> None:
         held = self._ledger.batches.keys()
         require(self._executor._sender._unsent <= held, "what is not sent is not held by anybody")
-        require(self._executor._limits._timers.keys() <= held, "a deadline belongs to no batch")
+        require(
+            self._executor._sender._limits._timers.keys() <= held, "a deadline belongs to no batch"
+        )
 
     def _check_news(self) -> None:
         if self._failures and self._workers.error is None and not self._told:
@@ -228,7 +229,7 @@ class PoolAudit:
         self._readings.append(reading)
         real, stream = reading.stream.grant, reading.stream
 
-        def grant(waiting: int, workers: int, pace: Pace, target: float) -> None:
+        def grant(waiting: int, workers: int, pace: TaskPace, target: float) -> None:
             before = waiting + stream._granted - stream._taken
             real(waiting, workers, pace, target)
             ahead = waiting + stream._granted - stream._taken
@@ -270,7 +271,7 @@ class PoolAudit:
             self._workers.members,
             self._ledger.demand(),
             self._ledger.batches,
-            executor._limits._timers,
+            executor._sender._limits._timers,
             executor._sender._unsent,
             executor._jobs._streams,
             *(queue.called for queue in executor.calls._queues),

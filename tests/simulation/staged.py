@@ -22,7 +22,7 @@ from fiber._agent import service
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._backends import remote
 from fiber._backends.remote import RemoteTaskChannel
-from fiber._runtime import executor, launcher, receiver
+from fiber._runtime import executor, receiver, workers
 from fiber._wire.packet import Message
 from simulation.agents import Agent, Child
 from simulation.remote_hosts import NoCapture, RemoteHost
@@ -64,7 +64,7 @@ class Stage:
         self._stack.enter_context(mock.patch.object(remote, "RemoteTaskChannel", channel))
         self._stack.enter_context(mock.patch.object(executor, "say", self._say))
         self._stack.enter_context(mock.patch.object(receiver, "say", self._say))
-        self._stack.enter_context(mock.patch.object(launcher, "Latch", partial(StagedLatch, self)))
+        self._stack.enter_context(mock.patch.object(workers, "Latch", partial(StagedLatch, self)))
         self._stack.enter_context(mock.patch.object(PlannedError, "unpickled", self.run_user_code))
 
     def leave(self) -> None:
@@ -354,7 +354,7 @@ class StagedChannel:
         self._received: deque[Any] = deque()
         self._reader: Actor | None = None
         self._ended = False
-        stage.world.note("%s is lent", child.name)
+        stage.world.note("%s is leased", child.name)
 
     def send(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> None:
         """Send it a packet."""
@@ -411,7 +411,7 @@ class StagedTaskChannel(RemoteTaskChannel):
         super().__init__(loop, deliver)
         self._stage = stage
         self._reader: Actor | None = None
-        stage.world.note("a worker is lent to callers on another host")
+        stage.world.note("a worker is leased to callers on another host")
 
     def send(self, seq: int, payload: Any, buffers: Sequence[memoryview] = ()) -> None:
         """Send it a packet."""

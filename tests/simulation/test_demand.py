@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from fiber._engine.demand import Demand
-from fiber._engine.placement import Placement
+from fiber._engine.placement import Demand, Placement
 
 RELEASES = 1000
 """In each run; so many scale-downs while other agents are at work."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fiber._engine.ledger import Worker
 from fiber._engine.scheduler import Scheduler
+from fiber._engine.tasks import WorkerEntry
 from simulation.explore import run
 from simulation.schedule import Job, Kill, Schedule, Task
 from simulation.suites import PARTS, SUITES, examine_part
@@ -24,7 +24,7 @@ def test_it_keeps_them_over_real_links_to_real_agent_services(part: int) -> None
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_what_a_lent_worker_answers_before_it_dies_counts(seed: int) -> None:
+def test_what_a_leased_worker_answers_before_it_dies_counts(seed: int) -> None:
     """Its caller may not have looked yet; then the call must not run again."""
     job = Job(0.0, (Task(1e-4),) * 12, bite=3000, pause=0.0, retries=1)
     for at in range(5, 25):
@@ -36,7 +36,7 @@ class Late:
     """A worker that is ready, and gone, before whoever started it could note how to reach it."""
 
     def __init__(self) -> None:
-        self.worker: Worker | None = None
+        self.worker: WorkerEntry | None = None
         self.leaving = False
 
 

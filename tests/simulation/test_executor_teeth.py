@@ -8,21 +8,18 @@ from typing import Any
 import pytest
 
 from fiber._engine import start_failures, worker_set
-from fiber._engine.ledger import Batch, Job, Loss, Receipt, Worker
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import StartFailure
-from fiber._engine.worker_set import Member
-from fiber._runtime.calls import CallQueue, Calls
-from fiber._runtime.executor import Executor
-from fiber._runtime.input_stream import InputStream
-from fiber._runtime.jobs import Jobs
+from fiber._engine.tasks import Batch, Job, Loss, Receipt, WorkerEntry
+from fiber._engine.worker_set import PoolMember
+from fiber._runtime.answers import Pickled
+from fiber._runtime.executor import PoolExecutor
+from fiber._runtime.jobs import CallQueue, Calls, Jobs
 from fiber._runtime.leases import Lease, Leases
-from fiber._runtime.outcome import Pickled
-from fiber._runtime.receiver import Receiver
-from fiber._runtime.sender import Sender
-from fiber._runtime.time_limits import TimeLimits
-from fiber._runtime.work_items import Call
-from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.receiver import AnswerReceiver
+from fiber._runtime.sender import BatchSender, TimeLimits
+from fiber._runtime.work_items import Call, InputStream
+from fiber._runtime.workers import WorkerHandle
 from simulation.explore import first_failure
 from simulation.suites import SUITES
 
@@ -33,7 +30,7 @@ SEEDS = range(10_100)
 
 RARE = {
     "forgets_what_is_unsent": 350,
-    "lends_what_is_needed": 600,
+    "leases_what_is_needed": 600,
     "blames_what_was_dropped": 10_000,
 }
 """Where the search begins for those that show late; it goes on with all the others."""
@@ -45,12 +42,12 @@ Fault = Callable[[Patch], None]
 def forgets_what_is_unsent(patch: Patch) -> None:
     """Takes what was assigned, but not sent, for something that its worker may have run."""
 
-    def lost(self: Sender, worker: Worker) -> set[int]:
+    def lost(self: BatchSender, worker: WorkerEntry) -> set[int]:
         real(self, worker)
         return set()
 
-    real = Sender.lost
-    patch.setattr(Sender, "lost", lost)
+    real = BatchSender.lost
+    patch.setattr(BatchSender, "lost", lost)
 
 
 def decides(patch: Patch, change: Callable[[Scheduler, Decisions], Decisions]) -> None:
@@ -88,10 +85,10 @@ def never_looks_again(patch: Patch) -> None:
 
 
 def forgets_that_somebody_left(patch: Patch) -> None:
-    def let_go(self: worker_set.WorkerSet, member: Member) -> None:
+    def let_go(self: worker_set.PoolWorkerSet, member: PoolMember) -> None:
         member.leaving = True
 
-    patch.setattr(worker_set.WorkerSet, "let_go", let_go)
+    patch.setattr(worker_set.PoolWorkerSet, "let_go", let_go)
 
 
 def gives_up_at_once(patch: Patch) -> None:
@@ -101,24 +98,24 @@ def gives_up_at_once(patch: Patch) -> None:
 
 
 def never_gives_up(patch: Patch) -> None:
-    def _failed(self: worker_set.WorkerSet, failure: StartFailure, now: float) -> None:
+    def _failed(self: worker_set.PoolWorkerSet, failure: StartFailure, now: float) -> None:
         real(self, failure, now)
         self.error = None
 
-    real = worker_set.WorkerSet._failed
-    patch.setattr(worker_set.WorkerSet, "_failed", _failed)
+    real = worker_set.PoolWorkerSet._failed
+    patch.setattr(worker_set.PoolWorkerSet, "_failed", _failed)
 
 
 def gives_up_with_workers_at_work(patch: Patch) -> None:
-    patch.setattr(worker_set.WorkerSet, "_at_work", lambda _: False)
+    patch.setattr(worker_set.PoolWorkerSet, "_at_work", lambda _: False)
 
 
 def tells_nobody_that_none_starts(patch: Patch) -> None:
-    patch.setattr(worker_set.WorkerSet, "news", lambda *_: "")
+    patch.setattr(worker_set.PoolWorkerSet, "news", lambda *_: "")
 
 
 def hears_nothing_back(patch: Patch) -> None:
-    patch.setattr(Executor, "on_recalled", lambda *_: None)
+    patch.setattr(PoolExecutor, "on_recalled", lambda *_: None)
 
 
 def hears_of_no_end(patch: Patch) -> None:
@@ -141,7 +138,7 @@ def forgets_deadlines(patch: Patch) -> None:
 
 
 def keeps_deadlines(patch: Patch) -> None:
-    patch.setattr(Sender, "settled", lambda *_: None)
+    patch.setattr(BatchSender, "settled", lambda *_: None)
 
 
 def tells_twice(patch: Patch) -> None:
@@ -170,24 +167,24 @@ def tells_of_no_loss(patch: Patch) -> None:
 
 
 def pickles_on_the_loop(patch: Patch) -> None:
-    def send(self: Sender, batch: Batch) -> None:
+    def send(self: BatchSender, batch: Batch) -> None:
         assert batch.job is not None
         self._encode(batch.job.owner, batch)
 
-    patch.setattr(Sender, "send", send)
+    patch.setattr(BatchSender, "send", send)
 
 
 def unpickles_on_the_loop(patch: Patch) -> None:
-    def _unreadable(self: Receiver, kind: str, batch: Batch, error: Pickled) -> None:
+    def _unreadable(self: AnswerReceiver, kind: str, batch: Batch, error: Pickled) -> None:
         error.decode()
         real(self, kind, batch, error)
 
-    real = Receiver._unreadable
-    patch.setattr(Receiver, "_unreadable", _unreadable)
+    real = AnswerReceiver._unreadable
+    patch.setattr(AnswerReceiver, "_unreadable", _unreadable)
 
 
 def blames_what_was_dropped(patch: Patch) -> None:
-    patch.setattr(Sender, "dropped", lambda *_: None)
+    patch.setattr(BatchSender, "dropped", lambda *_: None)
 
 
 def ignores_the_limit(patch: Patch) -> None:
@@ -230,8 +227,8 @@ def acts_later(patch: Patch) -> None:
     patch.setattr(Calls, "_take", _take)
 
 
-def lends_what_is_needed(patch: Patch) -> None:
-    patch.setattr(Scheduler, "needs_lent", lambda _: False)
+def leases_what_is_needed(patch: Patch) -> None:
+    patch.setattr(Scheduler, "needs_leased", lambda _: False)
 
 
 def forgets_calls_that_take_longer(patch: Patch) -> None:
@@ -241,8 +238,8 @@ def forgets_calls_that_take_longer(patch: Patch) -> None:
     patch.setattr(Leases, "_adopt", _adopt)
 
 
-def forgets_who_died_while_lent(patch: Patch) -> None:
-    patch.setattr(Executor, "_back", lambda self, _: self._advance())
+def forgets_who_died_while_leased(patch: Patch) -> None:
+    patch.setattr(PoolExecutor, "_back", lambda self, _: self._advance())
 
 
 def never_takes_back_what_nobody_returns(patch: Patch) -> None:
@@ -279,9 +276,9 @@ FAULTS: list[Fault] = [
     never_resumes,
     holds_nothing_back,
     acts_later,
-    lends_what_is_needed,
+    leases_what_is_needed,
     forgets_calls_that_take_longer,
-    forgets_who_died_while_lent,
+    forgets_who_died_while_leased,
     never_takes_back_what_nobody_returns,
 ]
 

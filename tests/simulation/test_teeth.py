@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from fiber._engine.ledger import Batch, Job, Ledger, Loss, Receipt, Worker, WrongAnswer
+from fiber._engine.ledger import Ledger
+from fiber._engine.tasks import Batch, Job, Loss, Receipt, WorkerEntry, WrongAnswer
 from simulation.explore import Failure, Suite, examine, first_failure, run
 from simulation.ledger_master import LedgerMaster, for_ledger
 from simulation.schedule import draw
@@ -22,7 +23,7 @@ SEEDS = range(600)
 
 class ForgetsLostBatches(Ledger):
     def lose(
-        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+        self, worker: WorkerEntry, unread: Iterable[int], running: Any, disrupted: bool = False
     ) -> list[Loss]:
         for batch in worker.queue:
             del self.batches[batch.seq]
@@ -34,7 +35,7 @@ class KeepsLostBatches(Ledger):
     """Late results of a lost worker count."""
 
     def lose(
-        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+        self, worker: WorkerEntry, unread: Iterable[int], running: Any, disrupted: bool = False
     ) -> list[Loss]:
         batches = dict(self.batches)
         losses = super().lose(worker, unread, running, disrupted)
@@ -43,13 +44,13 @@ class KeepsLostBatches(Ledger):
 
 
 class TakesResultsTwice(Ledger):
-    def receive(self, worker: Worker, seq: int, offset: int, *rest: Any, **more: Any) -> Any:
+    def receive(self, worker: WorkerEntry, seq: int, offset: int, *rest: Any, **more: Any) -> Any:
         batch = self.batches.get(seq)
         return super().receive(worker, seq, batch.received if batch else offset, *rest, **more)
 
 
 class BelievesAnyone(Ledger):
-    def held(self, worker: Worker, seq: int) -> Batch | None:
+    def held(self, worker: WorkerEntry, seq: int) -> Batch | None:
         return self.batches.get(seq)
 
 
@@ -63,21 +64,21 @@ class IgnoresWrongAnswers(Ledger):
 
 class ChargesUnread(Ledger):
     def lose(
-        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+        self, worker: WorkerEntry, unread: Iterable[int], running: Any, disrupted: bool = False
     ) -> list[Loss]:
         return super().lose(worker, (), running)
 
 
 class ChargesAllThatWasRead(Ledger):
     def lose(
-        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+        self, worker: WorkerEntry, unread: Iterable[int], running: Any, disrupted: bool = False
     ) -> list[Loss]:
         return super().lose(worker, unread, None)
 
 
 class ChargesNobody(Ledger):
     def lose(
-        self, worker: Worker, unread: Iterable[int], running: Any, disrupted: bool = False
+        self, worker: WorkerEntry, unread: Iterable[int], running: Any, disrupted: bool = False
     ) -> list[Loss]:
         return super().lose(worker, [batch.seq for batch in worker.queue], running)
 
@@ -97,19 +98,19 @@ class RetriesForEver(Ledger):
 
 
 class LetsTheBusyLeave(Ledger):
-    def leave(self, worker: Worker) -> bool:
+    def leave(self, worker: WorkerEntry) -> bool:
         super().leave(worker)
         worker.leaving = True
         return True
 
 
 class GivesToWhoLeaves(Ledger):
-    def leave(self, worker: Worker) -> bool:
+    def leave(self, worker: WorkerEntry) -> bool:
         return not worker.queue and not worker.pinned
 
 
 class DropsWhatIsTakenBack(Ledger):
-    def put_back(self, worker: Worker, seqs: Iterable[int], now: float) -> None:
+    def put_back(self, worker: WorkerEntry, seqs: Iterable[int], now: float) -> None:
         seqs = list(seqs)
         for seq in seqs:
             if seq in self.batches:
@@ -123,7 +124,7 @@ class IgnoresWhatIsKept(Ledger):
 
 
 class NeverRecalls(Ledger):
-    def recall(self, now: float) -> list[Worker]:
+    def recall(self, now: float) -> list[WorkerEntry]:
         return []
 
 
@@ -133,18 +134,18 @@ class ForgetsToRecallLater(Ledger):
 
 
 class ForgetsToCancel(Ledger):
-    def cancel(self, job: Job) -> list[Worker]:
+    def cancel(self, job: Job) -> list[WorkerEntry]:
         self.jobs.discard(job)
         return []
 
 
 class IgnoresMaxTasks(Ledger):
-    def add(self, key: Any, now: float, left: int | None = None) -> Worker:
+    def add(self, key: Any, now: float, left: int | None = None) -> WorkerEntry:
         return super().add(key, now, left and left + 1)
 
 
 class PinsToAnyone(Ledger):
-    def pin(self, job: Job, worker: Worker | None, item: Any) -> None:
+    def pin(self, job: Job, worker: WorkerEntry | None, item: Any) -> None:
         super().pin(job, next(iter(self.workers), worker), item)
 
 
@@ -154,26 +155,26 @@ class NeverFinishes(Ledger):
 
 
 class LendsTheBusy(Ledger):
-    def lend(self, worker: Worker) -> bool:
-        worker.lent = True
+    def lease(self, worker: WorkerEntry) -> bool:
+        worker.leased = True
         return True
 
 
 class GivesToWhoIsLent(Ledger):
-    def lend(self, worker: Worker) -> bool:
-        if not super().lend(worker):
+    def lease(self, worker: WorkerEntry) -> bool:
+        if not super().lease(worker):
             return False
         self._load.idle[worker] = None
         return True
 
 
 class ForgetsWhoIsBack(Ledger):
-    def return_idle(self, worker: Worker, now: float) -> None:
-        worker.lent = False
+    def return_idle(self, worker: WorkerEntry, now: float) -> None:
+        worker.leased = False
 
 
 class ForgetsWhatIsAdopted(Ledger):
-    def return_busy(self, worker: Worker, seq: int, *rest: Any) -> None:
+    def return_busy(self, worker: WorkerEntry, seq: int, *rest: Any) -> None:
         super().return_busy(worker, self.next_seq(), *rest)
 
 
@@ -260,7 +261,7 @@ TELLING = {
         "Ref(job=0, task=0) is given up",
         "is back",
         "is late: Results",
-        "is lent",
+        "is leased",
         "is returned",
         "Unreadable",
         "kept=1",
@@ -287,7 +288,7 @@ TELLING = {
         "the pool is terminated",
         "the input of job 0 is broken",
         "a direct call",
-        "is lent",
+        "is leased",
         "is called directly",
         "is interrupted",
         "is held back",

@@ -10,11 +10,12 @@ from types import SimpleNamespace
 from typing import Any
 
 from fiber._agent.interface import ExitReport
-from fiber._engine.ledger import Batch, Ledger
-from fiber._runtime.executor import Executor
+from fiber._engine.ledger import Ledger
+from fiber._engine.tasks import Batch
+from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.work_items import WorkItem
-from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.workers import WorkerHandle
 from fiber._transport.loop import Timer
 from fiber._wire import work
 from fiber._wire.packet import Message
@@ -201,7 +202,7 @@ class Rig:
         self.threads: dict[str, ManualThread] = {}
         new_process = partial(PoolProcess, like=Process)
         sizes = {"minimum": count, "maximum": count}
-        self.executor = Executor(
+        self.executor = PoolExecutor(
             PoolOptions(new_process, **(sizes | options)), host, thread=self._thread
         )
         self.background = self.threads["fiber-pool"]

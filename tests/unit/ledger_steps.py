@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from fiber._engine.chunks import Pace
-from fiber._engine.ledger import Batch, Job, Ledger, Worker
+from fiber._engine.chunks import TaskPace
+from fiber._engine.ledger import Ledger
+from fiber._engine.tasks import Batch, Job, WorkerEntry
 
 
-def known(seconds: float, largest: int = 10**4) -> Pace:
-    pace = Pace()
+def known(seconds: float, largest: int = 10**4) -> TaskPace:
+    pace = TaskPace()
     pace.observe(largest, seconds * largest)
     return pace
 
 
-def ledger_with(workers: int, left: int | None = None) -> tuple[Ledger, list[Worker]]:
+def ledger_with(workers: int, left: int | None = None) -> tuple[Ledger, list[WorkerEntry]]:
     ledger = Ledger()
     return ledger, [ledger.add(f"w{n}", 0.0, left) for n in range(workers)]
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.workers import WorkerHandle
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import WorkerDied

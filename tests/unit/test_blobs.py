@@ -18,7 +18,7 @@ from fiber._agent import service
 from fiber._agent.service import BlobLacking, BlobStore
 from fiber._backends.remote import BlobSender
 from fiber._runtime import state
-from fiber._runtime.shared_arguments import SharedArguments
+from fiber._runtime.state import SharedArguments
 from fiber._wire import messages
 from fiber._wire.blob import Blob
 from fiber._wire.descriptor import contents

@@ -6,10 +6,10 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from fiber._engine.charges import Limits
-from fiber._runtime.call_future import CallFuture
-from fiber._runtime.calls import CallQueue
+from fiber._engine.tasks import Limits
+from fiber._runtime.jobs import CallQueue
 from fiber.errors import FiberError
+from fiber.futures import CallFuture
 from unit import pool_tasks as tasks
 from unit.executor_rig import Rig
 

@@ -7,9 +7,9 @@ from collections import Counter
 
 import pytest
 
-from fiber._engine.charges import Charges, Counts, Limits
-from fiber._engine.chunks import Pace
+from fiber._engine.chunks import TaskPace
 from fiber._engine.ledger import Ledger
+from fiber._engine.tasks import Charges, Limits, LossCounts
 from unit.ledger_steps import assign_all, job_of
 
 
@@ -33,7 +33,7 @@ def test_each_kind_has_its_own_count_for_each_task(seed: int) -> None:
         again = charges.charge(task, disrupted=disrupted)
         assert again == (seen[task, disrupted] <= limits[disrupted])
         if not again:
-            assert charges.settle(task) == Counts(
+            assert charges.settle(task) == LossCounts(
                 seen.pop((task, False), 0), seen.pop((task, True), 0)
             )
     for task in range(3):
@@ -47,7 +47,7 @@ def test_a_lost_task_runs_again_until_one_of_its_counts_is_used_up(seed: int) ->
     rng = random.Random(seed)
     limits = Limits(rng.randrange(4), rng.randrange(6))
     ledger = Ledger()
-    job = job_of(ledger, ["task"], limits=limits, pace=Pace())
+    job = job_of(ledger, ["task"], limits=limits, pace=TaskPace())
     left = list(limits)
     while True:
         worker = ledger.add("worker", 0.0)
@@ -60,5 +60,5 @@ def test_a_lost_task_runs_again_until_one_of_its_counts_is_used_up(seed: int) ->
         assert left[disrupted] >= 0
     (loss,) = losses
     assert left[disrupted] == -1
-    assert loss.counts == Counts(limits.retries - left[0], limits.disruptions - left[1])
+    assert loss.counts == LossCounts(limits.retries - left[0], limits.disruptions - left[1])
     assert job.finished

@@ -15,22 +15,22 @@ from fiber._engine.chunks import (
     SLOW,
     STRIDE_LIMIT,
     TARGET,
-    Pace,
+    TaskPace,
     default_chunksize,
 )
 
 MANY = 10**9
 
 
-def pace(seconds: float, tasks: int = LIMIT) -> Pace:
+def pace(seconds: float, tasks: int = LIMIT) -> TaskPace:
     """A pace that was measured on one message of ``tasks``."""
-    known = Pace()
+    known = TaskPace()
     known.observe(tasks, seconds * tasks)
     return known
 
 
 def test_first_message_carries_one_task() -> None:
-    assert Pace().batch_size(MANY, 1) == 1
+    assert TaskPace().batch_size(MANY, 1) == 1
 
 
 @pytest.mark.parametrize("target", [PROMPT, TARGET])
@@ -43,7 +43,7 @@ def test_slow_tasks_travel_alone_and_do_not_queue() -> None:
     assert slow.batch_size(1000, 4) == 1
     assert not slow.may_queue(1000)
     assert pace(SLOW / 2).may_queue(1)
-    assert Pace().may_queue(1)
+    assert TaskPace().may_queue(1)
 
 
 def test_less_than_a_message_is_worth_does_not_queue() -> None:
@@ -75,9 +75,9 @@ def test_one_long_task_among_short_ones_is_soon_forgotten() -> None:
 
 
 def test_a_known_function_starts_with_a_little_trust() -> None:
-    again = Pace(pace(1e-7))
+    again = TaskPace(pace(1e-7))
     assert again.batch_size(MANY, 1) == RESUMED * GROWTH
-    assert Pace(Pace()).batch_size(MANY, 1) == 1
+    assert TaskPace(TaskPace()).batch_size(MANY, 1) == 1
 
 
 def test_no_time_at_all_is_a_time() -> None:
@@ -92,7 +92,7 @@ def test_nothing_measured_changes_nothing() -> None:
 
 
 def test_stride_is_one_unless_tasks_are_very_short() -> None:
-    assert Pace().stride() == 1
+    assert TaskPace().stride() == 1
     assert pace(1e-3).stride() == 1
     assert 1 < pace(2e-6).stride() <= STRIDE_LIMIT
 

@@ -15,16 +15,16 @@ import pytest
 
 import fiber
 from fiber import context
-from fiber._runtime import methods
+from fiber._runtime import start_methods
 from patience import PATIENCE
 
 
 @pytest.fixture(autouse=True)
 def _as_at_the_start() -> Iterator[None]:
-    chosen, preload = methods.chosen, list(methods.preload)
-    methods.choose(None)
+    chosen, preload = start_methods.chosen, list(start_methods.preload)
+    start_methods.choose(None)
     yield
-    methods.inherit(chosen, preload)
+    start_methods.inherit(chosen, preload)
 
 
 @pytest.fixture
@@ -90,23 +90,23 @@ def test_a_concrete_context_keeps_its_method(method: str) -> None:
 def test_the_default_process_follows_the_default_method(fresh: context.DefaultContext) -> None:
     for method, asked in (("spawn", "spawn"), ("fork", "fork"), ("forkserver", "fork")):
         fresh.set_start_method(method, force=True)
-        assert methods.zygote_method(None) == asked
-        assert methods.zygote_method("spawn") == "spawn"
+        assert start_methods.zygote_method(None) == asked
+        assert start_methods.zygote_method("spawn") == "spawn"
 
 
 def test_preload_takes_names_only() -> None:
     with pytest.raises(TypeError, match="must be a list of strings"):
         fiber.set_forkserver_preload([1])  # type: ignore[list-item]
     fiber.set_forkserver_preload(["json"])
-    assert methods.preload == ["json"]
+    assert start_methods.preload == ["json"]
 
 
 def test_a_child_inherits_method_and_preload() -> None:
     script = """
         import fiber
-        from fiber._runtime import methods
+        from fiber._runtime import start_methods
         def report():
-            print(fiber.get_start_method(), methods.preload)
+            print(fiber.get_start_method(), start_methods.preload)
         fiber.set_start_method("spawn")
         fiber.set_forkserver_preload(["json"])
         child = fiber.Process(target=report)

@@ -16,15 +16,13 @@ import pytest
 
 from fiber._agent.interface import ExitReport
 from fiber._agent.last_words import TELL
-from fiber._engine import ledger
-from fiber._runtime import time_limits, worker_view
-from fiber._runtime.executor import Executor
-from fiber._runtime.input_stream import InputStream
+from fiber._engine import load
+from fiber._runtime import sender, workers
+from fiber._runtime.answers import Pickled, TaskFailure
+from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.latch import Latch
-from fiber._runtime.launcher import KILL_AFTER
-from fiber._runtime.outcome import Failure, Pickled
-from fiber._runtime.work_items import Call
-from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.work_items import Call, InputStream
+from fiber._runtime.workers import KILL_AFTER, WorkerHandle
 from fiber._wire import work
 from fiber.errors import FiberError, WorkerDied
 from patience import PATIENCE
@@ -154,7 +152,7 @@ def test_idle_workers_get_what_busy_ones_have_not_read(rig: Rig) -> None:
     for seq, _ in list(rig.children[0].packets):
         rig.answer(idle, seq, [seq])
     assert rig.children[1].recalls == 0
-    rig.loop.pass_time(ledger.PATIENCE)
+    rig.loop.pass_time(load.PATIENCE)
     assert rig.children[1].recalls == 1
     unread = rig.children[1].packets[1][0]
     busy.recalled([unread])
@@ -170,7 +168,7 @@ def test_an_item_that_does_not_pickle_concerns_its_task_alone(rig: Rig) -> None:
     rig.answer_all()
     assert results.done == 1
     failure = results.outcomes[1]
-    assert type(failure) is Failure
+    assert type(failure) is TaskFailure
     assert "cannot be pickled" in str(failure.error)
     assert [results.outcomes[0], results.outcomes[2]] == [None, None]
 
@@ -181,7 +179,7 @@ def test_a_pickler_may_raise_anything(rig: Rig, tries: int) -> None:
     rig.answer_all()
     assert results.done == 1
     failure = results.outcomes[0]
-    assert type(failure) is Failure
+    assert type(failure) is TaskFailure
     assert type(failure.error) is SystemExit
 
 
@@ -347,7 +345,7 @@ def test_a_task_that_kills_its_workers(rig: Rig) -> None:
         rig.background.run()
         rig.all_ready()
     outcome = results.outcomes[0]
-    assert type(outcome) is Failure
+    assert type(outcome) is TaskFailure
     assert isinstance(outcome.error, WorkerDied)
     assert "square" in outcome.error.task
     assert (outcome.error.pod, outcome.error.node) == ("es-3", "node-2")
@@ -386,7 +384,7 @@ def test_nobody_waits_long_for_the_end_of_a_worker(rig: Rig) -> None:
     results = rig.call(timeout=2.0)
     (handle,) = rig.busy
     rig.loop.pass_time(2.0)
-    rig.loop.pass_time(time_limits.PATIENCE)
+    rig.loop.pass_time(sender.STACK_PATIENCE)
     assert "2 s" in str(results.outcomes[0].error)
     assert rig.child(handle).signals == [TELL, signal.SIGKILL]
     rig.answer(handle, rig.child(handle).packets[0][0], [9])
@@ -506,7 +504,7 @@ def test_nobody_waits_for_workers_of_a_loop_that_has_failed(
     assert str(found.exception(PATIENCE)) == "the loop has failed"
 
 
-def wait_in_a_thread(executor: Executor, patch: pytest.MonkeyPatch) -> Future[bool]:
+def wait_in_a_thread(executor: PoolExecutor, patch: pytest.MonkeyPatch) -> Future[bool]:
     """As a caller of ``wait_until_workers_up``; returns once that one waits."""
     found: Future[bool] = Future()
     asked = threading.Event()
@@ -522,7 +520,7 @@ def wait_in_a_thread(executor: Executor, patch: pytest.MonkeyPatch) -> Future[bo
             asked.set()
             return super().wait(timeout)
 
-    patch.setattr(worker_view, "Latch", Noted)
+    patch.setattr(workers, "Latch", Noted)
     threading.Thread(target=wait, daemon=True).start()
     assert asked.wait(PATIENCE)
     return found

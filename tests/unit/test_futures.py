@@ -17,10 +17,10 @@ import pytest
 
 import fiber
 from fiber import futures
-from fiber._runtime import executor_group, methods
-from fiber._runtime.call_future import CallFuture
-from fiber._runtime.calls import CallQueue
+from fiber._runtime import executor_group, start_methods
+from fiber._runtime.jobs import CallQueue
 from fiber._runtime.work_items import Call
+from fiber.futures import CallFuture
 from patience import PATIENCE
 from unit import pool_tasks as tasks
 from unit.interrupting import INSTRUCTIONS, is_interrupted
@@ -430,7 +430,7 @@ def test_a_task_that_comes_while_it_is_shut_down(
     assert "after shutdown" in str(late.exception(PATIENCE))
 
     other = fiber.Executor(1)
-    monkeypatch.setattr(methods, "check_main", other.shutdown)
+    monkeypatch.setattr(start_methods, "check_main", other.shutdown)
     with pytest.raises(RuntimeError, match="cannot schedule new futures after shutdown"):
         other.submit(tasks.square, 3)
     assert not other._group.executors()

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from fiber._engine.chunks import TARGET, Pace
-from fiber._runtime.input_stream import AHEAD, InputStream
+from fiber._engine.chunks import TARGET, TaskPace
+from fiber._runtime.work_items import AHEAD, InputStream
 from unit.ledger_steps import known
 
 SLOW_TASKS = known(1.0, 1)
@@ -35,7 +35,7 @@ class Reading:
         self.consumed += 1
         self.stream.ask()
 
-    def grant(self, waiting: int = 0, workers: int = 1, pace: Pace = SLOW_TASKS) -> None:
+    def grant(self, waiting: int = 0, workers: int = 1, pace: TaskPace = SLOW_TASKS) -> None:
         self.stream.grant(waiting, workers, pace, TARGET)
 
     def items(self, iterable: Any) -> Iterator[Any]:

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from fiber._runtime.input_stream import InputStream
 from fiber._runtime.latch import Latch, Waiters, acquire
+from fiber._runtime.work_items import InputStream
 from patience import PATIENCE
 
 

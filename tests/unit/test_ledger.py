@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from fiber._engine.charges import Limits
 from fiber._engine.chunks import SLOW
-from fiber._engine.ledger import WrongAnswer
+from fiber._engine.tasks import Limits, WrongAnswer
 from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, run_to_end
 
 # Giving

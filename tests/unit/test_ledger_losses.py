@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from fiber._engine.charges import Limits
 from fiber._engine.chunks import SLOW
-from fiber._engine.ledger import PATIENCE
+from fiber._engine.load import PATIENCE
+from fiber._engine.tasks import Limits
 from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, run_to_end
 
 # Taking back
@@ -271,7 +271,7 @@ def test_demand_counts_what_waits_and_what_runs() -> None:
     assign_all(ledger)
     ledger.pin(job, worker, "x")
     assert ledger.demand() == 11
-    assert ledger.has_capacity() is False
+    assert ledger.assign(0.0) is None
 
 
 def test_demand_counts_no_tasks_that_wait_until_results_are_read() -> None:

@@ -7,8 +7,7 @@ import random
 
 import pytest
 
-from fiber._engine.demand import LINGER, Demand
-from fiber._engine.placement import Placement
+from fiber._engine.placement import LINGER, Demand, Placement
 
 IDLE = 60.0
 

@@ -29,9 +29,9 @@ from fiber import pool as pool_module
 from fiber import process
 from fiber._agent import agent, local_child
 from fiber._engine.scheduler import Scheduler
-from fiber._runtime import executor, launcher, popen, state, worker_handle
-from fiber._runtime.input_stream import InputStream
+from fiber._runtime import executor, popen, state, workers
 from fiber._runtime.state import runtime
+from fiber._runtime.work_items import InputStream
 from fiber.pool import Pool
 from patience import PATIENCE
 from unit import pool_tasks as tasks
@@ -201,7 +201,7 @@ def test_a_handler_at_any_line_may_use_the_pool(pool: Pool, call: Callable[[Pool
 @pytest.mark.parametrize(
     ("function", "call"),
     [
-        ("Executor.call", "pool.apply_async(abs, (1,))"),
+        ("PoolExecutor.call", "pool.apply_async(abs, (1,))"),
         ("InputStream.read", "pool.map(abs, iter([1]))"),
     ],
 )
@@ -211,8 +211,8 @@ def test_a_signal_handler_may_terminate_the_pool_that_it_interrupts(
     done = run_program(f"""
         import signal
         import fiber
-        from fiber._runtime.executor import Executor
-        from fiber._runtime.input_stream import InputStream
+        from fiber._runtime.executor import PoolExecutor
+        from fiber._runtime.work_items import InputStream
         real = {function}
         def interrupted(*args, **options):
             signal.raise_signal(signal.SIGTERM)
@@ -411,13 +411,12 @@ def test_a_pool_that_the_collector_finds_while_the_loop_works_for_it_ends(
 STARTING = (
     agent,
     executor,
-    launcher,
     local_child,
     pool_module,
     popen,
     process,
     state,
-    worker_handle,
+    workers,
 )
 
 

@@ -15,9 +15,9 @@ import pytest
 
 from fiber import results
 from fiber._engine.chunks import TARGET
-from fiber._runtime import input_stream
-from fiber._runtime.input_stream import InputStream
-from fiber._runtime.outcome import Failure, Pickled
+from fiber._runtime import work_items
+from fiber._runtime.answers import Pickled, TaskFailure
+from fiber._runtime.work_items import InputStream
 from fiber._wire import work
 from fiber.pool import MaybeEncodingError
 from fiber.results import ApplyResult, IMapIterator, IMapUnorderedIterator, MapResult
@@ -160,7 +160,7 @@ def test_whoever_is_interrupted_at_any_step_asks_for_more_the_next_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(results, "HELD", 1)
-    files = {results.__file__, input_stream.__file__}
+    files = {results.__file__, work_items.__file__}
 
     def take_two(stop: int) -> bool:
         """Whether it was interrupted, at step ``stop`` of taking the first."""
@@ -251,7 +251,7 @@ def test_a_map_whose_getting_is_interrupted_at_any_step_raises_its_error_the_nex
 
 def test_what_unpickles_to_an_error_is_raised_and_the_next_is_there() -> None:
     found = iterator()
-    found._buffer.add_results(0, [Failure(KeyError("one")), 2], True)
+    found._buffer.add_results(0, [TaskFailure(KeyError("one")), 2], True)
     with pytest.raises(KeyError):
         next(found)
     assert next(found) == 2

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from fiber._engine.charges import Limits
-from fiber._engine.ledger import PATIENCE, Job, Worker
+from fiber._engine.load import PATIENCE
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import FIRST_PAUSE, RAISED_PATIENCE, StartFailure
+from fiber._engine.tasks import Job, Limits, WorkerEntry
 from fiber._engine.worker_set import IDLE_DEATHS
 from unit.ledger_steps import answer, known
 
@@ -19,11 +19,11 @@ class Member:
     """A worker's process."""
 
     def __init__(self) -> None:
-        self.worker: Worker | None = None
+        self.worker: WorkerEntry | None = None
         self.leaving = False
 
     @property
-    def ready(self) -> Worker:
+    def ready(self) -> WorkerEntry:
         assert self.worker is not None
         return self.worker
 
@@ -258,36 +258,36 @@ def test_who_waits_for_a_newcomer_hears_that_none_starts_while_others_work() -> 
 def test_a_worker_is_lent_while_nobody_needs_it() -> None:
     scheduler, members = pool(1)
     worker = members[0].ready
-    assert scheduler.lend(worker)
-    assert not scheduler.lend(worker), "it is"
+    assert scheduler.lease(worker)
+    assert not scheduler.lease(worker), "it is"
     assert nothing(scheduler.decide(0.0)), "and so it is not missing"
-    assert not scheduler.needs_lent()
+    assert not scheduler.needs_leased()
     job_of(scheduler, 1)
-    assert scheduler.needs_lent()
+    assert scheduler.needs_leased()
     assert scheduler.decide(0.0).assign == []
     scheduler.return_idle(worker, 0.0)
     assert len(scheduler.decide(0.0).assign) == 1
-    assert not scheduler.needs_lent()
+    assert not scheduler.needs_leased()
 
 
 def test_no_worker_is_lent_that_has_something_to_do_or_could_have() -> None:
     scheduler, members = pool(1)
     job_of(scheduler, 2)
-    assert not scheduler.lend(members[0].ready), "something waits"
+    assert not scheduler.lease(members[0].ready), "something waits"
     scheduler.decide(0.0)
-    assert not scheduler.lend(members[0].ready), "it is busy"
+    assert not scheduler.lease(members[0].ready), "it is busy"
     scheduler, members = pool(1)
     scheduler.close()
-    assert not scheduler.lend(members[0].ready), "it is about to end"
+    assert not scheduler.lease(members[0].ready), "it is about to end"
     scheduler, members = pool(1, max_tasks=5)
-    assert not scheduler.lend(members[0].ready), "its tasks are counted"
+    assert not scheduler.lease(members[0].ready), "its tasks are counted"
 
 
 def test_a_closed_pool_needs_those_that_are_lent() -> None:
     scheduler, members = pool(1)
-    assert scheduler.lend(members[0].ready)
+    assert scheduler.lease(members[0].ready)
     scheduler.close()
-    assert scheduler.needs_lent()
+    assert scheduler.needs_leased()
     assert not scheduler.decide(0.0).over
     scheduler.return_idle(members[0].ready, 0.0)
     assert scheduler.decide(0.0).dismiss == members
@@ -295,7 +295,7 @@ def test_a_closed_pool_needs_those_that_are_lent() -> None:
 
 def test_a_lent_worker_counts_as_busy_when_more_are_wanted() -> None:
     scheduler, members = pool(1, 2)
-    assert scheduler.lend(members[0].ready)
+    assert scheduler.lease(members[0].ready)
     job_of(scheduler, 1)
     assert scheduler.decide(0.0).start == 1
 
@@ -303,26 +303,26 @@ def test_a_lent_worker_counts_as_busy_when_more_are_wanted() -> None:
 def test_a_worker_that_is_returned_while_it_runs_a_call() -> None:
     scheduler, members = pool(1)
     worker = members[0].ready
-    assert scheduler.lend(worker)
+    assert scheduler.lease(worker)
     seq = scheduler.ledger.next_seq()
     job = scheduler.ledger.open("owner")
     scheduler.return_busy(worker, seq, job, "call", 0.0)
     scheduler.ledger.close(job)
-    assert scheduler.lent == 0
-    assert not scheduler.lend(worker)
+    assert scheduler.ledger.leased == 0
+    assert not scheduler.lease(worker)
     receipt = scheduler.ledger.receive(worker, seq, 0, 1, 0.0)
     assert receipt is not None
     assert (receipt.job, receipt.item(0), job.finished) == (job, "call", True)
-    assert scheduler.lend(worker)
+    assert scheduler.lease(worker)
 
 
 def test_what_a_returned_worker_runs_for_nobody_holds_it_up_and_no_more() -> None:
     scheduler, members = pool(1)
     worker = members[0].ready
-    assert scheduler.lend(worker)
+    assert scheduler.lease(worker)
     seq = scheduler.ledger.next_seq()
     scheduler.return_busy(worker, seq, None, None, 0.0)
-    assert not scheduler.lend(worker)
+    assert not scheduler.lease(worker)
     scheduler.close()
     assert scheduler.decide(0.0).dismiss == []
     assert scheduler.ledger.receive(worker, seq, 0, 1, 0.0) is None
@@ -332,13 +332,13 @@ def test_what_a_returned_worker_runs_for_nobody_holds_it_up_and_no_more() -> Non
 def test_a_lent_worker_that_is_gone_is_replaced() -> None:
     scheduler, members = pool(1)
     worker = members[0].ready
-    assert scheduler.lend(worker)
+    assert scheduler.lease(worker)
     scheduler.gone(members[0], 0.0)
-    assert scheduler.lent == 0
+    assert scheduler.ledger.leased == 0
     assert scheduler.decide(0.0).start == 1
     scheduler.return_idle(worker, 0.0)
     scheduler.return_busy(worker, 7, None, None, 0.0)
-    assert scheduler.lent == 0
+    assert scheduler.ledger.leased == 0
     assert scheduler.ledger.batches == {}
     assert scheduler.ledger.idle() == [], "who is gone cannot come back"
 

@@ -16,8 +16,8 @@ from fiber._engine.start_failures import (
     TRIES,
     StartFailure,
 )
-from fiber._engine.tasks import Worker
-from fiber._engine.worker_set import IDLE_DEATHS, IDLE_PAUSE, WorkerSet
+from fiber._engine.tasks import WorkerEntry
+from fiber._engine.worker_set import IDLE_DEATHS, IDLE_PAUSE, PoolWorkerSet
 from fiber.errors import StartError
 
 RAISED = StartFailure("pool worker 'w'", "exit status 1", "no such device")
@@ -28,28 +28,30 @@ class Member:
     """A worker's process."""
 
     def __init__(self) -> None:
-        self.worker: Worker | None = None
+        self.worker: WorkerEntry | None = None
         self.leaving = False
 
 
 @pytest.fixture
-def workers() -> WorkerSet:
-    return WorkerSet(2, 4)
+def workers() -> PoolWorkerSet:
+    return PoolWorkerSet(2, 4)
 
 
-def start(workers: WorkerSet, *, ready: bool = False) -> Member:
+def start(workers: PoolWorkerSet, *, ready: bool = False) -> Member:
     member = Member()
     workers.add(member)
     if ready:
-        workers.ready(member, Worker(member, None))
+        workers.ready(member, WorkerEntry(member, None))
     return member
 
 
-def fail(workers: WorkerSet, now: float, failure: StartFailure = RAISED) -> None:
+def fail(workers: PoolWorkerSet, now: float, failure: StartFailure = RAISED) -> None:
     workers.gone(start(workers), now, failure)
 
 
-def fail_until(workers: WorkerSet, stop: float, failure: StartFailure, now: float = 0.0) -> float:
+def fail_until(
+    workers: PoolWorkerSet, stop: float, failure: StartFailure, now: float = 0.0
+) -> float:
     """Start one whenever that may be; each fails at once.  The time of the last."""
     while True:
         fail(workers, now, failure)
@@ -63,7 +65,7 @@ def fail_until(workers: WorkerSet, stop: float, failure: StartFailure, now: floa
 # How many
 
 
-def test_the_number_of_workers_follows_the_demand_within_bounds(workers: WorkerSet) -> None:
+def test_the_number_of_workers_follows_the_demand_within_bounds(workers: PoolWorkerSet) -> None:
     assert [workers.wanted(demand) for demand in (0, 1, 2, 3, 4, 100)] == [2, 2, 2, 3, 4, 4]
     assert workers.missing(3, 0) == 3
     start(workers)
@@ -71,7 +73,7 @@ def test_the_number_of_workers_follows_the_demand_within_bounds(workers: WorkerS
     assert workers.missing(0, 0) == 1
 
 
-def test_newcomers_are_wanted_for_tasks_that_only_they_may_run(workers: WorkerSet) -> None:
+def test_newcomers_are_wanted_for_tasks_that_only_they_may_run(workers: PoolWorkerSet) -> None:
     for _ in range(2):
         start(workers, ready=True)
     assert workers.missing(1, 0) == 0
@@ -82,7 +84,7 @@ def test_newcomers_are_wanted_for_tasks_that_only_they_may_run(workers: WorkerSe
     assert workers.missing(1, 5) == 0, "more than the maximum"
 
 
-def test_counts(workers: WorkerSet) -> None:
+def test_counts(workers: PoolWorkerSet) -> None:
     one, other = start(workers, ready=True), start(workers)
     assert (workers.size, workers.starting) == (2, 1)
     workers.let_go(other)
@@ -95,7 +97,7 @@ def test_counts(workers: WorkerSet) -> None:
     assert workers.failures == 0, "who was told to go, or was ready, did not fail to start"
 
 
-def test_as_many_as_are_missing_are_started_at_once(workers: WorkerSet) -> None:
+def test_as_many_as_are_missing_are_started_at_once(workers: PoolWorkerSet) -> None:
     assert workers.startable(4, 0.0) == 4
     assert workers.next_try() is None
 
@@ -107,7 +109,7 @@ def test_as_many_as_are_missing_are_started_at_once(workers: WorkerSet) -> None:
     ("failure", "patience"), [(RAISED, RAISED_PATIENCE), (KILLED, KILLED_PATIENCE)]
 )
 def test_it_gives_up_when_none_has_started_for_long(
-    workers: WorkerSet, failure: StartFailure, patience: float
+    workers: PoolWorkerSet, failure: StartFailure, patience: float
 ) -> None:
     last = fail_until(workers, patience + LAST_PAUSE, failure)
     assert patience <= last <= patience + LAST_PAUSE
@@ -117,7 +119,7 @@ def test_it_gives_up_when_none_has_started_for_long(
     assert failure.text in str(workers.error)
 
 
-def test_however_many_fail_at_once_that_is_no_reason_to_give_up(workers: WorkerSet) -> None:
+def test_however_many_fail_at_once_that_is_no_reason_to_give_up(workers: PoolWorkerSet) -> None:
     members = [start(workers) for _ in range(1000)]
     for member in members:
         workers.gone(member, 0.5, RAISED)
@@ -125,7 +127,7 @@ def test_however_many_fail_at_once_that_is_no_reason_to_give_up(workers: WorkerS
     assert workers.next_try() == 0.5 + FIRST_PAUSE, "one wave, one pause"
 
 
-def test_however_long_it_takes_there_are_some_tries(workers: WorkerSet) -> None:
+def test_however_long_it_takes_there_are_some_tries(workers: PoolWorkerSet) -> None:
     for at in range(TRIES - 1):
         fail(workers, 100.0 * at)
         assert workers.error is None
@@ -134,14 +136,14 @@ def test_however_long_it_takes_there_are_some_tries(workers: WorkerSet) -> None:
 
 
 def test_one_that_was_killed_after_some_that_raised_may_have_done_nothing_wrong(
-    workers: WorkerSet,
+    workers: PoolWorkerSet,
 ) -> None:
     fail_until(workers, RAISED_PATIENCE / 2, RAISED)
     fail(workers, RAISED_PATIENCE + 1, KILLED)
     assert workers.error is None
 
 
-def test_one_that_raises_after_some_that_were_killed_has_its_tries(workers: WorkerSet) -> None:
+def test_one_that_raises_after_some_that_were_killed_has_its_tries(workers: PoolWorkerSet) -> None:
     fail_until(workers, KILLED_PATIENCE / 2, KILLED)
     fail(workers, KILLED_PATIENCE / 2, RAISED)
     assert workers.error is None, "it may be the first of its kind"
@@ -155,7 +157,7 @@ def test_one_that_raises_after_some_that_were_killed_has_its_tries(workers: Work
 )
 @pytest.mark.parametrize("told_to_go", [False, True])
 def test_patience_begins_when_the_last_at_work_is_lost(
-    workers: WorkerSet, failure: StartFailure, patience: float, told_to_go: bool
+    workers: PoolWorkerSet, failure: StartFailure, patience: float, told_to_go: bool
 ) -> None:
     at_work = start(workers, ready=True)
     fail_until(workers, 300.0, failure)
@@ -168,13 +170,13 @@ def test_patience_begins_when_the_last_at_work_is_lost(
     assert workers.error is not None
 
 
-def test_a_lost_host_says_nothing_of_its_workers(workers: WorkerSet) -> None:
+def test_a_lost_host_says_nothing_of_its_workers(workers: PoolWorkerSet) -> None:
     for at in range(100):
         workers.gone(start(workers), float(at), None)
     assert (workers.failures, workers.error, workers.next_try()) == (0, None, None)
 
 
-def test_one_that_starts_clears_the_others(workers: WorkerSet) -> None:
+def test_one_that_starts_clears_the_others(workers: PoolWorkerSet) -> None:
     fail_until(workers, RAISED_PATIENCE / 2, RAISED)
     member = start(workers, ready=True)
     assert (workers.failures, workers.next_try()) == (0, None)
@@ -194,7 +196,7 @@ def test_the_cause_of_a_refusal_is_kept() -> None:
 # Pauses
 
 
-def test_pauses_between_waves_double_up_to_a_limit(workers: WorkerSet) -> None:
+def test_pauses_between_waves_double_up_to_a_limit(workers: PoolWorkerSet) -> None:
     now, pauses = 0.0, []
     for _ in range(9):
         fail(workers, now, KILLED)
@@ -205,18 +207,18 @@ def test_pauses_between_waves_double_up_to_a_limit(workers: WorkerSet) -> None:
     assert pauses == pytest.approx([min(FIRST_PAUSE * 2**n, LAST_PAUSE) for n in range(9)])
 
 
-def test_after_a_pause_one_is_tried(workers: WorkerSet) -> None:
+def test_after_a_pause_one_is_tried(workers: PoolWorkerSet) -> None:
     fail(workers, 10.0)
     assert workers.startable(4, 10.0) == 0
     assert workers.startable(4, 10.0 + FIRST_PAUSE) == 1
     member = start(workers)
     assert workers.startable(3, 99.0) == 0, "it has not shown yet that they can start"
     assert workers.next_try() is None
-    workers.ready(member, Worker(member, None))
+    workers.ready(member, WorkerEntry(member, None))
     assert workers.startable(3, 10.1) == 3
 
 
-def test_what_fails_in_a_pause_is_of_the_same_wave(workers: WorkerSet) -> None:
+def test_what_fails_in_a_pause_is_of_the_same_wave(workers: PoolWorkerSet) -> None:
     late = [start(workers) for _ in range(3)]
     fail(workers, 10.0)
     for member in late:
@@ -224,7 +226,7 @@ def test_what_fails_in_a_pause_is_of_the_same_wave(workers: WorkerSet) -> None:
     assert workers.next_try() == 10.0 + FIRST_PAUSE
 
 
-def test_while_others_work_it_tries_again_less_and_less_often(workers: WorkerSet) -> None:
+def test_while_others_work_it_tries_again_less_and_less_often(workers: PoolWorkerSet) -> None:
     at_work = start(workers, ready=True)
     now = fail_until(workers, 1000.0, RAISED)
     assert workers.error is None
@@ -236,7 +238,7 @@ def test_while_others_work_it_tries_again_less_and_less_often(workers: WorkerSet
     assert workers.error is not None
 
 
-def test_workers_that_die_idle_again_and_again_are_replaced_slowly(workers: WorkerSet) -> None:
+def test_workers_that_die_idle_again_and_again_are_replaced_slowly(workers: PoolWorkerSet) -> None:
     for _ in range(IDLE_DEATHS + workers.maximum):
         workers.gone(start(workers, ready=True), 5.0, None)
         assert workers.next_try() is None
@@ -250,7 +252,7 @@ def test_workers_that_die_idle_again_and_again_are_replaced_slowly(workers: Work
     assert workers.error is None
 
 
-def test_who_dies_at_work_is_replaced_at_once(workers: WorkerSet) -> None:
+def test_who_dies_at_work_is_replaced_at_once(workers: PoolWorkerSet) -> None:
     batch: Any = object()
     for _ in range(100):
         member = start(workers, ready=True)
@@ -263,7 +265,7 @@ def test_who_dies_at_work_is_replaced_at_once(workers: WorkerSet) -> None:
 # What is said
 
 
-def test_failures_that_last_are_told_once_while_one_waits(workers: WorkerSet) -> None:
+def test_failures_that_last_are_told_once_while_one_waits(workers: PoolWorkerSet) -> None:
     fail(workers, 0.0, KILLED)
     assert workers.news(KILLED, 0.0) == ""
     fail(workers, SAID_AFTER, KILLED)
@@ -279,7 +281,7 @@ def test_failures_that_last_are_told_once_while_one_waits(workers: WorkerSet) ->
     assert workers.news(KILLED, 100.0 + SAID_AFTER) != "", "it is something new"
 
 
-def test_an_error_needs_no_news(workers: WorkerSet) -> None:
+def test_an_error_needs_no_news(workers: PoolWorkerSet) -> None:
     last = fail_until(workers, 100.0, KILLED)
     assert workers.error is not None
     assert workers.news(KILLED, last) == ""

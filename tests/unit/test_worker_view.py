@@ -8,7 +8,7 @@ import time
 import pytest
 
 import fiber
-from fiber._runtime.worker_resources import WorkerResources
+from fiber._runtime.workers import WorkerResources
 from fiber.errors import StartError, TimeoutError
 from fiber.resources import Resources
 from patience import PATIENCE

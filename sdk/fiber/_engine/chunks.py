@@ -36,12 +36,12 @@ STRIDE_SECONDS = 200e-6
 STRIDE_LIMIT = 1024
 
 
-class Pace:
+class TaskPace:
     """Running estimate of the seconds that one task of a function takes."""
 
     __slots__ = ("largest", "seconds")
 
-    def __init__(self, earlier: Pace | None = None) -> None:
+    def __init__(self, earlier: TaskPace | None = None) -> None:
         """Start without an estimate, or with an earlier one of the same function."""
         self.seconds: float | None = earlier.seconds if earlier else None
         self.largest: int = min(earlier.largest, RESUMED) if earlier else 0

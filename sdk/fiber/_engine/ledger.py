@@ -26,18 +26,25 @@ from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 from typing import Any
 
-from fiber._engine.charges import Limits
-from fiber._engine.chunks import Pace
-from fiber._engine.load import PATIENCE, WorkersByLoad
-from fiber._engine.spans import Span, Waiting
-from fiber._engine.tasks import Batch, Job, Loss, Receipt, Worker, WrongAnswer
+from fiber._engine.chunks import TaskPace
+from fiber._engine.load import WorkersByLoad
+from fiber._engine.tasks import (
+    Batch,
+    Job,
+    Limits,
+    Loss,
+    Receipt,
+    RunningTask,
+    Span,
+    WaitingTasks,
+    WorkerEntry,
+    WrongAnswer,
+)
 
 LOOKAHEAD = 4
 """Number of jobs that may lose their turn to a job whose tasks may queue."""
 
 _by_seq = attrgetter("seq")
-
-__all__ = ["PATIENCE", "Batch", "Job", "Ledger", "Loss", "Receipt", "Span", "Worker", "WrongAnswer"]
 
 
 class Ledger:
@@ -48,15 +55,17 @@ class Ledger:
 
     def __init__(self) -> None:
         self.jobs: set[Job] = set()
-        self.workers: set[Worker] = set()
+        self.workers: set[WorkerEntry] = set()
         self.batches: dict[int, Batch] = {}
         self.starting = 0
+        self.leased = 0
+        """Number of workers that callers lease."""
         self._open_tasks = 0  # fed and not done, of jobs that count
         self._seq = itertools.count(1)
         self._turns: deque[Job] = deque()
         self._paused: set[Job] = set()
         self._load = WorkersByLoad()
-        self._pins: dict[Worker, None] = {}
+        self._pins: dict[WorkerEntry, None] = {}
         self._unassigned_pins: list[tuple[Job, Span]] = []
         self._cancelled: set[Batch] = set()
 
@@ -66,7 +75,7 @@ class Ledger:
         self,
         owner: Any = None,
         *,
-        pace: Pace | None = None,
+        pace: TaskPace | None = None,
         limits: Limits = Limits(),  # noqa: B008 - immutable
         unit: int = 1,
         alone: bool = False,
@@ -79,7 +88,7 @@ class Ledger:
         a crash must not leave in doubt whether another task ran.  ``exact``: results are wanted
         one by one, and the worker notes each task that it begins.
         """
-        job = Job(owner, pace or Pace(), limits, unit, alone, exact)
+        job = Job(owner, pace or TaskPace(), limits, unit, alone, exact)
         self.jobs.add(job)
         return job
 
@@ -94,7 +103,7 @@ class Ledger:
         self._fed(job, len(items))
         self._list(job)
 
-    def pin(self, job: Job, worker: Worker | None, item: Any) -> None:
+    def pin(self, job: Job, worker: WorkerEntry | None, item: Any) -> None:
         """Add a task to ``job`` for this worker alone; None: for a later worker.
 
         If the worker is lost, a later worker gets the task.
@@ -106,7 +115,7 @@ class Ledger:
         else:
             self._pin(job, worker, span)
 
-    def _pin(self, job: Job, worker: Worker, span: Span) -> None:
+    def _pin(self, job: Job, worker: WorkerEntry, span: Span) -> None:
         worker.pinned.append((job, span))
         self._pins[worker] = None
         job.pins[worker] = None
@@ -124,12 +133,12 @@ class Ledger:
         spans += [span for owner, span in pinned if owner is job]
         return [*job.waiting.items(), *itertools.chain.from_iterable(s.items for s in spans)]
 
-    def cancel(self, job: Job) -> list[Worker]:
+    def cancel(self, job: Job) -> list[WorkerEntry]:
         """Forget a job: its tasks are not sent, and its results do not count.
 
         Return the workers that hold unread batches of it, which are worth a recall.
         """
-        job.waiting = Waiting()
+        job.waiting = WaitingTasks()
         if job in self.jobs:
             self.jobs.discard(job)
             self._paused.discard(job)
@@ -163,16 +172,16 @@ class Ledger:
 
     # Workers
 
-    def add(self, key: Any, now: float, left: int | None = None) -> Worker:
+    def add(self, key: Any, now: float, left: int | None = None) -> WorkerEntry:
         """Add a worker that is ready for ``left`` units of work (None: any number)."""
-        worker = Worker(key, left)
+        worker = WorkerEntry(key, left)
         worker.since = now
         self.workers.add(worker)
         self._adopt(worker)
         self._load.sort(worker)
         return worker
 
-    def _adopt(self, worker: Worker) -> None:
+    def _adopt(self, worker: WorkerEntry) -> None:
         """Give a new worker the pinned tasks of a lost one, at most one of each job."""
         left = []
         for job, span in self._unassigned_pins:
@@ -182,7 +191,7 @@ class Ledger:
                 self._pin(job, worker, span)
         self._unassigned_pins = left
 
-    def leave(self, worker: Worker) -> bool:
+    def leave(self, worker: WorkerEntry) -> bool:
         """Give ``worker`` no more tasks; return False, and change nothing, if it is busy."""
         if worker.queue or worker.pinned:
             return False
@@ -190,16 +199,14 @@ class Ledger:
         self._load.spent.pop(worker, None)
         return True
 
-    def spent(self) -> list[Worker]:
+    def spent(self) -> list[WorkerEntry]:
         """Return workers that did all units they may do, each once; they get no more tasks."""
-        if not self._load.spent:
-            return []
         spent, self._load.spent = list(self._load.spent), {}
         for worker in spent:
             self.retire(worker)
         return spent
 
-    def retire(self, worker: Worker) -> None:
+    def retire(self, worker: WorkerEntry) -> None:
         """Give a leaving worker no more tasks; a later worker gets the tasks pinned to it."""
         worker.leaving = True
         self._unassigned_pins += worker.pinned
@@ -215,7 +222,7 @@ class Ledger:
         """Return the jobs with tasks that only a new worker may run."""
         return {job for job, _ in self._unassigned_pins}
 
-    def idle(self) -> list[Worker]:
+    def idle(self) -> list[WorkerEntry]:
         """Return the idle workers, the longest idle first."""
         return list(self._load.idle)
 
@@ -223,13 +230,9 @@ class Ledger:
         """Return the number of idle workers."""
         return len(self._load.idle)
 
-    def longest_idle(self) -> Worker | None:
+    def longest_idle(self) -> WorkerEntry | None:
         """Return the worker that has been idle for longest."""
         return next(iter(self._load.idle), None)
-
-    def has_capacity(self) -> bool:
-        """Return whether some worker has room for a batch."""
-        return bool(self._load.idle or self._load.queueable)
 
     def demand(self) -> int:
         """Return how many tasks run or wait for a worker, without those that a pause holds back.
@@ -253,7 +256,7 @@ class Ledger:
         if self._load.idle_pinned:
             return self._assign_pinned(now)
         turns = self._turns
-        if not turns or not self.has_capacity():
+        if not turns or not (self._load.idle or self._load.queueable):
             return None
         passed = 0
         while passed < len(turns) and passed <= min(len(self._load.queueable), LOOKAHEAD):
@@ -279,7 +282,7 @@ class Ledger:
             del self._pins[worker]
         return self._send(job, worker, span, now)
 
-    def _worker_for(self, job: Job, passed: int) -> Worker | None:
+    def _worker_for(self, job: Job, passed: int) -> WorkerEntry | None:
         """Return a worker that may get tasks of ``job``.
 
         ``passed`` earlier jobs wait for an idle worker.  So as many of the workers that will be
@@ -295,7 +298,7 @@ class Ledger:
             return None
         return self._load.queueable_after(passed)
 
-    def _cut(self, job: Job, worker: Worker, now: float) -> Batch:
+    def _cut(self, job: Job, worker: WorkerEntry, now: float) -> Batch:
         waiting = len(job.waiting)
         size = 1
         if waiting > 1:
@@ -307,7 +310,7 @@ class Ledger:
             size = min(size, worker.left * job.unit)
         return self._send(job, worker, job.waiting.take(size), now)
 
-    def _send(self, job: Job, worker: Worker, span: Span, now: float) -> Batch:
+    def _send(self, job: Job, worker: WorkerEntry, span: Span, now: float) -> Batch:
         batch = Batch(self.next_seq(), job, worker, span)
         if worker.left is not None:
             worker.left -= min(batch.units, worker.left)
@@ -325,51 +328,55 @@ class Ledger:
         worker.queue.append(batch)
         self._load.sort(worker)
 
-    # Lending
+    # Leases
 
     def next_seq(self) -> int:
         """Return a new sequence number.  Any thread may call this."""
         return next(self._seq)
 
-    def lend(self, worker: Worker) -> bool:
-        """Lend an idle worker to a caller, who sends it calls directly; return False if it is busy.
-
-        Ray's callers lease workers in the same way.
-        """
+    def lease(self, worker: WorkerEntry) -> bool:
+        """Lease an idle worker to callers, who send it calls directly; False if it is not idle."""
         if worker not in self._load.idle or worker.left is not None:
             return False
-        worker.lent = True
+        worker.leased = True
+        self.leased += 1
         self._load.sort(worker)
         return True
 
-    def expect_late(self, worker: Worker, seq: int) -> None:
+    def expect_late(self, worker: WorkerEntry, seq: int) -> None:
         """Accept the answer of a worker to a call that its caller has given up."""
         worker.had.append(seq)
 
-    def return_idle(self, worker: Worker, now: float) -> None:
-        """Take back a lent worker, which is idle."""
-        worker.lent = False
+    def return_idle(self, worker: WorkerEntry, now: float) -> None:
+        """Take back a leased worker, which is idle."""
+        self._end_lease(worker)
         worker.since = now
         self._load.sort(worker)
 
-    def return_busy(self, worker: Worker, seq: int, job: Job | None, item: Any, now: float) -> None:
-        """Take back a lent worker that runs the call sent as ``seq``.
+    def return_busy(
+        self, worker: WorkerEntry, seq: int, job: Job | None, item: Any, now: float
+    ) -> None:
+        """Take back a leased worker that runs the call sent as ``seq``.
 
         From now on the call is a task of ``job``; None: its result does not count.
         """
-        worker.lent = False
-        start = 0
-        if job is not None:
-            start = job.fed
-            self._fed(job, 1)
+        self._end_lease(worker)
+        start = 0 if job is None else job.fed
         batch = Batch(seq, job, worker, Span(start, [item], alone=True))
         if job is None:
             self._cancelled.add(batch)
+        else:
+            self._fed(job, 1)
         self._hold(batch, now)
+
+    def _end_lease(self, worker: WorkerEntry) -> None:
+        if worker.leased:
+            worker.leased = False
+            self.leased -= 1
 
     # Receiving
 
-    def held(self, worker: Worker, seq: int) -> Batch | None:
+    def held(self, worker: WorkerEntry, seq: int) -> Batch | None:
         """Return the batch that ``worker`` answers for, or None if the batch is over.
 
         Raise WrongAnswer if the worker never had it.
@@ -384,7 +391,7 @@ class Ledger:
 
     def receive(
         self,
-        worker: Worker,
+        worker: WorkerEntry,
         seq: int,
         offset: int,
         count: int,
@@ -429,9 +436,7 @@ class Ledger:
         worker = batch.worker
         if worker.queue[0] is batch:
             worker.since = now
-            worker.queue.popleft()
-        else:
-            worker.queue.remove(batch)
+        worker.queue.remove(batch)
         self._load.sort(worker)
 
     def _drop(self, batch: Batch) -> None:
@@ -459,7 +464,7 @@ class Ledger:
             self._return(job, span)
         return True
 
-    def put_back(self, worker: Worker, seqs: Iterable[int], now: float) -> None:
+    def put_back(self, worker: WorkerEntry, seqs: Iterable[int], now: float) -> None:
         """Take back batches that ``worker`` never read: the answer to a recall."""
         worker.recalled = False
         held = (self.batches.get(seq) for seq in seqs)
@@ -509,13 +514,9 @@ class Ledger:
         self._finish(job)
         return Receipt(job, batch.start, 1, batch)
 
-    def imbalanced(self) -> bool:
-        """Return whether a worker is idle while another has an unread batch."""
-        return bool(self._load.idle and self._load.recallable)
-
-    def recall(self, now: float) -> list[Worker]:
+    def recall(self, now: float) -> list[WorkerEntry]:
         """Return the workers whose unread batch is to be recalled for idle workers."""
-        if any(job.has_next for job in self._turns):
+        if not self._load.idle or any(job.has_next for job in self._turns):
             return []
         return self._load.recall(now)
 
@@ -527,18 +528,19 @@ class Ledger:
 
     def lose(
         self,
-        worker: Worker,
+        worker: WorkerEntry,
         unread: Iterable[int],
-        running: tuple[int, int] | None,
+        running: RunningTask | None,
         disrupted: bool = False,
     ) -> list[Loss]:
         """Remove a worker that is gone: its tasks wait again, and its running task is charged.
 
-        ``unread``: batches that it never read.  ``running``: batch and offset of its running task;
-        if that is unknown, the first batch that it may have read counts.  ``disrupted``: the
-        cluster ended it.  Return the tasks that have no tries left; they are done.
+        ``unread``: batches that it never read.  ``running``: None if it is unknown; then the first
+        batch that it may have read counts.  ``disrupted``: the cluster ended it.  Return the tasks
+        that have no tries left; they are done.
         """
         self.workers.discard(worker)
+        self._end_lease(worker)
         guilty = worker.in_progress(set(unread), running)
         losses: list[Loss] = []
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):

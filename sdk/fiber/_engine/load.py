@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from fiber._engine.tasks import Worker
+from fiber._engine.tasks import WorkerEntry
 
 PATIENCE = 2e-3
 """Seconds that a worker may take for a batch before the unread one behind it is recalled."""
@@ -16,19 +16,19 @@ class WorkersByLoad:
     ``idle``: workers without a batch; ``idle_pinned``: those of them that have pinned tasks.
     ``queueable``: workers with one batch that may get another.  ``recallable``: workers with two
     batches, whose second one may be recalled; ``recalled``: those whose second one was recalled.
-    ``spent``: workers that did all units they may do.  Lent and leaving workers get no batches
+    ``spent``: workers that did all units they may do.  Leased and leaving workers get no batches
     and are neither idle nor queueable.
     """
 
     def __init__(self) -> None:
-        self.idle: dict[Worker, None] = {}
-        self.idle_pinned: dict[Worker, None] = {}
-        self.queueable: dict[Worker, None] = {}
-        self.recallable: dict[Worker, None] = {}
-        self.recalled: dict[Worker, None] = {}
-        self.spent: dict[Worker, None] = {}
+        self.idle: dict[WorkerEntry, None] = {}
+        self.idle_pinned: dict[WorkerEntry, None] = {}
+        self.queueable: dict[WorkerEntry, None] = {}
+        self.recallable: dict[WorkerEntry, None] = {}
+        self.recalled: dict[WorkerEntry, None] = {}
+        self.spent: dict[WorkerEntry, None] = {}
 
-    def sort(self, worker: Worker) -> None:
+    def sort(self, worker: WorkerEntry) -> None:
         """Move ``worker`` to the sets for the work that it has now."""
         self.idle.pop(worker, None)
         self.idle_pinned.pop(worker, None)
@@ -47,7 +47,7 @@ class WorkersByLoad:
             if not queue and not worker.leaving:
                 self.spent[worker] = None
             return
-        if worker.lent:
+        if worker.leased:
             return
         if not queue:
             self.idle[worker] = None
@@ -55,22 +55,22 @@ class WorkersByLoad:
         elif len(queue) == 1 and not queue[0].alone and not worker.pinned:
             self.queueable[worker] = None
 
-    def sort_pinned(self, worker: Worker) -> None:
+    def sort_pinned(self, worker: WorkerEntry) -> None:
         """Update ``idle_pinned`` if only the pinned tasks of ``worker`` have changed."""
         if worker.pinned and worker in self.idle:
             self.idle_pinned[worker] = None
         else:
             self.idle_pinned.pop(worker, None)
 
-    def last_idle(self) -> Worker | None:
+    def last_idle(self) -> WorkerEntry | None:
         """Return the worker that became idle last: its memory is warm, and the others may leave."""
         return next(reversed(self.idle), None)
 
-    def queueable_after(self, spared: int) -> Worker | None:
+    def queueable_after(self, spared: int) -> WorkerEntry | None:
         """Return the queueable worker that will be idle first, after ``spared`` others."""
         return next(itertools.islice(self.queueable, spared, None), None)
 
-    def recall(self, now: float) -> list[Worker]:
+    def recall(self, now: float) -> list[WorkerEntry]:
         """Return the workers whose unread batch to recall, one for each idle one; mark them."""
         victims = [worker for worker in self._candidates() if now >= worker.since + PATIENCE]
         for worker in victims:
@@ -82,5 +82,5 @@ class WorkersByLoad:
         """Return the time of the next recall, if no event comes before; None if there is none."""
         return min((worker.since + PATIENCE for worker in self._candidates()), default=None)
 
-    def _candidates(self) -> list[Worker]:
+    def _candidates(self) -> list[WorkerEntry]:
         return list(itertools.islice(self.recallable, len(self.idle)))

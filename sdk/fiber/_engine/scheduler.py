@@ -22,19 +22,20 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from fiber._engine.ledger import Batch, Job, Ledger, Loss, Worker
+from fiber._engine.ledger import Ledger
 from fiber._engine.start_failures import StartFailure
-from fiber._engine.worker_set import Member, WorkerSet
+from fiber._engine.tasks import Batch, Job, Loss, RunningTask, WorkerEntry
+from fiber._engine.worker_set import PoolMember, PoolWorkerSet
 
 
 class Decisions(NamedTuple):
     """Actions for the executor."""
 
     assign: list[Batch]
-    recall: list[Worker]
+    recall: list[WorkerEntry]
     start: int
-    dismiss: list[Member]
-    end: list[Member]
+    dismiss: list[PoolMember]
+    end: list[PoolMember]
     """Workers to end at once, since the pool gives up."""
     failed: list[tuple[Job, BaseException]]
     wake_at: float
@@ -61,11 +62,9 @@ class Scheduler:
         idle_timeout: float = math.inf,
     ) -> None:
         self.ledger = Ledger()
-        self.workers = WorkerSet(minimum, maximum)
+        self.workers = PoolWorkerSet(minimum, maximum)
         self.closing = False
         self.terminated = False
-        self.lent = 0
-        """Number of workers that are lent to callers."""
         self._max_tasks = max_tasks
         self._idle_timeout = idle_timeout
         self._gave_up = False
@@ -79,22 +78,22 @@ class Scheduler:
 
     # Workers
 
-    def starting(self, member: Member) -> None:
+    def starting(self, member: PoolMember) -> None:
         """Add a worker that is about to be started."""
         self.workers.add(member)
 
-    def ready(self, member: Member, now: float) -> None:
+    def ready(self, member: PoolMember, now: float) -> None:
         """Take note that a worker is ready; ignored if it was asked to end, or is gone."""
         if member in self.workers.members and not member.leaving and member.worker is None:
             self.workers.ready(member, self.ledger.add(member, now, self._max_tasks))
 
     def gone(
         self,
-        member: Member,
+        member: PoolMember,
         now: float,
         *,
         unread: Iterable[int] = (),
-        running: tuple[int, int] | None = None,
+        running: RunningTask | None = None,
         disrupted: bool = False,
         failure: StartFailure | None = None,
     ) -> list[Loss]:
@@ -106,11 +105,9 @@ class Scheduler:
         self.workers.gone(member, now, failure)
         if member.worker is None:
             return []
-        if member.worker.lent:
-            self._returned(member.worker)
         return self.ledger.lose(member.worker, unread, running, disrupted=disrupted)
 
-    def drain(self, member: Member) -> bool:
+    def drain(self, member: PoolMember) -> bool:
         """Give no more tasks to a worker whose host is about to end; False if it leaves already.
 
         Another worker takes its place at once.  The old one ends after the tasks that it has begun.
@@ -122,32 +119,25 @@ class Scheduler:
         self.workers.let_go(member)
         return True
 
-    def let_go(self, member: Member) -> None:
+    def let_go(self, member: PoolMember) -> None:
         """Count a worker as leaving: the executor is about to kill it."""
         self.workers.let_go(member)
 
-    def lend(self, worker: Worker) -> bool:
-        """Lend an idle worker to callers; return False if it is needed, or not idle."""
-        if self.closing or self.ledger.waits() or not self.ledger.lend(worker):
-            return False
-        self.lent += 1
-        return True
+    def lease(self, worker: WorkerEntry) -> bool:
+        """Lease an idle worker to callers; return False if it is needed, or not idle."""
+        return not (self.closing or self.ledger.waits()) and self.ledger.lease(worker)
 
-    def return_idle(self, worker: Worker, now: float) -> None:
-        """Take back a lent worker, which is idle."""
-        if worker.lent:
-            self._returned(worker)
+    def return_idle(self, worker: WorkerEntry, now: float) -> None:
+        """Take back a leased worker, which is idle."""
+        if worker.leased:
             self.ledger.return_idle(worker, now)
 
-    def return_busy(self, worker: Worker, seq: int, job: Job | None, item: Any, now: float) -> None:
-        """Take back a lent worker that runs the call sent as ``seq``: see the ledger."""
-        if worker.lent:
-            self._returned(worker)
+    def return_busy(
+        self, worker: WorkerEntry, seq: int, job: Job | None, item: Any, now: float
+    ) -> None:
+        """Take back a leased worker that runs the call sent as ``seq``: see the ledger."""
+        if worker.leased:
             self.ledger.return_busy(worker, seq, job, item, now)
-
-    def _returned(self, worker: Worker) -> None:
-        worker.lent = False
-        self.lent -= 1
 
     # The end
 
@@ -155,7 +145,7 @@ class Scheduler:
         """Close the pool: no more jobs will come."""
         self.closing = True
 
-    def terminate(self) -> Sequence[Member]:
+    def terminate(self) -> Sequence[PoolMember]:
         """End the pool without its remaining tasks; return all workers, to be ended."""
         self.closing = self.terminated = True
         for member in self.workers.staying():
@@ -172,12 +162,9 @@ class Scheduler:
         assign: list[Batch] = []
         while (batch := ledger.assign(now)) is not None:
             assign.append(batch)
-        wake_at = math.inf
-        recall: list[Worker] = []
-        if ledger.imbalanced():
-            recall = ledger.recall(now)
-            wake_at = ledger.next_recall() or wake_at
-        dismiss: list[Member] = [worker.key for worker in ledger.spent()]
+        recall = ledger.recall(now)
+        wake_at = ledger.next_recall() or math.inf
+        dismiss: list[PoolMember] = [worker.key for worker in ledger.spent()]
         for member in dismiss:
             workers.let_go(member)
         start = 0
@@ -191,12 +178,12 @@ class Scheduler:
             over = self._is_over()
         return Decisions(assign, recall, start, dismiss, end, failed, wake_at, over)
 
-    def needs_lent(self) -> bool:
-        """Return whether the pool needs lent workers that their callers do not use."""
-        return bool(self.lent) and (self.closing or self.ledger.waits())
+    def needs_leased(self) -> bool:
+        """Return whether the pool needs the leased workers that no caller uses at the moment."""
+        return bool(self.ledger.leased) and (self.closing or self.ledger.waits())
 
     def _demand(self) -> int:
-        return self.ledger.demand() + self.lent
+        return self.ledger.demand() + self.ledger.leased
 
     def _missing(self, now: float, wake_at: float) -> tuple[int, float]:
         """Return how many workers to start, and when to decide again."""
@@ -214,7 +201,7 @@ class Scheduler:
         over = self.terminated or self.workers.error is not None
         return over or (self.closing and not self.ledger.jobs)
 
-    def _thin_out(self, now: float, dismiss: list[Member]) -> float:
+    def _thin_out(self, now: float, dismiss: list[PoolMember]) -> float:
         """Dismiss workers that were idle for too long; return when the next one is due."""
         while (idle := self.ledger.longest_idle()) is not None:
             if self.workers.size <= self.workers.wanted(self._demand()):
@@ -226,14 +213,14 @@ class Scheduler:
             dismiss.append(idle.key)
         return math.inf
 
-    def _give_up(self) -> tuple[list[tuple[Job, BaseException]], list[Member]]:
+    def _give_up(self) -> tuple[list[tuple[Job, BaseException]], list[PoolMember]]:
         """Return the jobs that fail since workers do not start, and the workers to end then."""
         trouble, error = self.workers.trouble, self.workers.error
         if trouble is None or self.terminated:
             return [], []
         if error is None:
             return [(job, trouble) for job in self.ledger.jobs_for_newcomers()], []
-        end: list[Member] = []
+        end: list[PoolMember] = []
         if not self._gave_up:
             self._gave_up = True
             end = self.workers.staying()
@@ -241,7 +228,7 @@ class Scheduler:
                 self.workers.let_go(member)
         return [(job, error) for job in self.ledger.jobs], end
 
-    def _not_needed(self) -> list[Member]:
+    def _not_needed(self) -> list[PoolMember]:
         """Return the workers to dismiss from a closed pool without jobs."""
         if self.ledger.jobs or not self.workers.size:
             return []
@@ -251,7 +238,7 @@ class Scheduler:
             self.workers.let_go(member)
         return leaving
 
-    def _starting_members(self) -> list[Member]:
+    def _starting_members(self) -> list[PoolMember]:
         if not self.workers.starting:
             return []
         return [member for member in self.workers.members if member.worker is None]

@@ -1,14 +1,188 @@
-"""The ledger's entries: jobs, batches and workers.  Only the ledger changes them."""
+"""Entries of the ledger: jobs, batches and workers, the tasks of a job that wait, and its losses.
+
+Only the ledger changes them.  Waiting tasks are slices of a job.  Slices stay whole, so a million
+tasks cost as much as one.
+
+A lost task runs again.  Two bounds limit that, for two causes of the loss:
+
+* **Deaths.**  The task may have killed its worker.  It runs again at most ``retries`` times.
+* **Disruptions.**  The cluster ended the worker: a drain, an eviction, a preemption, a lost node.
+  The task is not to blame, so this uses up no retry.  ``disruptions`` bounds it nevertheless:
+  a task that takes longer than any worker runs would be repeated without end."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from fiber._engine.charges import Charges, Counts, Limits
-from fiber._engine.chunks import PROMPT, TARGET, Pace
-from fiber._engine.spans import Span, Waiting
+from fiber._engine.chunks import PROMPT, TARGET, TaskPace
+
+
+class Limits(NamedTuple):
+    """Number of times that one task may run again, by the cause of its worker's end."""
+
+    retries: int = 3
+    disruptions: int = 20
+
+
+class LossCounts(NamedTuple):
+    """Number of times that one task was lost."""
+
+    deaths: int
+    disruptions: int
+
+
+class Charges:
+    """Losses that are charged to the tasks of one job, by their indices."""
+
+    __slots__ = ("deaths", "disruptions", "limits")
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+        self.deaths: dict[int, int] = {}
+        self.disruptions: dict[int, int] = {}
+
+    def charge(self, task: int, *, disrupted: bool = False) -> bool:
+        """Count one more lost run; return False if the task may not run again."""
+        counts = self.disruptions if disrupted else self.deaths
+        limit = self.limits.disruptions if disrupted else self.limits.retries
+        counts[task] = count = counts.get(task, 0) + 1
+        return count <= limit
+
+    def settle(self, task: int) -> LossCounts:
+        """Forget a task that is done; return its counts."""
+        return LossCounts(self.deaths.pop(task, 0), self.disruptions.pop(task, 0))
+
+
+COMPACT = 1024
+"""Given-out items at the front of a growing list above which the list is trimmed."""
+
+
+class Span:
+    """Tasks ``start``, ``start + 1``, ... with their ``items``.
+
+    ``alone``: each travels in a separate message; ``pin``: only one certain worker may run them.
+    """
+
+    __slots__ = ("alone", "items", "pin", "start")
+
+    def __init__(
+        self, start: int, items: Sequence[Any], alone: bool = False, pin: bool = False
+    ) -> None:
+        self.start = start
+        self.items = items
+        self.alone = alone
+        self.pin = pin
+
+    def part(self, first: int, stop: int, *, alone: bool = False) -> Span:
+        """Return the tasks from ``first`` to before ``stop``, as indexes of the job."""
+        items = self.items[first - self.start : stop - self.start]
+        return Span(first, items, alone or self.alone, self.pin)
+
+    def singly(self) -> list[Span]:
+        """Return each task as a span that travels alone."""
+        first = self.start
+        return [self.part(at, at + 1, alone=True) for at in range(first, first + len(self.items))]
+
+    def around(self, suspects: range) -> list[Span]:
+        """Return in pieces: tasks before the suspects, each suspect alone, tasks after them."""
+        if not suspects:
+            return [self] if len(self.items) else []
+        pieces, stop = [], self.start + len(self.items)
+        if self.start < suspects.start:
+            pieces.append(self.part(self.start, suspects.start))
+        pieces += self.part(suspects.start, suspects.stop).singly()
+        if suspects.stop < stop:
+            pieces.append(self.part(suspects.stop, stop))
+        return pieces
+
+
+class _Stock:
+    """Span that is given out from its front, and grows at its end while tasks come in."""
+
+    __slots__ = ("alone", "items", "position", "start")
+
+    def __init__(self, span: Span) -> None:
+        self.start = span.start
+        self.items = span.items
+        self.alone = span.alone
+        self.position = 0
+
+    def __len__(self) -> int:
+        return len(self.items) - self.position
+
+    def cut(self, size: int) -> Span:
+        position = self.position
+        span = Span(self.start + position, self.items[position : position + size], self.alone)
+        self.position = position + size
+        return span
+
+    def grow(self, span: Span) -> bool:
+        """Append ``span`` if it fits on without a copy of the items; return whether it does."""
+        if (
+            not isinstance(self.items, list)
+            or self.alone != span.alone
+            or self.start + len(self.items) != span.start
+        ):
+            return False
+        if self.position > COMPACT and 2 * self.position > len(self.items):
+            del self.items[: self.position]
+            self.start += self.position
+            self.position = 0
+        self.items.extend(span.items)
+        return True
+
+
+class WaitingTasks:
+    """Waiting tasks of one job, in the order in which they will be given out."""
+
+    __slots__ = ("_count", "_stocks")
+
+    def __init__(self) -> None:
+        self._stocks: deque[_Stock] = deque()
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def items(self) -> Iterator[Any]:
+        """Yield the items of the waiting tasks."""
+        for stock in self._stocks:
+            yield from stock.items[stock.position :]
+
+    def first(self) -> int:
+        """Return the index of the next task."""
+        stock = self._stocks[0]
+        return stock.start + stock.position
+
+    def first_alone(self) -> bool:
+        """Return whether the next task travels alone."""
+        return self._stocks[0].alone
+
+    def append(self, span: Span) -> None:
+        """Add tasks behind all others."""
+        self._count += len(span.items)
+        if not self._stocks or not self._stocks[-1].grow(span):
+            self._stocks.append(_Stock(span))
+
+    def appendleft(self, span: Span) -> None:
+        """Add tasks that come back ahead of all others."""
+        self._count += len(span.items)
+        self._stocks.appendleft(_Stock(span))
+
+    def take(self, size: int) -> Span:
+        """Take the next tasks: at most ``size``, contiguous, one if it travels alone."""
+        stock = self._stocks[0]
+        span = stock.cut(1 if stock.alone else min(size, len(stock)))
+        if not len(stock):
+            self._stocks.popleft()
+        self._count -= len(span.items)
+        return span
+
+
+RunningTask = tuple[int, int]
+"""Task that a worker runs: the number of its batch, and its offset in the batch."""
 
 HAD = 16
 """Number of last batches that a worker may still answer for, once they are over."""
@@ -40,16 +214,16 @@ class Job:
     )
 
     def __init__(
-        self, owner: Any, pace: Pace, limits: Limits, unit: int, alone: bool, exact: bool
+        self, owner: Any, pace: TaskPace, limits: Limits, unit: int, alone: bool, exact: bool
     ) -> None:
         self.owner = owner
         self.pace = pace
         self.unit = unit
         self.exact = exact
         self.alone = alone or limits.retries == 0
-        self.waiting = Waiting()
+        self.waiting = WaitingTasks()
         self.batches: dict[Batch, None] = {}  # batches of it that workers have
-        self.pins: dict[Worker, None] = {}  # workers that have pinned tasks of it
+        self.pins: dict[WorkerEntry, None] = {}  # workers that have pinned tasks of it
         self.charges = Charges(limits)
         self.fed = 0
         self.done = 0
@@ -81,7 +255,7 @@ class Job:
 
     def drop_waiting(self, wanted: Callable[[Any], bool]) -> int:
         """Drop the waiting tasks that are not ``wanted``; return how many."""
-        waiting, self.waiting = self.waiting, Waiting()
+        waiting, self.waiting = self.waiting, WaitingTasks()
         dropped = 0
         while waiting:
             span = waiting.take(len(waiting))
@@ -133,7 +307,7 @@ class Batch:
         "worker",
     )
 
-    def __init__(self, seq: int, job: Job | None, worker: Worker, span: Span) -> None:
+    def __init__(self, seq: int, job: Job | None, worker: WorkerEntry, span: Span) -> None:
         self.seq = seq
         self.job = job
         self.has_function = True
@@ -190,7 +364,7 @@ class Batch:
         self.items = self.items[:kept]
         return rest
 
-    def suspects(self, running: tuple[int, int] | None) -> range:
+    def suspects(self, running: RunningTask | None) -> range:
         """Return tasks one of which was running: without better knowledge all without a result."""
         first, stop = self.start + self.received, self.stop
         if running is None or running[0] != self.seq:
@@ -199,10 +373,10 @@ class Batch:
         return range(max(first, at), max(first, min(stop, at + self.stride)))
 
 
-class Worker:
+class WorkerEntry:
     """Batches of one worker.  ``left``: units that it may still get (maxtasksperchild)."""
 
-    __slots__ = ("had", "key", "leaving", "left", "lent", "pinned", "queue", "recalled", "since")
+    __slots__ = ("had", "key", "leased", "leaving", "left", "pinned", "queue", "recalled", "since")
 
     def __init__(self, key: Any, left: int | None) -> None:
         self.key = key
@@ -213,9 +387,9 @@ class Worker:
         self.since = 0.0  # time when it became idle, or began its current batch
         self.recalled = False
         self.leaving = False
-        self.lent = False  # a caller uses it directly
+        self.leased = False  # callers send it calls directly
 
-    def in_progress(self, unread: set[int], running: tuple[int, int] | None) -> Batch | None:
+    def in_progress(self, unread: set[int], running: RunningTask | None) -> Batch | None:
         """Return the batch that the worker ran when it died; a worker reads one at a time."""
         read = [batch for batch in self.queue if batch.seq not in unread]
         named = [batch for batch in read if running is not None and batch.seq == running[0]]
@@ -240,5 +414,5 @@ class Loss(NamedTuple):
 
     job: Job
     task: int
-    counts: Counts
+    counts: LossCounts
     item: Any

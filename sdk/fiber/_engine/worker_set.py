@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from fiber._engine.start_failures import StartFailure, StartFailures
-from fiber._engine.tasks import Worker
+from fiber._engine.tasks import WorkerEntry
 from fiber.errors import FiberError
 
 IDLE_DEATHS = 3
@@ -18,16 +18,16 @@ IDLE_PAUSE = 1.0
 """Seconds between slow replacements."""
 
 
-class Member(Protocol):
+class PoolMember(Protocol):
     """Process of a worker, from before its start until it is gone."""
 
-    worker: Worker | None
+    worker: WorkerEntry | None
     """Worker's entry in the ledger, once the worker is ready."""
     leaving: bool
     """True once the process was asked to end, or is about to be."""
 
 
-class WorkerSet:
+class PoolWorkerSet:
     """Workers of a pool, ``minimum`` to ``maximum`` of them.
 
     ``members`` are the workers whose processes start or run.  ``size`` counts members that stay,
@@ -38,7 +38,7 @@ class WorkerSet:
     def __init__(self, minimum: int, maximum: int) -> None:
         self.minimum = minimum
         self.maximum = maximum
-        self.members: dict[Member, None] = {}
+        self.members: dict[PoolMember, None] = {}
         self.size = 0
         self.starting = 0
         self.trouble: FiberError | None = None
@@ -52,7 +52,7 @@ class WorkerSet:
         """Number of failed starts since the last success."""
         return self._failures.count
 
-    def staying(self) -> list[Member]:
+    def staying(self) -> list[PoolMember]:
         """Return the members that were not asked to end."""
         return [member for member in self.members if not member.leaving]
 
@@ -90,13 +90,13 @@ class WorkerSet:
 
     # Events
 
-    def add(self, member: Member) -> None:
+    def add(self, member: PoolMember) -> None:
         """Add a worker that is about to be started."""
         self.members[member] = None
         self.size += 1
         self.starting += 1
 
-    def ready(self, member: Member, worker: Worker) -> None:
+    def ready(self, member: PoolMember, worker: WorkerEntry) -> None:
         """Take note that a worker is ready."""
         member.worker = worker
         self.starting -= 1
@@ -112,12 +112,12 @@ class WorkerSet:
             if not self.failures:
                 self._failures.pause = 0.0
 
-    def let_go(self, member: Member) -> None:
+    def let_go(self, member: PoolMember) -> None:
         """Count a worker as leaving; the caller asks it to end, or kills it."""
         self._uncount(member)
         member.leaving = True
 
-    def gone(self, member: Member, now: float, failure: StartFailure | None) -> None:
+    def gone(self, member: PoolMember, now: float, failure: StartFailure | None) -> None:
         """Remove a worker whose process is gone, or could not be started.
 
         ``failure`` says why, if the worker was not ready.  None: the worker is not to blame, as
@@ -158,7 +158,7 @@ class WorkerSet:
             f"{failure.who} ended before it was ready ({failure.reason}). Trying again"
         )
 
-    def _uncount(self, member: Member) -> None:
+    def _uncount(self, member: PoolMember) -> None:
         if not member.leaving:
             self.size -= 1
             self.starting -= member.worker is None

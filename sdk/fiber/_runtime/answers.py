@@ -1,20 +1,97 @@
-"""Messages of pool workers, checked before anything believes them.
+"""Answers of workers: checked, and decoded as far as that runs none of the user's code.
 
-A task can write to the channel of its own worker, by mistake or because it was taken over.  The
-form of the messages is in ``fiber._wire.work``.
-"""
+A task can write to the channel of its own worker, by mistake or because it was taken over.  So each
+message is checked before it is believed.  The form of the messages is in ``fiber._wire.work``.
+
+The loop thread never runs the user's code, and unpickling may.  So a value that is not plain stays
+pickled until its reader asks for it, on the thread of the reader."""
 
 from __future__ import annotations
 
 import math
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
-from fiber._engine.ledger import WrongAnswer
-from fiber._runtime.outcome import outcomes
+from fiber._engine.tasks import WrongAnswer
 from fiber._wire import work
-from fiber._wire.packet import Message
+from fiber._wire.packet import BytesLike, Message
+
+
+class TaskFailure:
+    """The task raised, or could not run."""
+
+    __slots__ = ("error",)
+
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+
+
+class Pickled:
+    """A value or an error, still pickled."""
+
+    __slots__ = ("buffers", "data", "kind")
+
+    def __init__(self, kind: int, data: BytesLike, buffers: Sequence[memoryview]) -> None:
+        self.kind = kind
+        self.data = data
+        self.buffers = buffers
+
+    @property
+    def failed(self) -> bool:
+        """True if the outcome is an error."""
+        return self.kind != work.VALUE
+
+    def decode(self) -> Any:
+        """Return the value, or the Failure."""
+        try:
+            value = pickle.loads(self.data, buffers=self.buffers)
+        except Exception as error:
+            return TaskFailure(_unreadable(error))
+        return TaskFailure(value) if self.failed else value
+
+
+def is_failure(outcome: Any) -> bool:
+    """Tell whether a task failed.  A value that does not unpickle does not count."""
+    kind = type(outcome)
+    return kind is TaskFailure or (kind is Pickled and outcome.failed)
+
+
+def decode(outcome: Any) -> Any:
+    """A plain value as it is; what is pickled as its value or a Failure."""
+    return outcome.decode() if type(outcome) is Pickled else outcome
+
+
+def outcomes(
+    values: list[Any], odd: list[tuple[int, int, bytes | None, int]], buffers: list[memoryview]
+) -> list[Any]:
+    """A worker's answer with what is pickled in its place; ValueError if it does not fit."""
+    used = 0
+    for position, kind, data, count in odd:
+        if not (0 <= position < len(values) and 0 <= count <= len(buffers) - used):
+            raise ValueError("a pickled value has no place, or not its buffers")
+        if not (type(data) is bytes or (data is None and count)):
+            raise ValueError("a pickled value is not there")
+        values[position] = Pickled(kind, *work.found(data, buffers[used : used + count]))
+        used += count
+    return values
+
+
+def _unreadable(reason: Exception) -> Exception:
+    from multiprocessing.pool import MaybeEncodingError  # type: ignore[attr-defined]
+
+    error: Exception = MaybeEncodingError(reason, _UNREADABLE)
+    error.__cause__ = reason
+    return error
+
+
+class _Unreadable:
+    def __repr__(self) -> str:
+        return "a result that was sent but does not unpickle here"
+
+
+_UNREADABLE = _Unreadable()
+
 
 Words: TypeAlias = tuple[Any, ...]
 """Content of a worker's message.  Results are (seq, offset, kept, seconds, values, mixed, size):

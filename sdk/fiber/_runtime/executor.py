@@ -31,24 +31,26 @@ from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import StartFailure
 from fiber._exceptions import fresh
+from fiber._runtime.answers import TaskFailure, decode
 from fiber._runtime.background import BackgroundThread, UserThreads, say
-from fiber._runtime.calls import CallQueue, Calls
-from fiber._runtime.functions import Function, FunctionCache
-from fiber._runtime.host import TICK, Host, Loop, Timer
-from fiber._runtime.input_stream import InputStream
-from fiber._runtime.jobs import Jobs
+from fiber._runtime.jobs import TICK, CallQueue, Calls, Jobs
 from fiber._runtime.latch import Latch
-from fiber._runtime.launcher import Launcher
 from fiber._runtime.leases import ADOPTED, UNAVAILABLE, Leases
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.outcome import Failure, decode
-from fiber._runtime.receiver import Receiver
-from fiber._runtime.sender import Sender
-from fiber._runtime.time_limits import TimeLimits
-from fiber._runtime.work_items import Call, Future, WorkItem, pickle_call
-from fiber._runtime.worker_handle import WorkerHandle
-from fiber._runtime.worker_resources import WorkerResources
-from fiber._runtime.worker_view import WorkerView
+from fiber._runtime.receiver import AnswerReceiver
+from fiber._runtime.sender import BatchSender
+from fiber._runtime.state import Runtime
+from fiber._runtime.work_items import (
+    Call,
+    Function,
+    FunctionCache,
+    Future,
+    InputStream,
+    WorkItem,
+    pickle_call,
+)
+from fiber._runtime.workers import Launcher, WorkerHandle, WorkerResources, WorkerView
+from fiber._transport.loop import Timer
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import FiberError
@@ -61,13 +63,13 @@ class Waitable(Future, Protocol):
         """Wait for the result, or the exception."""
 
 
-class Executor:
+class PoolExecutor:
     """The working half of a pool; ``fiber.pool.Pool`` is its face, and may be forgotten first."""
 
     def __init__(
         self,
         options: PoolOptions,
-        host: Host,
+        runtime: Runtime,
         *,
         thread: Callable[[str], BackgroundThread] = BackgroundThread,
     ) -> None:
@@ -75,9 +77,9 @@ class Executor:
         self.threads = UserThreads(thread)
         self.ended = Latch()
         """Set when the last worker has ended."""
-        self._host = host
-        self._elastic = host.elastic
-        self._loop: Loop = host.loop
+        self._runtime = runtime
+        self._elastic = runtime.elastic
+        self._loop = runtime.loop
         self._background = self.threads.pickling
         self._scheduler = Scheduler(
             options.minimum,
@@ -86,15 +88,13 @@ class Executor:
             idle_timeout=options.idle_timeout,
         )
         self._ledger = self._scheduler.ledger
-        self.workers = WorkerView(self._scheduler.workers, host.loop)
+        self.workers = WorkerView(self._scheduler.workers, runtime.loop)
         self._jobs = Jobs(self._ledger, options.limits, retry=bool(options.retryable))
-        self._limits = TimeLimits(self._loop, self._scheduler, self._jobs, advance=self._advance)
-        self._sender = Sender(
+        self._sender = BatchSender(
             self._loop,
             self._background,
-            self._ledger,
+            self._scheduler,
             self._jobs,
-            self._limits,
             advance=self._advance,
         )
         self._resources = WorkerResources(options.resources)
@@ -108,7 +108,7 @@ class Executor:
         self._leases = Leases(
             self._scheduler, self._loop, on_adopted=self._adopt, on_back=self._back
         )
-        self._receiver = Receiver(
+        self._receiver = AnswerReceiver(
             self._loop,
             self._background,
             self._scheduler,
@@ -153,13 +153,13 @@ class Executor:
             self._end()
             raise
         if self._elastic:
-            self._host.look_at_program()
+            self._runtime.look_at_program()
             return  # the first task says what they need, and starts them
-        handles = [WorkerHandle(self, self._host) for _ in range(self.options.minimum)]
+        handles = [WorkerHandle(self, self._runtime) for _ in range(self.options.minimum)]
         try:
             self._loop.call_soon(self._begin, handles)
-            self._host.look_at_program()
-            self._launcher.launch_now(handles, self._host.config.start_timeout)
+            self._runtime.look_at_program()
+            self._launcher.launch_now(handles, self._runtime.config.start_timeout)
         except BaseException as error:
             self._loop.call_soon(self._launcher.give_up, handles)
             self.terminate(error)
@@ -212,7 +212,7 @@ class Executor:
             self._enqueue(call, timeout)
         elif outcome is not ADOPTED:
             outcome = decode(outcome)
-            if type(outcome) is Failure:
+            if type(outcome) is TaskFailure:
                 raise fresh(outcome.error)
             return outcome
         return future.get()
@@ -393,7 +393,7 @@ class Executor:
         try:
             while True:
                 self._again = False
-                if self._scheduler.needs_lent():
+                if self._scheduler.needs_leased():
                     self._leases.recall()
                 self._act(self._scheduler.decide(self._loop.now()))
                 if not self._again:
@@ -475,7 +475,7 @@ class Executor:
     # Workers come and go
 
     def _start_workers(self, count: int) -> None:
-        handles = [WorkerHandle(self, self._host) for _ in range(count)]
+        handles = [WorkerHandle(self, self._runtime) for _ in range(count)]
         self._begin(handles)
         self._launcher.launch_soon(handles)
 
@@ -501,7 +501,8 @@ class Executor:
 
     def on_draining(self, handle: WorkerHandle) -> None:
         """A worker's host is about to go: another takes its place, and what it has not begun."""
-        if handle.worker is not None and handle.worker.lent and not self._leases.recall_one(handle):
+        leased = handle.worker is not None and handle.worker.leased
+        if leased and not self._leases.recall_one(handle):
             self._draining.add(handle)  # until the caller that uses it brings it back
         elif self._scheduler.drain(handle):
             _logs.debug("worker %s is drained", handle.name)
@@ -513,11 +514,11 @@ class Executor:
 
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
         """A worker is gone, with or without having been told to."""
-        lent = handle.worker is not None and handle.worker.lent
-        if lent and not self._leases.recall_one(handle):
+        leased = handle.worker is not None and handle.worker.leased
+        if leased and not self._leases.recall_one(handle):
             self._exits[handle] = report  # whoever uses it notices, and brings it back
             return
-        self._limits.ended(handle, report.stack)
+        self._sender.exited(handle, report.stack)
         # A lost host says nothing of the worker.
         lost_host = report.disrupted or report.cause == Cause.AGENT_LOST
         failure = None if lost_host else handle.start_failure(report)
@@ -581,7 +582,7 @@ class Executor:
         if self._wake is not None:
             self._wake.cancel()
         self._launcher.close()
-        self._limits.close()
+        self._sender.close()
         self._leases.close()
         self.threads.stop()
         # Its traceback may hold the pool, whose finalizer holds this.

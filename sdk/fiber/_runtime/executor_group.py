@@ -12,9 +12,8 @@ from multiprocessing import util
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from fiber._runtime import methods
-from fiber._runtime.call_future import broken
-from fiber._runtime.executor import Executor
+from fiber._runtime import start_methods
+from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import Runtime
 from fiber.resources import Resources, merged, resources_of
@@ -34,13 +33,13 @@ class ExecutorGroup:
         self._template = template
         self._runtime = runtime
         self._owner = os.getpid()
-        self._executors: dict[Resources, Executor] = {}
+        self._executors: dict[Resources, PoolExecutor] = {}
         self._lock = threading.RLock()  # a finalizer may come back here
         self._closed = False
         # Forgotten with tasks under way, it ends after them.
         util.Finalize(self, _close_all, args=(self._executors,))
 
-    def executor_for(self, function: Callable[..., Any], wishes: Resources) -> Executor:
+    def executor_for(self, function: Callable[..., Any], wishes: Resources) -> PoolExecutor:
         """Return the executor for ``function``; raise an error after shutdown."""
         if os.getpid() != self._owner:
             raise RuntimeError(
@@ -59,14 +58,14 @@ class ExecutorGroup:
             raise broken(executor.error)
         return executor
 
-    def _start(self, kind: Resources) -> Executor:
-        methods.check_main()
+    def _start(self, kind: Resources) -> PoolExecutor:
+        start_methods.check_main()
         with self._lock:
             if self._closed:  # by another thread, just now
                 raise refusal()
             executor = self._executors.get(kind)
             if executor is None:
-                executor = Executor(self._template._replace(resources=kind), self._runtime)
+                executor = PoolExecutor(self._template._replace(resources=kind), self._runtime)
                 reference = weakref.ref(executor)
                 util.Finalize(executor, _finish, (reference,), exitpriority=_EXIT_PRIORITY)
                 try:
@@ -77,7 +76,7 @@ class ExecutorGroup:
                         executor.close()
             return executor
 
-    def executors(self) -> list[Executor]:
+    def executors(self) -> list[PoolExecutor]:
         """Return the present executors."""
         return list(self._executors.values())
 
@@ -101,7 +100,7 @@ class ExecutorGroup:
         for executor in self._close():
             executor.terminate(BrokenProcessPool("terminate_workers() ended its worker"))
 
-    def _close(self) -> list[Executor]:
+    def _close(self) -> list[PoolExecutor]:
         if os.getpid() != self._owner:
             return []  # a copy that came here by a fork: nothing is here to end
         with self._lock:
@@ -113,12 +112,12 @@ class ExecutorGroup:
             executor.threads.check_may_wait()
 
 
-def _close_all(executors: dict[Resources, Executor]) -> None:
+def _close_all(executors: dict[Resources, PoolExecutor]) -> None:
     for executor in executors.values():
         executor.close()
 
 
-def _finish(reference: weakref.ref[Executor]) -> None:
+def _finish(reference: weakref.ref[PoolExecutor]) -> None:
     """The program ends: once its tasks are done, as in concurrent.futures."""
     executor = reference()
     if executor is not None:
@@ -129,3 +128,10 @@ def _finish(reference: weakref.ref[Executor]) -> None:
 def refusal() -> RuntimeError:
     """Return the error of concurrent.futures for a call after ``shutdown``."""
     return RuntimeError("cannot schedule new futures after shutdown")
+
+
+def broken(error: BaseException) -> BrokenProcessPool:
+    """Return the exception of calls that no worker will run, because of ``error``."""
+    raised = BrokenProcessPool(f"the executor is broken: {error}")
+    raised.__cause__ = error
+    return raised

@@ -1,22 +1,30 @@
-"""The work items of a pool that are not done: their jobs in the ledger, their input, their futures.
+"""Work items of a pool that are not done: their jobs in the ledger, their input, their futures.
 
-On the loop's thread only.
+Single calls with the same options share a queue, and a job of the ledger that stays open.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from fiber import _logs
 from fiber._agent.interface import ExitReport
-from fiber._engine.charges import Limits
-from fiber._engine.chunks import Pace
-from fiber._engine.ledger import Job, Ledger, Loss, Receipt, Worker
-from fiber._runtime.outcome import Failure, Pickled
-from fiber._runtime.work_items import Call, WorkItem
+from fiber._engine.chunks import FLOOR, TaskPace
+from fiber._engine.ledger import Ledger
+from fiber._engine.scheduler import Scheduler
+from fiber._engine.tasks import Job, Limits, Loss, Receipt, WorkerEntry
+from fiber._runtime.answers import Pickled, TaskFailure
+from fiber._runtime.work_items import Call, WorkItem, is_wanted
+from fiber._transport.loop import Loop
 from fiber._wire import work
 from fiber.errors import TimeoutError, WorkerDied, block
+
+TICK = 1e-4
+"""Seconds that any timer waits at least: a shorter one would fire too early, by a rounding error,
+and would be set again and again."""
 
 
 class Jobs:
@@ -31,7 +39,7 @@ class Jobs:
     def open(self, item: WorkItem) -> Job:
         """Begin with it."""
         function = item.function
-        pace = Pace(function.pace if function is not None else None)
+        pace = TaskPace(function.pace if function is not None else None)
         if function is not None:
             function.pace = pace
         item.job = job = self._ledger.open(
@@ -108,7 +116,7 @@ class Jobs:
             return  # failed or cancelled meanwhile
         self._ledger.feed(job, item.stream.take())
         if error is not None and item.future is not None:
-            item.future.add_results(job.fed, [Failure(error)], True)
+            item.future.add_results(job.fed, [TaskFailure(error)], True)
         self.close(item)
         self._streams.pop(item, None)
 
@@ -150,7 +158,7 @@ class Jobs:
         ]
         if stack:
             lines.append(block("Where it was:", stack.splitlines()))
-        self.put(receipt, [Failure(TimeoutError("\n".join(lines)))])
+        self.put(receipt, [TaskFailure(TimeoutError("\n".join(lines)))])
 
     def put_losses(
         self, losses: list[Loss], worker: str, pid: int | None, report: ExitReport
@@ -174,9 +182,9 @@ class Jobs:
             )
             _logs.debug("%s is given up: %s", error.task, report.describe())
             if item.future is not None:
-                item.future.add_results(loss.task, [Failure(error)], True)
+                item.future.add_results(loss.task, [TaskFailure(error)], True)
             else:
-                loss.item.future.add_results(0, [Failure(error)], True)
+                loss.item.future.add_results(0, [TaskFailure(error)], True)
                 loss.item.future.set_done()
         for job in {loss.job for loss in losses}:
             self.check_finished(job)
@@ -206,7 +214,7 @@ class Jobs:
         self._ledger.cancel(job)
         self._over(item)
 
-    def cancel(self, item: WorkItem) -> list[Worker]:
+    def cancel(self, item: WorkItem) -> list[WorkerEntry]:
         """Drop the rest of ``item``; return the workers to recall its unread tasks from."""
         if item.job is None or item.job.owner is not item:
             return []  # it was never submitted, or is done
@@ -222,3 +230,156 @@ class Jobs:
             item.job.owner = None
         item.future = item.stream = None
         item.grants.clear()
+
+
+class CallQueue:
+    """Calls that share their options, in the order in which they were made."""
+
+    __slots__ = ("called", "item", "stale", "watched")
+
+    def __init__(
+        self,
+        *,
+        limits: Limits | None = None,
+        timeout: float | None = None,
+        cancellable: bool = False,
+    ) -> None:
+        self.item = WorkItem(
+            work.CALLS, exact=True, timeout=timeout, limits=limits, cancellable=cancellable
+        )
+        self.called: deque[Call] = deque()
+        """Calls that the loop has not taken.  Any thread appends."""
+        self.stale = False
+        """True while the loop is about to drop cancelled calls."""
+        self.watched = False
+        """True while the loop is about to look for more calls, and need not be told.  Only the loop
+        sets it, so an interrupted caller leaves it as it is."""
+
+
+class Calls:
+    """All the queues of one pool.
+
+    ``refusal`` says why no call is taken any more; ``advance`` is called when something follows.
+    """
+
+    def __init__(
+        self,
+        loop: Loop,
+        scheduler: Scheduler,
+        jobs: Jobs,
+        *,
+        refusal: Callable[[], BaseException | None],
+        advance: Callable[[], None],
+    ) -> None:
+        self._loop = loop
+        self._workers = scheduler.workers
+        self._ledger = scheduler.ledger
+        self._jobs = jobs
+        self._refusal = refusal
+        self._advance = advance
+        self._queues: dict[CallQueue, None] = {}
+        """Queues with open jobs."""
+        self._without_options = CallQueue()
+        self._took = -math.inf
+
+    # Any thread
+
+    def put(self, call: Call, queue: CallQueue | None = None) -> None:
+        """Add a call.  Without ``queue`` it has no options."""
+        if queue is None:
+            queue = self._without_options
+        queue.called.append(call)
+        if call.blocking or not queue.watched:
+            self._loop.call_soon(self._take, queue)
+
+    def drop_cancelled(self, queue: CallQueue) -> None:
+        """Calls were cancelled: let no worker be started for them."""
+        if not queue.stale:
+            queue.stale = True
+            try:
+                self._loop.call_soon(self._drop_cancelled, queue)
+            except BaseException:  # interrupted: the next one must not rely on it
+                queue.stale = False
+                raise
+
+    def close(self, queue: CallQueue) -> None:
+        """No call of it will come any more."""
+        self._loop.call_soon(self._close, queue)
+
+    # The loop's thread
+
+    def take_all(self) -> None:
+        """Take what was called until now."""
+        for queue in list(self._queues):
+            self._take(queue)
+
+    def close_all(self) -> None:
+        """No call will come any more."""
+        for queue in list(self._queues):
+            self._close(queue)
+
+    def cancel_all(self) -> None:
+        """Cancel the calls that no worker was given, where they can be cancelled."""
+        self.take_all()
+        for queue in self._queues:
+            if queue.item.cancellable and queue.item.job is not None:
+                for call in self._ledger.unfinished(queue.item.job):
+                    call.future.cancel()
+                self._drop_cancelled(queue)
+
+    def _close(self, queue: CallQueue) -> None:
+        if queue in self._queues:
+            self._take(queue)
+            del self._queues[queue]
+            self._jobs.close(queue.item)
+
+    def _drop_cancelled(self, queue: CallQueue) -> None:
+        queue.stale = False
+        job = queue.item.job
+        if job is not None:
+            self._ledger.drop_waiting(job, is_wanted)
+            self._jobs.check_finished(job)
+            self._advance()
+
+    def _take(self, queue: CallQueue) -> None:
+        """Calls have come.  Of many short ones in a row, several travel together.
+
+        Each would else wake a worker, which costs more than the call.
+        """
+        called = queue.called
+        calls = [called.popleft() for _ in range(len(called))]
+        refusal = self._refusal()
+        if refusal is not None:
+            for call in calls:
+                call.future.set_exception(refusal)
+        if not calls or refusal is not None:
+            return
+        job = self._job(queue)
+        now = self._loop.now()
+        hurried = now - self._took < FLOOR and job.pace.short
+        self._took = now
+        busy = job.fed - job.done >= self._workers.size
+        # One for each who is idle: whoever turns out to be stuck then holds up no other.
+        alone = self._ledger.idle_count()
+        for call in calls[:alone]:
+            self._ledger.feed(job, [call])
+            self._advance()
+        together = calls[alone:]
+        self._ledger.feed(job, together)
+        if not hurried or not busy or (together and together[-1].blocking):
+            self._advance()
+        elif not queue.watched:
+            queue.watched = True
+            self._loop.call_later(TICK, self._take_more, queue)
+
+    def _take_more(self, queue: CallQueue) -> None:
+        queue.watched = False
+        self._take(queue)
+        self._advance()
+
+    def _job(self, queue: CallQueue) -> Job:
+        if queue not in self._queues:
+            self._queues[queue] = None
+            self._jobs.open(queue.item)
+        assert queue.item.job is not None
+        return queue.item.job

@@ -25,12 +25,12 @@ from collections.abc import Callable
 from typing import Any
 
 from fiber._agent.interface import DirectChannel
-from fiber._engine.ledger import WrongAnswer
 from fiber._engine.scheduler import Scheduler
+from fiber._engine.tasks import WrongAnswer
 from fiber._runtime.answers import OTHER, read, single
-from fiber._runtime.host import Loop, Timer
 from fiber._runtime.work_items import Call
-from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.workers import WorkerHandle
+from fiber._transport.loop import Loop, Timer
 from fiber._wire import work
 from fiber._wire.packet import Message
 
@@ -44,14 +44,14 @@ NO_OP_MESSAGE = work.pack_calls([(pickle.dumps((bool, (), {})), ())])
 """A call whose answer says that all before it is answered."""
 
 
-class Pending:
+class NoOutcome:
     """Mark in place of an outcome that has not come."""
 
 
-UNAVAILABLE = Pending()
+UNAVAILABLE = NoOutcome()
 """No worker was to be had."""
 
-ADOPTED = Pending()
+ADOPTED = NoOutcome()
 """The loop has taken over, and will tell the call's future."""
 
 
@@ -161,7 +161,7 @@ class Leases:
         """Lend a worker that has become idle, if nobody else needs it."""
         if handle.worker is None or handle.child is None:
             return
-        if not self._scheduler.lend(handle.worker):
+        if not self._scheduler.lease(handle.worker):
             return
         channel = handle.child.lend()
         if channel is None:

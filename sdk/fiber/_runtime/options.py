@@ -10,7 +10,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
 from fiber import config, cpu
-from fiber._engine.charges import Limits
+from fiber._engine.tasks import Limits
 from fiber.resources import Resources
 
 LARGEST_CHUNK = 2**32 - 1

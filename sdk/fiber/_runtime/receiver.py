@@ -8,24 +8,23 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 
-from fiber._engine.ledger import Batch, WrongAnswer
 from fiber._engine.scheduler import Scheduler
-from fiber._runtime.answers import Words, read
+from fiber._engine.tasks import Batch, WrongAnswer
+from fiber._runtime.answers import Pickled, Words, read
 from fiber._runtime.background import BackgroundThread, say
-from fiber._runtime.host import Loop
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.leases import Leases
-from fiber._runtime.outcome import Pickled
-from fiber._runtime.sender import Sender
+from fiber._runtime.sender import BatchSender
 from fiber._runtime.work_items import WorkItem
-from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.workers import WorkerHandle
+from fiber._transport.loop import Loop
 from fiber._wire import work
 from fiber._wire.packet import Message
 
 _NOT_READY = "it answered for batch {} before it was ready"
 
 
-class Receiver:
+class AnswerReceiver:
     """Takes what workers say.  ``advance`` is called when something follows, ``on_ready`` with a
     worker that is ready for work."""
 
@@ -35,7 +34,7 @@ class Receiver:
         background: BackgroundThread,
         scheduler: Scheduler,
         jobs: Jobs,
-        sender: Sender,
+        sender: BatchSender,
         leases: Leases,
         *,
         advance: Callable[[], None],
@@ -67,7 +66,7 @@ class Receiver:
 
     def _take(self, handle: WorkerHandle, words: Words) -> None:
         if type(words[0]) is int:
-            if handle.worker is not None and handle.worker.lent:
+            if handle.worker is not None and handle.worker.leased:
                 self._last_words[handle] = words
             else:
                 self._answered(handle, words)
@@ -171,16 +170,7 @@ class Receiver:
             return
         if 0 in seqs:  # no batch, but what told it to end: the recall was later by an agent's turn
             handle.dismiss()
-        if seqs and handle.worker.lent:  # a recall that was on its way as it was lent took them
+        if seqs and handle.worker.leased:  # a recall that was on its way as it was lent took them
             self._taken_back.setdefault(handle, []).extend(seqs)
-        for seq in seqs:
-            batch = self._ledger.batches.get(seq)
-            if batch is None or batch.worker is not handle.worker:
-                continue
-            self._sender.settled(seq)
-            if batch.job is not None:
-                function = batch.job.owner.function
-                if function is not None:
-                    handle.known.pop(function.id, None)
-        self._ledger.put_back(handle.worker, seqs, self._loop.now())
+        self._sender.unread(handle.worker, seqs)
         self._advance()

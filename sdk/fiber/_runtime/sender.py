@@ -1,62 +1,67 @@
-"""From a batch to a packet on its way: pickled where that may be done, within its time.
+"""From a batch to a packet on its way: pickled, sent, and watched until its time limit.
 
-On the loop's thread, but for ``_encode``, which may run the user's code and so has the background
-thread.
+Runs on the loop thread.  ``_encode`` is the exception: it may run the user's code, and so runs on
+the background thread.
 """
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
+from itertools import chain
 
-from fiber._engine.ledger import Batch, Job, Ledger, Worker
+from fiber import reduction
+from fiber._engine.scheduler import Scheduler
+from fiber._engine.tasks import Batch, Job, WorkerEntry
+from fiber._runtime.answers import TaskFailure
 from fiber._runtime.background import BackgroundThread
-from fiber._runtime.host import Loop
 from fiber._runtime.jobs import Jobs
-from fiber._runtime.outcome import Failure
-from fiber._runtime.time_limits import TimeLimits
-from fiber._runtime.work_items import (
-    Encoded,
-    WorkItem,
-    blame_items,
-    claim,
-    encode,
-    is_wanted,
-    pack,
-    pickles_without_user_code,
-)
-from fiber._runtime.worker_handle import WorkerHandle
+from fiber._runtime.work_items import Call, WorkItem, is_wanted
+from fiber._runtime.workers import WorkerHandle
+from fiber._transport.loop import Loop, Timer
+from fiber._wire import work
+
+STACK_PATIENCE = 1.0
+"""Seconds that the end of a worker may take before its task fails without the stacks."""
+
+Encoded = work.Pickle
+"""Pickled items, and the buffers beside them."""
 
 
-class Sender:
-    """Sends batches.  ``advance`` is called when something follows."""
+class BatchSender:
+    """Sends batches.  Owns which batches are not sent, and what each worker was sent.
+
+    ``advance`` is called when the scheduler has to decide again.
+    """
 
     def __init__(
         self,
         loop: Loop,
         background: BackgroundThread,
-        ledger: Ledger,
+        scheduler: Scheduler,
         jobs: Jobs,
-        limits: TimeLimits,
         *,
         advance: Callable[[], None],
     ) -> None:
         self._loop = loop
         self._background = background
-        self._ledger = ledger
+        self._ledger = scheduler.ledger
         self._jobs = jobs
         self._advance = advance
-        self._limits = limits
+        self._limits = TimeLimits(loop, scheduler, jobs, advance=advance)
         self._unsent: set[int] = set()
-        """Batches that their workers do not have: nobody can have run them."""
+        """Batches that were not sent: no worker can have run them."""
+        self._functions: dict[WorkerEntry, dict[int, None]] = {}
+        """Functions that each worker was sent, and so remembers."""
 
     def send(self, batch: Batch) -> None:
         """Send a batch, or have it encoded where the user's code may run."""
         assert batch.job is not None
         item: WorkItem = batch.job.owner
-        if item.cancellable and not claim(batch):
+        if item.cancellable and not _claim(batch):
             self._drop_cancelled(batch, batch.job)
             return
-        if not pickles_without_user_code(item, batch):
+        if not _pickles_without_user_code(item, batch):
             self._unsent.add(batch.seq)
             try:
                 self._background.submit(self._encode, item, batch)
@@ -64,7 +69,7 @@ class Sender:
                 self._unsendable(batch, error)
             return
         try:
-            encoded = encode(item, batch, plain=True)
+            encoded = _encode(item, batch, plain=True)
         except Exception as error:  # no memory
             self._unsendable(batch, error)
         else:
@@ -76,10 +81,10 @@ class Sender:
         if batch.job is not None:
             try:
                 try:
-                    encoded = encode(item, batch, plain=False)
+                    encoded = _encode(item, batch, plain=False)
                 except Exception as raised:
-                    error = blame_items(item, batch, raised)
-            except BaseException as raised:  # whatever the user's pickler raises is its own
+                    error = _blame_items(item, batch, raised)
+            except BaseException as raised:  # the user's pickler may raise anything
                 error = raised
         self._loop.call_soon(self._encoded, item, batch, encoded, error)
 
@@ -102,29 +107,36 @@ class Sender:
         seq = batch.seq
         if item.timeout is not None:
             self._limits.begin(seq, item.timeout)
+        sent = self._functions.setdefault(batch.worker, {})
         try:
-            taken = handle.child.deliver(seq, *pack(item, batch, encoded, handle.known))
+            taken = handle.child.deliver(seq, *_pack(item, batch, encoded, sent))
         except Exception as error:  # the system has no memory or descriptor for it
             self._unsendable(batch, error)
             return
         if taken:
             self._unsent.discard(seq)
         else:
-            self._unsent.add(seq)  # its worker is gone, as will be heard
+            self._unsent.add(seq)  # its worker is gone, as the agent will report
 
     def _unsendable(self, batch: Batch, error: BaseException) -> None:
         """Fail the tasks of a batch that cannot be sent, and no others."""
         self._unsent.discard(batch.seq)
         self.settled(batch.seq)
-        self.split(batch.seq, Failure(error))
+        self.split(batch.seq, TaskFailure(error))
         self._advance()
 
     def _drop_cancelled(self, batch: Batch, job: Job) -> None:
-        """Give the others to whoever has time for them."""
+        """Drop the cancelled calls of a batch; the others wait again."""
         self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
         self._ledger.drop_waiting(job, is_wanted)
         self._jobs.check_finished(job)
         self._advance()
+
+    # What becomes of a batch that was sent
+
+    def settled(self, seq: int) -> None:
+        """End the time limit of a batch, if it has one: its outcome is known."""
+        self._limits.settled(seq)
 
     def split(self, seq: int, failure: object) -> None:
         """Send the tasks of a batch one by one; of a single one, ``failure`` is the outcome."""
@@ -137,12 +149,31 @@ class Sender:
         self._unsent.add(batch.seq)
 
     def reassign(self, batch: Batch) -> None:
-        """Give it to whoever has time for it, if it is still wanted."""
+        """Have the tasks of a batch wait again."""
         self._unsent.discard(batch.seq)
         self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
 
-    def lost(self, worker: Worker) -> set[int]:
-        """A worker is gone; those of its batches that were not sent."""
+    def unread(self, worker: WorkerEntry, seqs: list[int]) -> None:
+        """Have the tasks of batches wait again that the worker will never read."""
+        for seq in seqs:
+            batch = self._ledger.batches.get(seq)
+            if batch is None or batch.worker is not worker:
+                continue
+            self.settled(seq)
+            function = batch.job.owner.function if batch.job is not None else None
+            if function is not None:
+                self._functions.get(worker, {}).pop(function.id, None)
+        self._ledger.put_back(worker, seqs, self._loop.now())
+
+    # Ends
+
+    def exited(self, handle: WorkerHandle, stack: str) -> None:
+        """Fail the task for whose time limit a worker was killed; ``stack`` is what it wrote."""
+        self._limits.exited(handle, stack)
+
+    def lost(self, worker: WorkerEntry) -> set[int]:
+        """Forget the batches of a worker that is gone; return those that were not sent."""
+        self._functions.pop(worker, None)
         held = {batch.seq for batch in worker.queue}
         for seq in held:
             self.settled(seq)
@@ -150,6 +181,133 @@ class Sender:
         self._unsent -= held
         return unsent
 
+    def close(self) -> None:
+        """Stop all timers."""
+        self._limits.close()
+
+
+class TimeLimits:
+    """Time limits of batches: kill the worker of a task that takes too long.
+
+    ``advance`` is called when the scheduler has to decide again.
+    """
+
+    def __init__(
+        self, loop: Loop, scheduler: Scheduler, jobs: Jobs, *, advance: Callable[[], None]
+    ) -> None:
+        self._loop = loop
+        self._scheduler = scheduler
+        self._ledger = scheduler.ledger
+        self._jobs = jobs
+        self._advance = advance
+        self._timers: dict[int, Timer] = {}
+        self._ending: dict[WorkerHandle, tuple[int, Timer]] = {}
+        """Batches whose time is over, with timers that wait for the ends of their workers."""
+
+    def begin(self, seq: int, seconds: float) -> None:
+        """Start the time of a batch."""
+        self._timers[seq] = self._loop.call_later(seconds, self._over, seq)
+
     def settled(self, seq: int) -> None:
-        """End the time limit of a batch, if it has one: its outcome is known."""
-        self._limits.settled(seq)
+        """Drop the time limit of a batch, if it has one: its outcome is known."""
+        if self._timers:
+            timer = self._timers.pop(seq, None)
+            if timer is not None:
+                timer.cancel()
+
+    def exited(self, handle: WorkerHandle, stack: str) -> None:
+        """Fail the task that a worker was killed for, with the stacks that it has written."""
+        seq, timer = self._ending.pop(handle, (0, None))
+        if timer is None:
+            return
+        timer.cancel()
+        receipt = self._ledger.expire(seq)
+        if receipt is not None:
+            self._jobs.put_timeout(receipt, handle.name, stack)
+
+    def close(self) -> None:
+        """Stop all timers."""
+        for timer in (*self._timers.values(), *(timer for _, timer in self._ending.values())):
+            timer.cancel()
+        self._timers.clear()
+        self._ending.clear()
+
+    def _over(self, seq: int) -> None:
+        batch = self._ledger.batches.get(seq)
+        if self._timers.pop(seq, None) is None or batch is None:
+            return
+        handle: WorkerHandle = batch.worker.key
+        self._ledger.retire(batch.worker)
+        self._scheduler.let_go(handle)
+        self._ending[handle] = seq, self._loop.call_later(STACK_PATIENCE, self._unheard, handle)
+        handle.kill_with_stack()
+        self._advance()
+
+    def _unheard(self, handle: WorkerHandle) -> None:
+        """Fail the task without stacks: the worker's host is slow, or does not answer."""
+        self.exited(handle, "")
+        handle.kill()
+        self._advance()
+
+
+# Encoding
+
+
+def _claim(batch: Batch) -> bool:
+    """Claim all calls of a batch; return False if one was cancelled."""
+    return all(call.future.claim() for call in batch.items)
+
+
+def _blame_items(item: WorkItem, batch: Batch, error: Exception) -> Exception:
+    """Return the error of tasks that cannot be sent."""
+    if len(batch.items) != 1 or item.function is None:
+        return error
+    name = item.task_name(batch.start, batch.items[0])
+    return reduction.blame({f"the item of {name}": batch.items[0]}, error)
+
+
+def _pickles_without_user_code(item: WorkItem, batch: Batch) -> bool:
+    """Tell whether ``_encode`` runs none of the user's code for this batch."""
+    items = batch.items
+    return item.kind == work.CALLS or type(items) in (range, str, bytes) or work.is_plain(items)
+
+
+def _encode(item: WorkItem, batch: Batch, *, plain: bool) -> Encoded:
+    """Encode the items of a batch; ``plain`` says that this runs none of the user's code."""
+    if item.kind == work.CALLS:
+        calls: list[Call] = list(batch.items)
+        if len(calls) == 1:
+            return calls[0].message(), calls[0].buffers
+        buffers = list(chain.from_iterable(call.buffers for call in calls))
+        return work.pack_calls([(call.data, call.buffers) for call in calls]), buffers
+    if plain:
+        return work.beside((pickle.dumps(batch.items, 5), []))
+    items = tuple(batch.items) if type(batch.items) is list else batch.items
+    data, buffers, grants = reduction.encode_reusable(items)
+    if grants is not None:
+        item.grants.append(grants)
+    if len(buffers) > work.BUFFERS:
+        data, buffers = reduction.dumps(batch.items, 5), []
+    return work.beside((data, buffers))
+
+
+def _pack(item: WorkItem, batch: Batch, encoded: Encoded, sent: dict[int, None]) -> Encoded:
+    """Return the whole message for a batch; ``sent`` are the functions that its worker has."""
+    data, buffers = encoded
+    function = item.function
+    if function is None:
+        return encoded
+    carry = function.id not in sent
+    head = work.Head(
+        item.kind,
+        0 if item.exact else batch.stride,
+        item.unit,
+        function.id,
+        (len(function.data) or work.BESIDE) if carry else 0,
+        len(function.buffers) if carry else 0,
+    )
+    batch.has_function = carry
+    if not carry:
+        return work.pack_batch(head, b"", data), buffers
+    sent[function.id] = None
+    return work.pack_batch(head, function.data, data), [*function.buffers, *buffers]

@@ -21,16 +21,19 @@ from fiber._agent.interface import ChildHandle, ChildObserver, ChildSpec, ExitRe
 from fiber._hub import client as hub_client
 from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.hub import Hub
-from fiber._runtime import methods
+from fiber._runtime import start_methods
 from fiber._transport.loop import Loop
 from fiber._transport.unix import naming_the_limit
+from fiber._wire.blob import Blob
 from fiber.errors import StartError
 from fiber.resources import resources_of
 
 if TYPE_CHECKING:
     from fiber._backends.local import Backend
     from fiber._backends.shipping import Program, Shipping
-    from fiber._runtime.shared_arguments import SharedArguments
+
+_WORTH_SHARING = 1 << 16
+"""Bytes of a pickle below which it is as well sent to each process."""
 
 _EXIT_PRIORITY = -100  # after multiprocessing has ended daemons and joined the other children
 
@@ -126,14 +129,14 @@ class Runtime:
         # What such a process starts itself runs on its own host.
         data["calls"] = [
             (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),
-            (methods.inherit, (methods.chosen, methods.preload)),
+            (start_methods.inherit, (start_methods.chosen, start_methods.preload)),
         ]
         data["same_host"] = same_host
         if same_host:
             data["environ"] = dict(os.environb)
-            data["preload"] = [*methods.preload, *_modules_of(process)]
+            data["preload"] = [*start_methods.preload, *_modules_of(process)]
         elif self._shipping is not None:
-            data["preload"] = ["cloudpickle", *methods.preload, *_modules_of(process)]
+            data["preload"] = ["cloudpickle", *start_methods.preload, *_modules_of(process)]
         else:
             data["preload"] = ["cloudpickle"]
         program = None
@@ -168,6 +171,27 @@ class Runtime:
         self.backend.close()
         self.loop.stop()
         self._close_hub()
+
+
+class SharedArguments:
+    """``args`` of Processes, to be pickled when the first is started.
+
+    If several threads start one first, each may pickle them: equal bytes are the same blob.
+    """
+
+    def __init__(self, args: tuple[Any, ...]) -> None:
+        self.args = args
+        self._blob: Blob | None = None
+        self._tried = False
+
+    def blob(self, *, same_host: bool) -> Blob | None:
+        """Return their pickle; None if each process gets a separate pickle."""
+        if not self._tried:
+            data = reduction.dump_shared(self.args, same_host=same_host)
+            if data is not None and len(data) >= _WORTH_SHARING:
+                self._blob = Blob(data)
+            self._tried = True
+        return self._blob
 
 
 class ChildOwner(ChildObserver, Protocol):

@@ -1,23 +1,218 @@
-"""Work items of a pool, which are calls and maps, and their messages.
+"""Work items of a pool: calls and maps, the functions that they apply, and their input.
 
-As in ``concurrent.futures``, a work item holds what to run and the future that gets the outcome;
-here one item may be a map of a million tasks.
+As in ``concurrent.futures``, a work item holds what to run and the future that gets the outcome.
+Here one item may be a map of a million tasks.
 """
 
 from __future__ import annotations
 
-import pickle
+import contextlib
+import itertools
+import queue
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import chain
 from typing import Any, Protocol
 
 from fiber import reduction
-from fiber._engine.charges import Limits
-from fiber._engine.ledger import Batch, Job
+from fiber._engine.chunks import TaskPace
+from fiber._engine.tasks import Job, Limits
 from fiber._hub.handles import GrantSet
-from fiber._runtime.functions import Function, name_of
-from fiber._runtime.input_stream import InputStream
+from fiber._runtime.latch import check_may_wait
+from fiber._transport.loop import DOZE
 from fiber._wire import packet, work
+
+FUNCTIONS = 128
+"""Functions that are recognized when they come again."""
+
+FUNCTION_SIZE = 1 << 16
+"""Bytes of a pickled function up to which it is."""
+
+
+class Function:
+    """A function that workers are asked to apply, pickled once."""
+
+    __slots__ = ("buffers", "data", "grants", "id", "name", "pace")
+
+    def __init__(
+        self,
+        id_: int,
+        name: str,
+        data: bytes,
+        buffers: Sequence[memoryview],
+        grants: GrantSet | None,
+        pace: TaskPace | None = None,
+    ) -> None:
+        self.grants = grants
+        self.id = id_
+        self.name = name
+        self.data = data
+        self.buffers = buffers
+        self.pace = pace
+
+
+def name_of(function: Any) -> str:
+    """Return the name of a function, for messages."""
+    return getattr(function, "__qualname__", None) or repr(function)
+
+
+class FunctionCache:
+    """Recognizes functions.  Any thread."""
+
+    def __init__(self) -> None:
+        self._known: dict[bytes, Function] = {}
+        self._ids = itertools.count(1)
+
+    def get(self, function: Callable[..., Any]) -> Function:
+        """``function``, pickled; one that pickles as an earlier one did is the same."""
+        try:
+            data, buffers, grants = reduction.encode_reusable(function)
+        except reduction.REFUSALS as error:
+            what = f"the function {name_of(function)}"
+            raise reduction.blame({what: function}, error) from error
+        known = self._known.get(data)
+        if known is not None:
+            return known
+        sent = work.beside((data, buffers))
+        made = Function(next(self._ids), name_of(function), *sent, grants)
+        if not buffers and grants is None and len(data) <= FUNCTION_SIZE:
+            if len(self._known) >= FUNCTIONS:
+                self._known.clear()  # in one step: several threads may be here
+            self._known[data] = made
+        return made
+
+
+AHEAD = 3
+"""Messages worth of tasks that are read ahead for each worker."""
+
+
+class InputStream:
+    """The input of one job.  ``limit``: tasks that may be read and not yet consumed by the user.
+
+    ``consumed`` says how many were.  ``notify`` is called, on the reading thread or the user's,
+    when there is something that the executor waits for: input, or room below the limit.
+    """
+
+    def __init__(
+        self,
+        unit: int,
+        notify: Callable[[], None],
+        limit: int | None = None,
+        consumed: Callable[[], int] = lambda: 0,
+    ) -> None:
+        self.ended = False
+        """True once reading has ended."""
+        self._unit = unit
+        self._limit = None if limit is None else max(limit, unit)
+        self._consumed = consumed
+        self._notify = notify
+        self._items: deque[Any] = deque()
+        self._credit: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._granted = 0
+        self._taken = 0
+        self._awaited = True
+        self._refused = 0  # how often the executor has looked for room
+        self._asked = 0  # of these, the last time that it found some or was asked to look again
+
+    # The reading thread
+
+    def read(self, iterable: Iterable[Any]) -> None:
+        """Read it all; raises what the iterable raises."""
+        check_may_wait()
+        iterator = iter(iterable)
+        items, unit = self._items, self._unit
+        chunk: list[Any] = []
+        while (credit := self._next_credit()) > 0:
+            left = credit
+            for item in itertools.islice(iterator, credit):
+                left -= 1
+                chunk.append(item)
+                if len(chunk) == unit:
+                    items.extend(chunk)
+                    chunk.clear()
+                    if self._awaited:
+                        self._awaited = False
+                        self._notify()
+                if self.ended:
+                    return
+            if left:
+                items.extend(chunk)
+                return
+
+    def _next_credit(self) -> int:
+        while True:
+            with contextlib.suppress(queue.Empty):
+                return self._credit.get(timeout=DOZE)  # a signal may be slept over
+
+    def read_on_thread(
+        self, iterable: Iterable[Any], finish: Callable[[BaseException | None], None]
+    ) -> None:
+        """Read it all on a thread of its own, and ``finish`` with what was raised, if anything."""
+
+        def run() -> None:
+            error = None
+            try:
+                self.read(iterable)
+            except BaseException as raised:
+                error = raised
+            finish(error)
+
+        try:
+            threading.Thread(target=run, name="fiber-pool-feeder", daemon=True).start()
+        except RuntimeError as error:  # the system has no room for it
+            finish(error)
+
+    # The user's thread
+
+    def ask(self) -> None:
+        """The user took results: notify, if there was no room before.
+
+        Only notes that it has, when it has: whoever is interrupted asks again the next time.
+        """
+        refused = self._refused
+        if self._asked < refused:
+            self._notify()
+            self._asked = refused
+
+    # The executor
+
+    def take(self) -> list[Any]:
+        """Take the items that were read."""
+        items = self._items
+        taken = [items.popleft() for _ in range(len(items))]
+        self._taken += len(taken)
+        return taken
+
+    def await_input(self) -> None:
+        """Notify when there is something.  Take once more after this: it may have come before."""
+        self._awaited = True
+
+    def grant(self, waiting: int, workers: int, pace: TaskPace, target: float) -> None:
+        """Let the reader go on if little is left: ``waiting`` tasks that nobody has yet."""
+        bound = AHEAD * max(workers, 1) * max(pace.message_size(target), self._unit)
+        ahead = waiting + self._granted - self._taken
+        if self.ended or 2 * ahead > bound:
+            return
+        units = -(-(bound - ahead) // self._unit)
+        if self._limit is not None:
+            self._refused += 1  # first: who consumes after the count asks
+            units = min(units, self._room(self._limit) // self._unit)
+        if units:
+            self._asked = self._refused
+            self._granted += units * self._unit
+            self._credit.put(units * self._unit)
+
+    def _room(self, limit: int) -> int:
+        return limit - (self._granted - self._consumed())
+
+    def lift_limit(self) -> None:
+        """Read without a limit: a caller that waits for all results consumes none."""
+        self._limit = None
+
+    def end(self) -> None:
+        """Read no more."""
+        self.ended = True
+        self._credit.put(0)
 
 
 class Future(Protocol):
@@ -183,67 +378,3 @@ def _blame_call(
 def is_wanted(call: Any) -> bool:
     """Tell whether a waiting call was not cancelled.  If it was, its waiters are notified."""
     return not call.future.cancelled() or call.future.claim()
-
-
-def claim(batch: Batch) -> bool:
-    """Claim all calls of a batch; return False if one was cancelled."""
-    return all(call.future.claim() for call in batch.items)
-
-
-def blame_items(item: WorkItem, batch: Batch, error: Exception) -> Exception:
-    """Return the error of tasks that cannot be sent."""
-    if len(batch.items) != 1 or item.function is None:
-        return error
-    name = item.task_name(batch.start, batch.items[0])
-    return reduction.blame({f"the item of {name}": batch.items[0]}, error)
-
-
-def pickles_without_user_code(item: WorkItem, batch: Batch) -> bool:
-    """Tell whether ``encode`` runs none of the user's code for this batch."""
-    items = batch.items
-    return item.kind == work.CALLS or type(items) in (range, str, bytes) or work.is_plain(items)
-
-
-Encoded = work.Pickle
-"""Pickled items, and the buffers beside them."""
-
-
-def encode(item: WorkItem, batch: Batch, *, plain: bool) -> Encoded:
-    """The items of a batch; ``plain`` says that pickling them runs none of the user's code."""
-    if item.kind == work.CALLS:
-        calls: list[Call] = list(batch.items)
-        if len(calls) == 1:
-            return calls[0].message(), calls[0].buffers
-        buffers = list(chain.from_iterable(call.buffers for call in calls))
-        return work.pack_calls([(call.data, call.buffers) for call in calls]), buffers
-    if plain:
-        return work.beside((pickle.dumps(batch.items, 5), []))
-    items = tuple(batch.items) if type(batch.items) is list else batch.items
-    data, buffers, grants = reduction.encode_reusable(items)
-    if grants is not None:
-        item.grants.append(grants)
-    if len(buffers) > work.BUFFERS:
-        data, buffers = reduction.dumps(batch.items, 5), []
-    return work.beside((data, buffers))
-
-
-def pack(item: WorkItem, batch: Batch, encoded: Encoded, known: dict[int, None]) -> Encoded:
-    """The whole message for a batch; ``known`` are the functions that its worker was sent."""
-    data, buffers = encoded
-    function = item.function
-    if function is None:
-        return encoded
-    carry = function.id not in known
-    head = work.Head(
-        item.kind,
-        0 if item.exact else batch.stride,
-        item.unit,
-        function.id,
-        (len(function.data) or work.BESIDE) if carry else 0,
-        len(function.buffers) if carry else 0,
-    )
-    batch.has_function = carry
-    if not carry:
-        return work.pack_batch(head, b"", data), buffers
-    known[function.id] = None
-    return work.pack_batch(head, function.data, data), [*function.buffers, *buffers]

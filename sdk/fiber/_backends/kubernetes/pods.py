@@ -16,8 +16,7 @@ from fiber._backends.kubernetes.program import ListenerObserver, PreparedPool
 from fiber._backends.kubernetes.waiting import Preparation, Waiting
 from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
-from fiber._engine.demand import Demand
-from fiber._engine.placement import Placement
+from fiber._engine.placement import Demand, Placement
 from fiber._hub.hub import Hub
 from fiber._transport.handshake import Identity
 from fiber._transport.link import Link

@@ -1,10 +1,12 @@
-"""Start methods: the one in force for this program, and what the zygote imports for it.
+"""Start method of this program, and the zygote's start before the rest of Fiber is imported.
 
-A child starts with its parent's.
+A child begins with the start method and the preloaded modules of its parent.
 """
 
 from __future__ import annotations
 
+import contextlib
+import resource
 import sys
 from multiprocessing.process import current_process
 
@@ -15,6 +17,13 @@ START_METHODS = ("forkserver", "spawn", "fork")
 
 chosen: str | None = None
 """Start method that ``set_start_method`` set, or that the first use settled."""
+
+_FEW_DESCRIPTORS = 64
+"""Limit of open files below which the zygote is not started early: the step that needs it first
+reports what is missing."""
+
+_LOCAL = ("local", "auto")
+"""Backends whose children are this process's own, or may be."""
 
 preload: list[str] = []
 """Modules that the zygote imports before it forks."""
@@ -55,3 +64,16 @@ def check_main() -> None:
         "imported. A new process imports the main module first, so processes would start without "
         'end. Put the lines that start processes under: if __name__ == "__main__":'
     )
+
+
+def start_zygote() -> None:
+    """Have the zygote start and import while this process does."""
+    from fiber import config  # not for children, which only inherit the start method
+    from fiber._agent import zygote_process
+
+    if "fiber._runtime.state" in sys.modules or config.current().backend not in _LOCAL:
+        return
+    if resource.getrlimit(resource.RLIMIT_NOFILE)[0] < _FEW_DESCRIPTORS:
+        return
+    with contextlib.suppress(OSError):  # the first child tries again and reports the error
+        zygote_process.start_early()
